@@ -12,6 +12,7 @@ import time
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import safetensors.torch
@@ -27,9 +28,24 @@ from pansplat.predictor import Predictor
 
 _MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash
-_GAINS = "gains"
+_GAINS, _REFINEMENT = "gains", "refinement"
 _ABANDONED_SECONDS = 3600.0  # after which an unfinished file is that of a process that was killed
 _FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
+
+
+class CachedScene(NamedTuple):
+    """Content of a file.
+
+    Attributes:
+        gaussians, gains: see `Scene`.
+        steps: of the refinement; 0 for a prediction.
+        is_starved: whether the refinement did few steps because other processes had the processor.
+    """
+
+    gaussians: Gaussians
+    gains: Gains = ()
+    steps: int = 0
+    is_starved: bool = False
 
 
 class CachedPrediction:
@@ -47,16 +63,18 @@ class CachedPrediction:
         self._folders = list_cache_folders(pair)
         self._num_views = len(views.images)
 
-    def read(self) -> tuple[Gaussians, Gains] | None:
-        """Gaussians and gains (see `Scene`) of the first undamaged file; None if there is none."""
-        found = (_read_gaussians(folder / self._name, self._num_views) for folder in self._folders)
+    def read(self) -> CachedScene | None:
+        """Content of the first undamaged file; None if there is none."""
+        found = (_read_scene(folder / self._name, self._num_views) for folder in self._folders)
         return next((content for content in found if content is not None), None)
 
-    def write(self, gaussians: Gaussians, gains: Gains = ()) -> None:
+    def write(self, content: CachedScene) -> None:
         """Write to the first writable folder, if any, and delete outdated predictions there."""
-        tensors = {name: getattr(gaussians, name).detach().cpu().contiguous() for name in _FIELDS}
-        if gains:
-            tensors[_GAINS] = torch.tensor(gains, dtype=torch.float64)
+        tensors = {name: getattr(content.gaussians, name).detach().cpu().contiguous() for name in _FIELDS}
+        if content.gains:
+            tensors[_GAINS] = torch.tensor(content.gains, dtype=torch.float64)
+        if content.steps:
+            tensors[_REFINEMENT] = torch.tensor((content.steps, content.is_starved))
         body = safetensors.torch.save(tensors)
         written = write_cache_file(self._folders, self._name, body, zlib.crc32(body).to_bytes(4, "little"))
         for old in [] if written is None else written.parent.glob("*.scene"):
@@ -112,8 +130,8 @@ def _hash_inputs(views: Views, predictor: Predictor, refinement: str) -> str:
     return digest.hexdigest()
 
 
-def _read_gaussians(path: Path, num_views: int) -> tuple[Gaussians, Gains] | None:
-    """The Gaussians and gains of a file; None if it is missing, damaged, or holds values that no predictor writes."""
+def _read_scene(path: Path, num_views: int) -> CachedScene | None:
+    """The content of a file; None if it is missing, damaged, or holds values that no predictor writes."""
     try:
         content = read_file(path)
         body, checksum = content[:-4], int.from_bytes(content[-4:], "little")
@@ -122,6 +140,7 @@ def _read_gaussians(path: Path, num_views: int) -> tuple[Gaussians, Gains] | Non
         tensors = safetensors.torch.load(body)
         gaussians = Gaussians(*(tensors[name] for name in _FIELDS))
         gains = tensors.get(_GAINS, torch.zeros(0))
+        steps, is_starved = tensors.get(_REFINEMENT, torch.zeros(2)).tolist()
     except (OSError, ValueError, KeyError, safetensors.SafetensorError):
         return None
     floats = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.harmonics)
@@ -136,7 +155,7 @@ def _read_gaussians(path: Path, num_views: int) -> tuple[Gaussians, Gains] | Non
     is_valid = gains.dtype == torch.float64 and gains.shape == (num_views, 3) and bool((gains > 0).all())
     if gains.numel() and not (is_valid and bool(gains.isfinite().all())):
         return None
-    return gaussians, tuple(map(tuple, gains.tolist()))
+    return CachedScene(gaussians, tuple(map(tuple, gains.tolist())), int(steps), bool(is_starved))
 
 
 def _make_file_name(name: str) -> str:

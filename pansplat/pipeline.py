@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -18,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.cache import CachedPrediction
+from pansplat.cache import CachedPrediction, CachedScene
 from pansplat.data import folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
@@ -26,7 +27,7 @@ from pansplat.errors import InputError
 from pansplat.files import expand_home, find_scene_suffix
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.ply import save_ply_parts
-from pansplat.gaussians.scene import Gains, Gaussians, Scene, empty_gaussians, prune
+from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
 from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.model.layers import Precision
@@ -60,6 +61,8 @@ _DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
 _MAX_CACHED_HEIGHT = 512  # of predictions of networks; taller ones are written tile by tile
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
 _GAUSSIANS_OF_ROWS = 0.75  # of a panorama, over the square of its height
+_ENOUGH_STEPS = 40  # of a refinement; more change little
+_STARVED_SHARE = 1 / 3  # of the processor's threads, below which a refinement of fewer steps is starved by load
 _MAX_MERGERS = 4  # Gaussians that become one on average
 
 
@@ -197,7 +200,8 @@ def predict(
 ) -> Scene:
     """Predict the scene of a pair's context panoramas, and refine it.
 
-    The prediction of a pair and its refinement are cached in its folder (`pansplat.cache`).
+    The prediction of a pair and its refinement are cached in its folder (`pansplat.cache`). A cached refinement of few
+    steps, which shared the processor with other work, is run once more, and the one of more steps is kept.
 
     Args:
         source: a pair, the path of a folder that holds exactly one pair, or loaded panoramas (never cached).
@@ -227,40 +231,44 @@ def predict(
         return _predict_views(cached_pair, views, predictor, height, report)
     refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
     cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
-    refined = _read_cached(cached, views, predictor)
-    if refined is not None and on_predicted is None:
+    found = None if cached is None else cached.read()
+    final = None if found is None or found.is_starved else _make_scene(found, views, predictor)
+    if final is not None and on_predicted is None:
         report("read from the cache", 1.0)
-        return refined
+        return final
     scene = _predict_views(cached_pair, views, predictor, height, lambda what, done: report(what, 0.5 * done))
     if on_predicted is not None:
         on_predicted(scene)
-    if refined is not None:
-        return refined
-    scene = refine(
-        scene, views, seconds=refine_seconds, config=config, progress=lambda what, done: report(what, 0.5 + 0.5 * done)
+    if final is not None:
+        return final
+    began = time.process_time()
+    scene, done = _run_refinement(
+        scene, views, refine_seconds, None, config, 0, lambda what, done: report(what, 0.5 + 0.5 * done)
     )
+    share = (time.process_time() - began) / (done.seconds * torch.get_num_threads())  # of the processor
     if cached is not None:
-        cached.write(scene.gaussians, scene.gains)
+        is_starved = done.stopped == "done" and done.steps < _ENOUGH_STEPS and share < _STARVED_SHARE
+        refined = CachedScene(scene.gaussians, scene.gains, done.steps, is_starved and found is None)
+        if found is not None and found.steps > done.steps:
+            refined = found._replace(is_starved=False)  # it runs once more only
+        cached.write(refined)
+        return _make_scene(refined, views, predictor)
     return scene
 
 
 def _predict_views(pair: Pair | None, views: Views, predictor: Predictor, height: int, progress: Progress) -> Scene:
     """Predict without refinement; with a pair the cache is read and written."""
     cached = None if pair is None else CachedPrediction(pair, views, predictor, height)
-    scene = _read_cached(cached, views, predictor)
-    if scene is not None:
+    found = None if cached is None else cached.read()
+    if found is not None:
         progress("read from the cache", 1.0)
-        return scene
+        return _make_scene(found, views, predictor)
     gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress)
     assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
+    predicted = CachedScene(gaussians)
     if cached is not None:
-        cached.write(gaussians)
-    return _make_scene(gaussians, views, predictor)
-
-
-def _read_cached(cached: CachedPrediction | None, views: Views, predictor: Predictor) -> Scene | None:
-    content = None if cached is None else cached.read()
-    return None if content is None else _make_scene(content[0], views, predictor, content[1])
+        cached.write(predicted)
+    return _make_scene(predicted, views, predictor)
 
 
 def refine(
@@ -433,8 +441,8 @@ def predict_to_file(
         )
         pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
         if suffix == ".ply":
-            return save_ply_parts(_make_scene(empty_gaussians(), views, predictor), pruned, path)
-        scene = _make_scene(Gaussians.cat(list(pruned)), views, predictor)
+            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), views, predictor), pruned, path)
+        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), views, predictor)
     else:
         scene = predict(pair, predictor, height=height, refine_seconds=refine_seconds, cache=cache, progress=progress)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
@@ -567,14 +575,14 @@ def _load_only_pair(path: str | Path) -> Pair:
     return pairs[0]
 
 
-def _make_scene(gaussians: Gaussians, views: Views, predictor: Predictor, gains: Gains = ()) -> Scene:
+def _make_scene(content: CachedScene, views: Views, predictor: Predictor) -> Scene:
     return Scene(
-        gaussians,
+        content.gaussians,
         views.cam2world.double(),
         near=views.near,
         far=views.far,
         names=views.names,
         model=predictor.name,
         height=views.images.shape[-2],
-        gains=gains,
+        gains=content.gains,
     )

@@ -1,18 +1,22 @@
 """The prediction cache: invalidation, damaged files, folders."""
 
 import dataclasses
+import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from pansplat import pipeline
 from pansplat.cache import list_cache_folders, write_cache_file
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -138,17 +142,52 @@ def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> Non
     assert not any(folder.exists() for folder in list_cache_folders(pair))
 
 
+@pytest.fixture
+def gray_pair(pair_folder: Path) -> Path:
+    """Photographs of different exposure, which a refinement finds."""
+    for name, gray in (("left.png", 90), ("right.png", 140)):
+        Image.new("L", (2 * HEIGHT, HEIGHT), gray).convert("RGB").save(pair_folder / name)
+    return pair_folder
+
+
 @pytest.mark.usefixtures("refinement_clock")
-def test_a_refined_scene_is_cached_apart_from_its_prediction(pair_folder: Path, sphere_predictor) -> None:
+def test_a_refined_scene_is_cached_apart_from_its_prediction(
+    gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "time", SimpleNamespace(process_time=itertools.count(step=100).__next__))
     predictor, shown = sphere_predictor(), []
-    first = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, on_predicted=shown.append)
-    again = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, on_predicted=shown.append)
+    first = predict(gray_pair, predictor, height=HEIGHT, refine_seconds=1.0, on_predicted=shown.append)
+    again = predict(gray_pair, predictor, height=HEIGHT, refine_seconds=1.0, on_predicted=shown.append)
     assert have_equal_gaussians(first, again) and predictor.calls == 1
     assert len(first.gains) == 2 and again.gains == first.gains
-    prediction = predict(pair_folder, predictor, height=HEIGHT)
+    prediction = predict(gray_pair, predictor, height=HEIGHT)
     assert not have_equal_gaussians(first, prediction) and predictor.calls == 1
     assert len(shown) == 2 and all(have_equal_gaussians(scene, prediction) for scene in shown)
-    assert len(list((pair_folder / ".pansplat").iterdir())) == 2
+    assert len(list((gray_pair / ".pansplat").iterdir())) == 2
+
+
+@pytest.mark.usefixtures("refinement_clock")
+def test_a_refinement_that_load_has_starved_is_run_once_more(
+    gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work: list[str] = []
+
+    def refine(processor_seconds: float, **limit: float) -> Scene:
+        clock = SimpleNamespace(process_time=itertools.count(step=processor_seconds).__next__)
+        monkeypatch.setattr(pipeline, "time", clock)
+        work.clear()
+        report = lambda what, _: work.append(what)  # noqa: E731
+        return predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_seconds=1.0, progress=report)
+
+    first = refine(0.1)
+    second = refine(0.1)  # starved again, and a run of as many steps
+    assert "refining" in work and have_equal_gaussians(first, second)
+    refine(0.1)
+    assert work == ["read from the cache"]
+    shutil.rmtree(gray_pair / ".pansplat")
+    for _ in range(2):
+        refine(100.0)
+    assert work == ["read from the cache"], "a run that had the processor is kept"
 
 
 @pytest.mark.usefixtures("refinement_clock")
