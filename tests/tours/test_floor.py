@@ -1,0 +1,89 @@
+"""The floor under cameras, and floor plans."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+import torch
+
+import pansplat.tours as tours
+from pansplat.data.pairs import Panorama
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.tours import TourGraph, draw_floor_plan, find_floor_outline
+
+
+@pytest.fixture(scope="module")
+def room_scene() -> Scene:
+    """Gaussians on the surfaces of a room 4 m wide and 6 m long, around a camera 1.5 m over its floor; z is up."""
+    low, high, count = np.array((-1.0, -2.0, 0.0)), np.array((3.0, 4.0, 2.5)), 20000
+    here = np.array((0.5, 0.0, 1.5))
+    directions = fibonacci_directions(count).double().numpy() + 1e-9
+    far = np.where(directions > 0, high - here, low - here) / directions
+    means = here + far.min(-1, keepdims=True) * directions
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor(((1.0, 0, 0), (0, 0, 1), (0, -1, 0)))
+    pose[:3, 3] = torch.from_numpy(here)
+    zeros = torch.zeros(count, dtype=torch.int64)
+    gaussians = Gaussians(
+        torch.from_numpy(means).float(),
+        torch.full((count, 3), 0.02),
+        torch.tensor((1.0, 0, 0, 0)).expand(count, 4),
+        torch.ones(count),
+        torch.zeros(count, 1, 3),
+        zeros,
+        zeros,
+    )
+    return Scene(gaussians, pose[None], 0.45, 10.0)
+
+
+def test_the_floor_of_a_room_ends_at_its_walls(room_scene):
+    level = room_scene.cam2world[0, :3, :3].numpy()
+    outline = find_floor_outline(room_scene, 0, level)
+    assert outline.camera_height == pytest.approx(1.5, abs=0.01)
+    assert np.allclose(outline.center, (0.5, 0.0)), "right is x, forward is y of this world"
+    inside = (outline.corners - (-1, -2)) / (4, 6)
+    border = np.minimum(inside, 1 - inside).min(axis=1)
+    assert np.abs(border).max() < 0.04, "all corners are near a wall"
+    scene = Scene(room_scene.gaussians.select(torch.arange(20)), room_scene.cam2world, 0.45, 10.0)
+    assert find_floor_outline(scene, 0, level) is None and tours.find_camera_height(scene, 0, level) is None
+    assert tours.find_camera_height(room_scene, 0, level) == outline.camera_height
+    assert tours.choose_camera_height((1.0, None, 1.4, 1.6), 10.0) == 1.4
+    assert tours.choose_camera_height((None,), 10.0) == 1.5
+
+
+def test_the_plan_shows_the_floor_and_its_walls(room_scene):
+    panoramas = (Panorama("a", Path("a"), room_scene.cam2world[0]),)
+    tour = TourGraph("", Path(), panoramas, 0.45, 10.0)
+    outline = find_floor_outline(room_scene, 0, tour.level_axes)
+    plan = draw_floor_plan(tour, [outline], size=200)
+    assert max(plan.image.shape[:2]) in (200, 201)
+
+    def alpha(x: float, y: float) -> int:
+        column, row = plan.to_pixels(np.array((x, y))).round().astype(int)
+        return int(plan.image[row, column, 3])
+
+    assert alpha(0.5, 0) == alpha(2.8, 3.8) == alpha(-0.8, -1.8) == 255
+    assert alpha(3.3, 0) == alpha(0.5, 4.3) == alpha(-1.3, -2.3) == 0
+    walls = (plan.image[..., 0] > 200).sum() / plan.pixels_per_metre
+    assert 20 < walls / 2 < 26, "a line of 2 pixels around 20 m"
+    empty = draw_floor_plan(tour, [])
+    assert empty.image.max() == 0
+    assert math.isfinite(empty.pixels_per_metre)
+
+
+def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):
+    tours.write_floor_plan(room_scene, tmp_path / "plan.png")
+    with PIL.Image.open(tmp_path / "plan.png") as image:
+        colors = np.asarray(image.convert("RGB")).astype(int)
+    assert max(colors.shape[:2]) in (1024, 1025)
+    assert (np.abs(colors - (90, 204, 255)).max(axis=2) < 12).sum() > 60, "the dot of the panorama"
+    empty = dataclasses.replace(room_scene, gaussians=room_scene.gaussians.select(torch.arange(20)))
+    for scene in (empty, dataclasses.replace(empty, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64))):
+        with pytest.raises(InputError, match="needed a floor below"):
+            tours.write_floor_plan(scene, tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()

@@ -1,0 +1,35 @@
+"""Overlap of images."""
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from pansplat.data.images import write_image
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.tours import connect
+
+
+def draw_room(place, low, high, seed) -> torch.Tensor:
+    """A panorama in a box-shaped room with a random pattern on its surfaces."""
+    directions, here = pixel_directions(96, 192).double().numpy(), np.array(place)
+    far = np.where(directions > 0, high - here, low - here) / (directions + 1e-9)
+    points = here + far.min(-1, keepdims=True) * directions
+    cells = np.floor(points / 0.4 + 1e-6).astype(int)
+    values = np.random.default_rng(seed).random((64, 64, 64, 3))
+    return torch.from_numpy(values[tuple((cells + 32).transpose(2, 0, 1))]).float()
+
+
+def test_panoramas_of_one_room_overlap_and_those_of_two_rooms_do_not(tmp_path, make_tour):
+    places = ((0.0, 0.0), (0.0, 1.0), (0.7, 0.4), (2.7, 0.0))
+    tour = make_tour(places, (), tmp_path)
+    for index, (x, z) in enumerate(places):
+        room = ((-1.5, -1.3, -2.0), (1.5, 1.2, 2.0)) if index < 3 else ((1.6, -1.3, -2.0), (4.0, 1.2, 2.0))
+        image = draw_room((x, 0.0, z), *map(np.array, room), seed=index // 3)
+        write_image(tour.panoramas[index].image, image.numpy())
+    tasks = []
+    given = dataclasses.replace(tour, overlaps={(0, 3): 0.0})
+    overlaps = connect(given, lambda task, done: tasks.append(done)).overlaps
+    assert set(overlaps) == {(0, 1), (0, 2), (1, 2), (0, 3)}, "given edges are kept"
+    assert min(overlaps[0, 1], overlaps[0, 2], overlaps[1, 2]) > 0.25 > 0.1 > overlaps[0, 3]
+    assert tasks == sorted(tasks) and tasks[-1] < 1

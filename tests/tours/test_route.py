@@ -1,0 +1,55 @@
+"""Smooth flights through panoramas."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pansplat.data.pairs import Panorama
+from pansplat.tours import TourGraph, plan_route
+
+
+def test_a_route_is_smooth_and_passes_the_panoramas(comb):
+    start = np.eye(4)
+    start[:3, 3] = 0.3, 0.0, -0.5
+    walk = comb.plan_walk(0)
+    route = plan_route(comb, walk, start)
+    assert np.allclose(route.pose(0), start)
+    assert np.allclose(route.pose(1)[:3, 3], comb.positions[walk[-1]])
+    poses = np.stack([route.pose(f) for f in np.linspace(0, 1, round(route.seconds * 30) + 1)])
+    assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 1.05 / 30, "at most 1 m/s"
+    cosines = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
+    turns = np.degrees(np.arccos(np.clip((cosines - 1) / 2, -1, 1)))
+    assert turns.max() < 46 / 30, "at most 45 degrees per second"
+    distances = np.linalg.norm(poses[:, None, :3, 3] - comb.positions[None], axis=2).min(axis=0)
+    assert distances.max() < 0.2
+    assert np.allclose(poses[:, :3, 1], (0, 1, 0)), "level"
+
+
+def test_a_route_reports_its_edges_in_order(comb):
+    route = plan_route(comb, [4, 1, 2], comb.cam2world[0].numpy())
+    edges = [route.edge(f) for f in np.linspace(0, 1, 200)]
+    assert [key for key, _ in itertools.groupby(edges)] == [None, (1, 4), (1, 2)]
+    assert route.edges_after(0) == [(1, 4), (1, 2)] and route.edges_after(1) == [(1, 2)]
+    assert route.leg(0.0) == -1
+
+
+def test_a_route_to_the_panorama_at_the_camera_stays_there(comb):
+    pose = comb.cam2world[2].numpy()
+    route = plan_route(comb, [2], pose)
+    assert route.seconds < 3 and route.edge(0.5) is None
+    assert np.allclose(route.pose(0.5), pose)
+
+
+def test_the_camera_looks_along_its_way_in_any_world(comb):
+    turn = torch.tensor(((1.0, 0, 0), (0, 0, 1), (0, -1, 0)), dtype=torch.float64)  # z up
+    panoramas = []
+    for panorama in comb.panoramas:
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3] = turn @ panorama.cam2world[:3]
+        panoramas.append(Panorama(panorama.name, panorama.image, pose))
+    tour = TourGraph("", Path(), tuple(panoramas), 0.45, 10.0, (), comb.overlaps)
+    pose = plan_route(tour, [0, 1, 2, 3]).pose(0.5)
+    assert np.allclose(pose[:3, 2], turn @ torch.tensor((0.0, 0, 1), dtype=torch.float64), atol=1e-6)
+    assert np.allclose(pose[:3, 1], (0, 0, -1))
