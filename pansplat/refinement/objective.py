@@ -68,15 +68,10 @@ class Photograph:
         return cls(image, whole, PixelWeights.from_mask(mask & ~held_out), whole.pixels * held_out)
 
 
-def image_difference(
-    error: Float[Tensor, "3 height width"], weights: PixelWeights, structure: float
-) -> Float[Tensor, ""]:
-    """Mean absolute error of colours, and `structure` times that of their gradients."""
-    total = (error.abs().mean(0) * weights.pixels).sum()
-    if structure:
-        right = error.roll(-1, 2) - error
-        below = error[:, 1:] - error[:, :-1]
-        gradients = (right.abs().mean(0) * weights.right).sum()
-        gradients = gradients + (below.abs().mean(0) * weights.below[:-1]).sum()
-        total = total + structure / 2 * gradients
-    return total
+def image_difference(error: Float[Tensor, "3 height width"], weights: PixelWeights) -> Float[Tensor, ""]:
+    """Mean absolute error of the colours plus that of their gradients."""
+    colors = (error.abs().mean(0) * weights.pixels).sum()
+    right = error.roll(-1, 2) - error
+    below = error[:, 1:] - error[:, :-1]
+    gradients = (right.abs().mean(0) * weights.right).sum() + (below.abs().mean(0) * weights.below[:-1]).sum()
+    return colors + 0.5 * gradients

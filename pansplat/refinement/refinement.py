@@ -39,6 +39,14 @@ from pansplat.rendering import rasterize
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.weights import compute_blending_weights
 
+_HEIGHT = 512  # largest of the images that are compared; colours are fitted at the photographs' own height
+_HELD_OUT = 0.04  # fraction of the blocks of the photographs
+_SPLIT_ERROR = 0.1  # least sum of a split Gaussian's absolute errors times its blending weights, pixels
+_BETAS = (0.9, 0.99)  # decay of Adam's averages of the gradients and of their squares
+# Adam's epsilon relative to the root mean square of the first gradients, for photographs that are compared at their own
+# size; it grows with the number of their pixels. Gaussians of little effect move less.
+_DAMPING = 0.2
+_COLORS = ColorFitConfig()
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
@@ -53,37 +61,16 @@ class RefineConfig:
     rates: LearningRates = field(default_factory=LearningRates)
     gaussians: int | None = None
     """Largest number of Gaussians; None for no limit."""
-    own: float = 1.0
-    """Weight of a view's image at its own camera."""
-    cross: float = 1.0
-    """Weight of a view's image at another camera."""
-    structure: float = 1.0
-    """Weight of the gradients of the images relative to their colours."""
     hold: float = 20.0
     """Weight of the mean squared change of the logarithms of distances."""
-    gains: bool = True
-    """Whether a gain of each photograph's channels is estimated."""
     poses: bool = False
     """Whether small corrections of the poses are estimated."""
     pose_hold: float = 100.0
     """Weight of the squared corrections, in radians and relative to the baseline."""
-    height: int = 512
-    """Largest height of the images that are compared; colours are fitted at the photographs' own height."""
-    colors: ColorFitConfig = field(default_factory=ColorFitConfig)
-    """Settings of the fit of colours at the end."""
-    held_out: float = 0.04
-    """Fraction of the blocks of the photographs that are held out."""
     release: float = 0.75
     """Fraction of the run after which held-out blocks are fitted too."""
     splits: tuple[float, ...] = (0.2, 0.4)
     """Fractions of the run at which Gaussians are split."""
-    split_error: float = 0.1
-    """Least error of a Gaussian that is split: the sum of its pixels' absolute errors times its blending weights."""
-    betas: tuple[float, float] = (0.9, 0.99)
-    """Decay of Adam's averages of the gradients and of their squares."""
-    damping: float = 0.2
-    """Adam's epsilon relative to the root mean square of the first gradients, for photographs that are compared at
-    their own size; it grows with the number of their pixels. Gaussians of little effect move less."""
 
     def __post_init__(self) -> None:
         if self.gaussians is not None and self.gaussians < 1:
@@ -136,10 +123,10 @@ class Refinement:
         self._images = views.images.float().to(device)
         self._masks = views.masks.to(device)
         compared = (views.masks & mask_holes(views.images)).to(device)
-        height = min(self._images.shape[-2], self.config.height)
+        height = min(self._images.shape[-2], _HEIGHT)
         self._size = (height, 2 * height)
         self._photographs = [
-            Photograph.split(image, mask > 0.999, self.config.held_out, random)
+            Photograph.split(image, mask > 0.999, _HELD_OUT, random)
             for image, mask in zip(
                 self._shrink(self._images), self._shrink(compared[:, None].float())[:, 0], strict=True
             )
@@ -190,9 +177,7 @@ class Refinement:
             photograph = self._photographs[target]
             weights = photograph.scene if fraction >= config.release else photograph.fitted
             error = self._draw(parameters.build(), view, target) - photograph.image
-            loss = image_difference(error, weights, config.structure)
-            loss = (config.own if target == view else config.cross) * loss
-            loss = loss + config.hold * parameters.tensors["distance"].square().mean()
+            loss = image_difference(error, weights) + config.hold * parameters.tensors["distance"].square().mean()
             loss.backward()
         if config.poses:
             (config.pose_hold * self._cameras.twists.square().sum()).backward()
@@ -200,8 +185,8 @@ class Refinement:
         for group in self._groups:
             group.clean_gradients()
             if not self._steps:
-                group.set_damping(config.damping * pixels)
-            group.step(_cosine_fall(fraction), config.betas)
+                group.set_damping(_DAMPING * pixels)
+            group.step(_cosine_fall(fraction), _BETAS)
         for parameters in self._views.values():
             parameters.clamp()
         self._steps += 1
@@ -218,7 +203,7 @@ class Refinement:
             return
         parts = [self._errors(view) for view in self._views]
         errors = torch.cat(parts)
-        is_split, limit = errors > self.config.split_error, self.config.gaussians
+        is_split, limit = errors > _SPLIT_ERROR, self.config.gaussians
         if limit is not None and len(errors) + int(is_split.sum()) > limit:
             is_split = errors > errors.topk(limit - len(errors) + 1).values[-1]
         for parameters, part in zip(self._views.values(), is_split.split([len(part) for part in parts]), strict=True):
@@ -246,9 +231,7 @@ class Refinement:
     def _draw(self, gaussians: Gaussians, view: int, target: int) -> Tensor:
         """The colours (3 height width) of a view's Gaussians in a photograph, with its gain."""
         color = rasterize(gaussians, self._cameras.pose_in_view(view, target), size=self._size).color
-        if target == view or not self.config.gains:
-            return color
-        return color * self._cameras.gains(view, target)[:, None, None]
+        return color if target == view else color * self._cameras.gains(view, target)[:, None, None]
 
     @torch.no_grad()
     def held_out_error(self) -> float:
@@ -370,13 +353,13 @@ class Refinement:
         gradient = 1.7  # duration of a backward pass relative to its image
         weights, product = 1.2, 0.5  # of blending weights, and of a product with them
         contributions = (images + views) * (weights + product)
-        steps = self.config.colors.steps_at(self._images.shape[-2])
+        steps = _COLORS.steps_at(self._images.shape[-2])
         colors = views * pixels * (weights + product + 2 * steps * product)
         return (contributions + colors) / (views * (1 + gradient))
 
     def _finish(self, scene: Scene) -> Scene:
         """Fit the colours to the photographs at their own size."""
-        colors = fit_colors(scene.gaussians, self._images, scene.cam2world, self._masks, self.config.colors)
+        colors = fit_colors(scene.gaussians, self._images, scene.cam2world, self._masks, _COLORS)
         return dataclasses.replace(scene, gaussians=colors)
 
 
