@@ -620,8 +620,3 @@ def _run_once(
                 )
             yield ItemReport(names[future.key], "failed", 0.0, error=text)
         future.release()
-
-
-def format_report(report: ItemReport) -> str:
-    """The report as one line of JSON."""
-    return json.dumps(dataclasses.asdict(report)) + "\n"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from pansplat.cli.inputs import Compat, Out, Precision
+from pansplat.cli.inputs import Compat, Out, Precision, progress_bar
 from pansplat.console import print_message
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
@@ -141,7 +142,7 @@ class Batch:
 
         reports = []
         cluster = batch.start_workers(self.workers, memory) if self.scheduler is None else nullcontext()
-        with cluster as local, _item_bar(len(items)) as show, open(out / batch.REPORT_NAME, "wb", 0) as file:
+        with cluster as local, progress_bar() as progress, open(out / batch.REPORT_NAME, "wb", 0) as file:
             lines = ReportFile(file)
             address = self.scheduler or ""
             if local is not None:
@@ -152,8 +153,10 @@ class Batch:
             began = time.perf_counter()
             for report in batch.run_items(address, items, options, out):
                 reports.append(report)
-                lines.add(batch.format_report(report))
-                show(report)
+                lines.add(json.dumps(dataclasses.asdict(report)) + "\n")
+                progress(f"{len(reports)} of {len(items)}: {report.item[-30:]}", len(reports) / len(items))
+                if report.error is not None:
+                    print_message("note", f"{report.item}: {report.error}")
             return reports, time.perf_counter() - began, lines.problem
 
 
@@ -184,30 +187,3 @@ class ReportFile:
             f"{self._file.name}: needed free disk space for the report, got {self._reason!r}; the items are finished: "
             "free some space and run the same command again"
         )
-
-
-@contextmanager
-def _item_bar(total: int) -> Iterator[Callable[[ItemReport], None]]:
-    """A bar of the items with the time that is left; failed items are printed."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
-    times = TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
-    with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("items", total=total)
-
-        def show(report: ItemReport) -> None:
-            bar.update(task, advance=1, description=report.item[-30:])
-            if report.error is not None:
-                print_message("note", f"{report.item}: {report.error}")
-
-        yield show
