@@ -242,18 +242,18 @@ def predict(
     if final is not None:
         return final
     began = time.process_time()
-    scene, done = _run_refinement(
-        scene, views, refine_seconds, None, config, 0, lambda what, done: report(what, 0.5 + 0.5 * done)
-    )
+    refinement = Refinement(scene, views, config)
+    done = refinement.run(seconds=refine_seconds, progress=lambda what, done: report(what, 0.5 + 0.5 * done))
+    scene = refinement.scene()
+    if cached is None:
+        return scene
     share = (time.process_time() - began) / (done.seconds * torch.get_num_threads())  # of the processor
-    if cached is not None:
-        is_starved = done.stopped == "done" and done.steps < _ENOUGH_STEPS and share < _STARVED_SHARE
-        refined = CachedScene(scene.gaussians, scene.gains, done.steps, is_starved and found is None)
-        if found is not None and found.steps > done.steps:
-            refined = found._replace(is_starved=False)  # it runs once more only
-        cached.write(refined)
-        return _make_scene(refined, views, predictor)
-    return scene
+    is_starved = done.stopped == "done" and done.steps < _ENOUGH_STEPS and share < _STARVED_SHARE
+    refined = CachedScene(scene.gaussians, scene.gains, done.steps, is_starved and found is None)
+    if found is not None and found.steps > done.steps:
+        refined = found._replace(is_starved=False)  # it runs once more only
+    cached.write(refined)
+    return _make_scene(refined, views, predictor)
 
 
 def _predict_views(pair: Pair | None, views: Views, predictor: Predictor, height: int, progress: Progress) -> Scene:
@@ -300,7 +300,7 @@ def refine(
     Raises:
         InputError: scene and views do not fit, or an argument is out of range.
     """
-    return _run_refinement(scene, views, seconds, steps, config, seed, progress)[0]
+    return _run_refinement(scene, views, config, seed, seconds=seconds, steps=steps, progress=progress)[0]
 
 
 def refine_to_file(
@@ -329,24 +329,20 @@ def refine_to_file(
         InputError: see `refine` and `save`.
     """
     find_scene_suffix(path)  # an error before the work
-    refined, report = _run_refinement(scene, views, seconds, steps, config, seed, progress, should_stop)
+    limits = {"seconds": seconds, "steps": steps}
+    refined, report = _run_refinement(scene, views, config, seed, **limits, progress=progress, should_stop=should_stop)
     save(refined, path)
     return refined, report
 
 
 def _run_refinement(
-    scene: Scene,
-    views: Views,
-    seconds: float | None,
-    steps: int | None,
-    config: RefineConfig | None,
-    seed: int,
-    progress: Progress | None,
-    should_stop: Callable[[], bool] = lambda: False,
+    scene: Scene, views: Views, config: RefineConfig | None, seed: int, **run: Any
 ) -> tuple[Scene, RefineReport]:
+    """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`, 10 s by default."""
     refinement = Refinement(scene, views, config, seed=seed)
-    limit = 10.0 if seconds is None and steps is None else seconds
-    report = refinement.run(seconds=limit, steps=steps, progress=progress, should_stop=should_stop)
+    if run["steps"] is None and run["seconds"] is None:
+        run["seconds"] = 10.0
+    report = refinement.run(**run)
     return refinement.scene(), report
 
 
