@@ -151,33 +151,26 @@ def test_tiny_worlds_are_enlarged(scene: Scene, tmp_path: Path) -> None:
     assert small["near"] == usual["near"] and small["speed"] == pytest.approx(usual["speed"])
 
 
-def test_a_scene_without_gaussians_is_refused(scene: Scene, tmp_path: Path) -> None:
-    empty = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(0)))
-    with pytest.raises(InputError, match="no visible Gaussians"):
-        write_page(empty, tmp_path / "tour.html")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_page_too_large_for_one_file_is_refused(
+def test_pages_that_cannot_be_drawn_or_written_are_refused(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    empty = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(0)))
     monkeypatch.setattr(page_module, "MAX_FILE_BYTES", 60_000)
-    with pytest.raises(InputError, match=r"--split.*at most [\d,]+ Gaussians"):
-        write_page(scene, tmp_path / "tour.html")
+    for given, name, options, message in (
+        (empty, "tour.html", {}, "no visible Gaussians"),
+        (scene, "tour.html", {}, r"--split.*at most [\d,]+ Gaussians"),
+        (scene, "tour.html", {"gaussians": 0}, "must be 1 to 4,000,000"),
+        (scene, "tour.html", {"gaussians": 4_000_001}, "must be 1 to 4,000,000"),
+        (scene, "missing/tour.html", {"split": True}, "missing/tour_files: needed a folder"),
+    ):
+        with pytest.raises(InputError, match=message):
+            write_page(given, tmp_path / name, **options)
     assert not list(tmp_path.iterdir())
-    write_page(scene, tmp_path / "tour.html", split=True)
-
-
-@pytest.mark.parametrize("count", [0, 4_000_001])
-def test_counts_that_no_device_can_draw_are_refused(scene: Scene, tmp_path: Path, count: int) -> None:
-    with pytest.raises(InputError, match="must be 1 to 4,000,000"):
-        write_page(scene, tmp_path / "tour.html", gaussians=count)
-
-
-def test_pages_that_cannot_be_written_are_refused(scene: Scene, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="existing folder"):
-        write_page(scene, tmp_path / "missing" / "tour.html")
     (tmp_path / "tour_files").write_text("")
     with pytest.raises(InputError, match="tour_files: needed a folder"):
         write_page(scene, tmp_path / "tour.html", split=True)
+    monkeypatch.undo()
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    with pytest.raises(InputError, match="existing folder"):
+        write_page(scene, tmp_path / "missing" / "tour.html")
     assert [file.name for file in tmp_path.iterdir()] == ["tour_files"]
