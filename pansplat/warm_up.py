@@ -19,7 +19,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.pipeline import predict
 from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels, enlarge
 from pansplat.rendering.image_planes import Layout
-from pansplat.rendering.rasterize import RasterOptions, rasterize
+from pansplat.rendering.rasterize import Order, RasterOptions, rasterize
 
 
 def main() -> None:
@@ -43,10 +43,10 @@ def compile_kernels(name: str) -> None:
         step()
 
 
-def _rasterize(degree: int, layout: Layout, options: RasterOptions) -> None:
+def _rasterize(degree: int, layout: Layout, order: Order) -> None:
     """Rasterise Gaussians with harmonics of a degree, forward and backward."""
     scene, pose = _make_gaussians(degree), torch.eye(4, dtype=torch.float64)
-    rasterize(scene, pose, size=(16, 32), layout=layout, options=options, backend="numba").color.sum().backward()
+    rasterize(scene, pose, size=(16, 32), layout=layout, order=order, backend="numba").color.sum().backward()
 
 
 @torch.no_grad()
@@ -89,16 +89,12 @@ def _predict(model: str) -> None:
     predict(Views(images, poses, masks, near=0.1, far=10.0, names=("left", "right")), model)
 
 
-_EWA = RasterOptions(kernel="ewa", order="z", lowpass="3dgs")
-
 # Few kernels are in both; the first process that compiles one writes it to numba's cache for the other.
 STEPS = {
     "sweep and depth network": (partial(_predict, "sweep"), partial(_predict, "default")),
     "rasteriser and viewer": (
-        partial(_rasterize, 0, "equirect", RasterOptions()),
-        partial(_rasterize, 1, "pinhole", RasterOptions()),
-        partial(_rasterize, 0, "pinhole", _EWA),
-        partial(_rasterize, 1, "cubemap", _EWA),
+        partial(_rasterize, 0, "equirect", "radial"),
+        partial(_rasterize, 1, "pinhole", "z"),
         _rasterize_stereo,
         _draw_display_image,
     ),

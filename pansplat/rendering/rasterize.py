@@ -227,8 +227,8 @@ def rasterize(
             gradients are those of "torch" then.
         background: one number for each channel; the default is black for any number of channels.
         covariances: world covariances in place of those of `scales` and `quats`, square metres.
-        backend: "torch" is the reference, "numba" is fast on a CPU, "triton" on CUDA; "auto" chooses the fastest
-            available for the Gaussians' type and device.
+        backend: "torch" is the reference, "numba" is fast on a CPU (kernel "ray" only), "triton" on CUDA; "auto"
+            chooses the fastest available for the kernel and the Gaussians' type and device.
         options: by default `RasterOptions()`.
         kernel, order, lowpass, near, strict, stitching: each replaces that field of `options`.
 
@@ -237,7 +237,7 @@ def rasterize(
 
     Raises:
         InputError: an argument is out of range or does not fit the Gaussians, the pose is not rigid, kernel "ewa" is
-            combined with layout "equirect", or `strict` and a Gaussian is not finite.
+            combined with layout "equirect" or backend "numba", or `strict` and a Gaussian is not finite.
     """
     given: dict[str, Any] = dict(
         kernel=kernel, order=order, lowpass=lowpass, near=near, strict=strict, stitching=stitching
@@ -264,18 +264,19 @@ def rasterize(
         eye_offset=eye_offset,
         device=device,
     )
-    result = _select_backend(backend, gaussians)(gaussians, covariances, pose, planes, options)
+    result = _select_backend(backend, gaussians, options.kernel)(gaussians, covariances, pose, planes, options)
     sums = result.sums.squeeze(0)
     if layout == "cubemap":
         sums = stitch_faces(result.sums, size, stitching=options.stitching)
     return _normalise_sums(sums, background_color, result.info)
 
 
-def _select_backend(name: Backend, gaussians: Gaussians) -> RasterBackend:
-    """Select the backend of this name; "auto" chooses by the Gaussians' type and device."""
+def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> RasterBackend:
+    """Select the backend of this name; "auto" chooses by the kernel and the Gaussians' type and device."""
     if name == "auto":
-        fast: Backend = "numba" if gaussians.means.device.type == "cpu" else "triton"
-        available = fast == "numba" or (gaussians.means.is_cuda and find_spec("triton") is not None)
+        on_cpu = gaussians.means.device.type == "cpu"
+        available = kernel == "ray" if on_cpu else gaussians.means.is_cuda and find_spec("triton") is not None
+        fast: Backend = "numba" if on_cpu else "triton"
         name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
     module = import_module(_BACKEND_MODULES[name])
     return module.rasterize_planes  # type: ignore[no-any-return]

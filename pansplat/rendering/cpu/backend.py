@@ -15,13 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
 from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.columns import rasterize_columns
-from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE, backpropagate_ewa, project_ewa
 from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE, SavedForBackward, allocate_saved, rasterize_forward
@@ -57,16 +55,10 @@ class CameraView(NamedTuple):
     threads: int
     min_transmittance: float = MIN_TRANSMITTANCE
 
-    @property
-    def is_exact(self) -> bool:
-        """Whether the kernel is exact, not EWA."""
-        return self.options.kernel == "ray"
-
 
 class _PlaneState(NamedTuple):
-    """The footprints on one image plane; tiles and transmittances only if all tiles fit one band."""
+    """What the backward reads of one image plane; tiles and transmittances only if all tiles fit one band."""
 
-    records: np.ndarray
     boxes: np.ndarray
     distances: np.ndarray  # the intersections are sorted by these
     tiles: TileIntersections | None = None
@@ -102,9 +94,10 @@ def rasterize_planes(
     """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
 
     Raises:
-        InputError: the Gaussians are not in main memory, a side is longer than 32767 pixels, or `options.strict` and a
-            Gaussian is not finite.
+        InputError: the kernel is EWA, the Gaussians are not in main memory, a side is longer than 32767 pixels, or
+            `options.strict` and a Gaussian is not finite.
     """
+    require_exact_kernel(options)
     if gaussians.means.device.type != "cpu":
         raise InputError(
             f"backend 'numba' needs Gaussians in main memory, got them on {gaussians.means.device}; use "
@@ -127,6 +120,14 @@ def rasterize_planes(
         raise InputError(not_finite_message(gaussians, covariances, pose, options))
     info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
     return RasterSums(sums.to(gaussians.means.dtype), info)
+
+
+def require_exact_kernel(options: RasterOptions) -> None:
+    """Raise an InputError for a kernel other than the exact one."""
+    if options.kernel != "ray":
+        raise InputError(
+            f"backend 'numba' has kernel 'ray' only, got kernel {options.kernel!r}; use backend='torch'"
+        )
 
 
 class _Rasterize(torch.autograd.Function):
@@ -216,10 +217,10 @@ def rasterize_plane(
         return None
     workspace = saved_in or Workspace()
     with statistics.timed("bound"):
-        records, boxes = find_footprints(view, plane, workspace)
+        boxes = find_bounding_boxes(projected.records, plane, workspace, threads)
     with statistics.timed("sort"):
         distances = find_distances(view, plane, workspace)
-    tables, state = tabulate_pixels(plane, exact=view.is_exact), _PlaneState(records, boxes, distances)
+    tables, state = tabulate_pixels(plane), _PlaneState(boxes, distances)
     bands = intersect_tiles(boxes, plane.size, slots=needs_grad, threads=threads, limit=tiling.MAX_INTERSECTIONS)
     while True:
         with statistics.timed("intersect"):
@@ -231,10 +232,9 @@ def rasterize_plane(
         is_whole_image = len(tiles.starts) == 1 + math.prod(tables.tiles)
         saved = allocate_saved(tiles.starts, tiles.workspace) if needs_grad and is_whole_image else None
         with statistics.timed("rasterize"):
-            _rasterize_band(view, records, tiles, tables, sums, saved)
+            _rasterize_band(view, tiles, tables, sums, saved)
         statistics.intersections += len(tiles.intersections)
-        shared = projected.records, projected.radii
-        arrays = [array for array in (records, distances) if not any(array is other for other in shared)]
+        arrays = [] if distances is projected.radii else [distances]
         arrays += [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
         statistics.bytes = max(statistics.bytes, sum(array.nbytes for array in arrays))
         if saved is not None:
@@ -253,27 +253,12 @@ def find_distances(view: CameraView, plane: ImagePlane, workspace: Workspace) ->
     return compute_depths(projected.records, projected.radii, axis, workspace, view.threads)
 
 
-def find_footprints(view: CameraView, plane: ImagePlane, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
-    """Records and boxes on an image plane."""
-    if view.is_exact:
-        records = view.projected.records
-        return records, find_bounding_boxes(records, plane, workspace, view.threads)
-    depth_cut = EWA_NEAR_FACTOR * view.options.near
-    scene = view.gaussians, view.camera, view.projected
-    return project_ewa(*scene, plane, view.options.dilation, depth_cut, workspace, view.threads)
-
-
 def _rasterize_band(
-    view: CameraView,
-    records: np.ndarray,
-    tiles: TileIntersections,
-    tables: PixelTables,
-    sums: np.ndarray,
-    saved: SavedForBackward | None,
+    view: CameraView, tiles: TileIntersections, tables: PixelTables, sums: np.ndarray, saved: SavedForBackward | None
 ) -> None:
     """Write the sums of a band of tile rows."""
     rasterize_forward(
-        records, view.projected.values, tiles.intersections, tiles.starts, tables, sums,
+        view.projected.records, view.projected.values, tiles.intersections, tiles.starts, tables, sums,
         first_row=tiles.first_row, saved=saved, threads=view.threads, min_transmittance=view.min_transmittance,
     )  # fmt: skip
 
@@ -285,19 +270,18 @@ def _backpropagate_planes(
     sums: np.ndarray,
     grad_sums: np.ndarray,
     workspace: Workspace,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gradients of records and values by slot, those of the EWA projection, and the first slot of each Gaussian.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients of records and values by slot, and the first slot of each Gaussian.
 
     With one image plane in one band the slots are those of its intersections; otherwise each Gaussian has one.
     """
-    gaussians, camera, projected, options, threads = view[:5]
+    projected, threads = view.projected, view.threads
     num, num_values = projected.values.shape
-    is_single = view.is_exact and len(planes) == 1 and states[0].tiles is not None
-    total_records = np.zeros((num if view.is_exact and not is_single else 0, RECORD_SIZE), np.float32)
-    ewa_grads = np.zeros((0 if view.is_exact else num, EWA_GRAD_SIZE))
+    is_single = len(planes) == 1 and states[0].tiles is not None
+    total_records = np.zeros((0 if is_single else num, RECORD_SIZE), np.float32)
     total_values = np.zeros((0 if is_single else num, num_values), np.float32)
     for plane, state, plane_sums, plane_grads in zip(planes, states, sums, grad_sums, strict=True):
-        tables = tabulate_pixels(plane, exact=view.is_exact)
+        tables = tabulate_pixels(plane)
         bands = [state.tiles] if state.tiles else intersect_tiles(
             state.boxes, plane.size, slots=True, threads=threads, limit=tiling.MAX_INTERSECTIONS
         )  # fmt: skip
@@ -306,20 +290,16 @@ def _backpropagate_planes(
             if saved is None:  # rasterise again: the transmittances of all bands would take too much memory
                 sort_front_to_back(tiles, state.distances, threads)
                 saved = allocate_saved(tiles.starts, tiles.workspace)
-                _rasterize_band(view, state.records, tiles, tables, plane_sums, saved)
+                _rasterize_band(view, tiles, tables, plane_sums, saved)
             band_workspace = workspace if is_single else Workspace()
             grad_records = band_workspace.array((len(tiles.intersections), RECORD_SIZE), np.float32)
             grad_values = band_workspace.array((len(tiles.intersections), num_values), np.float32)
             rasterize_backward(
-                state.records, projected.values, tiles.intersections, tiles.starts, tiles.slots, tables, plane_sums,
+                projected.records, projected.values, tiles.intersections, tiles.starts, tiles.slots, tables, plane_sums,
                 saved, plane_grads, grad_records, grad_values, first_row=tiles.first_row, threads=threads,
             )  # fmt: skip
-            offsets = tiles.offsets
             if is_single:
-                return grad_records, grad_values, ewa_grads, offsets
-            if view.is_exact:
-                accumulate_slots(offsets, grad_records, total_records, threads)
-            else:
-                backpropagate_ewa(gaussians, camera, plane, options.dilation, grad_records, offsets, ewa_grads, threads)
-            accumulate_slots(offsets, grad_values, total_values, threads)
-    return total_records, total_values, ewa_grads, np.arange(num + 1)
+                return grad_records, grad_values, tiles.offsets
+            accumulate_slots(tiles.offsets, grad_records, total_records, threads)
+            accumulate_slots(tiles.offsets, grad_values, total_values, threads)
+    return total_records, total_values, np.arange(num + 1)

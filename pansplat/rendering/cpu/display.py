@@ -22,9 +22,9 @@ from pansplat.rendering.cpu.backend import (
     CameraView,
     Statistics,
     find_distances,
-    find_footprints,
     make_camera,
     rasterize_plane,
+    require_exact_kernel,
 )
 from pansplat.rendering.cpu.footprints import Footprint, draw_footprints
 from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
@@ -40,7 +40,7 @@ from pansplat.rendering.cpu.runtime import (
     thread_count,
 )
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
-from pansplat.rendering.cpu.tiling import EMPTY_BOX
+from pansplat.rendering.cpu.tiling import EMPTY_BOX, find_bounding_boxes
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions
 
@@ -211,12 +211,13 @@ class DisplayScene:
             plane: its rotation is from its axes to the world's; a direct panorama has its axes in the world's.
             labels: layer of each Gaussian, int16, or `NO_LAYER`.
             num_layers: number of layers.
-            options: of the image.
+            options: of the image; with the exact kernel.
             selection: leaves out Gaussians that are not in view.
             cache: has the Gaussians of earlier views; written if they do not serve this one.
             min_transmittance: a pixel is finished at this transmittance or below.
             footprint: drawn in place of blended Gaussians.
         """
+        require_exact_kernel(options)
         statistics, threads, workspace = Statistics(), thread_count(), Workspace()
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = torch.from_numpy(np.asarray(position, np.float64))
@@ -314,11 +315,11 @@ def _draw_plane(
     """Draw footprints that are not blended."""
     workspace, projected = Workspace(), view.projected
     with statistics.timed("bound"):
-        records, boxes = find_footprints(view, plane, workspace)
+        boxes = find_bounding_boxes(projected.records, plane, workspace, view.threads)
         distances = find_distances(view, plane, workspace)
     with statistics.timed("rasterize"):
-        tables = tabulate_pixels(plane, exact=view.is_exact)
-        draw_footprints(footprint, records, projected.values, distances, boxes, tables, sums, view.threads)
+        tables = tabulate_pixels(plane)
+        draw_footprints(footprint, projected.records, projected.values, distances, boxes, tables, sums, view.threads)
     statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != EMPTY_BOX))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pansplat.constants import ALPHA_CUT, ELLIPSOID_AMBIENT
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.rasterize import pixel_point
-from pansplat.rendering.cpu.records import PIXEL_CENTRES, PixelTables
+from pansplat.rendering.cpu.records import PixelTables
 from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for
 
 Footprint = Literal["count", "ellipsoids"]
@@ -50,7 +50,7 @@ def draw_footprints(
 
 
 @inline_kernel_no_refcount
-def _measure(record, exact, d_x, d_y, d_z):
+def _measure(record, d_x, d_y, d_z):
     """The exponent of a Gaussian's response at a pixel, times log2(e); negative behind the camera."""
     x = np.float32((d_x - record[0]) - record[3])
     y = np.float32((d_y - record[1]) - record[4])
@@ -58,7 +58,7 @@ def _measure(record, exact, d_x, d_y, d_z):
     along_a, along_b = record[layout.L_ALONG_A], record[layout.L_ALONG_B]
     a = record[6] * x + record[7] * y + record[8] * z
     b = record[9] * x + record[10] * y + record[11] * z
-    front = np.float32(1) + exact * (record[0] * x + record[1] * y + record[2] * z + along_a * a + along_b * b)
+    front = np.float32(1) + (record[0] * x + record[1] * y + record[2] * z + along_a * a + along_b * b)
     square = a * a + b * b
     exponent = square / (front * front + record[layout.RADIAL_VARIANCE] * square)
     return exponent if front > np.float32(0) else np.float32(-1)
@@ -74,7 +74,6 @@ def _draw_rows(counts, kind, columns, rows, rotation, records, values, distances
         for x in range(width):
             directions[y - first, x] = pixel_point(kind, columns, rows, rotation, x, y)
     sums[:, first:end] = np.float32(0)
-    exact = np.float32(kind != PIXEL_CENTRES)
     for g in range(len(boxes)):
         left, right, top, bottom = boxes[g, 0], boxes[g, 1], max(boxes[g, 2], first), min(boxes[g, 3], end - 1)
         record, peak, distance = records[g], records[g, layout.LOG2_PEAK], distances[g]
@@ -83,7 +82,7 @@ def _draw_rows(counts, kind, columns, rows, rotation, records, values, distances
             for i in range(across):
                 x = left + i if left + i < width else left + i - width
                 d = directions[y - first, x]
-                exponent = _measure(record, exact, d[0], d[1], d[2])
+                exponent = _measure(record, d[0], d[1], d[2])
                 if exponent < 0 or peak - exponent < _LOG2_CUT:
                     continue
                 if counts:

@@ -57,11 +57,10 @@ _MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32
 _ROUNDING = -MIN_EIGENVALUE_RATIO
 _DROPPED, _NEAR = 0, 1  # columns of the counts
 
-# Rows of a block: inputs, results, and inputs of the EWA kernel.
+# Rows of a block: inputs and results.
 MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 12  # the shape is a quaternion and three scales, or a covariance
 DIRECTION_ROW, RADIUS_ROW, VALID_ROW = 13, 16, 17  # world axes; metres; 1, or 0 if a number is unusable
-FRAME_ROW, COV_ROW = 18, 24
-NUM_ROWS = 33
+NUM_ROWS = 18
 
 
 class GaussianArrays(NamedTuple):
@@ -456,37 +455,6 @@ def whitened_axes(u, v, factors):
     a_scale, mix, b_scale = factors
     a = u[0] * a_scale, u[1] * a_scale, u[2] * a_scale
     return a, ((v[0] - mix * u[0]) * b_scale, (v[1] - mix * u[1]) * b_scale, (v[2] - mix * u[2]) * b_scale)
-
-
-# --- covariances of a block, for the EWA kernel ---
-
-
-@inline_kernel
-def store_tangent_covariances(covariances, pose, near, rows):
-    """Store distance, direction, tangent frame and covariance of a block in its rows."""
-    camera = pose_columns(pose)
-    for i in range(0, GAUSSIAN_BLOCK, LANES):
-        n, radius, inverse, state = compute_direction(rows, i, camera, near)
-        u, v, cov, _ = compute_tangent_covariance(covariances, rows, i, n, inverse, state)
-        store_row(rows, RADIUS_ROW, i, radius)
-        store_vector(rows, DIRECTION_ROW, i, n)
-        store_vector(rows, FRAME_ROW, i, u)
-        store_vector(rows, FRAME_ROW + 3, i, v)
-        for j in range(9):
-            store_row(rows, COV_ROW + j, i, cov[j])
-
-
-@inline_kernel
-def load_tangent_covariance(rows, i):
-    """Tangent axes u and v, the direction and the covariance of one Gaussian."""
-    u = rows[FRAME_ROW, i], rows[FRAME_ROW + 1, i], rows[FRAME_ROW + 2, i]
-    v = rows[FRAME_ROW + 3, i], rows[FRAME_ROW + 4, i], rows[FRAME_ROW + 5, i]
-    n = rows[DIRECTION_ROW, i], rows[DIRECTION_ROW + 1, i], rows[DIRECTION_ROW + 2, i]
-    cov = (
-        rows[COV_ROW, i], rows[COV_ROW + 1, i], rows[COV_ROW + 2, i], rows[COV_ROW + 3, i], rows[COV_ROW + 4, i],
-        rows[COV_ROW + 5, i], rows[COV_ROW + 6, i], rows[COV_ROW + 7, i], rows[COV_ROW + 8, i],
-    )  # fmt: skip
-    return u, v, n, cov
 
 
 # --- vector algebra, for float64 and f64x8 ---

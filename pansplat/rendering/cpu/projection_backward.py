@@ -81,8 +81,7 @@ _POSE_SIZE = 12  # entries of a pose: its rotation and its centre, by rows
 _RADIUS_GRAD_ROW = NUM_ROWS
 _MEAN_GRAD_ROW = NUM_ROWS + 1  # of n in world axes, then of the mean
 _SHAPE_GRAD_ROW = NUM_ROWS + 4  # of a quaternion and three scales, or a covariance's xx xy xz yy yz zz
-_EWA_GRAD_ROW = NUM_ROWS + 11  # of n and C, from ewa.py
-_NUM_ROWS = NUM_ROWS + 20
+_NUM_ROWS = NUM_ROWS + 11
 
 
 class GaussianGradients(NamedTuple):
@@ -103,7 +102,6 @@ def backpropagate_projection(
     projected: ProjectedGaussians,
     grad_records: np.ndarray,
     grad_values: np.ndarray,
-    ewa_grads: np.ndarray,
     offsets: np.ndarray,
     gradients: GaussianGradients,
     threads: int,
@@ -114,7 +112,6 @@ def backpropagate_projection(
         gaussians, camera, projected: of the forward.
         grad_records: (slot, RECORD_SIZE), of the camera's records.
         grad_values: (slot, channel + 1).
-        ewa_grads: from `backpropagate_ewa`, in place of `grad_records`; no rows for the exact kernel.
         offsets: (n + 1), where each Gaussian's slots begin.
         gradients: arrays to write; arrays without rows are skipped.
         threads: number of threads; the result does not depend on it.
@@ -123,8 +120,7 @@ def backpropagate_projection(
     pose_sums = np.zeros((num_items if len(gradients.pose) > 0 else 0, _POSE_SIZE))
     work = partial(
         _backpropagate_projection, *gaussians.kernel_arguments, *camera, gaussians.view_dependent, projected.kept,
-        projected.values, grad_records.reshape(-1), grad_values.reshape(-1), ewa_grads if len(ewa_grads) > 0 else None,
-        offsets, *gradients[:6], pose_sums,
+        projected.values, grad_records.reshape(-1), grad_values.reshape(-1), offsets, *gradients[:6], pose_sums,
     )  # fmt: skip
     parallel_for(work, num_items, threads)
     if len(gradients.pose) == 0:
@@ -150,7 +146,7 @@ def _accumulate_slots(offsets, slots, totals, item):
 @kernel
 def _backpropagate_projection(
     means, quats, scales, covariances, opacities, harmonics, pose, filter_variance, compensate, near,
-    view_dependent, scene_kept, values, grad_records, grad_values, ewa_grads, offsets,
+    view_dependent, scene_kept, values, grad_records, grad_values, offsets,
     grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums, item,
 ):  # fmt: skip
     align_stack()
@@ -164,14 +160,12 @@ def _backpropagate_projection(
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
         load_block(means, quats, scales, covariances, opacities, start, count, rows)
-        _sum_slots(
-            grad_records, grad_values, ewa_grads, offsets, start, count, record_sums, value_sums, grad_colors, rows
-        )
-        _load_record_gradients(record_sums, ewa_grads, start, count, soa, rows)
+        _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, grad_colors, rows)
+        records_to_soa(record_sums, 0, count, soa.reshape(-1), GAUSSIAN_BLOCK)
         _clear_culled(scene_kept, start, count, pose, rows, soa, kept)
         for i in range(0, GAUSSIAN_BLOCK, LANES):
             _backpropagate_records(
-                covariances, ewa_grads, camera, filter_variance, compensate, near, rows, soa.reshape(-1), grad_pose, i
+                covariances, camera, filter_variance, compensate, near, rows, soa.reshape(-1), grad_pose, i
             )
         if view_dependent is None:
             backpropagate_constant_colors(harmonics, start, count, values, value_sums, grad_colors, grad_harmonics)
@@ -198,9 +192,7 @@ def _backpropagate_projection(
 
 
 @inline_kernel
-def _sum_slots(
-    grad_records, grad_values, ewa_grads, offsets, start, count, record_sums, value_sums, grad_colors, rows
-):  # fmt: skip
+def _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, grad_colors, rows):
     """Sum the slots of each Gaussian of a block, in their order; 0 if it has none.
 
     Args:
@@ -217,17 +209,15 @@ def _sum_slots(
         prefetch(grad_values, 4 * (first + PREFETCH_DISTANCE // 4))
         if channels == 3:  # the common case has one loop, so that its end is mispredicted once
             for slot in range(first, end):
-                if ewa_grads is None:
-                    low = low + load(grad_records, layout.RECORD_SIZE * slot)
-                    high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
+                low = low + load(grad_records, layout.RECORD_SIZE * slot)
+                high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
                 values = values + load_four(grad_values, 4 * slot)
             store(value_sums, 4 * i, values)
         else:
             grad_colors[i] = 0
             for slot in range(first, end):
-                if ewa_grads is None:
-                    low = low + load(grad_records, layout.RECORD_SIZE * slot)
-                    high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
+                low = low + load(grad_records, layout.RECORD_SIZE * slot)
+                high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
                 for c in range(channels):
                     grad_colors[i, c] += load_scalar(grad_values, (channels + 1) * slot + c)
                 radius += load_scalar(grad_values, (channels + 1) * slot + channels)
@@ -237,18 +227,6 @@ def _sum_slots(
     if channels == 3:
         for i in range(0, GAUSSIAN_BLOCK, LANES):
             store_row(rows, _RADIUS_GRAD_ROW, i, to_f64(load_aos4(value_sums, 4 * i)[3]))
-
-
-@inline_kernel
-def _load_record_gradients(record_sums, ewa_grads, start, count, soa, rows):
-    """Turn a block's gradients of records into rows of `soa`, or the gradients from ewa.py into rows."""
-    if ewa_grads is not None:
-        for i in range(count):
-            soa[layout.LOG2_PEAK, i] = ewa_grads[start + i, 9]
-            for j in range(9):
-                rows[_EWA_GRAD_ROW + j, i] = ewa_grads[start + i, j]
-        return
-    records_to_soa(record_sums, 0, count, soa.reshape(-1), GAUSSIAN_BLOCK)
 
 
 @inline_kernel
@@ -269,7 +247,6 @@ def _clear_culled(scene_kept, start, count, pose, rows, soa, kept):
         rows[OPACITY_ROW, i], rows[_RADIUS_GRAD_ROW, i] = 1.0, 0.0
         for j in range(9):
             rows[SHAPE_ROW + j, i] = 1.0 if j % 4 == 0 else 0.0
-            rows[_EWA_GRAD_ROW + j, i] = 0.0
         for j in range(layout.RECORD_SIZE):
             soa[j, i] = 0.0
 
@@ -278,21 +255,17 @@ def _clear_culled(scene_kept, start, count, pose, rows, soa, kept):
 
 
 @inline_kernel
-def _backpropagate_records(
-    covariances, ewa_grads, pose, filter_variance, compensate, near, rows, soa, grad_pose, i
-):  # fmt: skip
+def _backpropagate_records(covariances, pose, filter_variance, compensate, near, rows, soa, grad_pose, i):
     """Write the gradients of shapes, opacities, directions and distances, given those of records."""
     n, radius, inverse, state = compute_direction(rows, i, pose, near)
     u, v, cov, _ = compute_tangent_covariance(covariances, rows, i, n, inverse, state)
     g_n, parts, g_det = _backpropagate_footprint_rows(
         pose, filter_variance, compensate, u, v, n, cov, soa, i, grad_pose
     )
-    if ewa_grads is not None:
-        g_n = _add_ewa_gradients(rows, i, u, v, n, cov, g_n, grad_pose)
     if covariances is not None:
-        g_n, g_radius = _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, parts, g_det)
+        g_n, g_radius = _backpropagate_matrices(rows, i, u, v, n, cov, inverse, g_n, parts, g_det)
     else:
-        g_n, g_radius = _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g_det)
+        g_n, g_radius = _backpropagate_axes(rows, i, u, n, inverse, g_n, parts, g_det)
     store_row(rows, _RADIUS_GRAD_ROW, i, load_row(rows, _RADIUS_GRAD_ROW, i) + g_radius)
     g_log_peak = (1 / math.log(2)) * _load_field(soa, layout.LOG2_PEAK, i)
     store_row(rows, OPACITY_ROW, i, g_log_peak / load_row(rows, OPACITY_ROW, i))
@@ -367,30 +340,6 @@ def _add_to_pose(grad_pose, n, a, b, g_n, g_a, g_b):
 
 
 @inline_kernel
-def _add_ewa_gradients(rows, i, u, v, n, cov, g_n, grad_pose):
-    """Add the gradients from ewa.py to that of n, which is returned, and to the pose's."""
-    ewa_n = load_vector(rows, _EWA_GRAD_ROW, i)
-    xx, xy, xz, yy, yz, zz = _ewa_covariance_gradient(rows, i)
-    columns = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
-    for other in range(3):
-        on_u, on_v, on_n = dot(*u, *columns[other]), dot(*v, *columns[other]), dot(*n, *columns[other])
-        by_u = 2 * (cov[0] * on_u + cov[1] * on_v + cov[3] * on_n)
-        by_v = 2 * (cov[1] * on_u + cov[2] * on_v + cov[4] * on_n)
-        by_n = 2 * (cov[3] * on_u + cov[4] * on_v + cov[5] * on_n) + ewa_n[other]
-        if grad_pose.shape[0] > 0:
-            for axis in range(3):
-                term = u[axis] * by_u + v[axis] * by_v + n[axis] * by_n
-                store_row(grad_pose, 4 * axis + other, 0, load_row(grad_pose, 4 * axis + other, 0) + term)
-    return g_n[0] + ewa_n[0], g_n[1] + ewa_n[1], g_n[2] + ewa_n[2]
-
-
-@inline_kernel
-def _ewa_covariance_gradient(rows, i):
-    """The gradient of C from ewa.py, world axes."""
-    return (*load_vector(rows, _EWA_GRAD_ROW + 3, i), *load_vector(rows, _EWA_GRAD_ROW + 6, i))
-
-
-@inline_kernel
 def _covariance_gradient(u, v, n, parts):
     """The gradient of C (xx xy xz yy yz zz) in the axes of u, v and n."""
     factors, (alpha, beta), g_radial, (aa, ab, bb, by_alpha, by_beta) = parts
@@ -418,18 +367,14 @@ def _covariance_gradient(u, v, n, parts):
 
 
 @inline_kernel
-def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, parts, g):
+def _backpropagate_matrices(rows, i, u, v, n, cov, inverse, g_n, parts, g):
     """Write the gradients of covariances; return those of n and the distance.
 
     Args:
-        ewa_grads: None if there are none.
         inverse: one over the distance.
         g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and det B.
     """
     xx, xy, xz, yy, yz, zz = _covariance_gradient(u, v, n, parts)
-    if ewa_grads is not None:
-        t = _ewa_covariance_gradient(rows, i)
-        xx, xy, xz, yy, yz, zz = xx + t[0], xy + t[1], xz + t[2], yy + t[3], yz + t[4], zz + t[5]
     uu, uv, vv, un, vn = cov[0], cov[1], cov[2], cov[3], cov[4]
     # det B = uu vv - uv^2; the frame rotates with n.
     xx = xx + g * (vv * u[0] * u[0] + uu * v[0] * v[0] - 2 * uv * u[0] * v[0])
@@ -453,7 +398,7 @@ def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, part
 
 
 @inline_kernel
-def _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g):
+def _backpropagate_axes(rows, i, u, n, inverse, g_n, parts, g):
     """Write the gradients of quaternions and scales; return those of n and the distance.
 
     det B = sum_k w_k (n.e_k)^2. A rotation about one axis has no effect if the other two scales are equal, and the
@@ -461,7 +406,6 @@ def _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g):
     torque about axis 0 is 2 (a_1 - a_2) (G_12 - g a_0 n_1 n_2), and cyclically.
 
     Args:
-        ewa_grads: None if there are none.
         inverse: one over the distance.
         g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and det B.
     """
@@ -472,11 +416,6 @@ def _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g):
     n0, n1, n2 = dot(*n, *e0), dot(*n, *e1), dot(*n, *e2)
     v = cross(n0, n1, n2, u0, u1, u2)
     g00, g01, g02, g11, g12, g22 = _covariance_gradient((u0, u1, u2), v, (n0, n1, n2), parts)
-    if ewa_grads is not None:
-        t = _ewa_covariance_gradient(rows, i)
-        by_0, by_1, by_2 = _symmetric_times(t, e0), _symmetric_times(t, e1), _symmetric_times(t, e2)
-        g00, g11, g22 = g00 + dot(*e0, *by_0), g11 + dot(*e1, *by_1), g22 + dot(*e2, *by_2)
-        g01, g02, g12 = g01 + dot(*e0, *by_1), g02 + dot(*e2, *by_0), g12 + dot(*e1, *by_2)
     a0, a1, a2 = s0 * s0, s1 * s1, s2 * s2
     gn0, gn1, gn2 = g * n0, g * n1, g * n2
     t0, t1, t2 = 2 * a1 * a2 * gn0, 2 * a2 * a0 * gn1, 2 * a0 * a1 * gn2
@@ -503,12 +442,6 @@ def _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g):
     store_row(rows, _SHAPE_GRAD_ROW + 2, i, q[0] * y + q[3] * x - q[1] * z)
     store_row(rows, _SHAPE_GRAD_ROW + 3, i, q[0] * z + q[1] * y - q[2] * x)
     return g_n, -(d0 * s0 + d1 * s1 + d2 * s2) * inverse
-
-
-@inline_kernel
-def _symmetric_times(matrix, e):
-    xx, xy, xz, yy, yz, zz = matrix
-    return dot(xx, xy, xz, *e), dot(xy, yy, yz, *e), dot(xz, yz, zz, *e)
 
 
 # --- gradients of a block's means, and writing the gradients ---

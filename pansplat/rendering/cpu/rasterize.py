@@ -24,7 +24,6 @@ from pansplat.rendering.cpu.records import (
     BLOCK_WIDTH,
     COLUMN_RAYS,
     EQUIRECT_RAYS,
-    PIXEL_CENTRES,
     RECORD_SIZE,
     TILE_SIZE,
     PixelTables,
@@ -95,7 +94,7 @@ def image_position(pixel, left, top):
 
 @inline_kernel_no_refcount
 def pixel_point(kind, columns, rows, rotation, x, y):
-    """The unit direction of pixel (x, y), or its centre for the EWA kernel."""
+    """The unit direction of pixel (x, y)."""
     if kind == EQUIRECT_RAYS:
         cosine = rows[y, 1]
         return cosine * columns[x, 0], rows[y, 0], cosine * columns[x, 1]
@@ -104,8 +103,6 @@ def pixel_point(kind, columns, rows, rotation, x, y):
         cosine = rows[y, row + 1]
         return cosine * columns[x, 0], rows[y, row], cosine * columns[x, 1]
     right, down = columns[x, 0], rows[y, 0]
-    if kind == PIXEL_CENTRES:
-        return right, down, 0.0
     scale = 1 / math.sqrt(right * right + down * down + 1)
     right, down = right * scale, down * scale
     return (
@@ -123,8 +120,8 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
         kind, columns, rows, rotation: of the PixelTables.
         left, top: pixel at the tile's corner.
         centre: (3) float64, written.
-        frame: (TILE_FRAME_SIZE), written: the centre as float32, its residual, two axes across, and a third axis, which
-            is the centre, or zeros for the EWA kernel.
+        frame: (TILE_FRAME_SIZE), written: the centre as float32, its residual, two axes across, and the centre again as
+            the third axis.
 
     Returns:
         Whether a pixel is too far from the centre for footprint rows with two components.
@@ -138,15 +135,13 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
         d_x, d_y, d_z = pixel_point(kind, columns, rows, rotation, x, y)
         if corner < 0:
             centre[0], centre[1], centre[2] = d_x, d_y, d_z
-        elif kind != PIXEL_CENTRES:
+        else:
             min_cosine = min(min_cosine, dot(centre[0], centre[1], centre[2], d_x, d_y, d_z))
-    axes = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-    if kind != PIXEL_CENTRES:
-        axes = tangent_frame(centre[0], centre[1], centre[2])
+    axes = tangent_frame(centre[0], centre[1], centre[2])
     for axis in range(3):
         frame[axis] = np.float32(centre[axis])
         frame[3 + axis] = np.float32(centre[axis] - np.float64(frame[axis]))
-        frame[12 + axis] = np.float32(0 if kind == PIXEL_CENTRES else centre[axis])
+        frame[12 + axis] = np.float32(centre[axis])
     for axis in range(6):
         frame[6 + axis] = np.float32(axes[axis])
     return min_cosine < MIN_PLANAR_COSINE
@@ -215,7 +210,7 @@ def load_eight_records(records, intersections, e, last):
 
 
 @inline_kernel_no_refcount
-def load_chunk(records, values, intersections, first, count, frame, exact, is_3d, footprints, chunk_values):
+def load_chunk(records, values, intersections, first, count, frame, is_3d, footprints, chunk_values):
     """Compute the footprints and copy the values of a chunk.
 
     Args:
@@ -223,7 +218,6 @@ def load_chunk(records, values, intersections, first, count, frame, exact, is_3d
         values: (n, value).
         first, count: the chunk's intersections.
         frame: of the tile.
-        exact: float32 1, or 0 for the EWA kernel, whose L is 1.
         is_3d: whether the tile needs three components.
         footprints: (FOOTPRINT_SIZE CHUNK_SIZE), written; past `count` the last Gaussian is repeated.
         chunk_values: (CHUNK_SIZE value), written.
@@ -232,7 +226,7 @@ def load_chunk(records, values, intersections, first, count, frame, exact, is_3d
         Whether the footprints have three components, because a Gaussian is too far from the tile's centre for two.
     """
     num_values = values.shape[1]
-    while _compute_footprints(records, intersections, first, count, frame, exact, is_3d, footprints):
+    while _compute_footprints(records, intersections, first, count, frame, is_3d, footprints):
         is_3d = True
     if num_values == VALUE_LANES:
         for s in range(count):
@@ -247,10 +241,10 @@ def load_chunk(records, values, intersections, first, count, frame, exact, is_3d
 
 
 @inline_kernel_no_refcount
-def _compute_footprints(records, intersections, first, count, frame, exact, is_3d, footprints):
+def _compute_footprints(records, intersections, first, count, frame, is_3d, footprints):
     """Compute a chunk's footprints; return whether they must be computed again in 3d."""
     last = first + count - 1
-    l_factor, one = broadcast(exact), broadcast(np.float32(1))
+    one = broadcast(np.float32(1))
     min_ahead, max_horizon = one, broadcast(np.float32(0))
     for at in range(0, count, LANES):
         low, high = load_eight_records(records, intersections, first + at, last)
@@ -262,11 +256,11 @@ def _compute_footprints(records, intersections, first, count, frame, exact, is_3
         m_x, m_y, m_z = _to_tile_frame(frame, m_x, m_y, m_z)
         a_x, a_y, a_z = _to_tile_frame(frame, a_x, a_y, a_z)
         b_x, b_y, b_z = _to_tile_frame(frame, b_x, b_y, b_z)
-        l_x = l_factor * multiply_add(l_along_a, a_x, multiply_add(l_along_b, b_x, m_x))
-        l_y = l_factor * multiply_add(l_along_a, a_y, multiply_add(l_along_b, b_y, m_y))
+        l_x = multiply_add(l_along_a, a_x, multiply_add(l_along_b, b_x, m_x))
+        l_y = multiply_add(l_along_a, a_y, multiply_add(l_along_b, b_y, m_y))
         ahead = one + m_z
         if is_3d:
-            l_z = l_factor * multiply_add(l_along_a, a_z, multiply_add(l_along_b, b_z, ahead))
+            l_z = multiply_add(l_along_a, a_z, multiply_add(l_along_b, b_z, ahead))
             store(footprints, THIRD * CHUNK_SIZE + at, a_z)
             store(footprints, (THIRD + 1) * CHUNK_SIZE + at, b_z)
             store(footprints, (THIRD + 2) * CHUNK_SIZE + at, l_z)
@@ -399,7 +393,6 @@ def _rasterize_tiles(
     chunk_values = np.empty(num_values * CHUNK_SIZE, np.float32)
     masks = np.empty(CHUNK_WORDS * NUM_MASKS, np.uint64)
     log2_alphas, indices = np.empty(2 * BUFFER_SIZE * LANES, np.float32), np.empty(2 * BUFFER_SIZE, np.uint8)
-    exact = np.float32(0 if kind == PIXEL_CENTRES else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE_SIZE, (first_row + tile // tiles_across) * TILE_SIZE
         tile_is_3d, pixels_are_3d = set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame), -1
@@ -412,7 +405,7 @@ def _rasterize_tiles(
                 _save_transmittance(transmittance, saved_transmittance, saved_rows[tile] + num_chunks)
             num_chunks += 1
             is_3d = load_chunk(
-                records, values, intersections, first, count, frame, exact, tile_is_3d, footprints, chunk_values
+                records, values, intersections, first, count, frame, tile_is_3d, footprints, chunk_values
             )
             if pixels_are_3d != is_3d:
                 set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets)

@@ -46,7 +46,7 @@ from pansplat.rendering.cpu.rasterize import (
     set_tile_frame,
     set_tile_pixels,
 )
-from pansplat.rendering.cpu.records import PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE, PixelTables
+from pansplat.rendering.cpu.records import RECORD_SIZE, TILE_SIZE, PixelTables
 from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel
 from pansplat.rendering.cpu.simd import (
     LANES,
@@ -135,7 +135,6 @@ def _rasterize_tiles_backward(
     weights = np.empty(2 * BUFFER_SIZE * LANES, np.float32)
     visible = np.empty(2 * BUFFER_SIZE, np.int32)
     gradient_sums = np.empty(_NUM_SUMS * CHUNK_SIZE, np.float32)
-    exact = np.float32(0 if kind == PIXEL_CENTRES else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE_SIZE, (first_row + tile // tiles_across) * TILE_SIZE
         tile_is_3d, pixels_are_3d = set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame), -1
@@ -148,7 +147,7 @@ def _rasterize_tiles_backward(
             first = begin + chunk * CHUNK_SIZE
             count = min(CHUNK_SIZE, end - first)
             is_3d = load_chunk(
-                records, values, intersections, first, count, frame, exact, tile_is_3d, footprints, chunk_values
+                records, values, intersections, first, count, frame, tile_is_3d, footprints, chunk_values
             )
             if pixels_are_3d != is_3d:
                 set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets)
@@ -164,7 +163,7 @@ def _rasterize_tiles_backward(
             )  # fmt: skip
             _write_chunk_gradients(
                 records, intersections, first, count, slots, heads, links, pairs, is_3d, footprints, offsets,
-                tile_grads, num_values, gradient_sums, exact, grad_records, grad_values,
+                tile_grads, num_values, gradient_sums, grad_records, grad_values,
             )  # fmt: skip
 
 
@@ -322,7 +321,7 @@ def _write_zeros(slots, first, end, num_values, grad_records, grad_values):
 @inline_kernel_no_refcount
 def _write_chunk_gradients(
     records, intersections, first, count, slots, heads, links, pairs, is_3d, footprints, offsets, tile_grads,
-    num_values, gradient_sums, exact, grad_records, grad_values,
+    num_values, gradient_sums, grad_records, grad_values,
 ):  # fmt: skip
     """Write the gradients of a chunk's records and values to their slots."""
     last = first + count - 1
@@ -335,7 +334,7 @@ def _write_chunk_gradients(
         for value in range(VALUE_LANES, num_values):
             store_scalar(grad_values, row + value, _sum_value_gradient(s, heads, links, pairs, tile_grads, value))
     for s in range(0, count, LANES):
-        _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, exact, grad_records)
+        _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, grad_records)
 
 
 @inline_kernel_no_refcount
@@ -388,7 +387,7 @@ def _sum_value_gradient(s, heads, links, pairs, tile_grads, value):
 
 
 @inline_kernel_no_refcount
-def _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, exact, grad_records):
+def _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, grad_records):
     """Convert the sums of eight Gaussians to the gradients of their records, and write these to their slots.
 
     The length of a ray is arbitrary. For L = 1, d - n = x p + y q, where a.p = b.q = 1 and a.q = b.p = l.p = l.q = 0.
@@ -400,28 +399,24 @@ def _write_record_gradients(s, records, intersections, first, count, slots, grad
     n_x, n_y, n_z, _, _, _, a_x, a_y = low
     a_z, b_x, b_y, b_z, l_along_a, l_along_b, _, _ = high
     n, a, b = (n_x, n_y, n_z), (a_x, a_y, a_z), (b_x, b_y, b_z)
-    zero, one, l_factor = broadcast(np.float32(0)), broadcast(np.float32(1)), broadcast(exact)
-    two = broadcast(np.float32(2 * _LN2))
-    twice, half = two * l_factor, broadcast(np.float32(_LN2))
-    ahead = l_factor * n[0], l_factor * n[1], multiply_add(l_factor, n[2], one - l_factor)
-    p, q = _cross(b, ahead), _cross(ahead, a)
+    zero, one = broadcast(np.float32(0)), broadcast(np.float32(1))
+    two, half = broadcast(np.float32(2 * _LN2)), broadcast(np.float32(_LN2))
+    p, q = _cross(b, n), _cross(n, a)
     inverse = one / _dot(a, p)
     p = _combine(inverse, p, -l_along_a, n)
     q = _combine(inverse, q, -l_along_b, n)
     l_row = _combine(l_along_a, a, l_along_b, b)
     l_row = n[0] + l_row[0], n[1] + l_row[1], n[2] + l_row[2]
-    grad_l = _combine(twice * qx, p, twice * qy, q)
+    grad_l = _combine(two * qx, p, two * qy, q)
     grad_a = _combine(two * (l_along_a * qx - xx), p, two * (l_along_a * qy - xy), q)
     grad_b = _combine(two * (l_along_b * qx - xy), p, two * (l_along_b * qy - yy), q)
-    across, back = _combine(two * sum_x, a, two * sum_y, b), -(twice * (xx + yy))
+    across, back = _combine(two * sum_x, a, two * sum_y, b), -(two * (xx + yy))
     grad_n_x = grad_l[0] + multiply_add(back, l_row[0], across[0])
     grad_n_y = grad_l[1] + multiply_add(back, l_row[1], across[1])
     grad_n_z = grad_l[2] + multiply_add(back, l_row[2], across[2])
     # The gradients overwrite the sums, which are in registers.
     low = transpose(grad_n_x, grad_n_y, grad_n_z, zero, zero, zero, grad_a[0], grad_a[1])
-    high = transpose(
-        grad_a[2], grad_b[0], grad_b[1], grad_b[2], twice * qx, twice * qy, half * l_factor * qq, half * sum_gradient
-    )
+    high = transpose(grad_a[2], grad_b[0], grad_b[1], grad_b[2], two * qx, two * qy, half * qq, half * sum_gradient)
     _store_rows(gradient_sums, at, low)
     _store_rows(gradient_sums, at + LANES, high)
     for i in range(s, min(s + LANES, count)):

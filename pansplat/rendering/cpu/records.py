@@ -7,9 +7,7 @@ Gaussian, d the ray of a pixel, and a, b, l the footprint rows:
     alpha = min(0.99, 2^(log2_peak - Q / (L^2 + radial_variance Q))),  Q = A^2 + B^2
 
 So a and b are sqrt(HALF_LOG2_E) times those of docs/rendering.md, and radial_variance is its S' over HALF_LOG2_E. n is
-stored as a float32 vector and its residual, so that n minus another direction has no cancellation. For the EWA kernel
-n is the point in pixels (z = 0), d the pixel's centre, L = 1, and all of a_y, a_z, b_z, radial_variance, l_along_a and
-l_along_b are 0.
+stored as a float32 vector and its residual, so that n minus another direction has no cancellation.
 
 Only A / L and B / L matter, and a.n = b.n = 0. Gradients of records are those for rays scaled so that L = 1.
 
@@ -56,8 +54,7 @@ panorama and reaches both ends of one tile has the tile's full width."""
 
 EQUIRECT_RAYS = 0  # columns: sine and cosine of the longitude; rows: of the latitude
 PINHOLE_RAYS = 1  # columns: x of the ray (x, y, 1); rows: y
-PIXEL_CENTRES = 2  # columns, rows: pixel centres, for the EWA kernel
-COLUMN_RAYS = 3  # a panorama of which each column is a column of blocks: see `tabulate_columns`
+COLUMN_RAYS = 2  # a panorama of which each column is a column of blocks: see `tabulate_columns`
 BLOCK_WIDTH = 4  # pixels of a raster block
 
 
@@ -65,7 +62,7 @@ class PixelTables(NamedTuple):
     """The pixels of one image plane, each given by a column and a row.
 
     Attributes:
-        kind: EQUIRECT_RAYS, PINHOLE_RAYS, PIXEL_CENTRES or COLUMN_RAYS.
+        kind: EQUIRECT_RAYS, PINHOLE_RAYS or COLUMN_RAYS.
         columns: float64 (width, 2).
         rows: float64 (height, 2); for COLUMN_RAYS (height, 2 BLOCK_WIDTH).
         rotation: float64 (3, 3), the image plane's axes in the camera's; used by PINHOLE_RAYS.
@@ -82,16 +79,14 @@ class PixelTables(NamedTuple):
         return -(-len(self.rows) // TILE_SIZE), -(-len(self.columns) // TILE_SIZE)
 
 
-def tabulate_pixels(plane: ImagePlane, *, exact: bool) -> PixelTables:
-    """Pixel tables of an image plane, for the exact kernel or for EWA.
+def tabulate_pixels(plane: ImagePlane) -> PixelTables:
+    """Pixel tables of an image plane.
 
     Source: docs/rendering.md, section 6.
     """
     height, width = plane.size
     x, y = (np.arange(extent, dtype=np.float64) + 0.5 for extent in (width, height))
     rotation = np.ascontiguousarray(plane.rotation.to("cpu", torch.float64).numpy())
-    if not exact:
-        return PixelTables(PIXEL_CENTRES, _table(x, np.zeros(width)), _table(y, np.zeros(height)), rotation)
     if plane.is_panorama:
         longitude, latitude = (2 * x / width - 1) * np.pi, (y / height - 0.5) * np.pi
         columns, rows = (_table(np.sin(angle), np.cos(angle)) for angle in (longitude, latitude))
@@ -106,7 +101,7 @@ def tabulate_columns(plane: ImagePlane, low: int, high: int) -> PixelTables:
     Column j of the panorama is columns 4 j to 4 j + 3 of the folded image, and its row i is row i // 4, column
     4 j + i % 4. A block evaluates every Gaussian that reaches it for all of its pixels.
     """
-    tables = tabulate_pixels(plane, exact=True)
+    tables = tabulate_pixels(plane)
     folded = -(-len(tables.rows) // BLOCK_WIDTH) * BLOCK_WIDTH
     rows = np.pad(tables.rows, ((0, folded - len(tables.rows)), (0, 0)), mode="edge")
     columns = np.repeat(tables.columns[low:high], BLOCK_WIDTH, axis=0)

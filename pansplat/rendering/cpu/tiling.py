@@ -146,36 +146,31 @@ def _bound_pinhole(records, rotation, height, width, focal, boxes, item):
             rows[_EDGES + 2, i] = (y - root_y) * to_pixels + middle_y if bounded else -_UNBOUNDED
             bottom = (y + root_y) * to_pixels + middle_y if bounded else _UNBOUNDED
             rows[_EDGES + 3, i] = _ABOVE_IMAGE if invisible else bottom
-        round_boxes(rows, _EDGES, start, count, height, width, boxes)
+        _round_boxes(rows, start, count, height, width, boxes)
 
 
 @inline_kernel
-def round_boxes(rows, edges, start, count, height, width, boxes):
-    """Write the boxes of the pixels whose centres lie within the edges.
-
-    Args:
-        rows, edges: left, right, top and bottom in pixels, in four rows from row `edges` on.
-        boxes: (n, 2) int32, two numbers of a box per int32.
-    """
+def _round_boxes(rows, start, count, height, width, boxes):
+    """Write the boxes of the pixels whose centres lie within the edges (n, 2), two numbers per int32."""
     margin = _pixel_margin(height, width)
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
     for i in range(GAUSSIAN_BLOCK):
-        x0 = max(np.ceil(rows[edges, i] - _HALF - margin), _ZERO)
-        x1 = min(np.floor(rows[edges + 1, i] - _HALF + margin), last_x)
-        y0 = max(np.ceil(rows[edges + 2, i] - _HALF - margin), _ZERO)
-        y1 = min(np.floor(rows[edges + 3, i] - _HALF + margin), last_y)
+        x0 = max(np.ceil(rows[_EDGES, i] - _HALF - margin), _ZERO)
+        x1 = min(np.floor(rows[_EDGES + 1, i] - _HALF + margin), last_x)
+        y0 = max(np.ceil(rows[_EDGES + 2, i] - _HALF - margin), _ZERO)
+        y1 = min(np.floor(rows[_EDGES + 3, i] - _HALF + margin), last_y)
         visible = (x0 <= x1) & (y0 <= y1)
-        rows[edges, i], rows[edges + 1, i] = x0 if visible else _ZERO, x1 if visible else _ZERO
-        rows[edges + 2, i], rows[edges + 3, i] = y0 if visible else _ONE, y1 if visible else _ZERO
-    _write_boxes(rows, edges, start, count, boxes)
+        rows[_EDGES, i], rows[_EDGES + 1, i] = x0 if visible else _ZERO, x1 if visible else _ZERO
+        rows[_EDGES + 2, i], rows[_EDGES + 3, i] = y0 if visible else _ONE, y1 if visible else _ZERO
+    _write_boxes(rows, start, count, boxes)
 
 
 @inline_kernel
-def _write_boxes(rows, edges, start, count, boxes):
-    """Write four rows of whole numbers as boxes, two numbers per int32."""
+def _write_boxes(rows, start, count, boxes):
+    """Write the edges, which are whole numbers, as boxes (n, 2), two numbers per int32."""
     for i in range(count):
-        boxes[start + i, 0] = np.int32(rows[edges, i]) | np.int32(rows[edges + 1, i]) << np.int32(16)
-        boxes[start + i, 1] = np.int32(rows[edges + 2, i]) | np.int32(rows[edges + 3, i]) << np.int32(16)
+        boxes[start + i, 0] = np.int32(rows[_EDGES, i]) | np.int32(rows[_EDGES + 1, i]) << np.int32(16)
+        boxes[start + i, 1] = np.int32(rows[_EDGES + 2, i]) | np.int32(rows[_EDGES + 3, i]) << np.int32(16)
 
 
 @inline_kernel
@@ -240,7 +235,7 @@ def _bound_equirect(records, rotation, height, width, boxes, item):
             rows[_EDGES, i] = _ZERO if full_width | ~visible else x0
             rows[_EDGES + 1, i] = (last_x if full_width else x1) if visible else _ZERO
             rows[_EDGES + 2, i], rows[_EDGES + 3, i] = y0 if visible else _ONE, y1 if visible else _ZERO
-        _write_boxes(rows, _EDGES, start, count, boxes)
+        _write_boxes(rows, start, count, boxes)
 
 
 @inline_kernel
@@ -291,7 +286,7 @@ def _equirect_edges(rows, height, width):
 
 
 def find_bounding_boxes(records: np.ndarray, plane: ImagePlane, workspace: Workspace, threads: int) -> np.ndarray:
-    """Bounding box of each record of the exact kernel on an image plane, (n, 4) int16."""
+    """Bounding box of each record on an image plane, (n, 4) int16."""
     words = workspace.array((len(records), 2), np.int32)
     rotation = np.ascontiguousarray(plane.rotation.numpy().astype(np.float32))
     if plane.is_panorama:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.cpu.backend import CameraView, find_footprints, make_camera
+from pansplat.rendering.cpu.backend import make_camera
 from pansplat.rendering.cpu.projection import GaussianArrays, project_gaussians
 from pansplat.rendering.cpu.projection_backward import accumulate_slots
 from pansplat.rendering.cpu.rasterize import (
@@ -68,7 +68,13 @@ from pansplat.rendering.cpu.simd import (
     store,
     store_scalar,
 )
-from pansplat.rendering.cpu.tiling import TileIntersections, intersect_tiles, parallel_for_tiles, sort_front_to_back
+from pansplat.rendering.cpu.tiling import (
+    TileIntersections,
+    find_bounding_boxes,
+    intersect_tiles,
+    parallel_for_tiles,
+    sort_front_to_back,
+)
 from pansplat.rendering.image_planes import image_planes
 from pansplat.rendering.rasterize import RasterOptions
 
@@ -113,12 +119,11 @@ class StoredWeights:
         fields = gaussians.means, gaussians.quats, gaussians.scales, None, gaussians.opacities, gaussians.harmonics
         tensors = tuple(None if field is None else field.detach().contiguous() for field in fields)
         arrays, camera = GaussianArrays.from_tensors(tensors), make_camera(cam2world.double(), plane, options)
-        self._workspace, self._tables = Workspace(), tabulate_pixels(plane, exact=True)
+        self._workspace, self._tables = Workspace(), tabulate_pixels(plane)
         with announce_compilation():
             projected = project_gaussians(arrays, camera, self._workspace, self._threads)
-            view = CameraView(arrays, camera, projected, options, self._threads)
-            records, boxes = find_footprints(view, plane, self._workspace)
-            self._scene = records.reshape(-1), projected.values
+            boxes = find_bounding_boxes(projected.records, plane, self._workspace, self._threads)
+            self._scene = projected.records.reshape(-1), projected.values
             self._bands = list(
                 intersect_tiles(boxes, size, slots=True, threads=self._threads, limit=MAX_BAND_INTERSECTIONS)
             )
@@ -213,7 +218,7 @@ def _compute_weights(
     chunk_values = np.empty(values.shape[1] * CHUNK_SIZE, np.float32)
     masks = np.empty(CHUNK_WORDS * NUM_MASKS, np.uint64)
     log2_alphas, indices = np.empty(BUFFER_SIZE * LANES, np.float32), np.empty(BUFFER_SIZE, np.uint8)
-    exact, cut = np.float32(1), broadcast(np.float32(MIN_TRANSMITTANCE))
+    cut = broadcast(np.float32(MIN_TRANSMITTANCE))
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE_SIZE, (first_row + tile // tiles_across) * TILE_SIZE
         tile_is_3d, pixels_are_3d = set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame), -1
@@ -222,7 +227,7 @@ def _compute_weights(
         for first in range(starts[tile], starts[tile + 1], CHUNK_SIZE):
             count = min(CHUNK_SIZE, starts[tile + 1] - first)
             is_3d = load_chunk(
-                records, values, intersections, first, count, frame, exact, tile_is_3d, footprints, chunk_values
+                records, values, intersections, first, count, frame, tile_is_3d, footprints, chunk_values
             )
             if pixels_are_3d != is_3d:
                 set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets)

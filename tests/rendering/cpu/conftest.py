@@ -12,7 +12,6 @@ from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import projection as reference
-from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE
 from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, backpropagate_projection
 from pansplat.rendering.cpu.rasterize import MIN_PLANAR_COSINE
@@ -23,7 +22,6 @@ from pansplat.rendering.cpu.records import (
     L_ALONG_A,
     L_ALONG_B,
     LOG2_PEAK,
-    PIXEL_CENTRES,
     RADIAL_VARIANCE,
     RECORD_SIZE,
     ROW_A,
@@ -118,14 +116,12 @@ def backpropagate() -> Callable[..., GaussianGradients]:
         grad_records: np.ndarray,
         grad_values: np.ndarray,
         *,
-        ewa_grads: np.ndarray | None = None,
         offsets: np.ndarray | None = None,
         threads: int = 1,
     ) -> GaussianGradients:
         gradients = GaussianGradients(*(np.full_like(field, np.nan) for field in view.gaussians), pose=np.zeros((3, 4)))
         offsets = np.arange(len(grad_values) + 1) if offsets is None else offsets
-        ewa_grads = np.zeros((0, EWA_GRAD_SIZE)) if ewa_grads is None else ewa_grads
-        return backpropagate_projection(*view, grad_records, grad_values, ewa_grads, offsets, gradients, threads)
+        return backpropagate_projection(*view, grad_records, grad_values, offsets, gradients, threads)
 
     return run
 
@@ -154,15 +150,11 @@ class Case:
             row.split((3, 3, 3, 3, 4)) for row in records
         ):
             l = n + l_along_a * a + l_along_b * b  # noqa: E741
-            offset = self.points - n
-            if self.tables.kind != PIXEL_CENTRES:
-                # The length of a ray is arbitrary, and so are the gradients that rotate a and b out of their plane.
-                # The kernel computes those at L = 1.
-                length = (1 + offset @ l).detach()
-                offset = self.points / torch.where(length > 0, length, 1)[..., None] - n
+            # The length of a ray is arbitrary, and so are the gradients that rotate a and b out of their plane.
+            # The kernel computes those at L = 1.
+            length = (1 + (self.points - n) @ l).detach()
+            offset = self.points / torch.where(length > 0, length, 1)[..., None] - n
             front = 1 + offset @ l
-            if self.tables.kind == PIXEL_CENTRES:
-                front, radial_variance = torch.ones_like(front), 0.0
             q = (offset @ a).square() + (offset @ b).square()
             alpha = torch.exp2(log2_peak - q / (front.square() + radial_variance * q)).clamp_max(0.99)
             alpha = torch.where((front > 0) & (alpha >= 1 / 255), alpha, 0)
@@ -175,8 +167,9 @@ class Case:
         return sums.detach(), *torch.autograd.grad(sums, (records, values), torch.from_numpy(upstream).double())
 
     def flatten(self) -> "Case":
-        """Make every footprint of an EWA case wider than its tiles, with a constant alpha."""
-        self.records[:, ROW_A:L_ALONG_A] = 1e-3 * np.array((1, 0, 0, 0, 1, 0))
+        """Make every footprint wider than its tiles, with a nearly constant alpha."""
+        self.records[:, ROW_A:L_ALONG_A] *= 1e-3
+        self.records[:, L_ALONG_A:LOG2_PEAK] = 0
         return self
 
     def reduce(self, slots: np.ndarray) -> np.ndarray:
@@ -196,10 +189,6 @@ def _random_records(
     records = torch.zeros(count, RECORD_SIZE, dtype=torch.float64)
     records[:, LOG2_PEAK] = torch.from_numpy(np.log2(rng.uniform(*opacity, count)))
     pixels = rng.uniform(-1, 1, (count, 2)) * (width / 2 + 1, height / 2 + 1)
-    if kind == "ewa":
-        records[:, DIRECTION:2] = torch.from_numpy(pixels + np.array((width, height)) / 2)
-        records[:, ROW_A : ROW_A + 2], records[:, ROW_B : ROW_B + 2] = map(torch.from_numpy, (a, b))
-        return records
     if kind == "pinhole":
         rays = np.concatenate((pixels / plane.focal, np.ones((count, 1))), axis=1)
         direction = torch.from_numpy(rays) @ plane.rotation.T
@@ -218,7 +207,7 @@ def _random_records(
 
 @pytest.fixture
 def make_case(pose: Tensor) -> Callable[..., Case]:
-    """Makes cases of a kind: "equirect" or "pinhole" for the exact kernel, "ewa"."""
+    """Makes cases of a kind: "equirect" or "pinhole"."""
 
     def make(
         kind: str,
@@ -233,13 +222,12 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
         precise = _random_records(kind, plane, count, opacity, rng)
         records, heads = precise.float(), slice(DIRECTION_RESIDUAL)
         records[:, DIRECTION_RESIDUAL:ROW_A] = (precise[:, heads] - records[:, heads].double()).float()
-        tables = tabulate_pixels(plane, exact=kind != "ewa")
+        tables = tabulate_pixels(plane)
         tiles = tables.tiles[0] * tables.tiles[1]
         whole_tile = (TILE_SIZE - 1) << 8 | (TILE_SIZE - 1) << 24
         intersections = np.empty((tiles * count, 2), np.int32)
         intersections[:, 0], intersections[:, 1] = np.tile(np.arange(count), tiles), whole_tile
         slots = (np.tile(np.arange(count) * tiles, tiles) + np.repeat(np.arange(tiles), count)).astype(np.int32)
-        points = plane.coordinates() if kind == "ewa" else plane.directions()
         return Case(
             records.numpy(),
             rng.uniform(-0.5, 1.5, (count, num_values)).astype(np.float32),
@@ -247,7 +235,7 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
             np.arange(0, tiles * count + 1, count) if count else np.zeros(tiles + 1, np.int64),
             slots,
             tables,
-            torch.nn.functional.pad(points, (0, 3 - points.shape[-1])),
+            plane.directions(),
             size,
         )
 

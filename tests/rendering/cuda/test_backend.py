@@ -152,6 +152,6 @@ def test_auto_selects_triton_only_on_cuda(unchecked):
     from pansplat.rendering.rasterize import _select_backend
 
     means = types.SimpleNamespace(is_cuda=True, device=torch.device("cuda"), dtype=torch.float32)
-    assert _select_backend("auto", types.SimpleNamespace(means=means)) is cuda.rasterize_planes
+    assert _select_backend("auto", types.SimpleNamespace(means=means), "ewa") is cuda.rasterize_planes
     means.is_cuda, means.device = False, torch.device("cpu")
-    assert _select_backend("auto", types.SimpleNamespace(means=means)) is not cuda.rasterize_planes
+    assert _select_backend("auto", types.SimpleNamespace(means=means), "ewa") is not cuda.rasterize_planes

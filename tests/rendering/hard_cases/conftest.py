@@ -1,4 +1,9 @@
-"""All backends, and their comparison with the dense float64 renderer, forward and backward."""
+"""All backends, and their comparison with the dense float64 renderer, forward and backward.
+
+A test runs with torch in float64, and in float32 with the backend of "auto" on a CPU: numba, and torch for the
+EWA kernel. Tests marked `torch_float32` also run with torch in float32 and the exact kernel. Triton's interpreter, a
+thousand times slower, runs in `pytest -m exhaustive`.
+"""
 
 import dataclasses
 import os
@@ -54,22 +59,30 @@ class Renderer:
 
 
 _RENDERERS = {
-    "torch": Renderer("torch", torch.float64, 1e-9, 1e-8),
+    "float64": Renderer("torch", torch.float64, 1e-9, 1e-8),
+    "float32": Renderer("auto", torch.float32, 5e-6, 1e-4),
     "torch-float32": Renderer("torch", torch.float32, 5e-6, 1e-4),
-    "numba": Renderer("numba", torch.float32, 5e-6, 1e-4),
     "triton": Renderer("triton", torch.float32, 5e-6, 1e-4, height=8),
 }
-
-
-_NO_TRITON = find_spec("triton") is None and not os.environ.get("CI")
-
-
-@pytest.fixture(
-    params=[
-        pytest.param(name, marks=pytest.mark.skipif(name == "triton" and _NO_TRITON, reason="triton needs Linux"))
-        for name in _RENDERERS
-    ]
+_TRITON = (
+    pytest.mark.exhaustive,
+    pytest.mark.skipif(find_spec("triton") is None and not os.environ.get("CI"), reason="triton needs Linux"),
 )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "torch_float32: also with torch in float32 and the exact kernel")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "render" in metafunc.fixturenames:
+        names = ["float64", "float32", pytest.param("triton", marks=_TRITON)]
+        if metafunc.definition.get_closest_marker("torch_float32"):
+            names.append("torch-float32")
+        metafunc.parametrize("render", names, indirect=True)
+
+
+@pytest.fixture
 def render(request) -> Renderer:
     """A backend."""
     return _RENDERERS[request.param]

@@ -90,6 +90,7 @@ def _check(render, leaves, given_scene, options: dict) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.torch_float32
 @settings(_QUIET, max_examples=60)
 @given(scene=_scenes(), options=_images())
 def test_extreme_numbers_give_finite_images_and_gradients(render, leaves, scene, options):

@@ -61,6 +61,7 @@ def test_a_million_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(re
     assert (got.color[:, 0, 0] - expected).abs().max() < 1e-4
 
 
+@pytest.mark.torch_float32
 @pytest.mark.hard_case(18)
 def test_gradients_of_a_saturated_pixel_are_exactly_zero_behind_the_front(render, balls, leaves):
     count = 300 if render.interpreted else 3000
@@ -80,6 +81,7 @@ def test_gradients_of_a_saturated_pixel_are_exactly_zero_behind_the_front(render
     assert (scene.harmonics.grad.abs().amax(dim=(1, 2))[:10] > smallest).all()
 
 
+@pytest.mark.torch_float32
 @pytest.mark.hard_case(19)
 @pytest.mark.parametrize("opacity", [0.3, 0.9, 0.999])
 def test_gradients_at_low_transmittance_equal_the_dense_renderers(opacity, render, balls, equals_dense):
@@ -105,6 +107,7 @@ def test_only_pixels_within_rounding_of_the_alpha_cut_may_differ(render, make_sc
     assert float(off.max()) <= ALPHA_CUT * 1.5
 
 
+@pytest.mark.torch_float32
 @pytest.mark.hard_case(20)
 def test_alpha_is_cut_at_one_255th_and_clamped_at_0_99(render, balls):
     def alpha(opacity: float) -> float:

@@ -107,6 +107,7 @@ def test_gradients_are_inversely_proportional_to_the_unit(unit, render, make_sce
         assert float((found - expected).norm() / expected.norm()) < 1e-4, name
 
 
+@pytest.mark.torch_float32
 @pytest.mark.hard_case(24)
 def test_a_scene_from_a_millimetre_to_ten_metres_equals_the_dense_renderer(render, balls, equals_dense):
     far = (1e-3, 1e-2, 1e-1, 1.0, 1e1)
@@ -127,6 +128,7 @@ def test_scales_far_larger_than_the_distance_are_dropped_and_far_smaller_ones_va
             assert name == "pose" or not gradient[0].any()
 
 
+@pytest.mark.torch_float32
 @pytest.mark.hard_case(26)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("unit", [1.0, 300.0], ids=["near", "beyond 256 m"])

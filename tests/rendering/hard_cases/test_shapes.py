@@ -35,6 +35,7 @@ def test_where_ewa_clamps_the_gradient_is_that_of_the_centre(render, balls, leav
     assert float(scene.means.grad[0, 0]) == pytest.approx((sums[1] - sums[0]) / (2 * step), rel=0.05)
 
 
+@pytest.mark.torch_float32
 @pytest.mark.hard_case(14)
 @pytest.mark.parametrize("axis", [0, 1, 2], ids=["x", "y", "z"])
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])

@@ -111,7 +111,7 @@ def test_an_image_is_the_centre_of_a_larger_one(render, make_scene, pose):
 @pytest.mark.hard_case(29)
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_a_few_gaussians_in_a_large_image_are_visible_at_their_pixels(count, render, balls):
-    height = {"torch": 256, "numba": 1024, "triton": 48}[render.name]
+    height = {"torch": 256, "auto": 1024, "triton": 48}[render.name]
     means = [(0, 0.1, 2.0), (-1.0, 0.2, 0.9), (0.3, -0.5, -1.0)][:count]
     got = render(balls(means, 0.1), size=(height, 2 * height))
     assert got.info is not None and got.info.visible == count
