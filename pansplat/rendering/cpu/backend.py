@@ -4,10 +4,6 @@ Source: docs/rendering.md; docs/rasterizer.md describes the stages and their cos
 """
 
 import math
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +16,9 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
 from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.columns import rasterize_columns
-from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
+from pansplat.rendering.cpu.projection import GaussianArrays, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
-from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE, SavedForBackward, allocate_saved, rasterize_forward
+from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
 from pansplat.rendering.cpu.records import RECORD_SIZE, PixelTables, tabulate_pixels
 from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, pooled_empty, thread_count
@@ -34,26 +30,10 @@ from pansplat.rendering.cpu.tiling import (
     intersect_tiles,
     sort_front_to_back,
 )
+from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.projection import not_finite_message
 from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
-
-_MIN_FILTER_VARIANCE = 1e-9  # pixel^2: without a filter, a disc seen edge-on has width 0, and stage one divides by it
-
-
-class CameraView(NamedTuple):
-    """A scene, its projection for one camera, and the options.
-
-    Attributes:
-        min_transmittance: a pixel is finished at this transmittance or below.
-    """
-
-    gaussians: GaussianArrays
-    camera: Camera
-    projected: ProjectedGaussians
-    options: RasterOptions
-    threads: int
-    min_transmittance: float = MIN_TRANSMITTANCE
 
 
 class _PlaneState(NamedTuple):
@@ -63,25 +43,6 @@ class _PlaneState(NamedTuple):
     distances: np.ndarray  # the intersections are sorted by these
     tiles: TileIntersections | None = None
     saved: SavedForBackward | None = None
-
-
-@dataclass
-class Statistics:
-    """Counts, peak bytes of arrays and seconds by stage, collected for `RasterInfo`."""
-
-    dropped: int = 0
-    near: int = 0
-    visible: int = 0
-    intersections: int = 0
-    bytes: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the time of the `with` block to a stage."""
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
 def rasterize_planes(
@@ -125,9 +86,7 @@ def rasterize_planes(
 def require_exact_kernel(options: RasterOptions) -> None:
     """Raise an InputError for a kernel other than the exact one."""
     if options.kernel != "ray":
-        raise InputError(
-            f"backend 'numba' has kernel 'ray' only, got kernel {options.kernel!r}; use backend='torch'"
-        )
+        raise InputError(f"backend 'numba' has kernel 'ray' only, got kernel {options.kernel!r}; use backend='torch'")
 
 
 class _Rasterize(torch.autograd.Function):
@@ -192,12 +151,6 @@ class _Rasterize(torch.autograd.Function):
             grad_pose = torch.zeros_like(pose)
             grad_pose[:3] = torch.from_numpy(gradients.pose)
         return (grad_pose, None, None, None, None, *grads)
-
-
-def make_camera(pose: Tensor, plane: ImagePlane, options: RasterOptions) -> Camera:
-    """The camera of a pose (cam2world), and the settings that depend on the size of the image plane's pixels."""
-    variance = max(options.filter_variance(plane.pixel_angle), _MIN_FILTER_VARIANCE * plane.pixel_angle**2)
-    return Camera(np.ascontiguousarray(pose.detach().numpy()), variance, options.compensate, options.near)
 
 
 def rasterize_plane(

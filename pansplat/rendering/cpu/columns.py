@@ -7,12 +7,10 @@ image is folded (`tabulate_columns`), so that no block of pixels has two columns
 Source: docs/rendering.md, section 9.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -36,10 +34,8 @@ from pansplat.rendering.cpu.tiling import (
     intersect_tiles,
     sort_front_to_back,
 )
+from pansplat.rendering.cpu.view import CameraView, Statistics
 from pansplat.rendering.image_planes import ImagePlane
-
-if TYPE_CHECKING:
-    from pansplat.rendering.cpu.backend import CameraView, Statistics
 
 _MAX_PAIRS = 1 << 19  # in a strip of columns, unless one tile's width has more: 60 MB of records and values
 _MAX_COLUMNS = 4096  # in a strip, whose folded image is four times as wide

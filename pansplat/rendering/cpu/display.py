@@ -18,14 +18,7 @@ import torch
 from jaxtyping import Float, Int, UInt32
 
 from pansplat.geometry.cubemap import face_rotations
-from pansplat.rendering.cpu.backend import (
-    CameraView,
-    Statistics,
-    find_distances,
-    make_camera,
-    rasterize_plane,
-    require_exact_kernel,
-)
+from pansplat.rendering.cpu.backend import find_distances, rasterize_plane, require_exact_kernel
 from pansplat.rendering.cpu.footprints import Footprint, draw_footprints
 from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.records import tabulate_pixels
@@ -41,6 +34,7 @@ from pansplat.rendering.cpu.runtime import (
 )
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
 from pansplat.rendering.cpu.tiling import EMPTY_BOX, find_bounding_boxes
+from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions
 

@@ -19,7 +19,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.cpu.backend import make_camera
 from pansplat.rendering.cpu.projection import GaussianArrays, project_gaussians
 from pansplat.rendering.cpu.projection_backward import accumulate_slots
 from pansplat.rendering.cpu.rasterize import (
@@ -75,6 +74,7 @@ from pansplat.rendering.cpu.tiling import (
     parallel_for_tiles,
     sort_front_to_back,
 )
+from pansplat.rendering.cpu.view import make_camera
 from pansplat.rendering.image_planes import image_planes
 from pansplat.rendering.rasterize import RasterOptions
 
