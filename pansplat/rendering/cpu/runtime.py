@@ -22,9 +22,14 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 import torch
-from numba.core import event, types
 
 from pansplat import constants
+from pansplat.rendering.cpu.numba_api import (
+    known_options,
+    notify_of_compilation,
+    set_source_stamp,
+    share_literal_versions,
+)
 
 _PACKAGE = __name__.rpartition(".")[0]
 _IMPORT = re.compile(rf"^(?:from|import) {re.escape(_PACKAGE)}(?:\.(\w+)| import ([\w, ]+))", re.MULTILINE)
@@ -49,12 +54,14 @@ def kernel(function: Callable[..., Any]) -> Any:
     Without a writable cache directory the function is compiled once per process.
     """
     function = inspect.unwrap(function)  # the tests' annotation checks wrap every function
+    options = known_options(_OPTIONS)
     try:
-        compiled: Any = nb.njit(cache=True, **_OPTIONS)(function)
+        compiled: Any = nb.njit(cache=True, **options)(function)
     except RuntimeError:  # no writable cache directory
-        return nb.njit(**_OPTIONS)(function)
+        return nb.njit(**options)(function)
     # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
-    compiled._cache._cache_file._source_stamp = _hash_sources(Path(inspect.getfile(function)))
+    if not set_source_stamp(compiled, _hash_sources(Path(inspect.getfile(function)))):
+        return nb.njit(**options)(function)
     return compiled
 
 
@@ -82,55 +89,38 @@ def inline_kernel_no_refcount(function: Callable[..., Any]) -> Any:
 
 
 def _inline(function: Callable[..., Any], **options: Any) -> Any:
-    options = {"forceinline": True, "no_cpython_wrapper": True, **options, **_OPTIONS}
+    options = known_options({"forceinline": True, "no_cpython_wrapper": True, **options, **_OPTIONS})
     compiled: Any = nb.njit(**options)(inspect.unwrap(function))
-    # Numba would compile one version per literal argument; LLVM propagates these constants anyway.
-    resolve = compiled.get_call_template
-    compiled.get_call_template = lambda args, kws: resolve(
-        tuple(types.unliteral(kind) for kind in args), {name: types.unliteral(kind) for name, kind in kws.items()}
-    )
+    share_literal_versions(compiled)
     return compiled
 
 
 @contextlib.contextmanager
 def announce_compilation() -> Iterator[None]:
-    """Print a message on stderr, once per process, if kernels are compiled inside for more than a second."""
-    listener = _CompileListener()
-    with event.install_listener("numba:compile", listener):
-        try:
-            yield
-        finally:
-            listener.stop()
+    """Print a message on stderr, once per process, if kernels are compiled inside for more than a second.
 
-
-class _CompileListener(event.Listener):
-    """Schedules the message when the first kernel of this package is compiled, and pauses garbage collection.
-
-    Compilation makes millions of objects and little garbage; its collection would take a tenth of the time.
+    The delay counts from the first of several kernels. Garbage collection pauses meanwhile: compilation makes millions
+    of objects and little garbage, whose collection would take a tenth of the time.
     """
+    timer: threading.Timer | None = None
+    collection_paused = False
 
-    def __init__(self) -> None:
-        self._timer: threading.Timer | None = None
-        self._collection_paused = False
-
-    def on_start(self, event: event.Event) -> None:
-        data: Any = event.data
-        is_from_pansplat = data["dispatcher"].py_func.__module__.startswith(_PACKAGE)
-        if is_from_pansplat and self._timer is None:
-            self._timer = threading.Timer(_MESSAGE_DELAY, _show_message)
-            self._timer.daemon = True
-            self._timer.start()
-            self._collection_paused = gc.isenabled()
+    def start(module: str) -> None:
+        nonlocal timer, collection_paused
+        if timer is None and module.startswith(_PACKAGE):
+            timer = threading.Timer(_MESSAGE_DELAY, _show_message)
+            timer.daemon = True
+            timer.start()
+            collection_paused = gc.isenabled()
             gc.disable()
 
-    def on_end(self, event: event.Event) -> None:
-        """Do nothing: the delay counts from the first of several kernels."""
-
-    def stop(self) -> None:
-        """Cancel the message and resume garbage collection."""
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._collection_paused:
+    try:
+        with notify_of_compilation(start):
+            yield
+    finally:
+        if timer is not None:
+            timer.cancel()
+        if collection_paused:
             gc.enable()
 
 

@@ -20,11 +20,17 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba.core import types
-from numba.core.cgutils import alloca_once, get_or_insert_function
-from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
+from pansplat.rendering.cpu.numba_api import (
+    ConcreteTemplate,
+    alloca_once,
+    get_or_insert_function,
+    infer_global,
+    processor_features,
+    signature,
+    types,
+)
 from pansplat.rendering.cpu.records import RECORD_SIZE
 from pansplat.rendering.cpu.runtime import inline_kernel
 
@@ -372,7 +378,7 @@ def list_set_bits(context, array, index, bits, base):
 
     def generate(context, builder, sig, args):
         array, index, bits, base = args
-        has_compress = "+avx512vbmi2" in context.codegen().magic_tuple()[2].split(",")
+        has_compress = "+avx512vbmi2" in processor_features(context)
         emit = _compress_positions if has_compress else _loop_over_set_bits
         emit(builder, _pointer(context, builder, sig.args[0], array, index), bits, builder.trunc(base, _BYTE))
         return context.get_dummy_value()
