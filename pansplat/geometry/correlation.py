@@ -10,7 +10,7 @@ Source: PanSplat, section 3.2; docs/official.md, section 6.
 import inspect
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
 
@@ -198,10 +198,6 @@ def _split_rows(height: int) -> list[tuple[int, int]]:
 
 def _run_bands(work: Callable[[int, int], None], pairs: int, bands: int) -> None:
     """Call `work` for every pair and band, with one thread per band."""
-    if bands == 1:
-        for pair in range(pairs):
-            work(pair, 0)
-        return
     with ThreadPoolExecutor(bands) as pool:
         for done in [pool.submit(work, pair, band) for pair in range(pairs) for band in range(bands)]:
             done.result()
@@ -230,78 +226,66 @@ def correlate(
     """
     if backend == "auto":
         backend = "kernel" if reference.device.type == "cpu" else "torch"
-    method = _KernelCorrelation if backend == "kernel" else _WarpedCorrelation
     dtype = torch.promote_types(reference.dtype, torch.float32)
     # Scaled before the product, so that no partial sum overflows.
     scaled = reference.to(dtype) / math.sqrt(reference.shape[1])
-    return method.apply(scaled, other.to(dtype), inverse_depth.detach().to(dtype), pose.detach(), sampling)
+    candidates = inverse_depth.detach().to(dtype)
+    return _Correlation.apply(scaled, other.to(dtype), candidates, pose.detach(), sampling, backend)
 
 
-class _WarpedCorrelation(torch.autograd.Function):
-    """Warps a few candidates at a time; the backward pass warps them again."""
+class _Correlation(torch.autograd.Function):
+    """Correlates a chunk of candidates at a time; the backward pass computes their samples again."""
 
     @staticmethod
-    def forward(ctx, reference, other, inverse_depth, pose, sampling):
+    def forward(ctx, reference, other, inverse_depth, pose, sampling, backend):
         ctx.save_for_backward(reference, other, inverse_depth, pose)
-        ctx.sampling = sampling
-        parts = [
-            torch.einsum("nchw,ncdhw->ndhw", reference, warp_panorama(other, chunk, pose, sampling))
-            for chunk in _chunks(inverse_depth, reference.numel())
-        ]
-        return torch.cat(parts, dim=1)
+        ctx.options = sampling, backend
+        correlate_chunk = _correlate_by_kernel if backend == "kernel" else _correlate_by_warp
+        chunks = _chunks(inverse_depth, reference, backend)
+        return torch.cat([correlate_chunk(reference, other, chunk, pose, sampling) for chunk in chunks], dim=1)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
         reference, other, inverse_depth, pose = ctx.saved_tensors
+        sampling, backend = ctx.options
+        backward_chunk = _backward_by_kernel if backend == "kernel" else _backward_by_warp
         grad_reference, grad_other = torch.zeros_like(reference), torch.zeros_like(other)
-        chunks = _chunks(inverse_depth, reference.numel())
+        chunks = _chunks(inverse_depth, reference, backend)
         for chunk, part in zip(chunks, gradient.split([c.shape[1] for c in chunks], dim=1), strict=True):
-            with torch.enable_grad():
-                leaf = other.detach().requires_grad_()
-                warped = warp_panorama(leaf, chunk, pose, ctx.sampling)
-            grad_reference += torch.einsum("ndhw,ncdhw->nchw", part, warped.detach())
-            grad_other += torch.autograd.grad(warped, leaf, part[:, None] * reference[:, :, None])[0]
-        return grad_reference, grad_other, None, None, None
-
-
-class _KernelCorrelation(torch.autograd.Function):
-    """Runs the compiled kernels, without warping."""
-
-    @staticmethod
-    def forward(ctx, reference, other, inverse_depth, pose, sampling):
-        ctx.save_for_backward(reference, other, inverse_depth, pose)
-        ctx.sampling = sampling
-        parts = [
-            correlate_positions(reference, other, *positions, wraps=sampling == "sphere")
-            for _, positions in _chunk_positions(inverse_depth, pose, sampling)
-        ]
-        return torch.cat(parts, dim=1)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
-        reference, other, inverse_depth, pose = ctx.saved_tensors
-        grad_reference, grad_other = torch.zeros_like(reference), torch.zeros_like(other)
-        for candidates, positions in _chunk_positions(inverse_depth, pose, ctx.sampling):
-            parts = correlate_positions_backward(
-                gradient[:, candidates], reference, other, *positions, wraps=ctx.sampling == "sphere"
-            )
+            parts = backward_chunk(part, reference, other, chunk, pose, sampling)
             grad_reference += parts[0]
             grad_other += parts[1]
-        return grad_reference, grad_other, None, None, None
+        return grad_reference, grad_other, None, None, None, None
 
 
-def _chunk_positions(
-    inverse_depth: Tensor, pose: Tensor, sampling: Sampling
-) -> Iterator[tuple[slice, tuple[Tensor, Tensor]]]:
-    """Chunks of candidates with their positions in the other panorama."""
-    start = 0
-    for chunk in _chunks(inverse_depth, inverse_depth[:, :1].numel()):
-        yield slice(start, start + chunk.shape[1]), warp_positions(chunk, pose, sampling)
-        start += chunk.shape[1]
+def _correlate_by_warp(reference: Tensor, other: Tensor, chunk: Tensor, pose: Tensor, sampling: Sampling) -> Tensor:
+    return torch.einsum("nchw,ncdhw->ndhw", reference, warp_panorama(other, chunk, pose, sampling))
 
 
-def _chunks(inverse_depth: Tensor, elements: int) -> tuple[Tensor, ...]:
-    """The candidates in chunks of at most `_CHUNK` elements; one candidate has `elements` elements."""
+def _backward_by_warp(
+    part: Tensor, reference: Tensor, other: Tensor, chunk: Tensor, pose: Tensor, sampling: Sampling
+) -> tuple[Tensor, Tensor]:
+    with torch.enable_grad():
+        leaf = other.detach().requires_grad_()
+        warped = warp_panorama(leaf, chunk, pose, sampling)
+    grad_reference = torch.einsum("ndhw,ncdhw->nchw", part, warped.detach())
+    return grad_reference, torch.autograd.grad(warped, leaf, part[:, None] * reference[:, :, None])[0]
+
+
+def _correlate_by_kernel(reference: Tensor, other: Tensor, chunk: Tensor, pose: Tensor, sampling: Sampling) -> Tensor:
+    positions = warp_positions(chunk, pose, sampling)
+    return correlate_positions(reference, other, *positions, wraps=sampling == "sphere")
+
+
+def _backward_by_kernel(
+    part: Tensor, reference: Tensor, other: Tensor, chunk: Tensor, pose: Tensor, sampling: Sampling
+) -> tuple[Tensor, Tensor]:
+    positions = warp_positions(chunk, pose, sampling)
+    return correlate_positions_backward(part, reference, other, *positions, wraps=sampling == "sphere")
+
+
+def _chunks(inverse_depth: Tensor, reference: Tensor, backend: Backend) -> tuple[Tensor, ...]:
+    """The candidates in chunks of at most `_CHUNK` elements: warped features, or positions for the kernels."""
+    elements = inverse_depth[:, :1].numel() if backend == "kernel" else reference.numel()
     return inverse_depth.split(max(1, _CHUNK // max(1, elements)), dim=1)

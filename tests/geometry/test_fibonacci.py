@@ -31,17 +31,6 @@ def test_adjacent_points_differ_by_the_golden_angle():
     assert float((step - math.pi * (3 - math.sqrt(5))).abs().max()) < 1e-8
 
 
-def test_spacing_is_uniform_at_4k():
-    from scipy.spatial import cKDTree
-
-    count = lattice_size(4096)
-    band = fibonacci_directions(count)[count // 3 : count // 3 + 40000].numpy()
-    pixel = 2 * math.pi / 4096
-    inner = band[15000:25000]
-    distance = cKDTree(band).query(inner, k=2)[0][:, 1] / pixel
-    assert distance.min() > 0.9 and distance.max() < 1.05
-
-
 def test_an_empty_lattice_is_refused():
     with pytest.raises(ValueError, match="at least 1"):
         fibonacci_directions(0)

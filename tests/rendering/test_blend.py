@@ -35,11 +35,6 @@ def test_two_views_have_the_papers_weights():
     assert torch.allclose(weights, torch.tensor([0.8, 0.2], dtype=torch.float64))
 
 
-def test_inputs_that_coincide_at_the_target_share_all_weight():
-    weights = blend_weights(_points((1, 0, 0))[0], _points((1, 0, 0), (5, 0, 0), (1, 0, 0)))
-    assert torch.equal(weights, torch.tensor([0.5, 0, 0.5], dtype=torch.float64))
-
-
 def test_weights_have_finite_gradients_everywhere_and_zero_at_an_input():
     inputs = _points((0, 0, 0), (1, 0, 0), (1, 0, 0)).requires_grad_()
     cases = (((0, 0, 0), True), ((1, 0, 0), True), ((1e-9, 0, 0), False), ((0.5, 0.1, 0), False))

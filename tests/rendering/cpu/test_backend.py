@@ -1,9 +1,6 @@
 """The numba backend, forward and backward: its accuracy, and its behaviour in a program."""
 
 import dataclasses
-import multiprocessing
-import os
-import threading
 
 import pytest
 import torch
@@ -148,13 +145,6 @@ def test_without_grad_nothing_is_saved(scene, pose):
     assert unrecorded.info.bytes == plain.info.bytes < recorded.info.bytes
 
 
-def test_second_derivatives_are_refused(scene, pose):
-    scene.means.requires_grad_()
-    image = rasterize(scene, pose, size=(16, 32), backend="numba")
-    with pytest.raises(RuntimeError, match="second derivatives of a rendering are not available"):
-        torch.autograd.grad(image.color.sum(), scene.means, create_graph=True)
-
-
 def test_the_backward_may_run_twice(scene, pose):
     scene.means.requires_grad_()
     total = rasterize(scene, pose, size=(16, 32), backend="numba").color.sum()
@@ -191,55 +181,6 @@ def test_float64_gaussians_have_float64_images_and_gradients(scene, pose):
     assert image.color.dtype == scene.means.grad.dtype == torch.float64
 
 
-def test_strict_reports_the_first_gaussian_that_is_not_finite(scene, pose):
-    scene.scales[17, 1] = float("nan")
-    options = {"size": (8, 16), "backend": "numba"}
-    assert rasterize(scene, pose, **options).info.dropped == 1
-    with pytest.raises(InputError, match=r"got 1 of 300 that do not \(the first is number 17\)"):
-        rasterize(scene, pose, strict=True, **options)
-
-
 def test_a_side_longer_than_32767_pixels_is_refused(scene, pose):
     with pytest.raises(InputError, match="at most 32767 pixels a side"):
         rasterize(scene, pose, size=(1, 40000), layout="pinhole", backend="numba")
-
-
-def test_two_threads_may_rasterize_at_once(make_colored_scene, pose):
-    scene, results = make_colored_scene(count=5000), {}
-    expected = {layout: _run(scene, pose, layout) for layout in ("equirect", "cubemap")}
-
-    def work(layout):
-        for _ in range(5):
-            results[layout] = _run(scene, pose, layout)
-
-    threads = [threading.Thread(target=work, args=(layout,)) for layout in expected]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for layout, run in results.items():
-        _assert_same_bits(run, expected[layout])
-    assert results.keys() == expected.keys()
-
-
-def _sum_colors(scene, pose):
-    return rasterize(scene, pose, size=(16, 32), backend="numba").color.double().sum().item()
-
-
-def _put_sum(scene, pose, queue):
-    queue.put(_sum_colors(scene, pose))
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-@pytest.mark.usefixtures("_restore_threads")
-def test_a_forked_child_gives_the_same_image(scene, pose):
-    torch.set_num_threads(2)
-    expected = _sum_colors(scene, pose)
-    context = multiprocessing.get_context("fork")
-    queue = context.Queue()
-    child = context.Process(target=_put_sum, args=(scene, pose, queue))
-    child.start()
-    assert queue.get(timeout=60) == expected
-    child.join()
-    assert child.exitcode == 0

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pansplat.rendering.cpu.rasterize import rasterize_forward
-from pansplat.rendering.cpu.records import TILE_SIZE
 
 
 def _rasterize(case, *, threads=1):
@@ -41,27 +40,6 @@ def test_several_chunks_are_composited_in_order(make_case):
 
 def test_a_gaussian_that_needs_three_components_equals_the_dense_sums(one_too_wide):
     _compare(one_too_wide)
-
-
-@pytest.mark.parametrize("threads", [2, 5])
-def test_the_number_of_threads_changes_no_bit(threads, make_case):
-    case = make_case("equirect", (96, 192), 60)
-    assert np.array_equal(_rasterize(case), _rasterize(case, threads=threads))
-
-
-def test_a_band_equals_its_part_of_the_image(make_case):
-    case = make_case("pinhole", (100, 60), 60)
-    whole, across = _rasterize(case), case.tables.tiles[1]
-    band = np.zeros_like(whole)
-    starts = np.ascontiguousarray(case.starts[across : 3 * across + 1])
-    rasterize_forward(case.records, case.values, case.intersections, starts, case.tables, band, first_row=1)
-    inside = slice(TILE_SIZE, 3 * TILE_SIZE)
-    assert np.array_equal(band[:, inside], whole[:, inside])
-    assert not band[:, :TILE_SIZE].any() and not band[:, 3 * TILE_SIZE :].any()
-
-
-def test_without_intersections_the_image_is_empty(make_case):
-    assert np.array_equal(_rasterize(make_case("equirect", (32, 64), 0)), np.zeros((5, 32, 64)))
 
 
 def test_only_blocks_that_the_box_reaches_are_composited(make_case):

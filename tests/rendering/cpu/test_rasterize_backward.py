@@ -84,11 +84,3 @@ def test_hidden_gaussians_have_zero_gradients_in_their_slots(make_case):
     values = case.reduce(grad_values)
     assert values[:2].any(axis=1).all()
     assert not values[256:].any()
-
-
-@pytest.mark.parametrize("threads", [2, 5])
-def test_the_number_of_threads_changes_no_bit(threads, make_case):
-    case = make_case("equirect", (96, 192), 60)
-    upstream = _upstream(case)
-    for single, several in zip(_slots(case, upstream), _slots(case, upstream, threads=threads), strict=True):
-        assert np.array_equal(single, several)

@@ -14,6 +14,8 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
+exhaustive = pytest.mark.exhaustive  # an intersection takes milliseconds in the interpreter
+
 _CASES = [
     dict(layout="equirect", kernel="ray", lowpass="angular"),
     dict(layout="equirect", kernel="ray", lowpass="3dgs"),
@@ -71,7 +73,13 @@ def _compare(
     return expected, got
 
 
-@pytest.mark.slow
+def test_a_small_image_and_its_gradients_equal_float64_torch(make_scene, pose):
+    scene = make_scene(3, scale=0.4, degree=1)
+    _, got = _compare(scene, pose, torch.float32, (2e-6, 1e-5), size=(4, 8), layout="equirect")
+    assert got[2].backend == "triton" and got[2].intersections > 0 and got[2].bytes > 0
+
+
+@exhaustive
 @pytest.mark.parametrize(
     ("options", "dtype", "channels"),
     [*((case, torch.float64, 5) for case in _CASES), *((_CASES[k], torch.float32, 3) for k in (0, 4, 5))],
@@ -86,9 +94,10 @@ def test_images_and_gradients_equal_float64_torch(options, dtype, channels, make
     expected, got = _compare(scene, pose, dtype, tolerances, covariances=covariances, **options)
     assert float(expected[0][channels].mean()) > 0.02
     assert len(got[1]) == (6 if covariances is not None else 7)
-    assert got[2].backend == "triton" and got[2].intersections > 0 and got[2].bytes > 0
+    assert got[2].intersections > 0
 
 
+@exhaustive
 def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene, pose, monkeypatch):
     from pansplat.rendering.cuda import rasterize as stage
 
@@ -98,6 +107,7 @@ def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene
     assert got[2].intersections > 2 * 16  # each has its own program, which sums in more than one step
 
 
+@exhaustive
 def test_opaque_gaussians_around_the_camera_equal_float64_torch(make_scene):
     scene = make_scene(12, scale=1.5, extent=0.6, seed=2, degree=0)
     scene = dataclasses.replace(scene, opacities=torch.linspace(0.5, 2.0, 12, dtype=torch.float64))
@@ -107,6 +117,7 @@ def test_opaque_gaussians_around_the_camera_equal_float64_torch(make_scene):
     assert float(expected[0][3].max()) > 0.9999  # several at the largest alpha
 
 
+@exhaustive
 def test_gaussians_behind_a_saturated_tile_are_left_out(make_scene, pose):
     scene = make_scene(130, scale=3.0, extent=0.1, seed=2, degree=0)
     ahead = torch.tensor((0.0, 0.0, 3.0), dtype=torch.float64)
@@ -121,6 +132,7 @@ def test_gaussians_behind_a_saturated_tile_are_left_out(make_scene, pose):
     assert 20 < int(hidden.sum()) < 100
 
 
+@exhaustive
 def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
     from pansplat.rendering.cuda import tiling
 

@@ -10,6 +10,8 @@ from pansplat.rendering.cuda.backend import project_gaussians
 from pansplat.rendering.projection import ProjectedGaussians
 from pansplat.rendering.projection import project_gaussians as reference
 
+pytestmark = pytest.mark.exhaustive
+
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
 

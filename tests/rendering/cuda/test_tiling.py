@@ -9,6 +9,8 @@ from pansplat.rendering.image_planes import image_planes
 from pansplat.rendering.projection import Footprints
 from pansplat.rendering.reference import tile_ranges
 
+pytestmark = pytest.mark.exhaustive
+
 
 def _boxes(count: int, size: tuple[int, int], seed: int) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
