@@ -18,6 +18,7 @@ from pansplat.data.views import Views
 from pansplat.gaussians.scene import Gaussians
 from pansplat.pipeline import predict
 from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels, enlarge
+from pansplat.rendering.cpu.tiling import radix_argsort
 from pansplat.rendering.image_planes import Layout
 from pansplat.rendering.rasterize import Order, RasterOptions, rasterize
 
@@ -79,6 +80,7 @@ def _draw_display_image() -> None:
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), pixels, bottom_up=True)
     enlarge(faces.pixels[0], np.zeros((24, 24), np.uint32))
     faces.sample(np.eye(3), 20.0, pixels)
+    radix_argsort(np.ones(9, np.float32))
 
 
 def _predict(model: str) -> None:

@@ -272,24 +272,7 @@ class DisplayScene:
 
         `margins` move the sides of the cone outwards, by metres and by radians.
         """
-        num, parts = len(self), _PARTS_PER_THREAD * threads
-        if len(labels) != num or not NO_LAYER <= labels.min(initial=NO_LAYER) <= labels.max(initial=-1) < num_layers:
-            raise ValueError(f"`labels` must hold {num} numbers from {NO_LAYER} to {num_layers - 1}")
-        edges = np.linspace(0, num, parts + 1).astype(np.int64)
-        marks, counts = workspace.array(num, np.int16), np.zeros((parts, num_layers), np.int64)
-        normals = np.zeros((0, 3)) if selection is None else selection.normals
-        offsets = normals @ position - margins[0]
-        deviation, slack = 1.001 * selection.deviation if selection and selection.bounded else 0.0, 1e-5 + margins[1]
-        bounded = float(selection is not None and selection.bounded)
-        parallel_for(
-            partial(
-                _mark_in_view, edges, self._balls, position.astype(np.float32),
-                np.ascontiguousarray(normals, np.float32), offsets.astype(np.float32), np.float32(deviation),
-                np.float32(slack), np.float32(1.001 * bounded), labels, marks, counts,
-            ),
-            parts,
-            threads,
-        )  # fmt: skip
+        edges, marks, counts = mark_in_view(self._balls, position, selection, labels, num_layers, margins)
         ends = np.cumsum(counts.sum(axis=0))
         positions = ends - counts.sum(axis=0) + np.cumsum(counts, axis=0) - counts
         total, coefficients = int(counts.sum()), self._num_coefficients
@@ -298,9 +281,48 @@ class DisplayScene:
         harmonics = workspace.array((total, coefficients, 3), np.float32)
         outputs = means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, harmonics.reshape(-1)
         rows = self._rows.reshape(-1), self._rows.shape[1], 3 * coefficients
-        parallel_for(partial(_copy_marked, edges, marks, positions, *rows, *outputs), parts, threads)
+        parallel_for(partial(_copy_marked, edges, marks, positions, *rows, *outputs), len(counts), threads)
         no_covariances = np.empty((0, 3, 3), np.float32)
         return GaussianArrays(means, quats, scales, no_covariances, opacities, harmonics), ends.tolist()
+
+
+def mark_in_view(
+    balls: Float[np.ndarray, "5 n"],
+    position: Float[np.ndarray, "3"],
+    selection: Selection | None,
+    labels: Int[np.ndarray, "label"],
+    num_layers: int = 1,
+    margins: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Int[np.ndarray, "edge"], Int[np.ndarray, "n"], Int[np.ndarray, "part layer"]]:
+    """Frustum culling: the layer of each Gaussian that may be in view, else `NO_LAYER`; conservative.
+
+    Args:
+        balls: rows x, y and z of the centre, radius that a Gaussian reaches, and the same in standard deviations.
+        position: camera centre.
+        selection: the cone in view; None keeps all Gaussians.
+        labels: layer of each Gaussian, int16, or `NO_LAYER`.
+        margins: by which the sides of the cone move outwards, in metres and in radians.
+
+    Returns:
+        Ends of parts of the scene, the layers (int16), and the number of Gaussians of each part and layer.
+    """
+    num, threads = balls.shape[1], thread_count()
+    if len(labels) != num or not NO_LAYER <= labels.min(initial=NO_LAYER) <= labels.max(initial=-1) < num_layers:
+        raise ValueError(f"`labels` must hold {num} numbers from {NO_LAYER} to {num_layers - 1}")
+    parts = _PARTS_PER_THREAD * threads
+    edges = np.linspace(0, num, parts + 1).astype(np.int64)
+    marks, counts = pooled_empty(num, np.int16), np.zeros((parts, num_layers), np.int64)
+    normals = np.zeros((0, 3)) if selection is None else selection.normals
+    offsets = normals @ position - margins[0]
+    deviation, slack = 1.001 * selection.deviation if selection and selection.bounded else 0.0, 1e-5 + margins[1]
+    bounded = float(selection is not None and selection.bounded)
+    mark = partial(
+        _mark_in_view, edges, balls, position.astype(np.float32), np.ascontiguousarray(normals, np.float32),
+        offsets.astype(np.float32), np.float32(deviation), np.float32(slack), np.float32(1.001 * bounded), labels,
+        marks, counts,
+    )  # fmt: skip
+    parallel_for(mark, parts, threads)
+    return edges, marks, counts
 
 
 def _draw_plane(

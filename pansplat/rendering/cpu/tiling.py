@@ -655,9 +655,9 @@ def _insertion_sort(words, count):
 
 
 @inline_kernel
-def _radix_sort(words, spare, count, end, counters):
-    """Sort words of `end` bits; return the two arrays, the sorted one first."""
-    for shift in range(0, end, _MAX_DIGIT_BITS):
+def _radix_sort(words, spare, count, begin, end, counters):
+    """Sort words by their bits from `begin` to `end`, stably; return the two arrays, the sorted one first."""
+    for shift in range(begin, end, _MAX_DIGIT_BITS):
         counters[:] = 0
         for j in range(count):
             digit = np.int64(load_scalar(words, j) >> np.uint64(shift) & np.uint64((1 << _MAX_DIGIT_BITS) - 1))
@@ -698,13 +698,33 @@ def _sort_tiles(intersections, slots, keys, starts, low, high):
         _scatter(words, count, lower, bits, low_counters, spare)
         _scatter(spare, count, upper, bits, high_counters, words)
         if not _insertion_sort(words, count):
-            words, spare = _radix_sort(words, spare, count, end, low_counters)
+            words, spare = _radix_sort(words, spare, count, 0, end, low_counters)
         mask = (np.uint64(1) << np.uint64(index_bits)) - np.uint64(1)
         for j in range(count):
             index = np.int64(load_scalar(words, j) & mask)
             store_scalar(intersections, begin + j, load_scalar(tile_intersections, index))
             if len(slots) > 0:
                 store_scalar(slots, begin + j, load_scalar(tile_slots, index))
+
+
+def radix_argsort(keys: np.ndarray) -> np.ndarray:
+    """The stable ascending order (n,) uint32 of float32 keys (n,) without NaN; -0 equals 0."""
+    bits, order = np.ascontiguousarray(keys, np.float32).view(np.int32), np.empty(len(keys), np.uint32)
+    _argsort_keys(bits, order)
+    return order
+
+
+@kernel
+def _argsort_keys(bits, order):
+    num = len(bits)
+    words, spare = np.empty(num, np.uint64), np.empty(num, np.uint64)
+    for i in range(num):
+        key = np.int64(load_scalar(bits, i))
+        key = (key if key >= 0 else (key ^ np.int64(0x7FFFFFFF)) + 1) + np.int64(1 << 31)
+        store_scalar(words, i, np.uint64(key) << np.uint64(32) | np.uint64(i))
+    words, spare = _radix_sort(words, spare, num, 32, 64, np.empty(1 << _MAX_DIGIT_BITS, np.int32))
+    for i in range(num):
+        store_scalar(order, i, np.uint32(load_scalar(words, i) & np.uint64(0xFFFFFFFF)))
 
 
 def sort_front_to_back(tiles: TileIntersections, distances: np.ndarray, threads: int) -> None:

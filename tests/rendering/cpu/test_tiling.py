@@ -13,6 +13,7 @@ from pansplat.rendering.cpu.tiling import (
     compute_depths,
     find_bounding_boxes,
     intersect_tiles,
+    radix_argsort,
     sort_front_to_back,
 )
 from pansplat.rendering.image_planes import image_planes
@@ -201,6 +202,14 @@ def _crowd(far):
 )
 def test_sorting_is_stable_for_any_distribution(distances, workspace):
     assert _order(distances, workspace) == np.argsort(distances, kind="stable").tolist()
+
+
+@pytest.mark.parametrize("count", [0, 1, 3000])
+def test_the_order_of_float32_keys_is_that_of_a_stable_sort(count):
+    random = np.random.default_rng(5)
+    keys = (random.standard_normal(count) * 10.0 ** random.integers(-30, 30, count)).astype(np.float32)
+    keys[::7], keys[3::7], keys[5::7], keys[6:20] = 0.0, -0.0, keys[5::7][::-1], np.inf
+    assert np.array_equal(radix_argsort(keys), np.argsort(keys, kind="stable"))
 
 
 def test_distances_that_differ_by_rounding_are_ties(workspace):
