@@ -73,7 +73,7 @@ def _draw_display_image() -> None:
     scene = DisplayScene(*(np.ones(shape, np.float32) for shape in ((9, 3), 9, (9, 4), (9, 3), (9, 1, 3), 9)))
     faces, pixels = PixelFaces.allocate(7.0), np.zeros((16, 16), np.uint32)
     labels = np.arange(9, dtype=np.int16) % 2
-    selection = Selection(np.eye(3), 0.01, bounded=True)
+    selection = Selection(np.eye(3), 0.01)
     layers = scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection)
     scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection, footprint="count")
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), faces.pixels[0])

@@ -14,10 +14,6 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "exhaustive: only in `pytest -m exhaustive`")
-
-
 def _scene(count: int, *, seed: int = 0, scale: float = 0.15, extent: float = 1.5, degree: int = 2) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
 

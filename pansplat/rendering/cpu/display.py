@@ -62,12 +62,10 @@ class Selection(NamedTuple):
     Attributes:
         normals: (plane, 3) inward unit normals, world axes.
         deviation: a bound of a Gaussian's widening by the filter, in standard deviations per distance, radians.
-        bounded: whether a Gaussian ends at its bounding ball; if not, only its centre is compared, with a margin.
     """
 
     normals: Float[np.ndarray, "plane 3"]
     deviation: float
-    bounded: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +95,7 @@ class _Selected:
         """Whether all Gaussians in view from another camera are among these."""
         return (
             (self.scene is scene and self.labels is labels and self.num_layers == num_layers)
-            and (self.selection.bounded == selection.bounded and self.selection.deviation >= selection.deviation)
+            and self.selection.deviation >= selection.deviation
             and self.selection.normals.shape == selection.normals.shape
             and float(np.linalg.norm(position - self.position)) <= _MARGIN_METRES
             and float(np.linalg.norm(selection.normals - self.selection.normals, axis=1).max()) <= _MARGIN_RADIANS
@@ -223,11 +221,11 @@ class DisplayScene:
             with statistics.timed("select"):
                 of_view = camera.pose[:3, 3], labels, num_layers, selection
                 if cache is None or selection is None:
-                    gaussians, ends = self._select(*of_view, workspace, threads)
+                    gaussians, ends = self._select(*of_view, workspace)
                 else:
                     if cache.selected is None or not cache.selected.contains(self, *of_view):
                         cache.selected = None  # its memory is reused
-                        cache.selected = self._select_around(*of_view, threads)
+                        cache.selected = self._select_around(*of_view)
                     gaussians, ends = cache.selected.gaussians, cache.selected.ends
             with statistics.timed("project"):
                 projected = project_gaussians(gaussians, camera, workspace, threads)
@@ -245,7 +243,7 @@ class DisplayScene:
         return Layers(sums, ends[-1] if ends else 0, statistics)
 
     def _select_around(
-        self, position: np.ndarray, labels: np.ndarray, num_layers: int, selection: Selection, threads: int
+        self, position: np.ndarray, labels: np.ndarray, num_layers: int, selection: Selection
     ) -> _Selected:
         """Copy the Gaussians in view of all cameras within the margins.
 
@@ -255,7 +253,7 @@ class DisplayScene:
         workspace = Workspace()
         growth = 1 + 1.001 * selection.deviation * float(self._balls[4].max(initial=0)) + 1e-5
         margins = 1.001 * growth * _MARGIN_METRES, 1.001 * _MARGIN_RADIANS
-        found = self._select(position, labels, num_layers, selection, workspace, threads, margins)
+        found = self._select(position, labels, num_layers, selection, workspace, margins)
         return _Selected(self, labels, num_layers, position.copy(), selection, *found, workspace)
 
     def _select(
@@ -265,7 +263,6 @@ class DisplayScene:
         num_layers: int,
         selection: Selection | None,
         workspace: Workspace,
-        threads: int,
         margins: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[GaussianArrays, list[int]]:
         """Copy the Gaussians in view, layer by layer in index order; returns them and the end of each layer.
@@ -281,7 +278,7 @@ class DisplayScene:
         harmonics = workspace.array((total, coefficients, 3), np.float32)
         outputs = means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, harmonics.reshape(-1)
         rows = self._rows.reshape(-1), self._rows.shape[1], 3 * coefficients
-        parallel_for(partial(_copy_marked, edges, marks, positions, *rows, *outputs), len(counts), threads)
+        parallel_for(partial(_copy_marked, edges, marks, positions, *rows, *outputs), len(counts), thread_count())
         no_covariances = np.empty((0, 3, 3), np.float32)
         return GaussianArrays(means, quats, scales, no_covariances, opacities, harmonics), ends.tolist()
 
@@ -312,14 +309,11 @@ def mark_in_view(
     parts = _PARTS_PER_THREAD * threads
     edges = np.linspace(0, num, parts + 1).astype(np.int64)
     marks, counts = pooled_empty(num, np.int16), np.zeros((parts, num_layers), np.int64)
-    normals = np.zeros((0, 3)) if selection is None else selection.normals
+    normals, deviation = selection or (np.zeros((0, 3)), 0.0)
     offsets = normals @ position - margins[0]
-    deviation, slack = 1.001 * selection.deviation if selection and selection.bounded else 0.0, 1e-5 + margins[1]
-    bounded = float(selection is not None and selection.bounded)
     mark = partial(
         _mark_in_view, edges, balls, position.astype(np.float32), np.ascontiguousarray(normals, np.float32),
-        offsets.astype(np.float32), np.float32(deviation), np.float32(slack), np.float32(1.001 * bounded), labels,
-        marks, counts,
+        offsets.astype(np.float32), np.float32(1.001 * deviation), np.float32(1e-5 + margins[1]), labels, marks, counts,
     )  # fmt: skip
     parallel_for(mark, parts, threads)
     return edges, marks, counts
@@ -340,9 +334,7 @@ def _draw_plane(
 
 
 @kernel
-def _mark_in_view(
-    edges, balls, position, normals, offsets, deviation, slack, bounded, labels, marks, counts, part
-):  # fmt: skip
+def _mark_in_view(edges, balls, position, normals, offsets, deviation, slack, labels, marks, counts, part):
     """Write the layer of each Gaussian that is in view, else NO_LAYER, and count the Gaussians of each layer."""
     x, y, z, extent, reach = balls[0], balls[1], balls[2], balls[3], balls[4]
     p_x, p_y, p_z = position[0], position[1], position[2]
@@ -357,7 +349,7 @@ def _mark_in_view(
             )
             distance = math.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
             bound = distance * (deviation * load_scalar(reach, first + i) + slack)
-            store_scalar(bounds, i, bound + bounded * load_scalar(extent, first + i))
+            store_scalar(bounds, i, bound + np.float32(1.001) * load_scalar(extent, first + i))
             store_scalar(seen, i, np.float32(0) if load_scalar(reach, first + i) > np.float32(0) else -np.float32(1))
         for k in range(normals.shape[0]):
             n_x, n_y, n_z, offset = normals[k, 0], normals[k, 1], normals[k, 2], offsets[k]
@@ -403,19 +395,11 @@ def blend_layers(
     sums: Float[np.ndarray, "layer 5 height width"],
     weights: Float[np.ndarray, "layer"],
     background: tuple[float, float, float],
-    *,
-    difference: bool = False,
 ) -> tuple[Float[np.ndarray, "height width 4"], Float[np.ndarray, "height width"]]:
-    """RGB over the background and alpha, and depth, of weighted layers; or the difference of the first and last.
+    """RGB over the background and alpha, and depth, of weighted layers.
 
     Source: docs/rendering.md, section 7, with positive weights.
     """
-    if difference:
-        ends = sums[:1], sums[-1:]
-        (first, first_depth), (other, other_depth) = (blend_layers(end, np.ones(1), background) for end in ends)
-        color = np.abs(first[..., :3] - other[..., :3])
-        alpha = np.maximum(first[..., 3:], other[..., 3:])
-        return np.concatenate((color, alpha), axis=2), np.abs(first_depth - other_depth)
     alphas = np.minimum(sums[:, 4], 1)
     mix = np.asarray(weights, np.float32)[:, None, None] * alphas
     total = mix.sum(axis=0)
@@ -437,37 +421,29 @@ def blend_to_pixels(
     background: tuple[float, float, float],
     pixels: UInt32[np.ndarray, "height width"],
     *,
-    difference: bool = False,
     bottom_up: bool = False,
 ) -> None:
     """Write the image of `blend_layers` with 8 bits per channel.
 
     Args:
-        sums, weights, background, difference: as in `blend_layers`.
+        sums, weights, background: as in `blend_layers`.
         pixels: written.
         bottom_up: write the bottom row first, as OpenGL stores images.
     """
     work = partial(
-        _blend_rows, sums, np.asarray(weights, np.float32), np.array(background, np.float32), difference, bottom_up,
-        pixels,
-    )  # fmt: skip
+        _blend_rows, sums, np.asarray(weights, np.float32), np.array(background, np.float32), bottom_up, pixels
+    )
     with announce_compilation():
         parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
 
 
 @kernel
-def _blend_rows(sums, weights, background, difference, bottom_up, pixels, item):
-    num_layers, _, height, width = sums.shape
-    rgb, other = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
+def _blend_rows(sums, weights, background, bottom_up, pixels, item):
+    _, _, height, width = sums.shape
+    rgb = np.empty((3, width), np.float32)
     total, coverage = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(item * _ROWS_PER_ITEM, min((item + 1) * _ROWS_PER_ITEM, height)):
-        last = 1 if difference else num_layers
-        _blend_row(sums, weights, background, y, 0, last, rgb, total, coverage)
-        if difference:
-            _blend_row(sums, weights, background, y, num_layers - 1, num_layers, other, total, coverage)
-            for channel in range(3):
-                for x in range(width):
-                    rgb[channel, x] = abs(rgb[channel, x] - other[channel, x])
+        _blend_row(sums, weights, background, y, rgb, total, coverage)
         row = pixels[height - 1 - y if bottom_up else y]
         for x in range(width):
             red, green, blue = _to_byte(rgb[0, x]), _to_byte(rgb[1, x]), _to_byte(rgb[2, x])
@@ -481,14 +457,14 @@ def _to_byte(value):
 
 
 @inline_kernel
-def _blend_row(sums, weights, background, y, first, end, rgb, total, coverage):
-    """Write RGB over the background of one row, from layers `first` to `end` - 1."""
-    width = rgb.shape[1]
+def _blend_row(sums, weights, background, y, rgb, total, coverage):
+    """Write RGB over the background of one row."""
+    num_layers, width = sums.shape[0], rgb.shape[1]
     for x in range(width):
         total[x] = coverage[x] = np.float32(0)
         rgb[0, x] = rgb[1, x] = rgb[2, x] = np.float32(0)
-    for layer in range(first, end):
-        weight = weights[layer] if end > first + 1 else np.float32(1)
+    for layer in range(num_layers):
+        weight = weights[layer] if num_layers > 1 else np.float32(1)
         for x in range(width):
             alpha = min(sums[layer, 4, y, x], np.float32(1))
             total[x] += weight * alpha

@@ -109,12 +109,10 @@ def backpropagate_projection(
     """Write the gradients of the Gaussians and return them with that of the pose.
 
     Args:
-        gaussians, camera, projected: of the forward.
         grad_records: (slot, RECORD_SIZE), of the camera's records.
         grad_values: (slot, channel + 1).
         offsets: (n + 1), where each Gaussian's slots begin.
         gradients: arrays to write; arrays without rows are skipped.
-        threads: number of threads; the result does not depend on it.
     """
     num_items = -(-len(gaussians.means) // GAUSSIANS_PER_ITEM)
     pose_sums = np.zeros((num_items if len(gradients.pose) > 0 else 0, _POSE_SIZE))

@@ -365,11 +365,9 @@ def rasterize_forward(
 
     Args:
         records, values, intersections, starts: see records.py; `starts` covers whole rows of tiles.
-        tables: the image plane's pixels.
         sums: (channel + 2, height, width), written within the band.
         first_row: first row of tiles of the band.
         saved: written, if given, for the backward.
-        threads: number of threads; the result does not depend on it.
         min_transmittance: a pixel is finished at this transmittance or below.
     """
     saved = saved or SavedForBackward(np.empty((0, TILE_PIXELS), np.float32), starts, starts)

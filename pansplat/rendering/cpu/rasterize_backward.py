@@ -99,14 +99,12 @@ def rasterize_backward(
     Args:
         records, values, intersections, starts: as in `rasterize_forward`.
         slots: see records.py.
-        tables: the image plane's pixels.
         sums, saved: outputs of `rasterize_forward`.
         grad_sums: gradient of the sums, of the same shape.
         grad_records: (slot, RECORD_SIZE), written; zeros in DIRECTION_RESIDUAL. Aligned to 32 bytes, for non-temporal
             stores.
         grad_values: (slot, channel + 1), written.
         first_row: first row of tiles of the band.
-        threads: number of threads; the result does not depend on it.
     """
     assert grad_records.size == 0 or grad_records.ctypes.data % (4 * LANES) == 0
     scene = records.reshape(-1), values, intersections.reshape(-1), starts, slots

@@ -25,6 +25,7 @@ from pansplat.rendering.cpu.records import BOX_BITS, TILE_SIZE
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, prefetch_for_write, records_to_soa, store_scalar
 from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.reference import split_rows
 
 # --- bounding boxes ---
 
@@ -502,7 +503,6 @@ def intersect_tiles(
         boxes: (n, 4) int16.
         size: height and width, pixels.
         slots: whether to assign slots for the backward.
-        threads: number of threads; the result does not depend on it.
         limit: largest number of intersections in a band, unless a single row has more.
     """
     rows, columns = (-(-side // TILE_SIZE) for side in size)
@@ -512,7 +512,7 @@ def intersect_tiles(
     all_counts = np.empty((parts, rows * columns), np.int64)
     parallel_for(partial(_count_intersections, ends, words, rows, columns, all_counts), parts, threads)
     per_row = all_counts.sum(axis=0).reshape(rows, columns).sum(axis=1)
-    for low, high in _split_rows(per_row.tolist(), limit):
+    for low, high in split_rows(per_row.tolist(), limit):
         counts, workspace = all_counts[:, low * columns : high * columns], Workspace()
         starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts.sum(axis=0))))
         positions, per_part = starts[:-1] + np.cumsum(counts, axis=0) - counts, counts.sum(axis=1)
@@ -524,17 +524,6 @@ def intersect_tiles(
         outputs = positions, np.cumsum(per_part) - per_part, intersections, numbers, offsets
         parallel_for(partial(_write_intersections, ends, words, columns, low, high, size[1], *outputs), parts, threads)
         yield TileIntersections(low, intersections.view(np.int32).reshape(-1, 2), starts, numbers, offsets, workspace)
-
-
-def _split_rows(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
-    """Split rows into bands with at most `limit` intersections, one row at least."""
-    low, total = 0, 0
-    for row, count in enumerate(per_row):
-        if row > low and total + count > limit:
-            yield low, row
-            low, total = row, 0
-        total += count
-    yield low, len(per_row)
 
 
 # --- sorting ---
@@ -568,11 +557,8 @@ def compute_depths(
     """Depth of each Gaussian along an axis, (n,) float64, metres.
 
     Args:
-        records: of the Gaussians.
         radii: radial distances, float64, metres.
         axis: in the records' axes.
-        workspace: memory for the depths.
-        threads: number of threads.
     """
     depths = workspace.array(len(radii), np.float64)
     measure = partial(_measure_depths, records, radii, axis, depths)
@@ -734,7 +720,6 @@ def sort_front_to_back(tiles: TileIntersections, distances: np.ndarray, threads:
         tiles: in the order of the Gaussians; sorted in place.
         distances: of the Gaussians, float64. They are compared to a part in 2^40, or a little less in a tile whose keys
             and indices together exceed 64 bits.
-        threads: number of threads; the order does not depend on it.
     """
     intersections, keys = tiles.intersections.reshape(-1).view(np.int64), distances.view(np.int64)
     parallel_for_tiles(_sort_tiles, (intersections, tiles.slots, keys, tiles.starts), tiles.starts, threads)
