@@ -207,10 +207,8 @@
       const { program, places } = this.resolve;
       gl.useProgram(program);
       gl.uniform3f(places.background, 0, 0, 0);
-      gl.uniform1i(places.difference, 0);
-      ["first_color", "first_depth", "second_color", "second_depth"].forEach((name, i) => {
-        gl.uniform1i(places[name], i % 2);
-      });
+      gl.uniform1i(places.sum_color, 0);
+      gl.uniform1i(places.sum_depth, 1);
       sum.textures.forEach((texture, unit) => {
         gl.activeTexture(gl.TEXTURE0 + unit);
         gl.bindTexture(gl.TEXTURE_2D, texture);

@@ -82,13 +82,11 @@ class _Groups:
     Attributes:
         labels: layer of each Gaussian, or `NO_LAYER`.
         weights: of the layers.
-        difference: whether the image is the difference of the first and the last layer.
         visible: number of Gaussians in all layers.
     """
 
     labels: Int[np.ndarray, "n"]
     weights: Float[np.ndarray, "layer"]
-    difference: bool
     visible: int
 
 
@@ -382,8 +380,8 @@ class CpuRenderer:
         """The sets of Gaussians of a frame and their weights."""
         assert self._splats is not None
         splats, settings = self._splats, frame.settings
-        images = choose_layer_weights(frame, splats, _MIN_WEIGHT)
-        views = tuple(dict.fromkeys(view for image in images for view in image))
+        layer_weights = choose_layer_weights(frame, splats, _MIN_WEIGHT)
+        views = tuple(layer_weights)
         key = (views, settings.levels, settings.opacity_threshold)
         if key not in self._groups:
             if len(self._groups) >= _MAX_SELECTIONS:
@@ -393,8 +391,7 @@ class CpuRenderer:
                 labels[splats.select(settings.levels, settings.opacity_threshold, view)] = layer
             self._groups[key] = labels, int(np.count_nonzero(labels != NO_LAYER))
         labels, visible = self._groups[key]
-        weights = np.array([images[0].get(view, 1.0) for view in views], np.float32)
-        return _Groups(labels, weights, len(images) == 2, visible)
+        return _Groups(labels, np.array(list(layer_weights.values()), np.float32), visible)
 
     def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
         """Draw the image of a frame."""
@@ -617,7 +614,7 @@ def _blend(
     settings: DrawSettings, groups: _Groups, sums: Float[np.ndarray, "layer 5 height width"]
 ) -> tuple[Float[np.ndarray, "height width 4"], Float[np.ndarray, "height width"]]:
     """Colour over the background and coverage, and depth."""
-    color, depth = blend_layers(sums, groups.weights, settings.background, difference=groups.difference)
+    color, depth = blend_layers(sums, groups.weights, settings.background)
     if settings.display in SCALAR_MAPS:
         values = {"depth": depth, "opacity": color[..., 3], "count": sums[0, 4]}[settings.display]
         mapped = map_values(values, settings.display_max, SCALAR_MAPS[settings.display]) / np.float32(255)
@@ -636,7 +633,7 @@ def _write_pixels(
     """Write the colours of `_blend` with 8 bits per channel, by the kernel where the display has one."""
     weights, background = groups.weights, settings.background
     if settings.display not in SCALAR_MAPS:
-        blend_to_pixels(sums, weights, background, pixels, difference=groups.difference, bottom_up=bottom_up)
+        blend_to_pixels(sums, weights, background, pixels, bottom_up=bottom_up)
         return
     color, _ = _blend(settings, groups, sums)
     color[..., 3] = 1

@@ -187,8 +187,7 @@ class SplatRenderer:
     def read_depth(self) -> Float[np.ndarray, "height width"]:
         """Return the radial depth of the last image in metres, float32, top row first; 0 where nothing is drawn.
 
-        `render` draws no depth. The first call after it draws the frame again with depth. In mode `difference` this is
-        the absolute difference of the two depths.
+        `render` draws no depth. The first call after it draws the frame again with depth.
         """
         if self._image is not None and self._frame is not None and self._image.depth is None:
             bound, stats = self._ctx.fbo, self.stats
@@ -214,19 +213,18 @@ class SplatRenderer:
         with_depth = with_depth or frame.settings.display == "depth"
         self._write_colors(splats, frame.settings.splat_colors)
         weights = choose_layer_weights(frame, splats.splats, _MIN_WEIGHT[self._targets.color_bits])
-        views = dict.fromkeys(view for image_weights in weights for view in image_weights)
-        layers = {view: painter.paint(frame, splats, view, with_depth=with_depth) for view in views}
-        weighted = [[(layers[view], weight) for view, weight in image_weights.items()] for image_weights in weights]
+        layers = [painter.paint(frame, splats, view, with_depth=with_depth) for view in weights]
+        weighted = list(zip(layers, weights.values(), strict=True))
         self._image = self._compositor.compose(frame, weighted, with_depth=with_depth)
         self._targets.trim()
         self.stats = FrameStats(
             total=len(splats.splats),
             dropped=splats.splats.dropped,
-            visible=sum(layer.visible for layer in layers.values()),
-            drawn=sum(layer.drawn for layer in layers.values()),
+            visible=sum(layer.visible for layer in layers),
+            drawn=sum(layer.drawn for layer in layers),
             sort_ms=splats.milliseconds,
             tier=self.tier,
-            cached=all(layer.cached for layer in layers.values()),
+            cached=all(layer.cached for layer in layers),
             size=frame.size,
         )
         return self._image
@@ -270,8 +268,8 @@ class SplatRenderer:
         self._targets.invalidate()
 
 
-def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> list[dict[int | None, float]]:
-    """Return each layer's weight by its view (None: all Gaussians); two images for mode `difference`, else one.
+def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dict[int | None, float]:
+    """Return each layer's weight by its view (None: all Gaussians).
 
     Raises:
         InputError: the scene lacks the view, or the cameras that mode `deferred` needs.
@@ -279,15 +277,13 @@ def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> lis
     settings, num_views = frame.settings, splats.num_views
     mode = settings.drawn_mode
     if mode == "joint":
-        return [{None: 1.0}]
-    if mode in ("view", "difference") and not 0 <= settings.view < max(num_views, 1):
+        return {None: 1.0}
+    if mode == "view" and not 0 <= settings.view < max(num_views, 1):
         raise InputError(f"`view` must be 0..{max(num_views, 1) - 1} in this scene, got {settings.view}")
     if mode == "view":
-        return [{settings.view: 1.0}]
-    if mode == "difference":
-        return [{settings.view: 1.0}, {(settings.view + 1) % max(num_views, 1): 1.0}]
+        return {settings.view: 1.0}
     if num_views < 2:
-        return [{None: 1.0}]
+        return {None: 1.0}
     positions = splats.view_positions
     if len(positions) != num_views:
         raise InputError(
@@ -298,7 +294,7 @@ def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> lis
     factors = (settings.view_weights + (1.0,) * num_views)[:num_views]
     factors = factors if any(factors) else (1.0,) * num_views
     weighted = enumerate(zip(weights.tolist(), factors, strict=True))
-    return [{view: max(weight * factor, min_weight) for view, (weight, factor) in weighted if factor > 0}]
+    return {view: max(weight * factor, min_weight) for view, (weight, factor) in weighted if factor > 0}
 
 
 class Compositor:
@@ -313,28 +309,22 @@ class Compositor:
         self._resolve = ctx.vertex_array(programs.resolve(), [])
         self._tables: dict[str, moderngl.Texture] = {}
 
-    def compose(self, frame: Frame, images: Sequence[Sequence[tuple[Layer, float]]], *, with_depth: bool) -> Target:
+    def compose(self, frame: Frame, weighted: Sequence[tuple[Layer, float]], *, with_depth: bool) -> Target:
         """Return the frame's image: RGB over the background, coverage, and depth if the layers have it.
 
         Args:
             frame: size, camera and background.
-            images: the weighted layers of one image, or of two whose absolute difference is returned.
+            weighted: the layers and their weights.
             with_depth: whether the layers have depth.
         """
-        sums = [
-            self._add_layers(frame, weighted, self._targets.get(f"sum {i}", frame.size, depth_components=2), with_depth)
-            for i, weighted in enumerate(images)
-        ]
+        total = self._add_layers(frame, weighted, with_depth)
         image = self._targets.get("image", frame.size, depth_components=int(with_depth))
         image.framebuffer.use()
         image.framebuffer.viewport = (0, 0, *frame.size)
         program = self._programs.resolve()
-        set_uniforms(program, difference=len(sums) == 2, background=frame.settings.background)
+        set_uniforms(program, background=frame.settings.background)
         self._set_color_map(program, frame.settings)
-        first, second = sums[0], sums[-1]
-        textures = {"first_color": first.color, "first_depth": first.depth}
-        textures |= {"second_color": second.color, "second_depth": second.depth}
-        self._bind_textures(program, **textures)
+        self._bind_textures(program, sum_color=total.color, sum_depth=total.depth)
         self._ctx.enable_only(moderngl.NOTHING)
         self._resolve.render(moderngl.TRIANGLES, vertices=3)
         return image
@@ -356,9 +346,8 @@ class Compositor:
             self._tables[name] = create_table_texture(self._ctx, name)
         self._tables[name].use(_COLOR_MAP_UNIT)
 
-    def _add_layers(
-        self, frame: Frame, weighted: Sequence[tuple[Layer, float]], target: Target, with_depth: bool
-    ) -> Target:
+    def _add_layers(self, frame: Frame, weighted: Sequence[tuple[Layer, float]], with_depth: bool) -> Target:
+        target = self._targets.get("sum", frame.size, depth_components=2)
         target.framebuffer.use()
         target.framebuffer.viewport = (0, 0, *frame.size)
         program = self._programs.accumulate(frame.storage)

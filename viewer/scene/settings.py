@@ -14,7 +14,7 @@ from pansplat.options import EYE_DISTANCE
 Kernel = Literal["ray", "ewa"]
 Order = Literal["radial", "z"]
 Lowpass = Literal["angular", "3dgs"]
-Mode = Literal["joint", "view", "deferred", "difference"]
+Mode = Literal["joint", "view", "deferred"]
 Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Projection = Literal["perspective", "equirect", "cubemap"]
@@ -44,9 +44,8 @@ class DrawSettings:
         order: sort key, radial distance or depth along the view axis.
         lowpass: `angular` with energy compensation, or `3dgs`.
         mode: `joint` draws all Gaussians together. `view` draws those of one context view. `deferred` draws each
-            context view separately and blends the images per pixel by distance. `difference` is the absolute
-            difference of the images of context views `view` and `view + 1` (cyclic), each over the background.
-        view: the context view of mode `view` and the first of mode `difference`.
+            context view separately and blends the images per pixel by distance.
+        view: the context view of mode `view`.
         view_weights: factors of the context views in mode `deferred`, at least 0; views beyond the last one have 1.
             Views of factor 0 are not drawn, unless all are 0, which is the same as all 1.
         levels: pyramid levels to draw; None draws all.
@@ -55,7 +54,7 @@ class DrawSettings:
             axes of the Gaussians, towards their camera, with 0.5 + 0.5 (x, y, z) of the world as RGB; `levels` and
             `views`, a colour for each label; `count`, the Gaussians that reach the alpha cut at the pixel;
             `ellipsoids`, the nearest Gaussian within one standard deviation, opaque and shaded. The last two draw all
-            views together in modes `deferred` and `difference`.
+            views together in mode `deferred`.
         display_max: of `depth`, `opacity` and `count`, the number with the last colour of the map; the first is 0.
         background: RGB in [0, 1].
         near: Gaussians whose mean is nearer than this radial distance, metres, are not drawn.
@@ -139,7 +138,7 @@ class DrawSettings:
     @property
     def drawn_mode(self) -> Mode:
         """The mode of the layers: counts and ellipsoids are not blended."""
-        return "joint" if self.footprint != "gaussian" and self.mode in ("deferred", "difference") else self.mode
+        return "joint" if self.footprint != "gaussian" and self.mode == "deferred" else self.mode
 
 
 @dataclass(frozen=True)

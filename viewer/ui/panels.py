@@ -262,11 +262,11 @@ class Panels:
 
     def _draw_gaussians(self, state: ViewerState) -> None:
         settings, num_views = state.settings, state.num_views
-        for mode in ("joint", "deferred", "difference") if num_views > 1 else ("joint",):
+        for mode in ("joint", "deferred") if num_views > 1 else ("joint",):
             if mode != "joint":
                 imgui.same_line()
             if self._radio(mode, settings.mode == mode):
-                settings = replace(settings, mode=mode, view=0 if mode == "difference" else settings.view)
+                settings = replace(settings, mode=mode)
         for view in range(num_views):
             if view % 3:
                 imgui.same_line()

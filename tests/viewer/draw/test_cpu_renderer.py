@@ -42,7 +42,7 @@ def read_pixels(texture) -> np.ndarray:
     return np.frombuffer(texture.read(), np.uint8).reshape(*texture.size[::-1], 4)[::-1, :, :3].astype(int)
 
 
-@pytest.mark.parametrize("mode", ["joint", "view", "deferred", "difference"])
+@pytest.mark.parametrize("mode", ["joint", "view", "deferred"])
 def test_pixels_are_the_image_of_opengl_within_two_steps(renderer, make_renderer, small_scene, pose, mode):
     settings = replace(SETTINGS, mode=mode)
     exact = make_renderer(small_scene)

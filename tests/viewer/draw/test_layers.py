@@ -35,7 +35,7 @@ def render_image(renderer, pose, settings, size=SIZE):
 
 
 @pytest.mark.parametrize("color_bits", [16, 32])
-@pytest.mark.parametrize("mode", ["joint", "deferred", "difference"])
+@pytest.mark.parametrize("mode", ["joint", "deferred"])
 def test_cached_faces_give_the_image_of_direct_drawing(make_renderer, random_scene, pose, mode, color_bits):
     scene = enlarge_gaussians(random_scene(150))
     kept, direct = make_renderer(scene, color_bits=color_bits, slot=1), make_renderer(scene)

@@ -168,20 +168,6 @@ def test_deferred_blending_equals_the_reference(
 
 
 @RENDERERS
-def test_difference_is_that_of_the_images_of_two_views(make_renderer, random_scene, pose, reference, tier):
-    scene = random_scene()
-    renderer = make_renderer(scene, tier)
-    renderer.render(pose, SIZE, replace(SETTINGS, mode="difference"))
-    first, second = (reference(select_view(scene, view), pose, SIZE, SETTINGS) for view in (0, 1))
-    expected = (first.color - second.color).abs().permute(1, 2, 0).numpy()
-    forwards = renderer.read_color()
-    assert np.abs(forwards[..., :3] - expected).max() <= 5e-3
-    assert np.abs(renderer.read_depth() - (first.depth - second.depth).abs().numpy()).mean() <= 1e-3
-    renderer.render(pose, SIZE, replace(SETTINGS, mode="difference", view=1))
-    assert np.abs(renderer.read_color() - forwards).max() <= 1e-6
-
-
-@RENDERERS
 def test_levels_and_opacity_threshold_select_gaussians(
     make_renderer, random_scene, pose, reference, assert_matches, tier
 ):

@@ -165,7 +165,7 @@ def test_q_quits_only_with_control(state):
 def test_entering_a_scene_of_one_view_resets_modes_that_need_two(small_scene):
     one = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
     state = ViewerState()
-    state.settings = replace(state.settings, mode="difference", view=1)
+    state.settings = replace(state.settings, mode="deferred", view=1)
     enter_scene(state, replace(one, cam2world=one.cam2world[:1]))
     assert state.settings.mode == "joint" and state.settings.view == 0
     assert state.levels == (0, 1, 2, 3)
