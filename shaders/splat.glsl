@@ -9,10 +9,8 @@ uniform mat3 world_to_camera;
 #endif
 uniform vec3 position;           // camera centre, in the moved frame of the means
 uniform float near;              // smallest radial distance, metres
-uniform int kernel;              // 0 ray, 1 ewa
-uniform float filter_variance;   // e^2 of section 2
-uniform bool compensate;         // whether the low-pass filter lowers the opacity
-uniform float dilation;          // added to the diagonal of the projected covariance (ewa with the 3dgs filter)
+uniform bool exact;              // the exact response, order and filter, or those of 3DGS
+uniform float filter_variance;   // e^2 of section 2; of 3DGS, added to the diagonal of the projected covariance
 uniform vec2 half_size;          // half the image
 uniform float margin;            // added to the quad, for the rounding of the rasteriser
 
@@ -113,13 +111,9 @@ bool set_footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2)
     vec3 x = j_x * axes, y = j_y * axes, normal = cross(j_x, j_y) * unit;
     float v_xx = dot(x, x), v_xy = dot(x, y), v_yy = dot(y, y);
     float determinant = dot(w2, normal * normal);
-    vec3 p = vec3(dot(j_x, j_x) - dot(j_x, n) * dot(j_x, n), dot(j_x, j_y) - dot(j_x, n) * dot(j_y, n),
-                  dot(j_y, j_y) - dot(j_y, n) * dot(j_y, n));
-    p = filter_variance * p + vec3(dilation, 0.0, dilation);
-    determinant += max(v_xx * p.z + v_yy * p.x - 2.0 * v_xy * p.y, 0.0) + max(p.x * p.z - p.y * p.y, 0.0);
-    v_xx += p.x;
-    v_xy += p.y;
-    v_yy += p.z;
+    determinant += filter_variance * (v_xx + v_yy + filter_variance);
+    v_xx += filter_variance;
+    v_yy += filter_variance;
     if (!(determinant > 0.0)) return false;
     float root_y = sqrt(determinant / v_xx);
     f.a = vec3(0.0, 1.0 / sqrt(v_xx), 0.0);
@@ -155,9 +149,9 @@ bool project_gaussian(Gaussian gaussian, out Footprint f) {
     float sharp = dot(w2, n_e * n_e);
     float determinant = sharp + e2 * trace + e2 * e2;
     f.peak = gaussian.opacity;
-    if (compensate) f.peak *= sqrt(sharp / determinant);
+    if (exact) f.peak *= sqrt(sharp / determinant);  // the filter conserves energy
     if (!(f.peak >= ALPHA_CUT)) return false;
-    if (kernel == 1) return set_footprint_ewa(f, axes, unit, n, w2);
+    if (!exact) return set_footprint_ewa(f, axes, unit, n, w2);
 
     float volume = k.x * k.y * k.z;
     float along = e2 * e2 * dot(n_a, n_a) + e2 * dot(w2, u_e * u_e + v_e * v_e) + volume * volume;

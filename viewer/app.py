@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -20,7 +20,7 @@ from pansplat_viewer.scene.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.scene.settings import DrawSettings, Kernel, Mode, Order, Projection, RendererChoice, Stereo
+from pansplat_viewer.scene.settings import DrawSettings, Mode, Preset, Projection, RendererChoice, Stereo
 
 if TYPE_CHECKING:
     import moderngl
@@ -70,12 +70,11 @@ class Options:
     """Farthest depth of the search, metres."""
     mode: Mode = "deferred"
     """How the Gaussians of the input views are combined."""
-    kernel: Kernel = "ray"
-    """Response of a Gaussian: exact on each ray, or the linearisation of 3DGS."""
-    order: Order = "radial"
-    """Sort Gaussians by distance, or by depth along the view axis."""
+    preset: Preset = "exact"
+    """Draw Gaussians exactly on each ray and by distance, or as 3DGS does: linearised and by depth (OpenGL only)."""
     renderer: RendererChoice = "auto"
-    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, and cpu where OpenGL is software."""
+    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU and for preset 3dgs, and cpu where OpenGL is
+    software."""
     at: Annotated[float, Range(0, 1), REAL] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     projection: Projection = "perspective"
@@ -125,9 +124,20 @@ class Options:
     @property
     def settings(self) -> DrawSettings:
         """Initial draw settings."""
-        return DrawSettings(
-            kernel=self.kernel, order=self.order, mode=self.mode, stereo=self.stereo, eye_distance=self.ipd
-        )
+        return DrawSettings(preset=self.preset, mode=self.mode, stereo=self.stereo, eye_distance=self.ipd)
+
+    @property
+    def renderer_choice(self) -> RendererChoice:
+        """`renderer`; the processor does not draw preset 3dgs.
+
+        Raises:
+            InputError: the renderer does not draw the preset.
+        """
+        if self.preset == "exact":
+            return self.renderer
+        if self.renderer == "cpu":
+            raise InputError("--preset 3dgs needs OpenGL, got --renderer cpu; use --renderer gl or --preset exact")
+        return "gl"
 
 
 def run_arguments(args: Sequence[str] | None = None) -> int:
@@ -157,7 +167,8 @@ def choose_entry(entries: list[SceneEntry], pair: str | None) -> int:
 
 def _run(options: Options) -> int:
     pixels = options.pixels
-    options.image_format.check(pixels, options.kernel)
+    options.image_format.check(pixels, options.preset)
+    options = replace(options, renderer=options.renderer_choice)
     windowless = options.offscreen is not None and options.stereo != "mono"
     if options.out is None and (windowless or options.projection != "perspective"):
         raise InputError("--projection, and --stereo without a window, need --out; give --path and --out FILE")

@@ -653,7 +653,7 @@ class Viewer:
         image_format = choose_format(state.film_projection, settings)
         if state.film_projection != "perspective":
             size = image_format.default_size
-        image_format.check(size, settings.kernel)
+        image_format.check(size, settings.preset)
         assert scene is not None
         folder = self._folder / loaded.entry.folder_name
         folder.mkdir(parents=True, exist_ok=True)
@@ -713,7 +713,7 @@ class Viewer:
     def _render_panorama(self, size: tuple[int, int], settings: DrawSettings) -> Float[np.ndarray, "height width 3"]:
         """The panorama at the camera; in stereo, both eyes', the left one at the top, drawn on the processor."""
         cam2world, image_format = self.state.camera.cam2world, choose_format("equirect", settings)
-        image_format.check(size, settings.kernel)
+        image_format.check(size, settings.preset)
         if not image_format.is_omnidirectional:
             return render_image(self.renderer, cam2world, size, settings, image_format)[0]
         assert self._slot.scene is not None

@@ -224,10 +224,8 @@
       gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
       gl.uniform3fv(places.position, position);
       gl.uniform1f(places.near, HEADER.near);
-      gl.uniform1i(places.kernel, 0);
+      gl.uniform1i(places.exact, 1);
       gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal * focal));
-      gl.uniform1i(places.compensate, 1);
-      gl.uniform1f(places.dilation, 0);
       gl.uniform2f(places.half_size, x, y);
       gl.uniform1f(places.margin, 0.02 / focal);
       gl.uniform2f(places.principal, 0.5 * width, 0.5 * height);

@@ -80,6 +80,7 @@ def test_with_an_unusable_display_a_fly_through_is_written(room, capsys, monkeyp
         (["room.ply", "--projection", "equirect"], "--projection, and --stereo without a window, need --out"),
         (["room.ply", "--projection", "equirect", "--size", "64x64"], "must be 2:1 for projection equirect"),
         (["room.ply", "--projection", "cubemap", "--size", "64x32"], "must be 3:2, of an even height"),
+        (["room.ply", "--preset", "3dgs", "--renderer", "cpu"], "--preset 3dgs needs OpenGL, got --renderer cpu"),
         (["room.ply", "--ipd", "0"], "--ipd must be a number above 0 to 1 metres"),
         (["room.ply", "--refine", "-1"], "--refine must be a number of 0 to 1000000 seconds"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),
@@ -132,6 +133,7 @@ def test_options_are_passed_on(tmp_path):
     given |= {"convention": "world2cam opengl", "near": 0.3, "far": 9.0}
     expected = LoadOptions(cache=False, refine_seconds=3.0, **given)
     assert Options(tmp_path, no_cache=True, refine=3.0, **given).load_options == expected
+    assert Options(tmp_path, preset="3dgs").renderer_choice == "gl"
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 
 

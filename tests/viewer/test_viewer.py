@@ -51,16 +51,14 @@ NAMES = ["first", "second"]
 # Widgets that must change the image, and the settings that give some of them something to change.
 IMAGE_WIDGETS = (
     "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
-    "min. opacity", "ray", "ewa", "radial", "z", "angular", "3dgs", "black", "grey", "white", "field of view",
+    "min. opacity", "exact", "3dgs", "black", "grey", "white", "field of view",
     "off##stereo", "pair##stereo", "red/cyan##stereo",
     "2##panorama", "##flight",
 )  # fmt: skip
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
     "joint": {"mode": "deferred"},
-    "ray": {"kernel": "ewa"},
-    "radial": {"order": "z"},
-    "angular": {"lowpass": "3dgs"},
+    "exact": {"preset": "3dgs"},
     "off##stereo": {"stereo": "anaglyph"},
     "black": {"background": (1.0, 1.0, 1.0)},
 }

@@ -261,6 +261,8 @@ class CpuRenderer:
         """
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
+        if not settings.is_exact:
+            raise InputError(f"the processor draws preset exact, got {settings.preset}; use renderer gl")
         frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
         largest = max(*frame.size, frame.face_size if settings.layout == "equirect" else 0)
         if largest > LARGEST_SIDE:
@@ -419,12 +421,9 @@ class CpuRenderer:
         plane = ImagePlane(
             (camera.height, camera.width), torch.from_numpy(np.ascontiguousarray(camera.rotation)), camera.focal
         )
-        options = _raster_options(frame.settings)
-        if frame.settings.kernel == "ewa":  # draws outside the bounding ball: leave out only what is behind the camera
-            selection = Selection(np.ascontiguousarray(camera.rotation[:, 2][None]), 0.0, bounded=False)
-        else:
-            deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
-            selection = Selection(camera.compute_side_normals(), deviation, bounded=True)
+        options = RasterOptions(near=frame.settings.near)
+        deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
+        selection = Selection(camera.compute_side_normals(), deviation, bounded=True)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,
@@ -453,16 +452,16 @@ class CpuRenderer:
     def _rasterize_panorama(
         self, frame: Frame, groups: _Groups, stages: dict[str, float]
     ) -> tuple[Float[np.ndarray, "layer 5 height width"], int]:
-        """Rasterise a panorama: directly, or from cube faces if the kernel or `face_size` needs them."""
+        """Rasterise a panorama: directly, or from cube faces of `face_size`."""
         size, settings = frame.size[::-1], frame.settings
-        if settings.kernel == "ray" and settings.face_size is None:
+        if settings.face_size is None:
             plane = ImagePlane(size, torch.from_numpy(frame.rotation.copy()), 0.0, settings.eye_offset)
             layers = self._find_scene(settings).rasterize(
                 np.asarray(frame.position),
                 plane,
                 groups.labels,
                 len(groups.weights),
-                _raster_options(settings),
+                RasterOptions(near=settings.near),
                 min_transmittance=self._min_transmittance,
                 footprint=_find_footprint(settings),
             )
@@ -600,10 +599,6 @@ def _face_key(frame: Frame) -> Hashable:
     """The values that the faces of a frame depend on: everything but rotation and image size."""
     settings = replace(frame.settings, cached=True, vertical_fov_degrees=90.0, scale=1.0)
     return frame.world_position.tobytes(), frame.focal, settings
-
-
-def _raster_options(settings: DrawSettings) -> RasterOptions:
-    return RasterOptions(settings.kernel, settings.order, settings.lowpass, settings.near)
 
 
 def _find_footprint(settings: DrawSettings) -> Footprint | None:

@@ -169,7 +169,7 @@ class GpuSplats:
 
     def _update_order(self, camera: Pinhole, position: tuple[float, float, float], settings: DrawSettings) -> None:
         """Sort all splats by distance from the position, or by depth along the camera's axis."""
-        by_depth = settings.order == "z"
+        by_depth = not settings.is_exact
         forward = tuple(float(x) for x in camera.rotation[:, 2])
         key = (position, forward) if by_depth else (position,)
         if key == self._order_key:
@@ -188,7 +188,7 @@ class GpuSplats:
         self, cameras: Sequence[Pinhole], mask: moderngl.Buffer, settings: DrawSettings, filter_variance: float
     ) -> None:
         """List the splats that touch the parts, part by part, in the order of the sort."""
-        bounded = settings.kernel != "ewa"  # the linearised kernel draws outside the ball
+        bounded = settings.is_exact  # the linearised response of preset 3dgs ends outside the ball
         planes, num_planes = np.zeros((MAX_PARTS, _PLANES, 4), np.float32), 0
         for part, camera in enumerate(cameras):
             normals = camera.compute_side_normals() if bounded else camera.rotation[:, 2][None]

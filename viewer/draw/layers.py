@@ -132,7 +132,7 @@ class Frame:
     def create_layer_key(self, splats: SortedSplats) -> tuple[Hashable, ...]:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
-        key = (splats, self.position, s.kernel, s.order, s.lowpass, s.levels, s.opacity_threshold, s.near)
+        key = (splats, self.position, s.preset, s.levels, s.opacity_threshold, s.near)
         key += (s.footprint, s.splat_colors)
         if self.storage == LayerStorage.IMAGE:
             return (*key, self.rotation.tobytes(), self.focal)
@@ -285,7 +285,7 @@ class LayerPainter:
         target.framebuffer.scissor = None
         drawn, settings = 0, frame.settings
         # One order by distance serves all parts, so the GPU draws them together.
-        together = self.rasterizer.draws_parts_together and settings.order == "radial"
+        together = self.rasterizer.draws_parts_together and settings.is_exact
         for parts in [missing] if together and missing else [[part] for part in missing]:
             drawn += self.rasterizer.draw(
                 target.framebuffer,
@@ -311,11 +311,9 @@ class LayerPainter:
         return self._selections[key]
 
 
-def compute_lowpass_variances(settings: DrawSettings, focal: float) -> tuple[float, float]:
-    """Return (e^2, dilation) of docs/rendering.md, section 2, in image-plane units squared."""
-    pixel = 1.0 / (focal * focal)
-    variance = FILTER_VARIANCE[settings.lowpass] * pixel
-    return (0.0, variance) if (settings.lowpass, settings.kernel) == ("3dgs", "ewa") else (variance, 0.0)
+def compute_filter_variance(settings: DrawSettings, focal: float) -> float:
+    """Variance of the low-pass filter (docs/rendering.md, section 2), in image-plane units squared."""
+    return FILTER_VARIANCE["angular" if settings.is_exact else "3dgs"] / (focal * focal)
 
 
 class SplatRasterizer:
@@ -398,7 +396,7 @@ class SplatRasterizer:
         self._ctx.enable_only(moderngl.BLEND)
         add = settings.footprint == "count"
         self._ctx.blend_func = moderngl.ONE, moderngl.ONE if add else moderngl.ONE_MINUS_SRC_ALPHA
-        variance, _ = compute_lowpass_variances(settings, camera.focal)
+        variance = compute_filter_variance(settings, camera.focal)
         drawn = 0
         if self._gpu is not None:
             for distance in range(4 if len(parts) > 1 else 0):
@@ -408,8 +406,8 @@ class SplatRasterizer:
             for distance in range(4 if len(parts) > 1 else 0):
                 self._ctx.disable_direct(_CLIP_DISTANCE_0 + distance)
         else:
-            seen = splats.cull(camera, selected, kernel=settings.kernel, filter_variance=variance)
-            drawn = self._draw_in_order(splats.sort_back_to_front(camera, seen, settings.order))
+            seen = splats.cull(camera, selected, variance, bounded=settings.is_exact)
+            drawn = self._draw_in_order(splats.sort_back_to_front(camera, seen, by_depth=not settings.is_exact))
         self._ctx.enable_only(moderngl.NOTHING)
         return drawn
 
@@ -436,7 +434,6 @@ class SplatRasterizer:
         return len(back_to_front)
 
     def _set_uniforms(self, camera: Pinhole, settings: DrawSettings) -> None:
-        variance, dilation = compute_lowpass_variances(settings, camera.focal)
         project = self._programs.project() if self._tier == "gl33" else self._programs.project_compute()
         set_uniforms(
             project,
@@ -444,10 +441,8 @@ class SplatRasterizer:
             world_to_camera=np.ascontiguousarray(camera.rotation, dtype=np.float32).tobytes(),
             position=camera.position,
             near=settings.near,
-            kernel=int(settings.kernel == "ewa"),
-            filter_variance=variance,
-            compensate=settings.lowpass == "angular",
-            dilation=dilation,
+            exact=settings.is_exact,
+            filter_variance=compute_filter_variance(settings, camera.focal),
             half_size=camera.half_size,
             margin=0.02 / camera.focal,
         )

@@ -209,15 +209,15 @@ class SortedSplats:
     milliseconds: float = 0.0
 
     def cull(
-        self, camera: Pinhole, selected: Bool[np.ndarray, "n"], *, kernel: str, filter_variance: float
+        self, camera: Pinhole, selected: Bool[np.ndarray, "n"], filter_variance: float, *, bounded: bool
     ) -> Bool[np.ndarray, "n"]:
         """Return which of the selected splats can touch the camera's image; conservative.
 
-        A splat is bounded by a ball of its reach, widened by the low-pass filter. The linearised kernel `ewa` draws
-        outside that ball, so `ewa` culls only splats behind the camera.
+        A splat is bounded by a ball of its reach, widened by the low-pass filter. The linearised response of preset
+        `3dgs` is not `bounded` by it: then only splats behind the camera are culled.
         """
         splats = self.splats
-        if kernel == "ewa":
+        if not bounded:
             normals, bound = camera.rotation[:, 2][None], np.float32(0)
         else:
             normals = camera.compute_side_normals()
@@ -234,9 +234,11 @@ class SortedSplats:
             seen &= distance >= np.float32(offset)
         return seen
 
-    def sort_back_to_front(self, camera: Pinhole, seen: Bool[np.ndarray, "n"], order: str) -> UInt[np.ndarray, "m"]:
-        """Return the indices of the seen splats, farthest first, by `radial` distance or by `z` of the camera."""
-        if order == "radial":
+    def sort_back_to_front(
+        self, camera: Pinhole, seen: Bool[np.ndarray, "n"], *, by_depth: bool
+    ) -> UInt[np.ndarray, "m"]:
+        """Return the indices of the seen splats, farthest first, by distance, or by depth along the camera's axis."""
+        if not by_depth:
             return self.order[seen[self.order]][::-1]
         indices = np.flatnonzero(seen).astype(np.uint32)
         forward = camera.rotation[:, 2]

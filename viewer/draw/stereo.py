@@ -24,7 +24,7 @@ from pansplat.rendering.image_planes import image_planes
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer, Renderer
 from pansplat_viewer.draw.programs import Programs, set_uniforms
 from pansplat_viewer.draw.renderer import bind
-from pansplat_viewer.scene.settings import DrawSettings, FrameStats, Projection, Stereo
+from pansplat_viewer.scene.settings import DrawSettings, FrameStats, Preset, Projection, Stereo
 
 # Places of the faces in an image of three columns and two rows: layout 0 of the spherical metadata, version 2.
 _GRID = ("right", "left", "up"), ("down", "front", "back")
@@ -64,11 +64,11 @@ class ImageFormat:
         """(width, height) of the image of one eye, pixels."""
         return _DEFAULT_SIZES[self.projection]
 
-    def check(self, size: tuple[int, int], kernel: str = "ray") -> None:
-        """Refuse a size (width, height) or a kernel that does not fit.
+    def check(self, size: tuple[int, int], preset: Preset = "exact") -> None:
+        """Refuse a size (width, height) or a preset that does not fit.
 
         Raises:
-            InputError: a panorama that is not 2:1, a cubemap that is not 3:2, or stereo of these with kernel `ewa`.
+            InputError: a panorama that is not 2:1, a cubemap that is not 3:2, or stereo of these with preset `3dgs`.
         """
         width, height = size
         if self.projection == "equirect" and width != 2 * height:
@@ -78,8 +78,8 @@ class ImageFormat:
                 f"`--size` must be 3:2, of an even height, for projection cubemap, got {width}x{height}; the image has "
                 "three columns and two rows of faces"
             )
-        if self.is_omnidirectional and kernel != "ray":
-            raise InputError(f"stereo of projection {self.projection} needs kernel ray, got {kernel}")
+        if self.is_omnidirectional and preset != "exact":
+            raise InputError(f"stereo of projection {self.projection} needs preset exact, got {preset}")
 
 
 def choose_format(projection: Projection, settings: DrawSettings) -> ImageFormat:

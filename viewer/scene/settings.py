@@ -11,9 +11,7 @@ from pansplat.constants import NEAR
 from pansplat.errors import InputError
 from pansplat.options import EYE_DISTANCE
 
-Kernel = Literal["ray", "ewa"]
-Order = Literal["radial", "z"]
-Lowpass = Literal["angular", "3dgs"]
+Preset = Literal["exact", "3dgs"]
 Mode = Literal["joint", "view", "deferred"]
 Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
@@ -23,9 +21,7 @@ Display = Literal["color", "depth", "opacity", "normals", "levels", "views", "co
 Comparison = Literal["off", "photograph", "error", "pinned"]
 
 _CHOICES = {
-    "kernel": Kernel,
-    "order": Order,
-    "lowpass": Lowpass,
+    "preset": Preset,
     "mode": Mode,
     "layout": Layout,
     "display": Display,
@@ -40,9 +36,9 @@ class DrawSettings:
     """Everything that changes the image except the scene, the pose and the size.
 
     Attributes:
-        kernel: `ray` is the exact response on each ray, `ewa` the linearised one of 3DGS.
-        order: sort key, radial distance or depth along the view axis.
-        lowpass: `angular` with energy compensation, or `3dgs`.
+        preset: `exact` has the exact response on each ray, the order of radial distance, and a low-pass filter that
+            conserves energy. `3dgs` has the linearised response, the order of depth along the view axis, and the
+            filter of 3DGS; OpenGL only.
         mode: `joint` draws all Gaussians together. `view` draws those of one context view. `deferred` draws each
             context view separately and blends the images per pixel by distance.
         view: the context view of mode `view`.
@@ -61,7 +57,7 @@ class DrawSettings:
         vertical_fov_degrees: of layout `pinhole`, in (0, 180).
         layout: `pinhole`, or `equirect` stitched from six cube faces.
         eye_offset: of layout `equirect`: radius of the viewing circle of omni-directional stereo, metres; negative for
-            the left eye. `CpuRenderer` only, with kernel `ray`.
+            the left eye. `CpuRenderer` only.
         stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, the left above the right,
             or the left in red and the right in green and blue.
         eye_distance: metres.
@@ -74,9 +70,7 @@ class DrawSettings:
             OpenGL returns the smaller texture, because a GPU enlarges it without cost.
     """
 
-    kernel: Kernel = "ray"
-    order: Order = "radial"
-    lowpass: Lowpass = "angular"
+    preset: Preset = "exact"
     mode: Mode = "joint"
     view: int = 0
     view_weights: tuple[float, ...] = ()
@@ -111,10 +105,10 @@ class DrawSettings:
             raise InputError(f"`display_max` must be a positive number, got {self.display_max}")
         if not 0 < self.near < math.inf:
             raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
-        if self.eye_offset and (self.layout, self.kernel, self.face_size) != ("equirect", "ray", None):
+        if self.eye_offset and (self.layout, self.preset, self.face_size) != ("equirect", "exact", None):
             raise InputError(
-                "omni-directional stereo needs layout equirect, kernel ray and no face_size, got "
-                f"{self.layout}, {self.kernel} and {self.face_size}"
+                "omni-directional stereo needs layout equirect, preset exact and no face_size, got "
+                f"{self.layout}, {self.preset} and {self.face_size}"
             )
         if self.eye_offset and self.footprint != "gaussian":
             raise InputError(f"display {self.display} has no omni-directional stereo; use another display")
@@ -124,6 +118,11 @@ class DrawSettings:
             raise InputError(f"`eye_offset` must be a distance in metres, got {self.eye_offset}")
         if self.face_size is not None and self.face_size < 1:
             raise InputError(f"`face_size` must be at least 1 pixel, got {self.face_size}")
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the preset is `exact`."""
+        return self.preset == "exact"
 
     @property
     def footprint(self) -> Literal["gaussian", "count", "ellipsoids"]:

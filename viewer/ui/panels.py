@@ -9,7 +9,7 @@ from imgui_bundle import imgui
 
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.key_frames import KeyFrame
-from pansplat_viewer.scene.settings import Comparison, Display, FrameStats, Kernel, Lowpass, Order, Projection
+from pansplat_viewer.scene.settings import Comparison, Display, FrameStats, Preset, Projection
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
     ViewerState,
@@ -217,7 +217,7 @@ class Panels:
             self._section("Compare", self._draw_comparison, state, data, commands)
             self._section("Camera", self._draw_camera, state)
             self._section("Screenshot", self._draw_screenshot, commands)
-            self._section("Drawing", self._draw_settings, state, opened=False)
+            self._section("Drawing", self._draw_settings, state, data.stats, opened=False)
             self._section("Camera path", self._draw_path, state, data, commands, opened=False)
             self._section("Window", self._draw_window, data, commands, opened=False)
             imgui.pop_item_width()
@@ -290,14 +290,15 @@ class Panels:
         threshold = self._slider("min. opacity", settings.opacity_threshold, 0.0, 1.0, "%.2f")
         state.settings = replace(settings, opacity_threshold=threshold)
 
-    def _draw_settings(self, state: ViewerState) -> None:
+    def _draw_settings(self, state: ViewerState, stats: FrameStats) -> None:
         settings = state.settings
-        for name, choices in (("kernel", Kernel), ("order", Order), ("lowpass", Lowpass)):
-            _draw_row_label(name)
-            for choice in get_args(choices):
-                imgui.same_line()
-                if self._radio(choice, getattr(settings, name) == choice):
-                    settings = replace(settings, **{name: choice})
+        _draw_row_label("preset")
+        imgui.begin_disabled(stats.tier == "cpu")  # which draws preset exact only
+        for preset in get_args(Preset):
+            imgui.same_line()
+            if self._radio(preset, settings.preset == preset):
+                settings = replace(settings, preset=preset)
+        imgui.end_disabled()
         _draw_row_label("stereo")
         for label, stereo in (("off", "mono"), ("pair", "side-by-side"), ("red/cyan", "anaglyph")):
             imgui.same_line()

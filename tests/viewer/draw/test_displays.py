@@ -84,7 +84,7 @@ def test_the_count_is_that_of_the_gaussians_at_the_pixel(make_renderer, disc, ti
 @pytest.mark.parametrize("tier", TIERS)
 def test_an_ellipsoid_ends_at_one_standard_deviation_and_hides_what_is_behind(make_renderer, disc, tier):
     renderer = make_renderer(disc, tier)
-    image = draw(renderer, np.eye(4), DrawSettings(display="ellipsoids", lowpass="angular"))
+    image = draw(renderer, np.eye(4), DrawSettings(display="ellipsoids"))
     red, green = image[24, :, 0] > 0.3, image[24, :, 1] > 0.3
     focal = 0.5 * SIZE[1] / math.tan(math.radians(45))
     assert abs(red.sum() - 2 * focal * 0.5 / 2) <= 2

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pansplat_viewer.draw.gpu_sort import GpuSplats, RadixSort
-from pansplat_viewer.draw.layers import SplatRasterizer, compute_lowpass_variances
+from pansplat_viewer.draw.layers import SplatRasterizer, compute_filter_variance
 from pansplat_viewer.draw.programs import TILE_SIZE, Programs
 from pansplat_viewer.draw.splats import Splats, sort_splats
 from pansplat_viewer.scene.camera import Pinhole
@@ -77,23 +77,22 @@ def draw(gpu, splats: Splats, camera: Pinhole, selected, settings: DrawSettings)
     return np.frombuffer(gpu._visible.read(), np.uint32)[: rasterizer.take_drawn()]
 
 
-@pytest.mark.parametrize("order", ["radial", "z"])
-@pytest.mark.parametrize("kernel", ["ray", "ewa"])
-def test_the_order_and_the_culling_are_the_processors(gpu, splats, pose, order, kernel):
+@pytest.mark.parametrize("preset", ["exact", "3dgs"])
+def test_the_order_and_the_culling_are_the_processors(gpu, splats, pose, preset):
     camera = Pinhole(pose[:3, :3], tuple(pose[:3, 3]), 60.0, 64, 48)
-    settings = DrawSettings(order=order, kernel=kernel)
+    settings = DrawSettings(preset=preset)
     selected = np.arange(len(splats)) % 3 > 0
-    variance, _ = compute_lowpass_variances(settings, camera.focal)
+    variance = compute_filter_variance(settings, camera.focal)
     expected = sort_splats(splats, camera.position)
-    seen = expected.cull(camera, selected, kernel=kernel, filter_variance=variance)
+    seen = expected.cull(camera, selected, variance, bounded=settings.is_exact)
     drawn = draw(gpu, splats, camera, selected, settings)
     assert 0 < len(drawn) < selected.sum() and set(drawn) <= set(np.flatnonzero(selected))
     # The bounds are conservative, and rounded differently: few splats at the border may differ.
     assert len(set(drawn) ^ set(np.flatnonzero(seen))) <= 3
     both = seen & np.isin(np.arange(len(splats)), drawn)
-    front_to_back = expected.sort_back_to_front(camera, both, order)[::-1]
+    front_to_back = expected.sort_back_to_front(camera, both, by_depth=not settings.is_exact)[::-1]
     shown = drawn[both[drawn]]
-    if order == "radial":
+    if settings.is_exact:
         assert np.array_equal(shown, front_to_back)
         assert np.array_equal(gpu[0]._gpu.read_order(), expected.order)
     else:  # the products of depths are rounded differently; those that coincide keep their order

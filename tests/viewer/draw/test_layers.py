@@ -78,9 +78,7 @@ def test_narrow_field_of_view_is_drawn_directly(make_renderer, random_scene, pos
 @pytest.mark.parametrize(
     "change",
     [
-        {"kernel": "ewa"},
-        {"order": "z"},
-        {"lowpass": "3dgs"},
+        {"preset": "3dgs"},
         {"mode": "view"},
         {"levels": frozenset({1, 2})},
         {"opacity_threshold": 0.5},

@@ -34,10 +34,10 @@ _DISABLED_EXTENSIONS = " ".join(
 
 
 def render_images(renderer, pose):
-    """Images of every kernel and layout, and one from cached faces."""
+    """Images of every preset and layout, and one from cached faces."""
     settings = {
-        f"{kernel} {layout}": DrawSettings(kernel=kernel, layout=layout, mode="deferred")
-        for kernel in ("ray", "ewa")
+        f"{preset} {layout}": DrawSettings(preset=preset, layout=layout, mode="deferred")
+        for preset in ("exact", "3dgs")
         for layout in ("pinhole", "equirect")
     }
     settings["cached"] = DrawSettings(cached=True)

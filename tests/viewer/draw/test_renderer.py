@@ -19,7 +19,7 @@ pytestmark = pytest.mark.gl
 SIZE = (64, 48)
 SETTINGS = DrawSettings(background=(0.1, 0.4, 0.7))
 RENDERERS = pytest.mark.parametrize("tier", ["auto", "cpu"])
-KERNELS = pytest.mark.parametrize("kernel", ["ray", "ewa"])
+PRESETS = pytest.mark.parametrize("preset", ["exact", "3dgs"])
 
 
 def select(scene, mask):
@@ -30,44 +30,40 @@ def select_view(scene, view):
     return select(scene, scene.gaussians.views == view)
 
 
-@KERNELS
-@pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
-@pytest.mark.parametrize("order", ["radial", "z"])
-def test_pinhole_image_equals_the_reference(random_scene, pose, assert_reference, kernel, lowpass, order):
-    settings = replace(SETTINGS, kernel=kernel, lowpass=lowpass, order=order, vertical_fov_degrees=65)
+@PRESETS
+def test_pinhole_image_equals_the_reference(random_scene, pose, assert_reference, preset):
+    settings = replace(SETTINGS, preset=preset, vertical_fov_degrees=65)
     assert_reference(random_scene(), pose, (97, 64), settings)
 
 
-@KERNELS
-def test_each_of_six_faces_equals_the_reference(random_scene, pose, assert_reference, kernel):
+@PRESETS
+def test_each_of_six_faces_equals_the_reference(random_scene, pose, assert_reference, preset):
     for face in face_poses(torch.from_numpy(pose)).numpy():
-        assert_reference(random_scene(seed=1), face, (48, 48), replace(SETTINGS, kernel=kernel))
+        assert_reference(random_scene(seed=1), face, (48, 48), replace(SETTINGS, preset=preset))
 
 
-@KERNELS
-@pytest.mark.parametrize("order", ["radial", "z"])
+@PRESETS
 @pytest.mark.parametrize("face_size", [None, 21])
-def test_stitched_panorama_equals_the_reference(random_scene, pose, assert_reference, kernel, order, face_size):
-    settings = replace(SETTINGS, kernel=kernel, order=order, layout="equirect", face_size=face_size)
+def test_stitched_panorama_equals_the_reference(random_scene, pose, assert_reference, preset, face_size):
+    settings = replace(SETTINGS, preset=preset, layout="equirect", face_size=face_size)
     assert_reference(random_scene(seed=2), pose, (96, 48), settings)
 
 
-@KERNELS
-@pytest.mark.parametrize("order", ["radial", "z"])
-def test_camera_among_large_gaussians_equals_the_reference(random_scene, pose, assert_reference, kernel, order):
-    settings = replace(SETTINGS, kernel=kernel, order=order, vertical_fov_degrees=110)
+@PRESETS
+def test_camera_among_large_gaussians_equals_the_reference(random_scene, pose, assert_reference, preset):
+    settings = replace(SETTINGS, preset=preset, vertical_fov_degrees=110)
     assert_reference(random_scene(150, size=0.5, seed=3), pose, SIZE, settings)
 
 
-@KERNELS
-def test_subpixel_needle_and_disc_gaussians_equal_the_reference(random_scene, pose, assert_reference, kernel):
+@PRESETS
+def test_subpixel_needle_and_disc_gaussians_equal_the_reference(random_scene, pose, assert_reference, preset):
     scene = random_scene(400, seed=4)
     scales = scene.gaussians.scales.clone()
     scales[:100] *= 0.01
     scales[100:200, 0] *= 30
     scales[200:300, 1] = 0
     scene = replace(scene, gaussians=replace(scene.gaussians, scales=scales))
-    assert_reference(scene, pose, (80, 60), replace(SETTINGS, kernel=kernel))
+    assert_reference(scene, pose, (80, 60), replace(SETTINGS, preset=preset))
 
 
 @RENDERERS
@@ -82,12 +78,12 @@ def test_colors_of_any_degree_follow_the_position(
         assert_matches(renderer, pose, SETTINGS, reference(scene, pose, SIZE, SETTINGS))
 
 
-@pytest.mark.parametrize("order", ["radial", "z"])
-def test_ties_are_drawn_in_the_order_of_indices(random_scene, pose, assert_reference, order):
+@PRESETS
+def test_ties_are_drawn_in_the_order_of_indices(random_scene, pose, assert_reference, preset):
     scene = random_scene(60, degree=0, size=0.15, seed=6)
     means = scene.gaussians.means[torch.arange(60) // 6 * 6]  # six of different colour at each position
     scene = replace(scene, gaussians=replace(scene.gaussians, means=means))
-    assert_reference(scene, pose, SIZE, replace(SETTINGS, order=order))
+    assert_reference(scene, pose, SIZE, replace(SETTINGS, preset=preset))
 
 
 def test_near_unusual_opacities_and_odd_sizes_equal_the_reference(random_scene, pose, assert_reference):
@@ -267,7 +263,7 @@ def test_culling_does_not_change_the_image(make_renderer, random_scene, pose, mo
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kernel": "surfel"}, "`kernel` must be one of ray, ewa, got 'surfel'"),
+        ({"preset": "surfel"}, "`preset` must be one of exact, 3dgs, got 'surfel'"),
         ({"vertical_fov_degrees": 180}, "between 0 and 180, got 180"),
         ({"face_size": 0}, "`face_size` must be at least 1"),
         ({"near": 0.0}, "`near` must be a positive distance"),

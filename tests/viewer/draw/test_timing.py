@@ -37,8 +37,8 @@ def test_lines_have_times_and_the_image_of_the_reference(run_job, random_scene, 
         "folder": str(tmp_path),
         "tiers": ["gl33", "gl43", "cpu"],
         "settings": [
-            {"kernel": "ray", "layout": "equirect", "face_size": 16},
-            {"kernel": "ewa", "order": "z", "lowpass": "3dgs"},
+            {"layout": "equirect", "face_size": 16},
+            {"mode": "deferred"},
             {"cached": True, "size": [64, 32]},
         ],
     }
@@ -62,7 +62,7 @@ def test_lines_have_times_and_the_image_of_the_reference(run_job, random_scene, 
 
 
 @pytest.mark.parametrize(
-    "content", ["{}", "no json", '{"scene": "none.ply", "pose": 0, "settings": [{"kernel": "x"}]}']
+    "content", ["{}", "no json", '{"scene": "none.ply", "pose": 0, "settings": [{"preset": "x"}]}']
 )
 def test_invalid_job_ends_with_one_line(run_job, content):
     status, output, errors = run_job(content)
