@@ -55,37 +55,48 @@ def splats(random_scene) -> Splats:
 
 
 @pytest.fixture
-def gpu(ctx, splats):
-    programs = Programs(ctx)
-    rasterizer = SplatRasterizer(ctx, programs, splats, "gl43")
+def target(ctx):
     target = ctx.simple_framebuffer((64, 48))
-    yield rasterizer, target
-    rasterizer.release()
-    programs.release()
+    yield target
     (ctx.screen or ctx.detect_framebuffer(0)).use()
     target.release()
 
 
-def draw(gpu, splats: Splats, camera: Pinhole, selected, settings: DrawSettings) -> np.ndarray:
-    """Indices of the splats that were drawn, front to back."""
-    rasterizer, target = gpu
+@pytest.fixture
+def make_rasterizer(ctx, splats):
+    programs, made = Programs(ctx), []
+
+    def make(tier: str = "gl43") -> SplatRasterizer:
+        made.append(SplatRasterizer(ctx, programs, splats, tier))
+        return made[-1]
+
+    yield make
+    for rasterizer in made:
+        rasterizer.release()
+    programs.release()
+
+
+def draw(rasterizer: SplatRasterizer, target, splats: Splats, camera: Pinhole, selected, settings: DrawSettings) -> int:
+    """Draw the selected splats to the cleared target; returns the number of those in view."""
     target.use()
+    target.clear()
     parts = [(camera, (0, 0, 64, 48))]
-    rasterizer.draw(target, parts, sort_splats(splats, camera.position), selected, None, settings)
-    gpu = rasterizer._gpu
-    assert isinstance(gpu, GpuSplats)
-    return np.frombuffer(gpu._visible.read(), np.uint32)[: rasterizer.take_drawn()]
+    drawn = rasterizer.draw(target, parts, sort_splats(splats, camera.position), selected, None, settings)
+    return drawn + rasterizer.take_drawn()
 
 
 @pytest.mark.parametrize("preset", ["exact", "3dgs"])
-def test_the_order_and_the_culling_are_the_processors(gpu, splats, pose, preset):
+def test_the_order_and_the_culling_are_the_processors(make_rasterizer, target, splats, pose, preset):
     camera = Pinhole(pose[:3, :3], tuple(pose[:3, 3]), 60.0, 64, 48)
     settings = DrawSettings(preset=preset)
     selected = np.arange(len(splats)) % 3 > 0
     variance = compute_filter_variance(settings, camera.focal)
     expected = sort_splats(splats, camera.position)
     seen = expected.cull(camera, selected, variance, bounded=settings.is_exact)
-    drawn = draw(gpu, splats, camera, selected, settings)
+    rasterizer = make_rasterizer()
+    count, gpu = draw(rasterizer, target, splats, camera, selected, settings), rasterizer._gpu
+    assert isinstance(gpu, GpuSplats)
+    drawn = np.frombuffer(gpu._visible.read(), np.uint32)[:count]
     assert 0 < len(drawn) < selected.sum() and set(drawn) <= set(np.flatnonzero(selected))
     # The bounds are conservative, and rounded differently: few splats at the border may differ.
     assert len(set(drawn) ^ set(np.flatnonzero(seen))) <= 3
@@ -94,7 +105,7 @@ def test_the_order_and_the_culling_are_the_processors(gpu, splats, pose, preset)
     shown = drawn[both[drawn]]
     if settings.is_exact:
         assert np.array_equal(shown, front_to_back)
-        assert np.array_equal(gpu[0]._gpu.read_order(), expected.order)
+        assert np.array_equal(gpu.read_order(), expected.order)
     else:  # the products of depths are rounded differently; those that coincide keep their order
         depth = (splats.means.astype(np.float64) @ camera.rotation[:, 2])[shown]
         assert (np.diff(depth) > -1e-5).all()
@@ -104,6 +115,19 @@ def test_the_order_and_the_culling_are_the_processors(gpu, splats, pose, preset)
         assert all(where[a] < where[b] for a, b in pairs)
 
 
-def test_no_selected_splat_draws_nothing_and_chunks_draw_all(gpu, splats, pose):
-    camera = Pinhole(pose[:3, :3], tuple(pose[:3, 3]), 60.0, 64, 48)
-    assert len(draw(gpu, splats, camera, np.zeros(len(splats), bool), DrawSettings())) == 0
+@pytest.mark.parametrize("tier", ["gl33", "gl43"])
+def test_splats_in_chunks_are_the_image_of_one_chunk_and_no_splat_is_none(
+    make_rasterizer, target, splats, pose, tier, monkeypatch
+):
+    camera, settings = Pinhole(pose[:3, :3], tuple(pose[:3, 3]), 60.0, 64, 48), DrawSettings()
+    everything, images, counts = np.ones(len(splats), bool), [], []
+    for size in (len(splats), 100):
+        monkeypatch.setattr("pansplat_viewer.draw.layers._CHUNK_SIZE", size)
+        rasterizer = make_rasterizer(tier)
+        counts.append(draw(rasterizer, target, splats, camera, everything, settings))
+        images.append(np.frombuffer(target.read(components=4), np.uint8))
+    assert counts[0] == counts[1] > 300, "more than three chunks"
+    assert images[0].max() > 100 and np.array_equal(*images)
+    nothing = DrawSettings(opacity_threshold=1.0)  # masks are kept by these settings
+    assert draw(rasterizer, target, splats, camera, ~everything, nothing) == 0
+    assert not np.frombuffer(target.read(components=4), np.uint8).any()
