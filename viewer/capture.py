@@ -1,7 +1,6 @@
 """Files that the viewer writes: screenshots, the fly-through of a pair, and films of tours and of camera paths."""
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -334,56 +333,6 @@ def write_path_film(
             write_image(written[-1], color, depth=depth, panorama=(projection, stereo) == ("equirect", "mono"))
     progress("done", 1.0)
     return written
-
-
-class FilmWriter:
-    """Writes one film at a time in a worker thread."""
-
-    def __init__(self) -> None:
-        """The thread starts with the first film."""
-        self._executor = ThreadPoolExecutor(1, "film-writer")
-        self._future: Future[list[Path]] | None = None
-        self._fraction, self._cancelled = 0.0, False
-
-    @property
-    def progress(self) -> float | None:
-        """Fraction of the film that is written; None if none is being written."""
-        return None if self._future is None else self._fraction
-
-    def start(self, write: Callable[[Callable[[str, float], None]], list[Path]]) -> None:
-        """Call `write` with a progress call in the thread; a film that is being written is cancelled."""
-        self.cancel()
-        self._fraction, self._cancelled = 0.0, False
-        self._future = self._executor.submit(write, self._report)
-
-    def poll(self) -> list[Path] | BaseException | None:
-        """The files or the exception of a film that is finished, once; None before, and if it was cancelled."""
-        if self._future is None or not self._future.done():
-            return None
-        future, self._future = self._future, None
-        error = future.exception()
-        return None if isinstance(error, _CancelledError) else error or future.result()
-
-    def cancel(self) -> None:
-        """End the film and wait for the thread; no incomplete film is left behind."""
-        self._cancelled = True
-        if self._future is not None:
-            wait([self._future])
-            self._future = None
-
-    def close(self) -> None:
-        """Cancel the film and end the thread."""
-        self.cancel()
-        self._executor.shutdown()
-
-    def _report(self, task: str, fraction: float) -> None:
-        if self._cancelled:
-            raise _CancelledError
-        self._fraction = fraction
-
-
-class _CancelledError(Exception):
-    """Raised from the progress call to end a film that was cancelled."""
 
 
 def name_frame(file: Path, frame: int) -> Path:

@@ -16,7 +16,6 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.tours import plan_route
 from pansplat_viewer.capture import (
-    FilmWriter,
     SceneFrames,
     TourFrames,
     find_free_name,
@@ -27,6 +26,7 @@ from pansplat_viewer.draw.cpu_renderer import CpuRenderer, create_renderer
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
 from pansplat_viewer.draw.stereo import StereoRenderer, choose_format, get_eye_size, render_image
 from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.background import BackgroundWorker, Report
 from pansplat_viewer.scene.key_frames import read_path, write_path
 from pansplat_viewer.scene.loader import LoadedScene, Progress, SceneEntry, SceneLoader
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
@@ -121,7 +121,7 @@ class Viewer:
         # Entries when the scene was loaded, its place among them, and their path.
         self._shown: tuple[list[SceneEntry], int, Path | None] | None = None
         self._refined: Scene | None = None
-        self._films = FilmWriter()
+        self._films: BackgroundWorker[list[Path]] = BackgroundWorker("film-writer")
         self._tour: TourScenes | None = None
         self._waiting = False
         self._last_camera = self.state.camera
@@ -143,7 +143,7 @@ class Viewer:
         """Whether the next frame differs without new input."""
         loading = self.loader.entry is not None or self.loader.is_searching or self._comparer.photographs.is_reading
         loading = loading or self._incoming is not None or self._preparer.progress is not None
-        return self.moving or loading or self._films.progress is not None
+        return self.moving or loading or self._films.future is not None
 
     @property
     def moving(self) -> bool:
@@ -423,7 +423,8 @@ class Viewer:
         data.photograph_distance = comparer.measure_distance(self.state)
         if comparer.error is not None:
             data.error, comparer.error = comparer.error, None
-        data.tour, data.film = self._tour, self._films.progress
+        film = self._films.progress
+        data.tour, data.film = self._tour, None if film is None else film[1]
         data.hotspots = []
         if self._tour is not None:
             if get_eye_size(size, self.state.settings.stereo) == size:
@@ -642,7 +643,7 @@ class Viewer:
         except (InputError, OSError) as error:
             self.panel_data.error = str(error)
         if commands.cancel_film:
-            self._films.cancel()
+            self._films.cancel(join=True)
 
     def _start_film(self, size: tuple[int, int]) -> None:
         """Write the film of the path in a worker thread, drawn on the processor, so that the window stays free."""
@@ -659,9 +660,9 @@ class Viewer:
         folder.mkdir(parents=True, exist_ok=True)
         file = find_free_name(folder, "path", state.film_suffix)
 
-        def write(progress: Callable[[str, float], None]) -> list[Path]:
+        def write(progress: Report) -> list[Path]:
             def load(entry: SceneEntry) -> LoadedScene:  # a film that is cancelled does not wait for a prediction
-                return self.loader.load(entry, lambda task, done: progress(task, self._films.progress or 0.0))
+                return self.loader.load(entry, lambda task, done: progress())
 
             renderers = [CpuRenderer(None) for _ in range(1 if tour is None else 2)]
             try:

@@ -1347,6 +1347,6 @@ def test_a_film_of_a_tour_is_cancelled_during_a_prediction(user, house, load_hou
     assert predicting.wait(60)
     timer = threading.Timer(5, go.set)
     timer.start()
-    user.viewer._films.cancel()
+    user.viewer._films.cancel(join=True)
     assert not go.is_set(), "it waited for the prediction"
     timer.cancel()

@@ -7,13 +7,13 @@ of the scene in the file. Imports no torch before it loads.
 
 import re
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pansplat.errors import InputError
 from pansplat.files import is_scene_file
+from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair, Panorama
@@ -208,27 +208,21 @@ def _load_tour_scene(
     return finish(scene, is_final=True)
 
 
-class _CancelledError(Exception):
-    """Raised from the progress call to end a load that was cancelled."""
-
-
 @dataclass
-class _Job:
+class _Request:
+    """An entry that is loaded.
+
+    Attributes:
+        preview: its prediction, which is being refined.
+        is_shown: whether `poll` has returned the prediction.
+    """
+
     entry: SceneEntry
-    future: "Future[LoadedScene] | Future[list[SceneEntry]] | None" = None
-    task: str = "starting"
-    fraction: float = 0.0
-    cancelled: bool = False
     preview: LoadedScene | None = None
     is_shown: bool = False
 
     def show(self, preview: LoadedScene) -> None:
         self.preview = preview
-
-    def report(self, task: str, fraction: float) -> None:
-        if self.cancelled:
-            raise _CancelledError
-        self.task, self.fraction = task, min(max(fraction, 0.0), 1.0)
 
 
 class SceneLoader:
@@ -237,21 +231,20 @@ class SceneLoader:
     def __init__(self, load: Callable[[SceneEntry, Progress, Callable[[LoadedScene], None]], LoadedScene]) -> None:
         """`load` loads one entry, such as `load_entry` with its options."""
         self._load = load
-        self._executor = ThreadPoolExecutor(thread_name_prefix="scene-loader")
-        self._job: _Job | None = None
-        self._search: _Job | None = None
+        self._loading: BackgroundWorker[LoadedScene] = BackgroundWorker("scene-loader")
+        self._searching: BackgroundWorker[list[SceneEntry]] = BackgroundWorker("scene-loader-search")
+        self._request: _Request | None = None
+        self._searched = ""
 
     def search(self, path: Path, find: Callable[[Path, Progress], list[SceneEntry]]) -> None:
         """Start to find the entries at a path. The request of an entry goes on."""
-        self.cancel_search()
-        self._search = _Job(SceneEntry(path.name or str(path)), task="looking for panoramas and scenes")
-        self._search.future = self._executor.submit(find, path, self._search.report)
+        self._searched = path.name or str(path)
+        self._searching.start(lambda report: find(path, report), "looking for panoramas and scenes")
 
     def request(self, entry: SceneEntry) -> None:
         """Start loading an entry."""
-        self.cancel()
-        self._job = _Job(entry)
-        self._job.future = self._executor.submit(self._load, entry, self._job.report, self._job.show)
+        request = self._request = _Request(entry)
+        self._loading.start(lambda report: self._load(entry, report, request.show))
 
     def load(self, entry: SceneEntry, progress: Progress) -> LoadedScene:
         """Load an entry in the calling thread, without regard to requests; `progress` may raise to end it."""
@@ -260,58 +253,54 @@ class SceneLoader:
     @property
     def is_searching(self) -> bool:
         """Whether entries are being looked for."""
-        return self._search is not None
+        return self._searching.future is not None
 
     @property
     def entry(self) -> SceneEntry | None:
         """The entry that is being loaded or refined; None if the loader is idle."""
-        return self._job.entry if self._job else None
+        return self._request.entry if self._request else None
 
     @property
     def progress(self) -> tuple[str, str, float] | None:
         """Name of the entry or path, task and fraction done; None if nothing is loading."""
-        job = self._search or self._job
-        return (job.entry.name, job.task, job.fraction) if job and not job.is_shown else None
+        if self._searching.progress is not None:
+            return self._searched, *self._searching.progress
+        if self._request is None or self._request.is_shown or self._loading.progress is None:
+            return None
+        return self._request.entry.name, *self._loading.progress
 
     @property
     def refinement(self) -> float | None:
         """Fraction of the refinement that is done; None if no scene is being refined."""
-        job = self._job
-        return max(2 * job.fraction - 1, 0.0) if job and job.is_shown else None
+        progress = self._loading.progress
+        return max(2 * progress[1] - 1, 0.0) if progress and self._request and self._request.is_shown else None
 
     def poll(self) -> LoadedScene | list[SceneEntry] | BaseException | None:
         """Return a prediction that is being refined, then the result or exception of the request, each once.
 
         Entries that are found come first. None while there is nothing new, or if there is no request.
         """
-        if self._search is not None and self._search.future is not None and self._search.future.done():
-            search, self._search = self._search.future, None
-            return search.exception() or search.result()
-        if self._job is None or self._job.future is None:
-            return None
-        if self._job.preview is not None and not self._job.is_shown:
-            self._job.is_shown = True
-            return self._job.preview
-        if not self._job.future.done():
-            return None
-        future, self._job = self._job.future, None
-        return future.exception() or future.result()
+        found = self._searching.poll()
+        if found is not None or self._request is None:
+            return found
+        if self._request.preview is not None and not self._request.is_shown:
+            self._request.is_shown = True
+            return self._request.preview
+        loaded = self._loading.poll()
+        if loaded is not None:
+            self._request = None
+        return loaded
 
     def cancel(self) -> None:
         """Cancel the request; its thread stops at its next progress call."""
-        if self._job is not None:
-            self._job.cancelled = True
-            self._job = None
+        self._loading.cancel()
+        self._request = None
 
     def cancel_search(self) -> bool:
         """Stop to look for entries; returns whether there was a search."""
-        search, self._search = self._search, None
-        if search is not None:
-            search.cancelled = True
-        return search is not None
+        return self._searching.cancel()
 
     def close(self) -> None:
         """Cancel the request and wait for all threads."""
-        self.cancel_search()
-        self.cancel()
-        self._executor.shutdown()
+        self._searching.close()
+        self._loading.close()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import moderngl
@@ -14,6 +13,7 @@ from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
 from pansplat_viewer.draw.stereo import StereoRenderer
+from pansplat_viewer.scene.background import BackgroundWorker
 from pansplat_viewer.scene.settings import DrawSettings
 
 _SMALL_SCENE = 100_000  # Gaussians; converted without a thread, because that takes less time than a frame
@@ -77,64 +77,46 @@ class SceneSlot:
         return self.renderer.stats.frame_ms
 
 
-class _StoppedError(Exception):
-    """Raised in the worker thread to end a conversion whose result is not needed."""
-
-
-@dataclass(eq=False)
-class _Preparation:
-    scene: Scene
-    future: Future[Any] | None = None
-    fraction: float = 0.0
-    stopped: bool = False
-
-    def report(self, fraction: float) -> None:
-        if self.stopped:
-            raise _StoppedError
-        self.fraction = max(self.fraction, fraction)
-
-
 class ScenePreparer:
     """Converts scenes for a renderer in a worker thread, one at a time, so that a window stays responsive."""
 
     def __init__(self, prepare: Callable[[Scene, Callable[[float], None]], Any]) -> None:
         """`prepare` is that of the renderer."""
         self._prepare = prepare
-        self._executor = ThreadPoolExecutor(1, "scene-preparer")
-        self._current: _Preparation | None = None
+        self._worker: BackgroundWorker[Any] = BackgroundWorker("scene-preparer")
+        self._scene: Scene | None = None
 
     @property
     def progress(self) -> float | None:
         """Fraction of the conversion that is done; None if there is none."""
-        current = self._current
-        return None if current is None or current.future is None or current.future.done() else current.fraction
+        future, progress = self._worker.future, self._worker.progress
+        return None if future is None or progress is None or future.done() else progress[1]
 
     def is_ready(self, scene: Scene) -> bool:
         """Whether `take` returns at once; starts the conversion of a large scene, in place of that of another one."""
         if len(scene.gaussians) <= _SMALL_SCENE:
             return True
-        if self._current is None or self._current.scene is not scene:
-            self.stop()
-            self._current = _Preparation(scene)
-            self._current.future = self._executor.submit(self._prepare, scene, self._current.report)
-        assert self._current.future is not None
-        return self._current.future.done()
+        if self._scene is not scene or self._worker.future is None:
+            self._scene = scene
+            self._worker.start(lambda report: self._prepare(scene, lambda done: report("", done)), "")
+        assert self._worker.future is not None
+        return self._worker.future.done()
 
     def take(self, scene: Scene) -> Any:
         """The converted scene, or its exception; None if it has not been converted."""
-        current = self._current
-        if current is None or current.scene is not scene or current.future is None:
+        future = self._worker.future
+        if self._scene is not scene or future is None:
             return None
-        self._current = None
-        return current.future.result()
+        self._scene = None
+        try:
+            return future.result()
+        finally:
+            self._worker.cancel()
 
     def stop(self) -> None:
         """End the conversion."""
-        if self._current is not None:
-            self._current.stopped = True
-        self._current = None
+        self._worker.cancel()
 
     def close(self) -> None:
         """End the conversion and wait for the thread."""
-        self.stop()
-        self._executor.shutdown()
+        self._worker.close()

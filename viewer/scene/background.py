@@ -1,0 +1,85 @@
+"""Work in a thread that reports its progress and can be cancelled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Generic, TypeVar
+
+Result = TypeVar("Result")
+Report = Callable[..., None]  # description of the work, fraction done
+
+
+class CancelledError(Exception):
+    """Raised from a report to end work whose result is not needed."""
+
+
+class _Task(Generic[Result]):
+    """Work that was started.
+
+    Attributes:
+        description, fraction: of the last report; the fraction of a description does not fall.
+        future: of the result.
+    """
+
+    def __init__(self, executor: ThreadPoolExecutor, work: Callable[[Report], Result], description: str) -> None:
+        self.description, self.fraction, self.is_cancelled = description, 0.0, False
+        self.future: Future[Result] = executor.submit(work, self.report)
+
+    def report(self, description: str | None = None, fraction: float = 0.0) -> None:
+        if self.is_cancelled:
+            raise CancelledError
+        if description is None:
+            return
+        before = self.fraction if description == self.description else 0.0
+        self.description, self.fraction = description, min(max(fraction, before), 1.0)
+
+
+class BackgroundWorker(Generic[Result]):
+    """Runs one piece of work at a time in a thread; a new one cancels the one before."""
+
+    def __init__(self, name: str) -> None:
+        """A thread with this name starts with the first work."""
+        self._executor = ThreadPoolExecutor(thread_name_prefix=name)
+        self._task: _Task[Result] | None = None
+
+    def start(self, work: Callable[[Report], Result], description: str = "starting") -> None:
+        """Call `work` in a thread with a function that takes a description and the fraction done.
+
+        This function raises `CancelledError` after the work is cancelled. Any thread may call it; without arguments it
+        keeps the progress.
+        """
+        self.cancel()
+        self._task = _Task(self._executor, work, description)
+
+    @property
+    def future(self) -> Future[Result] | None:
+        """The result of the work; None if there is none, or if `poll` has returned it."""
+        return None if self._task is None else self._task.future
+
+    @property
+    def progress(self) -> tuple[str, float] | None:
+        """Description and fraction done; None as for `future`."""
+        return None if self._task is None else (self._task.description, self._task.fraction)
+
+    def poll(self) -> Result | BaseException | None:
+        """The result or the exception of work that is finished, once; None before."""
+        if self._task is None or not self._task.future.done():
+            return None
+        future, self._task = self._task.future, None
+        return future.exception() or future.result()
+
+    def cancel(self, *, join: bool = False) -> bool:
+        """Make the work end at its next report; with `join`, wait for that. Returns whether there was work."""
+        task, self._task = self._task, None
+        if task is None:
+            return False
+        task.is_cancelled = True
+        if not task.future.cancel() and join:
+            wait([task.future])  # its result and error are not needed
+        return True
+
+    def close(self) -> None:
+        """Cancel the work and wait for the threads."""
+        self.cancel()
+        self._executor.shutdown()
