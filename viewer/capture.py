@@ -13,7 +13,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
 from pansplat.tours import Route, paint_floor_plan
-from pansplat_viewer.draw.cpu_renderer import Renderer
+from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.stereo import ImageFormat, render_image
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.camera import Camera
@@ -101,7 +101,7 @@ def compute_panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4
 
 
 def write_flythrough(
-    renderer: Renderer,
+    renderer: FrameRenderer,
     scene: Scene,
     folder: Path,
     film: Film,
@@ -158,7 +158,7 @@ class SceneFrames:
 
     def __init__(
         self,
-        renderer: Renderer,
+        renderer: FrameRenderer,
         scene: Scene,
         size: tuple[int, int],
         settings: DrawSettings,
@@ -187,7 +187,7 @@ class TourFrames:
 
     def __init__(
         self,
-        renderers: Sequence[Renderer],
+        renderers: Sequence[FrameRenderer],
         scenes: TourScenes,
         load: Callable[[SceneEntry], LoadedScene],
         size: tuple[int, int],
@@ -346,7 +346,7 @@ def to_bytes(color: Float[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "h
 
 
 def _render(
-    renderer: Renderer, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
+    renderer: FrameRenderer, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
 ) -> Float[np.ndarray, "height width 3"]:
     renderer.render(cam2world, size, settings, wait=True)
     return np.clip(renderer.read_color()[..., :3], 0.0, 1.0)

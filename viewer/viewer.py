@@ -132,7 +132,9 @@ class Viewer:
         return self._slot.renderer
 
     def _create_resolution(self) -> AdaptiveResolution:
-        return AdaptiveResolution(settle_after=self.renderer.settle_seconds, turn_ms=self.renderer.turn_ms)
+        return AdaptiveResolution(
+            settle_after=self.renderer.pacing.settle_seconds, turn_ms=self.renderer.pacing.turn_ms
+        )
 
     @property
     def _slot(self) -> SceneSlot:
@@ -472,7 +474,7 @@ class Viewer:
         moved = camera.position != self._last_camera.position
         turned = not moved and camera != self._last_camera
         self._last_camera = camera
-        self._resolution.limit(size, self.renderer.min_size)
+        self._resolution.limit(size, self.renderer.pacing.min_size)
         return self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
 
     def _try_to_draw(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
@@ -524,7 +526,7 @@ class Viewer:
         scale = plan.scale if settings.stereo == "mono" or not plan.cached else self._resolution.coarsest
         if not (plan.cached and slot.renderer.has_faces(cam2world, size, settings)):
             settings = replace(settings, scale=scale)
-        wait = plan.moving and slot.renderer.waits_while_moving
+        wait = plan.moving and slot.renderer.pacing.waits_while_moving
         milliseconds = slot.draw(cam2world, size, settings, wait=wait)
         slot.renderer.prefetch(cam2world, size, settings, scale)
         return milliseconds

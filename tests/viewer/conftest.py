@@ -22,7 +22,8 @@ from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import Rendering, rasterize
 from pansplat.tours import FloorOutline, TourGraph, merge_scenes
-from pansplat_viewer.draw.cpu_renderer import CpuRenderer, Renderer
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
@@ -68,8 +69,8 @@ def ctx(gl_context: moderngl.Context) -> Iterator[moderngl.Context]:
 
 
 @pytest.fixture(scope="session")
-def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, int], Renderer]]:
-    renderers: dict[tuple[str, int, int], Renderer] = {}
+def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, int], FrameRenderer]]:
+    renderers: dict[tuple[str, int, int], FrameRenderer] = {}
     yield renderers
     with gl_context:
         for renderer in renderers.values():
@@ -77,10 +78,10 @@ def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, in
 
 
 @pytest.fixture
-def make_renderer(ctx, _renderers) -> Callable[..., Renderer]:
+def make_renderer(ctx, _renderers) -> Callable[..., FrameRenderer]:
     """Returns a renderer with a newly uploaded scene; `tier` may be `cpu`, `slot` selects one of several."""
 
-    def get(scene: Scene, tier: str = "gl33", color_bits: int = 32, slot: int = 0) -> Renderer:
+    def get(scene: Scene, tier: str = "gl33", color_bits: int = 32, slot: int = 0) -> FrameRenderer:
         key = (tier, color_bits, slot)
         if key not in _renderers and tier == "cpu":
             _renderers[key] = CpuRenderer(ctx, exact=True)
@@ -159,7 +160,7 @@ def assert_matches() -> Callable[..., None]:
     """
 
     def check(
-        renderer: Renderer,
+        renderer: FrameRenderer,
         cam2world: np.ndarray,
         settings: DrawSettings,
         expected: Rendering,

@@ -23,6 +23,7 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.scene.loader import (
@@ -47,6 +48,7 @@ once = pytest.mark.parametrize("session", ["cpu"], indirect=True)  # does not de
 SIZE = (560, 900)
 IMAGE = (slice(20, 560), slice(310, 560))  # rows and columns without panels
 NAMES = ["first", "second"]
+SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_while_moving=True)
 
 # Widgets that must change the image, and the settings that give some of them something to change.
 IMAGE_WIDGETS = (
@@ -701,7 +703,7 @@ def test_focus_orbits_the_point_in_the_centre(user):
 
 def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
     user.viewer._resolution.budget_ms = 1e-3
-    monkeypatch.setattr(user.viewer.renderer, "min_size", (64, 64))
+    monkeypatch.setattr(user.viewer.renderer, "pacing", SMALL)
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
     user.draw_frames(8)
@@ -1023,7 +1025,7 @@ def tour_user(user, house, monkeypatch) -> User:
     user.show(SceneEntry(house.name, tour=house))
     user.settle()
     for slot in user.viewer._slots:
-        monkeypatch.setattr(slot.renderer, "min_size", (64, 64))
+        monkeypatch.setattr(slot.renderer, "pacing", SMALL)
     return user
 
 
@@ -1143,7 +1145,7 @@ def test_a_file_of_a_tour_is_flown_along_its_edges(user, house_file, monkeypatch
     assert first.gaussians.views.unique().tolist() == [0, 1], "only the views of the edge are blended"
     user.click_at(*user.panels.minimap.nodes[3])
     for slot in user.viewer._slots:
-        monkeypatch.setattr(slot.renderer, "min_size", (64, 64))
+        monkeypatch.setattr(slot.renderer, "pacing", SMALL)
     fly(user, seconds=0.5)
     assert find_node(user) == 3 and np.allclose(user.viewer._slot.scene.cam2world, user.state.context[2:])
     assert changed_fraction(before, user.read_image()) > 0.5

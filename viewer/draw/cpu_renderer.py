@@ -1,18 +1,16 @@
-"""Draws a scene's Gaussians on the processor, for machines without a GPU: `SplatRenderer`'s calls, other arithmetic.
+"""Draws a scene's Gaussians on the processor, for machines without a GPU.
 
 `CpuRenderer` rasterises with numba kernels in a worker thread and uploads the finished image as a texture. Turns are
-read from cube faces that are kept for the position; after an image without waiting the worker draws the missing faces.
+read from cube faces that are kept for the position.
 """
 
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError
-from concurrent.futures import wait as wait_for_all
+from concurrent.futures import Future, TimeoutError
 from dataclasses import dataclass, field, replace
 
 import moderngl
@@ -42,9 +40,11 @@ from pansplat.rendering.image_planes import ImagePlane, stitch_faces
 from pansplat.rendering.rasterize import RasterOptions
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.displays import color_by_property
+from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.layers import Frame, LayerStorage
 from pansplat_viewer.draw.renderer import SplatRenderer, choose_layer_weights, is_software
 from pansplat_viewer.draw.splats import Splats, drop_not_finite
+from pansplat_viewer.scene.background import BackgroundWorker, Report
 from pansplat_viewer.scene.camera import Pinhole, create_face_cameras
 from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
 
@@ -56,10 +56,6 @@ _SMALLER = "use a smaller size or face_size"
 _MAX_FACE_SETS = 5
 _MAX_SELECTIONS = 8
 _MAX_TEXTURES = 4
-
-
-class _StoppedError(Exception):
-    """Raised in the worker to end work whose result is not needed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,42 +118,11 @@ class _FaceSet:
         return [face for face in frame.find_parts_in_view() if face not in self.done]
 
 
-class _Job:
-    """Work in the worker thread that can be stopped."""
-
-    def __init__(self, work: Callable[[], _Picture | None]) -> None:
-        self._work, self._stopped = work, threading.Event()
-        self.future: Future[_Picture | None] = Future()
-
-    def run(self) -> _Picture | None:
-        """Do the work; ends with `_StoppedError` soon after `stop`."""
-        self.check()
-        with checking_each_item(self.check):
-            return self._work()
-
-    def stop(self) -> None:
-        """Make the work end at its next step."""
-        self._stopped.set()
-        self.future.cancel()
-
-    def check(self) -> None:
-        """Raise `_StoppedError` if the job is stopped."""
-        if self._stopped.is_set():
-            raise _StoppedError
-
-
 class CpuRenderer:
-    """Renders scenes of 3D Gaussians on the processor; the attributes and calls are those of `SplatRenderer`.
+    """Renders scenes of 3D Gaussians on the processor; see `FrameRenderer`."""
 
-    Attributes:
-        stats: counts and times of the last frame.
-        tier: `cpu`.
-    """
-
-    min_size = (640, 360)
-    settle_seconds = 0.02
-    turn_ms = 1000 / 60  # the worker draws the faces before a turn, so that reading them is always faster
-    waits_while_moving = True
+    # The worker draws the faces before a turn, so that reading them is always faster than 1/60 s.
+    pacing = Pacing(min_size=(640, 360), settle_seconds=0.02, turn_ms=1000 / 60, waits_while_moving=True)
 
     def __init__(self, ctx: moderngl.Context | None, *, exact: bool = False) -> None:
         """Create the renderer without a scene.
@@ -166,13 +131,11 @@ class CpuRenderer:
             ctx: the current context; without one, `render` returns no texture and `read_color` has the image.
             exact: continue behind a transmittance of 2^-10, which 8 bits do not show.
         """
-        self.tier = "cpu"
-        self.stats = FrameStats(tier=self.tier)
+        self.stats = FrameStats(tier="cpu")
         self._ctx = ctx
         self._min_transmittance = EXACT_TRANSMITTANCE if exact else MIN_TRANSMITTANCE
-        self._worker = ThreadPoolExecutor(1, "cpu-renderer")
-        self._jobs: list[_Job] = []
-        self._pending: tuple[Hashable, _Job] | None = None
+        self._worker: BackgroundWorker[_Picture | None] = BackgroundWorker("cpu-renderer")
+        self._pending: Hashable = None  # identifies the image that the worker draws
         self._splats: Splats | None = None
         self._scene: DisplayScene | None = None
         self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
@@ -184,11 +147,6 @@ class CpuRenderer:
         self._texture: moderngl.Texture | None = None
 
     @property
-    def num_views(self) -> int:
-        """Context views of the uploaded scene."""
-        return self._splats.num_views if self._splats is not None else 0
-
-    @property
     def pixels(self) -> UInt32[np.ndarray, "height width"] | None:
         """The last image as bytes, bottom row first; None before the first one."""
         return None if self._picture is None else self._picture.pixels
@@ -196,7 +154,7 @@ class CpuRenderer:
     @property
     def pending(self) -> Future[_Picture | None] | None:
         """The image that the worker draws; None if `render` has returned it, or waits for it."""
-        return None if self._pending is None else self._pending[1].future
+        return None if self._pending is None else self._worker.future
 
     def create_sibling(self) -> CpuRenderer:
         """A renderer that has this scene, without a copy."""
@@ -207,12 +165,7 @@ class CpuRenderer:
 
     @staticmethod
     def prepare(scene: Scene, report: Callable[[float], None] = lambda done: None) -> PreparedScene:
-        """Convert a scene for `upload`, in any thread.
-
-        Args:
-            scene: Gaussians with NaN or infinity are dropped and counted.
-            report: called with the fraction done, by any thread; an exception ends the work.
-        """
+        """See `FrameRenderer`."""
         gaussians = drop_not_finite(scene.gaussians, lambda done: report(0.2 * done))
         finite = replace(scene, gaussians=gaussians)
         splats = Splats.from_scene(finite, lambda done: report(0.2 + 0.4 * done), with_rows=False)
@@ -224,8 +177,8 @@ class CpuRenderer:
         return PreparedScene(splats, rows)
 
     def upload(self, scene: Scene, prepared: PreparedScene | None = None) -> None:
-        """Replace the scene; with `prepared`, made by `prepare`, this takes no time."""
-        self._stop_jobs()
+        """Replace the scene; with `prepared` this takes no time."""
+        self._stop()
         prepared = prepared or self.prepare(scene)
         self._splats, self._scene = prepared.splats, prepared.scene
         splats = prepared.splats
@@ -233,7 +186,7 @@ class CpuRenderer:
         self._selected = SelectionCache()
         self._faces.clear()
         self._picture = self._texture = self._colored = None
-        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
+        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier="cpu")
 
     def render(
         self,
@@ -243,22 +196,7 @@ class CpuRenderer:
         *,
         wait: bool = True,
     ) -> moderngl.Texture | None:
-        """Draw the scene and return the image's texture.
-
-        Args:
-            cam2world: rigid pose, OpenCV axes, metres.
-            size: (width, height) in pixels.
-            settings: draw settings.
-            wait: return this image. If False, return the last image while the worker draws; `stats.settled` is then
-                False, and the caller renders again until it is True. The worker then draws the cube faces.
-
-        Returns:
-            RGBA texture, as `SplatRenderer.render` returns it, with 8 bits per channel; None while the first image of
-            the scene is drawn.
-
-        Raises:
-            InputError: no scene is uploaded, or the size or a setting does not fit the scene.
-        """
+        """See `FrameRenderer`; the texture has 8 bits per channel."""
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
         if not settings.is_exact:
@@ -271,14 +209,13 @@ class CpuRenderer:
         if frame.storage == LayerStorage.PADDED_FACES:
             return self._show(self._read_from_faces(frame, groups))
         key = (frame.rotation.tobytes(), frame.world_position.tobytes(), frame.full_size, settings)
-        if self._pending is None or self._pending[0] != key:
-            self._stop_jobs()
-            self._pending = key, self._start(lambda: self._draw(frame, groups))
-            if not wait and settings.layout == "pinhole":
-                self._start_faces(frame, groups)
-        job = self._pending[1]
+        if self._pending != key:
+            self._stop()
+            self._start(lambda: self._draw(frame, groups))
+            self._pending = key
+        assert self._worker.future is not None
         try:
-            picture = job.future.result(None if wait else _POLL_SECONDS)
+            picture = self._worker.future.result(None if wait else _POLL_SECONDS)
         except TimeoutError:
             self.stats = replace(self.stats, settled=False, frame_ms=0.0)
             return self._texture
@@ -312,7 +249,7 @@ class CpuRenderer:
 
         With `everywhere`, it draws the faces of all directions.
         """
-        if any(not job.future.done() for job in self._jobs):
+        if self._worker.future is not None and not self._worker.future.done():
             return
         assert self._splats is not None
         pose, work = np.asarray(cam2world, dtype=np.float64), []
@@ -340,41 +277,29 @@ class CpuRenderer:
 
     def release(self) -> None:
         """Stop the worker thread and free the textures."""
-        self._stop_jobs()
-        self._worker.shutdown(cancel_futures=True)
+        self._worker.close()
         for texture in self._textures.values():
             texture.release()
         self._textures.clear()
 
     # --- the worker ---
 
-    def _start(self, work: Callable[[], _Picture | None]) -> _Job:
-        job = _Job(work)
-        job.future = self._worker.submit(job.run)
-        self._jobs = [*(other for other in self._jobs if not other.future.done()), job]
-        return job
+    def _start(self, work: Callable[[], _Picture | None]) -> Future[_Picture | None]:
+        """Let the worker do this work, after `_stop`."""
 
-    def _stop_jobs(self) -> None:
+        def run(report: Report) -> _Picture | None:
+            report()
+            with checking_each_item(report):
+                return work()
+
+        self._worker.start(run)
+        assert self._worker.future is not None
+        return self._worker.future
+
+    def _stop(self) -> None:
         """Stop all work and wait until it has stopped."""
-        for job in self._jobs:
-            job.stop()
-        wait_for_all([job.future for job in self._jobs])  # their results and errors are not needed
-        self._jobs.clear()
+        self._worker.cancel(join=True)
         self._pending = None
-
-    def _start_faces(self, frame: Frame, groups: _Groups) -> None:
-        """Let the worker draw the faces of this position, those in view first."""
-        frame = replace(frame, settings=replace(frame.settings, cached=True))
-        if frame.storage != LayerStorage.PADDED_FACES:
-            return
-        stored = self._find_face_set(frame)
-        order = dict.fromkeys([*frame.find_parts_in_view(), *range(6)])
-
-        def draw_faces() -> None:
-            for face in order:
-                self._draw_face(frame, groups, stored, face)
-
-        self._start(draw_faces)
 
     # --- drawing ---
 
@@ -485,13 +410,13 @@ class CpuRenderer:
         missing = stored.find_missing(frame)
         drawn, stages = 0, {}
         if missing:
-            self._stop_jobs()
+            self._stop()
 
             def draw_missing() -> None:
                 nonlocal drawn
                 drawn = sum(self._draw_face(frame, groups, stored, face) for face in missing)
 
-            self._start(draw_missing).future.result()
+            self._start(draw_missing).result()
             stages["faces"] = 1e3 * (time.perf_counter() - start)
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
@@ -534,7 +459,7 @@ class CpuRenderer:
             drawn=drawn,
             sort_ms=stages.get("sort", 0.0),
             frame_ms=frame_ms,
-            tier=self.tier,
+            tier="cpu",
             stages=stages,
             size=frame.size,
         )
@@ -574,9 +499,6 @@ class CpuRenderer:
         return _blend(picture.frame.settings, picture.groups, picture.sums)
 
 
-Renderer = SplatRenderer | CpuRenderer
-
-
 def choose_renderer(ctx: moderngl.Context | None, choice: RendererChoice) -> RendererChoice:
     """Return `gl` or `cpu`; `auto` is `cpu` where there is no OpenGL or OpenGL is software."""
     if choice == "auto":
@@ -586,7 +508,7 @@ def choose_renderer(ctx: moderngl.Context | None, choice: RendererChoice) -> Ren
 
 def create_renderer(
     ctx: moderngl.Context | None, choice: RendererChoice = "auto", *, color_bits: int | None = None
-) -> Renderer:
+) -> SplatRenderer | CpuRenderer:
     """Create the renderer of this choice; `color_bits` is for `gl`."""
     if choose_renderer(ctx, choice) == "cpu":
         return CpuRenderer(ctx)

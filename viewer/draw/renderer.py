@@ -20,6 +20,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.pose import blend_weights
 from pansplat_viewer.draw.color_maps import create_table_texture
+from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
 from pansplat_viewer.draw.programs import COUNT_STEP, Programs, choose_tier, set_uniforms
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
@@ -42,23 +43,16 @@ _COLOR_MAP_UNIT = 8  # texture unit, after those of the layers
 
 
 class SplatRenderer:
-    """Renders scenes of 3D Gaussians on an OpenGL 3.3 or 4.3 context.
+    """Renders scenes of 3D Gaussians on an OpenGL 3.3 or 4.3 context; see `FrameRenderer`.
 
     Each call leaves blending disabled and restores the framebuffer binding.
 
     Attributes:
         stats: counts and times of the last frame.
         tier: `gl33` or `gl43`; both draw the same image.
-        min_size: the window's image is not drawn at a lower resolution while the camera moves, pixels.
-        settle_seconds: after the last movement, until the image is drawn at full resolution.
-        turn_ms: time of a full image above which turns read cached faces.
-        waits_while_moving: whether a window waits for the image of each position.
     """
 
-    min_size = (1, 1)
-    settle_seconds = SETTLE_AFTER
-    turn_ms = BUDGET_MS
-    waits_while_moving = False
+    pacing = Pacing(min_size=(1, 1), settle_seconds=SETTLE_AFTER, turn_ms=BUDGET_MS, waits_while_moving=False)
 
     def __init__(
         self,
@@ -97,15 +91,6 @@ class SplatRenderer:
         self._frame: Frame | None = None
         self._image: Target | None = None
 
-    @property
-    def pending(self) -> None:
-        """No image is drawn in the background."""
-
-    @property
-    def num_views(self) -> int:
-        """Context views of the uploaded scene."""
-        return self._splats.num_views if self._splats is not None else 0
-
     def create_sibling(self) -> SplatRenderer:
         """A renderer with a copy of this scene on the GPU."""
         sibling = SplatRenderer(self._ctx, tier=self.tier, color_bits=self._targets.color_bits)
@@ -116,10 +101,7 @@ class SplatRenderer:
     prepare = staticmethod(Splats.from_scene)
 
     def upload(self, scene: Scene, prepared: Splats | None = None) -> None:
-        """Replace the scene on the GPU; `prepare` converts it before, in any thread.
-
-        Gaussians with NaN or infinity are dropped and counted.
-        """
+        """Replace the scene on the GPU."""
         self._upload(prepared or self.prepare(scene))
 
     def _upload(self, splats: Splats) -> None:
@@ -136,22 +118,7 @@ class SplatRenderer:
         *,
         wait: bool = True,
     ) -> moderngl.Texture:
-        """Draw the scene and return the image's texture.
-
-        Args:
-            cam2world: rigid pose, OpenCV axes, metres.
-            size: (width, height) in pixels.
-            settings: draw settings.
-            wait: sort for this position first. If False, draw at once with the last order while a worker thread sorts;
-                `stats.settled` is then False, and the caller renders again until it is True.
-
-        Returns:
-            RGBA texture: colour over the background, and coverage. Row 0 is the bottom row, so the texture is upright
-            when drawn as any OpenGL texture. The next call overwrites its content.
-
-        Raises:
-            InputError: no scene is uploaded, or the size or a setting does not fit the scene or the GPU.
-        """
+        """See `FrameRenderer`; without `wait`, a worker thread sorts for the position."""
         start = time.perf_counter()
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
@@ -170,15 +137,6 @@ class SplatRenderer:
             self.stats, settled=settled, drawn=drawn, frame_ms=1e3 * (time.perf_counter() - start)
         )
         return image.color
-
-    def has_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> bool:
-        """Whether faces of this resolution are kept while coarser ones are drawn: never, see `CpuRenderer`."""
-        return False
-
-    def prefetch_faces(
-        self, cam2world: np.ndarray, size: tuple[int, int], settings: list[DrawSettings], *, everywhere: bool = False
-    ) -> None:
-        """Draw no faces in advance: the GPU has no worker thread."""
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,9 +22,10 @@ from pansplat.geometry.cubemap import FACES
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.options import EYE_DISTANCE
 from pansplat.rendering.image_planes import image_planes
-from pansplat_viewer.draw.cpu_renderer import CpuRenderer, Renderer
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.programs import Programs, set_uniforms
-from pansplat_viewer.draw.renderer import bind
+from pansplat_viewer.draw.renderer import SplatRenderer, bind
 from pansplat_viewer.scene.settings import DrawSettings, FrameStats, Preset, Projection, Stereo
 
 # Places of the faces in an image of three columns and two rows: layout 0 of the spherical metadata, version 2.
@@ -89,7 +91,7 @@ def choose_format(projection: Projection, settings: DrawSettings) -> ImageFormat
 
 
 def render_image(
-    renderer: Renderer | StereoRenderer,
+    renderer: FrameRenderer,
     cam2world: Float[np.ndarray, "4 4"],
     size: tuple[int, int],
     settings: DrawSettings,
@@ -143,7 +145,7 @@ def move_eye(cam2world: Float[np.ndarray, "4 4"], offset: float) -> Float[np.nda
 
 
 def _render_eye(
-    renderer: Renderer | StereoRenderer,
+    renderer: FrameRenderer,
     cam2world: np.ndarray,
     size: tuple[int, int],
     settings: DrawSettings,
@@ -216,16 +218,17 @@ def _join_sizes(eye_size: tuple[int, int], stereo: Stereo) -> tuple[int, int]:
 
 
 class StereoRenderer:
-    """A renderer of images for one or two eyes, with the calls of the renderer that it is made of.
+    """A `FrameRenderer` of images for one or two eyes over another one.
 
     The second eye has a renderer of its own, made at the first stereo image. While `settings.cached`, the eyes stay
     where they are in the faces, until the camera has turned by `MAX_TURN`; then they move to where they belong.
     `prefetch` draws the faces of these places before.
     """
 
-    def __init__(self, renderer: Renderer, ctx: moderngl.Context | None) -> None:
+    def __init__(self, renderer: SplatRenderer | CpuRenderer, ctx: moderngl.Context | None) -> None:
         """Take over a renderer; `ctx` is its context."""
         self._eyes = [renderer]
+        self.pacing = renderer.pacing
         self._ctx = ctx
         self._programs: Programs | None = None
         self._triangle: moderngl.VertexArray | None = None
@@ -235,9 +238,15 @@ class StereoRenderer:
         self._stereo: Stereo = "mono"
         self._last: moderngl.Texture | None = None
 
-    def __getattr__(self, name: str) -> Any:
-        """Attributes of the renderer of the left eye."""
-        return getattr(self._eyes[0], name)
+    @property
+    def prepare(self) -> Callable[[Scene, Callable[[float], None]], Any]:
+        """That of the renderer."""
+        return self._eyes[0].prepare
+
+    @property
+    def _cpu_eyes(self) -> list[CpuRenderer]:
+        """The renderers, if they draw on the processor and so in the background."""
+        return [eye for eye in self._eyes if isinstance(eye, CpuRenderer)]
 
     @property
     def stats(self) -> FrameStats:
@@ -259,7 +268,7 @@ class StereoRenderer:
     @property
     def pending(self) -> Future[Any] | None:
         """The image of an eye that is being drawn in the background; None if there is none."""
-        eyes = self._eyes[:1] if self._stereo == "mono" else self._eyes
+        eyes = self._cpu_eyes[: 1 if self._stereo == "mono" else 2]
         return next((eye.pending for eye in eyes if eye.pending is not None), None)
 
     def upload(self, scene: Scene, prepared: Any = None) -> None:
@@ -295,25 +304,26 @@ class StereoRenderer:
             eye.render(pose, eye_size, eye_settings, wait=wait or self._last is None)
             for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings, self._axis), strict=True)
         ]
-        if self._last is None or self.stats.settled or not self._eyes[0].waits_while_moving:
+        if self._last is None or self.stats.settled or not self.pacing.waits_while_moving:
             self._last = self._arrange(textures, settings.stereo)
         return self._last  # the images of the processor's renderers that are not finished are those of another frame
 
     def has_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> bool:
-        """Whether the cube faces that the eyes read are finished."""
+        """Whether the cube faces that the eyes read are finished on the processor."""
         if settings.stereo == "mono":
-            return self._eyes[0].has_faces(cam2world, size, settings)
-        if len(self._eyes) == 1 or self._axis is None:
+            return any(eye.has_faces(cam2world, size, settings) for eye in self._cpu_eyes[:1])
+        if len(self._cpu_eyes) < 2 or self._axis is None:
             return False
         return self._has_faces(self._choose_axis(cam2world, size, settings), cam2world, size, settings)
 
     def draw_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
         """Draw the cube faces of all directions in the background, for the next turn."""
         if settings.stereo == "mono":
-            self._eyes[0].prefetch_faces(cam2world, size, [settings], everywhere=True)
-        elif self._axis is not None and len(self._eyes) == 2:
+            for eye in self._cpu_eyes[:1]:
+                eye.prefetch_faces(cam2world, size, [settings], everywhere=True)
+        elif self._axis is not None and len(self._cpu_eyes) == 2:
             eye_size, eye_settings = get_eye_size(size, settings.stereo), [replace(settings, stereo="mono")]
-            for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings, self._axis), strict=True):
+            for eye, pose in zip(self._cpu_eyes, self._place_eyes(cam2world, settings, self._axis), strict=True):
                 eye.prefetch_faces(pose, eye_size, eye_settings, everywhere=True)
 
     def prefetch(
@@ -327,7 +337,7 @@ class StereoRenderer:
         """
         if settings.stereo == "mono" or not settings.cached or self._axis is None:
             return
-        if len(self._eyes) == 1 or not isinstance(self._eyes[0], CpuRenderer):
+        if len(self._cpu_eyes) < 2:
             return
         right = cam2world[:3, 0]
         across = right - (right @ self._axis) * self._axis
@@ -339,7 +349,7 @@ class StereoRenderer:
             self._following = following
         eye_size, settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono", scale=1.0)
         turned = _turn(cam2world, right, self._following)
-        for eye, pose in zip(self._eyes, self._place_eyes(turned, settings, self._following), strict=True):
+        for eye, pose in zip(self._cpu_eyes, self._place_eyes(turned, settings, self._following), strict=True):
             eye.prefetch_faces(pose, eye_size, [replace(settings, scale=scale), settings])
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
@@ -399,7 +409,7 @@ class StereoRenderer:
         """Whether the faces that the eyes on an axis read are finished."""
         eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
         poses = self._place_eyes(cam2world, settings, axis)
-        return all(eye.has_faces(pose, eye_size, eye_settings) for eye, pose in zip(self._eyes, poses, strict=True))
+        return all(eye.has_faces(pose, eye_size, eye_settings) for eye, pose in zip(self._cpu_eyes, poses, strict=True))
 
     def _place_eyes(
         self, cam2world: np.ndarray, settings: DrawSettings, axis: Float[np.ndarray, "3"]
@@ -414,8 +424,8 @@ class StereoRenderer:
         left, right = textures
         if self._ctx is None or left is None or right is None:
             return None
-        first, second = self._eyes
-        if isinstance(first, CpuRenderer) and isinstance(second, CpuRenderer):
+        if self._cpu_eyes:
+            first, second = self._cpu_eyes
             return self._arrange_pixels(first.pixels, second.pixels, stereo)
         bound = self._ctx.fbo
         target = self._get_target(left.size, stereo, left.dtype)

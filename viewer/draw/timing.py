@@ -29,8 +29,8 @@ import numpy as np
 
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import load_ply
-from pansplat.gaussians.scene import Scene
-from pansplat_viewer.draw.cpu_renderer import CpuRenderer, Renderer
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
 from pansplat_viewer.draw.programs import choose_tier
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
@@ -69,9 +69,10 @@ def run_job(job: dict[str, Any]) -> Iterator[dict[str, object]]:
             except InputError:
                 continue
             try:
+                renderer.upload(scene)
                 for index, (each, size) in enumerate(zip(settings, sizes, strict=True)):
                     file = Path(job["folder"]) / f"{tier}_{index}.npy"
-                    measured = _measure(renderer, scene, pose, size, each, job["repeats"], file)
+                    measured = _measure(renderer, pose, size, each, job["repeats"], file)
                     device = "numba" if tier == "cpu" else ctx.info["GL_RENDERER"]
                     yield {"tier": tier, "settings": index, "renderer": device, **measured}
             finally:
@@ -86,8 +87,7 @@ def _create_gl_renderer(ctx: moderngl.Context, tier: str) -> SplatRenderer:
 
 
 def _measure(
-    renderer: Renderer,
-    scene: Scene,
+    renderer: FrameRenderer,
     pose: np.ndarray,
     size: tuple[int, int],
     settings: DrawSettings,
@@ -95,8 +95,6 @@ def _measure(
     file: Path,
 ) -> dict[str, object]:
     """Render along a short path, or turn, to the pose, and write the last image."""
-    if renderer.num_views == 0:
-        renderer.upload(scene)
     frames: list[float] = []
     stages: list[Mapping[str, float]] = []
     for index in range(repeats, -1, -1):

@@ -109,6 +109,7 @@ def test_without_waiting_the_last_image_is_shown_until_the_new_one_is_finished(r
         return changed
 
     wait_until(render, "image of the new pose")
+    renderer.prefetch_faces(turned, SIZE, [SETTINGS], everywhere=True)
     wait_until(
         lambda: all(renderer.has_faces(each, SIZE, SETTINGS) for each in (pose, turned)), "faces in every direction"
     )

@@ -228,6 +228,6 @@ def test_images_of_both_eyes_are_shown_when_both_are_finished(stereo_renderer, r
         expected = render_image(stereo_renderer, place, size, settings, ImageFormat("perspective", "anaglyph", 0.2))[0]
         assert texture.size == size and np.abs(shown[..., :3].clip(0, 1) - expected).max() < 0.003
     stereo_renderer.upload(random_scene(seed=1))
-    assert stereo_renderer.num_views == 2 and len(stereo_renderer._eyes) == 1
+    assert stereo_renderer.stats.total == 300 and len(stereo_renderer._eyes) == 1
     with pytest.raises(InputError, match="stereo of a window is perspective"):
         stereo_renderer.render(pose, (48, 24), replace(settings, layout="equirect"))

@@ -1,0 +1,92 @@
+"""The calls that all renderers have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import moderngl
+import numpy as np
+from jaxtyping import Float
+
+from pansplat.gaussians.scene import Scene
+from pansplat_viewer.scene.settings import DrawSettings, FrameStats
+
+
+@dataclass(frozen=True)
+class Pacing:
+    """How a window draws with a renderer while the camera moves.
+
+    Attributes:
+        min_size: the image is not drawn at a lower resolution (width, height), pixels.
+        settle_seconds: after the last movement, until the image is drawn at full resolution.
+        turn_ms: time of a full image above which turns read cached faces.
+        waits_while_moving: whether a window waits for the image of each position.
+    """
+
+    min_size: tuple[int, int]
+    settle_seconds: float
+    turn_ms: float
+    waits_while_moving: bool
+
+
+class FrameRenderer(Protocol):
+    """Draws images of one scene: `SplatRenderer` (OpenGL), `CpuRenderer`, and `StereoRenderer` over one of them."""
+
+    pacing: Pacing
+
+    @property
+    def stats(self) -> FrameStats:
+        """Counts and times of the last frame."""
+        ...
+
+    @property
+    def prepare(self) -> Callable[[Scene, Callable[[float], None]], Any]:
+        """A function that converts a scene for `upload`, in any thread.
+
+        It reports the fraction done, from any thread; an exception of the report ends the work. Gaussians with NaN or
+        infinity are dropped and counted.
+        """
+        ...
+
+    def upload(self, scene: Scene, prepared: Any = None) -> None:
+        """Replace the scene, which `prepare` may have converted before; if this fails, the scene before is kept."""
+
+    def render(
+        self,
+        cam2world: Float[np.ndarray, "4 4"],
+        size: tuple[int, int],
+        settings: DrawSettings,
+        *,
+        wait: bool = True,
+    ) -> moderngl.Texture | None:
+        """Draw the scene and return the image's texture.
+
+        Args:
+            cam2world: rigid pose, OpenCV axes, metres.
+            size: (width, height) in pixels.
+            settings: draw settings.
+            wait: finish this image. If False, return at once what there is: an image with the order of the last
+                position (OpenGL), or the last image (processor). `stats.settled` is then False, and the caller renders
+                again until it is True.
+
+        Returns:
+            RGBA texture: colour over the background, and coverage. Row 0 is the bottom row, so the texture is upright
+            when drawn as any OpenGL texture. The next call overwrites its content. None while the processor draws the
+            first image of a scene, and without a context.
+
+        Raises:
+            InputError: no scene is uploaded, or the size or a setting does not fit the scene or the renderer.
+        """
+
+    def read_color(self) -> Float[np.ndarray, "height width 4"]:
+        """Return the last image, float32, top row first: RGB over the background, and coverage."""
+        ...
+
+    def read_depth(self) -> Float[np.ndarray, "height width"]:
+        """Return the radial depth of the last image in metres, float32, top row first; 0 where nothing is drawn."""
+        ...
+
+    def release(self) -> None:
+        """Stop the threads and free every GL object."""
