@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import EDGE_HYSTERESIS, Edge, FloorOutline, Route, TourGraph, Views, plan_route
+from pansplat.tours import Edge, FloorOutline, Route, TourGraph, Views, choose_camera_height, plan_route
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
@@ -23,7 +23,6 @@ DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
 _NEXT_SCENES = 3  # that are predicted before they are needed
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor
 _MIN_HOTSPOT_PIXELS = 14.0
-_CAMERA_HEIGHT = 0.15  # over the floor, as a fraction of far, if no floor outline is known
 
 
 class TourScenes:
@@ -104,11 +103,7 @@ class TourScenes:
     def move(self, position: Float[np.ndarray, "3"], route: Route | None = None, fraction: float = 0.0) -> None:
         """Choose the edge of a camera position, or of a fraction of a route that is being flown."""
         edge = None if route is None else route.edge(fraction)
-        if edge is None:
-            edge, distance = self.tour.find_nearest_edge(position)
-            if self.tour.measure_distance(self.edge, position) <= distance + EDGE_HYSTERESIS:
-                edge = self.edge
-        self.edge = edge
+        self.edge = edge or self.tour.follow_edge(position, self.edge)
 
     def list_next(self, route: Route | None, fraction: float) -> list[Views]:
         """The scenes to have in memory, the most urgent first: that of the camera, then those that are next.
@@ -152,7 +147,7 @@ class TourScenes:
     def plan_route(self, camera: Float[np.ndarray, "4 4"], remaining: Sequence[int] = ()) -> Route:
         """A route from a pose through the remaining panoramas; without any, through all of them."""
         if remaining:
-            walk = [*self._find_walk(camera[:3, 3], remaining[0]), *remaining[1:]]
+            walk = [*self.tour.find_way(camera[:3, 3], remaining[0]), *remaining[1:]]
         else:
             edge, _ = self.tour.find_nearest_edge(camera[:3, 3])
             distances = np.linalg.norm(self.tour.positions[list(edge)] - camera[:3, 3], axis=1)
@@ -161,27 +156,12 @@ class TourScenes:
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
         """A route from a pose to a panorama."""
-        return plan_route(self.tour, self._find_walk(camera[:3, 3], node), camera)
-
-    def _find_walk(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
-        """The panoramas on the way from a position to one of them.
-
-        It begins at that end of the nearest edge which is on the way. `edge` can be another one: after a jump of the
-        camera, or where two edges are about as near.
-        """
-        nearest, _ = self.tour.find_nearest_edge(position)
-
-        def measure(walk: list[int]) -> float:
-            places = [position, *self.tour.positions[walk]]
-            return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
-
-        return min((self.tour.find_walk(end, node) for end in nearest), key=measure)
+        return plan_route(self.tour, self.tour.find_way(camera[:3, 3], node), camera)
 
     @property
     def camera_height(self) -> float:
         """Height of the cameras over the floor, metres."""
-        heights = [outline.camera_height for outline in self.outlines.values()]
-        return float(np.median(heights)) if heights else _CAMERA_HEIGHT * self.tour.far
+        return choose_camera_height((outline.camera_height for outline in self.outlines.values()), self.tour.far)
 
 
 def measure_bytes(scene: Scene) -> int:
