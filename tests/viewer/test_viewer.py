@@ -21,9 +21,11 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.rendering.cpu.display import DisplayScene
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
+from pansplat_viewer.draw.layers import SplatRasterizer
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.scene.loader import (
@@ -821,26 +823,32 @@ def test_a_search_and_a_prediction_can_be_cancelled(user, monkeypatch):
     assert changed_fraction(before, user.read_image()) == 0
 
 
-@once
 def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, small_scene, monkeypatch):
-    before, renderer = user.read_image(), user.viewer.renderer
-    upload = type(renderer).upload
+    before, allocate = user.read_image(), SplatRasterizer._allocate
+    twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
 
-    def refuse(self, scene, prepared=None):
-        if len(scene.gaussians) > 400:
+    def refuse(self, splats):
+        if len(splats) == len(twice.gaussians):
+            raise moderngl.Error("too many")
+        allocate(self, splats)
+
+    def refuse_rows(means, *arguments):
+        if len(means) == len(twice.gaussians):
             raise MemoryError("too many")
-        upload(self, scene)
+        return DisplayScene(means, *arguments)
 
-    monkeypatch.setattr(type(renderer), "upload", refuse)
+    monkeypatch.setattr(SplatRasterizer, "_allocate", refuse)
+    monkeypatch.setattr("pansplat_viewer.draw.cpu_renderer.DisplayScene", refuse_rows)
+    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, twice))
     user.show(SceneEntry("large"))
-    assert "the memory is exhausted" in user.data.error and user.data.reduced == len(small_scene.gaussians) // 4
+    assert "the memory is exhausted" in user.data.error and user.data.reduced == len(small_scene.gaussians) // 2
     assert user.data.entries == ["large"]
     user.click("OK")
     assert changed_fraction(before, user.read_image()) == 0 and user.data.entries == NAMES, "the scene before is kept"
     user.show(SceneEntry("large again"))
     user.click("Reduce")
     after = user.read_image()
-    assert user.data.error is None and len(user.viewer._slot.scene.gaussians) == 300
+    assert user.data.error is None and len(user.viewer._slot.scene.gaussians) == 600
     assert user.data.entries == ["large again"]
     assert changed_fraction(before, after) > 0.02
     assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"

@@ -14,7 +14,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Bool
 
-from pansplat_viewer.draw.programs import DIGITS, TILE_SIZE, Programs, set_uniforms
+from pansplat_viewer.draw.programs import DIGITS, TILE_SIZE, Programs, Resources, set_uniforms
 from pansplat_viewer.scene.camera import Pinhole
 from pansplat_viewer.scene.settings import DrawSettings
 
@@ -35,20 +35,20 @@ def count_groups(count: int, size: int) -> int:
 class RadixSort:
     """A stable sort of 32-bit keys with 32-bit values, by digits of log2 DIGITS bits from the lowest on."""
 
-    def __init__(self, ctx: moderngl.Context, programs: Programs, capacity: int) -> None:
+    def __init__(self, ctx: moderngl.Context, programs: Programs, resources: Resources, capacity: int) -> None:
         """Allocate the buffers.
 
         Args:
             ctx: the current context, OpenGL 4.3.
             programs: of the context.
+            resources: that the buffers belong to.
             capacity: largest number of keys.
         """
-        self._ctx, self._programs, self._capacity = ctx, programs, capacity
-        size = 4 * max(capacity, 1)
-        self.keys, self.values = ctx.buffer(reserve=size), ctx.buffer(reserve=size)
-        self._spare = ctx.buffer(reserve=size), ctx.buffer(reserve=size)
-        self._counts = ctx.buffer(reserve=4 * DIGITS * max(count_groups(capacity, TILE_SIZE), 1))
-        self._total = ctx.buffer(reserve=4)
+        self._ctx, self._programs = ctx, programs
+        size, keep = 4 * max(capacity, 1), resources.keep
+        self.keys, self.values, *self._spare = (keep(ctx.buffer(reserve=size)) for _ in range(4))
+        self._counts = keep(ctx.buffer(reserve=4 * DIGITS * max(count_groups(capacity, TILE_SIZE), 1)))
+        self._total = keep(ctx.buffer(reserve=4))
 
     def sort(self, count: int) -> None:
         """Sort the first `count` of `keys` in ascending order, and `values` with them; equal keys keep their order."""
@@ -65,12 +65,7 @@ class RadixSort:
             _run(self._ctx, self._programs.compute("sort_scatter.comp"), num_tiles, buffers, **numbers)
             source, target = target, source
         self.keys, self.values = source
-        self._spare = target
-
-    def release(self) -> None:
-        """Free the buffers."""
-        for buffer in (self.keys, self.values, *self._spare, self._counts, self._total):
-            buffer.release()
+        self._spare = list(target)
 
 
 class GpuSplats:
@@ -80,6 +75,7 @@ class GpuSplats:
         self,
         ctx: moderngl.Context,
         programs: Programs,
+        resources: Resources,
         geometry: moderngl.Buffer,
         colors: moderngl.Buffer,
         records: moderngl.Buffer,
@@ -91,6 +87,7 @@ class GpuSplats:
         Args:
             ctx: the current context, OpenGL 4.3.
             programs: of the context.
+            resources: that the buffers belong to.
             geometry, colors: of the splats.
             records: written, `capacity` splats at once.
             count: number of splats.
@@ -98,14 +95,15 @@ class GpuSplats:
         """
         self._ctx, self._programs, self._count, self._capacity = ctx, programs, count, capacity
         self._geometry, self._colors, self._records = geometry, colors, records
-        self._sort = RadixSort(ctx, programs, count)
+        self._resources, keep = resources, resources.keep
+        self._sort = RadixSort(ctx, programs, resources, count)
         self._order_key: Hashable = None
         self._num_chunks = max(count_groups(MAX_PARTS * count, capacity), 1)
-        self._counts = ctx.buffer(reserve=4 * MAX_PARTS * max(count_groups(count, TILE_SIZE), 1))
-        self._visible = ctx.buffer(reserve=4 * MAX_PARTS * max(count, 1))
-        self._total, self._drawn = ctx.buffer(reserve=4), ctx.buffer(np.zeros(1, np.uint32))
-        self._dispatches = ctx.buffer(reserve=_DISPATCH_BYTES * self._num_chunks)
-        self._draws = ctx.buffer(reserve=_DRAW_BYTES * self._num_chunks)
+        self._counts = keep(ctx.buffer(reserve=4 * MAX_PARTS * max(count_groups(count, TILE_SIZE), 1)))
+        self._visible = keep(ctx.buffer(reserve=4 * MAX_PARTS * max(count, 1)))
+        self._total, self._drawn = keep(ctx.buffer(reserve=4)), keep(ctx.buffer(np.zeros(1, np.uint32)))
+        self._dispatches = keep(ctx.buffer(reserve=_DISPATCH_BYTES * self._num_chunks))
+        self._draws = keep(ctx.buffer(reserve=_DRAW_BYTES * self._num_chunks))
         self._masks: dict[Hashable, moderngl.Buffer] = {}
 
     def draw(
@@ -159,14 +157,6 @@ class GpuSplats:
         """The indices of all splats in the order of the last draw, front to back."""
         return np.frombuffer(self._sort.values.read(4 * self._count), np.uint32)
 
-    def release(self) -> None:
-        """Free the buffers that this object made."""
-        self._sort.release()
-        for buffer in (self._counts, self._visible, self._total, self._drawn, self._dispatches, self._draws):
-            buffer.release()
-        for buffer in self._masks.values():
-            buffer.release()
-
     def _update_order(self, camera: Pinhole, position: tuple[float, float, float], settings: DrawSettings) -> None:
         """Sort all splats by distance from the position, or by depth along the camera's axis."""
         by_depth = not settings.is_exact
@@ -213,13 +203,15 @@ class GpuSplats:
     def _get_mask(self, selected: Bool[np.ndarray, "n"], selection: Hashable) -> moderngl.Buffer:
         """A buffer with one bit for each splat."""
         if selection not in self._masks:
-            if len(self._masks) >= _MAX_MASKS:
-                for buffer in self._masks.values():
-                    buffer.release()
-                self._masks.clear()
             padded = np.zeros(32 * count_groups(len(selected), 32), bool)
             padded[: len(selected)] = selected
-            self._masks[selection] = self._ctx.buffer(np.packbits(padded, bitorder="little"))
+            bits = np.packbits(padded, bitorder="little")
+            if len(self._masks) < _MAX_MASKS:
+                self._masks[selection] = self._resources.keep(self._ctx.buffer(bits))
+            else:  # all have the same size
+                buffer = self._masks.pop(next(iter(self._masks)))
+                buffer.write(bits)
+                self._masks[selection] = buffer
         return self._masks[selection]
 
 

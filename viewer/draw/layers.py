@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt
 from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat_viewer.draw.gpu_sort import MAX_PARTS, GpuSplats
-from pansplat_viewer.draw.programs import RECORD, RECORD_BYTES, Programs, set_uniforms
+from pansplat_viewer.draw.programs import RECORD, RECORD_BYTES, Programs, Resources, set_uniforms
 from pansplat_viewer.draw.splats import SortedSplats, Splats
 from pansplat_viewer.scene.camera import Pinhole, create_face_cameras, find_faces_in_view
 from pansplat_viewer.scene.settings import DrawSettings
@@ -328,31 +328,40 @@ class SplatRasterizer:
         self._ctx = ctx
         self._programs = programs
         self._tier = tier
-        self._geometry = ctx.buffer(splats.geometry) if len(splats) else ctx.buffer(reserve=48)
-        self._colors = ctx.buffer(reserve=max(16 * len(splats), 16), dynamic=True)
-        if splats.base_colors is not None:
-            self.write_colors(splats.base_colors)
         self._capacity = max(min(_CHUNK_SIZE, len(splats)), 1)
         self._indices: moderngl.Buffer | None = None
-        self._records = ctx.buffer(reserve=RECORD_BYTES * self._capacity, dynamic=True)
-        self._quads = ctx.vertex_array(programs.splat(), [(self._records, "4f " * len(RECORD) + "/i", *RECORD)])
         self._points: moderngl.VertexArray | None = None
         self._gpu: GpuSplats | None = None
-        if tier == "gl43":
+        self._resources = Resources()
+        try:
+            self._allocate(splats)
+        except BaseException:
+            self._resources.release()
+            raise
+
+    def _allocate(self, splats: Splats) -> None:
+        ctx, programs, keep = self._ctx, self._programs, self._resources.keep
+        self._geometry = keep(ctx.buffer(splats.geometry) if len(splats) else ctx.buffer(reserve=48))
+        self._colors = keep(ctx.buffer(reserve=max(16 * len(splats), 16), dynamic=True))
+        if splats.base_colors is not None:
+            self.write_colors(splats.base_colors)
+        self._records = keep(ctx.buffer(reserve=RECORD_BYTES * self._capacity, dynamic=True))
+        self._quads = keep(ctx.vertex_array(programs.splat(), [(self._records, "4f " * len(RECORD) + "/i", *RECORD)]))
+        if self._tier == "gl43":
             buffers = self._geometry, self._colors, self._records
-            self._gpu = GpuSplats(ctx, programs, *buffers, len(splats), self._capacity)
-        else:
-            self._indices = ctx.buffer(reserve=4 * self._capacity, dynamic=True)
-            self._points = ctx.vertex_array(
+            self._gpu = GpuSplats(ctx, programs, self._resources, *buffers, len(splats), self._capacity)
+            return
+        self._indices = keep(ctx.buffer(reserve=4 * self._capacity, dynamic=True))
+        rows = self._geometry, "4f 4f 4f", "in_mean_opacity", "in_quat", "in_scale"
+        self._points = keep(
+            ctx.vertex_array(
                 programs.project(),
-                [
-                    (self._geometry, "4f 4f 4f", "in_mean_opacity", "in_quat", "in_scale"),
-                    (self._colors, "4f", "in_color"),
-                ],
+                [rows, (self._colors, "4f", "in_color")],
                 index_buffer=self._indices,
                 index_element_size=4,
                 mode=moderngl.POINTS,
             )
+        )
 
     def write_colors(self, colors: Float[np.ndarray, "n 4"]) -> None:
         """Replace the colours."""
@@ -417,11 +426,7 @@ class SplatRasterizer:
 
     def release(self) -> None:
         """Free the buffers and vertex arrays."""
-        for resource in (self._quads, self._points, self._geometry, self._colors, self._indices, self._records):
-            if resource is not None:
-                resource.release()
-        if self._gpu is not None:
-            self._gpu.release()
+        self._resources.release()
 
     def _draw_in_order(self, back_to_front: UInt[np.ndarray, "n"]) -> int:
         """Project the splats with these indices by transform feedback, and draw them; returns their number."""

@@ -51,6 +51,24 @@ def set_uniforms(program: Any, **values: Any) -> None:
             member.value = value
 
 
+class Resources:
+    """GL objects that are freed together."""
+
+    def __init__(self) -> None:
+        """There are none yet."""
+        self._kept: list[Any] = []
+
+    def keep(self, resource: Any) -> Any:
+        """Add an object; returns it."""
+        self._kept.append(resource)
+        return resource
+
+    def release(self) -> None:
+        """Free the objects."""
+        while self._kept:
+            self._kept.pop().release()
+
+
 class Programs:
     """The viewer's programs on one context; each method compiles its program at the first call and returns it."""
 

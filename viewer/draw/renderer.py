@@ -105,7 +105,16 @@ class SplatRenderer:
         self._upload(prepared or self.prepare(scene))
 
     def _upload(self, splats: Splats) -> None:
-        self._release_scene()
+        before = self._splats
+        self._release_scene()  # before the allocation, because the memory may not hold both scenes
+        try:
+            self._create_painter(splats)
+        except BaseException:
+            if before is not None:
+                self._create_painter(before)
+            raise
+
+    def _create_painter(self, splats: Splats) -> None:
         self._painter = LayerPainter(self._ctx, self._programs, self._targets, splats, self.tier)
         self._splats = splats
         self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)

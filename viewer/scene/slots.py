@@ -52,8 +52,9 @@ class SceneSlot:
 
     def upload(self, scene: Scene, prepared: Any = None) -> None:
         """Replace the scene, which may be `prepared`; raises the renderer's errors, and keeps the old scene then."""
+        self.image = None
         self.renderer.upload(scene, prepared)
-        self.scene, self.image = scene, None
+        self.scene = scene
         self._waits = len(scene.gaussians) <= _LARGE_SCENE
 
     def draw(

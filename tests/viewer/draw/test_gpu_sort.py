@@ -6,7 +6,7 @@ import torch
 
 from pansplat_viewer.draw.gpu_sort import GpuSplats, RadixSort
 from pansplat_viewer.draw.layers import SplatRasterizer, compute_filter_variance
-from pansplat_viewer.draw.programs import TILE_SIZE, Programs
+from pansplat_viewer.draw.programs import TILE_SIZE, Programs, Resources
 from pansplat_viewer.draw.splats import Splats, sort_splats
 from pansplat_viewer.scene.camera import Pinhole
 from pansplat_viewer.scene.settings import DrawSettings
@@ -17,11 +17,11 @@ pytestmark = pytest.mark.gl
 @pytest.fixture(scope="module")
 def sorter(gl_context):
     with gl_context:
-        programs = Programs(gl_context)
-        sort = RadixSort(gl_context, programs, 4 * TILE_SIZE + 1)
+        programs, resources = Programs(gl_context), Resources()
+        sort = RadixSort(gl_context, programs, resources, 4 * TILE_SIZE + 1)
     yield sort
     with gl_context:
-        sort.release()
+        resources.release()
         programs.release()
 
 

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import moderngl
 import numpy as np
 import pytest
 import torch
@@ -11,6 +12,7 @@ from pansplat.errors import InputError
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.rendering import blend, blend_weights, rasterize
+from pansplat_viewer.draw.programs import Programs
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
 from pansplat_viewer.draw.splats import SortedSplats
 
@@ -319,3 +321,23 @@ def test_renderer_without_a_scene_refuses_to_draw(ctx, pose):
         with pytest.raises(InputError, match="call `render` first"):
             read()
     empty.release()
+
+
+@pytest.mark.parametrize("tier", ["gl33", "gl43", "cpu"])
+def test_a_failed_upload_keeps_the_scene_before(make_renderer, random_scene, pose, tier, monkeypatch):
+    renderer, compile_splat, failures = make_renderer(random_scene(), tier), Programs.splat, [True]
+    renderer.render(pose, SIZE, SETTINGS)
+    expected = renderer.read_color()
+
+    def fail_once(*arguments, **options):
+        if failures.pop() if failures else False:
+            raise moderngl.Error("out of memory")
+        return compile_splat(*arguments, **options)
+
+    with monkeypatch.context() as patch:  # when most of the buffers are allocated
+        patch.setattr(Programs, "splat", fail_once)
+        patch.setattr("pansplat_viewer.draw.cpu_renderer.DisplayScene", fail_once)
+        with pytest.raises(moderngl.Error, match="out of memory"):
+            renderer.upload(random_scene(seed=1))
+    renderer.render(pose, SIZE, SETTINGS)
+    assert np.array_equal(renderer.read_color(), expected) and renderer.stats.total == 300
