@@ -56,23 +56,14 @@ def find_free_name(folder: Path, stem: str, suffix: str) -> Path:
 
 @dataclass(frozen=True)
 class Film:
-    """Sizes and times of a fly-through.
+    """Sizes and times of a fly-through."""
 
-    Attributes:
-        size: of film and stills, pixels (width, height).
-        seconds: length of the film; None is 4, and for a tour the duration of its route.
-        fps: frames per second.
-        at: fraction of the flight at which the panorama is rendered.
-        vertical_fov_degrees: of film and stills.
-        panorama_height: pixels; None is the height that the scene was predicted at.
-    """
-
-    size: tuple[int, int] = (1280, 720)
-    seconds: float | None = None
-    fps: float = 24.0
-    at: float = 0.5
-    vertical_fov_degrees: float = 75.0
-    panorama_height: int | None = None
+    size: tuple[int, int] = (1280, 720)  # of film and stills, pixels (width, height)
+    seconds: float | None = None  # length of the film; None is 4, and for a tour the duration of its route
+    fps: float = 24.0  # frames per second
+    at: float = 0.5  # fraction of the flight at which the panorama is rendered
+    vertical_fov_degrees: float = 75.0  # of film and stills
+    panorama_height: int | None = None  # pixels; None is the height that the scene was predicted at
 
     def count_frames(self, route: Route | None = None) -> int:
         """Number of frames of the film of a pair, or of a tour's route."""

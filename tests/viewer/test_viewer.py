@@ -37,15 +37,14 @@ from pansplat_viewer.scene.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.scene.settings import Comparison, Display
+from pansplat_viewer.scene.settings import Comparison, Display, Preset
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.photographs import Photographs
 from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.viewer import Viewer
 from pansplat_viewer.window.preferences import Preferences
 
-pytestmark = pytest.mark.gl
-once = pytest.mark.parametrize("session", ["cpu"], indirect=True)  # does not depend on the renderer
+pytestmark = [pytest.mark.gl, pytest.mark.xdist_group("viewer")]
 
 SIZE = (560, 900)
 IMAGE = (slice(20, 560), slice(310, 560))  # rows and columns without panels
@@ -59,6 +58,7 @@ IMAGE_WIDGETS = (
     "off##stereo", "pair##stereo", "red/cyan##stereo",
     "2##panorama", "##flight",
 )  # fmt: skip
+PRESETS = get_args(Preset)  # which the processor's renderer does not offer
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
     "joint": {"mode": "deferred"},
@@ -195,7 +195,22 @@ def pair(axis_photos, small_scene, tmp_path_factory) -> Pair:
     return Pair("pair", folder, tuple(panoramas), (), 0.45, 10.0)
 
 
-@pytest.fixture(scope="module", params=["gl", "cpu"])
+def both(test: Callable[..., None]) -> Callable[..., None]:
+    """Run a test with both renderers; the other tests do not depend on the renderer."""
+    test.renderers = ("gl", "cpu")  # type: ignore[attr-defined]
+    return test
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "label" in metafunc.fixturenames:
+        cases = [("gl" if label in PRESETS else "cpu", label) for label in IMAGE_WIDGETS]
+        metafunc.parametrize(("session", "label"), cases, indirect=["session"], scope="module")
+    elif "session" in metafunc.fixturenames:
+        renderers = getattr(metafunc.function, "renderers", ("cpu",))
+        metafunc.parametrize("session", renderers, indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
 def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp_path_factory) -> Iterator[User]:
     def load(entry, progress, show):
         if entry.tour is not None:
@@ -255,7 +270,6 @@ def test_every_widget_has_a_test_and_fits_without_scrolling(user):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("label", IMAGE_WIDGETS)
 def test_clicking_the_widget_changes_the_image(user, label):
     user.state.settings = replace(user.state.settings, **INITIAL_SETTINGS.get(label, {}))
     before = user.read_image()
@@ -263,21 +277,14 @@ def test_clicking_the_widget_changes_the_image(user, label):
     assert changed_fraction(before, user.read_image()) > 3e-4  # 0 without an effect; the filter changes few pixels
 
 
-@pytest.mark.parametrize("label", ["0##level"])
-def test_clicking_a_check_box_twice_restores_the_image(user, label):
+def test_levels_are_hidden_and_shown_again(user):
     before = user.read_image()
-    user.click(label)
-    user.read_image()
-    user.click(label)
+    for _ in range(2):
+        for level in range(4):
+            user.click(f"{level}##level")
+        if user.state.settings.levels is not None:
+            assert user.read_image().max() == 0
     assert changed_fraction(before, user.read_image()) == 0
-
-
-def test_hiding_every_level_shows_the_background(user):
-    for level in range(4):
-        user.click(f"{level}##level")
-    assert user.read_image().max() == 0
-    user.click("white")
-    assert user.read_image().min() == 255
 
 
 def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
@@ -296,6 +303,7 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
     assert 0 < user.state.settings.view_weights[1] < 1
 
 
+@both
 def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 64)
     user.click("pair##stereo")
@@ -322,7 +330,6 @@ def test_fly_button_plays_and_stop_pauses(user):
     assert not user.state.playing and 0 < user.state.flight < 1
 
 
-@once
 def test_camera_buttons_switch_orbit_and_restore_the_start(user):
     user.click("orbit")
     assert user.state.orbiting
@@ -408,7 +415,6 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
     assert user.data.entries == ["opened"]
 
 
-@once
 def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
     opened = []
 
@@ -431,7 +437,6 @@ def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeyp
     assert user.data.entries == ["kitchen 2"]
 
 
-@once
 def test_the_background_is_chosen_in_a_picker(user):
     user.state.settings = replace(user.state.settings, levels=frozenset())
     assert user.read_image().max() == 0
@@ -481,6 +486,7 @@ def test_the_photograph_is_shown_in_the_viewing_direction(user):
     assert user.read_image().max() < 90, "the nearest photograph is the second, dim one"
 
 
+@both
 @pytest.mark.slow
 def test_rendering_at_an_input_camera_looks_like_its_photograph(user, pair):
     user.show(SceneEntry("sphere", pair=pair))
@@ -503,6 +509,7 @@ def assert_split(rendered: np.ndarray, compared: np.ndarray, split: float, right
     assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) > right
 
 
+@both
 def test_a_drag_moves_the_divider_between_rendering_and_photograph(user):
     rendered, camera = user.read_image(), user.state.camera
     user.click("photograph")
@@ -515,7 +522,6 @@ def test_a_drag_moves_the_divider_between_rendering_and_photograph(user):
     assert user.state.comparison == "off" and changed_fraction(rendered, user.read_image()) == 0
 
 
-@once
 def test_the_error_is_the_mapped_difference_from_the_photograph(user):
     state = user.state
     state.split, state.comparison = 0.0, "off"
@@ -530,7 +536,6 @@ def test_the_error_is_the_mapped_difference_from_the_photograph(user):
     assert state.max_error < 0.2 and user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
 
 
-@once
 def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
     rendered = user.read_image()
     user.press(imgui.Key.x)
@@ -547,7 +552,6 @@ def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
     assert user.data.right_name == "sphere, view, color"
 
 
-@once
 def test_a_chosen_photograph_is_compared_from_its_own_camera(user):
     user.state.comparison, user.state.photograph = "photograph", 1
     user.draw_frames(2)
@@ -561,7 +565,6 @@ def test_a_chosen_photograph_is_compared_from_its_own_camera(user):
     assert user.state.photograph is None, "the nearest one"
 
 
-@once
 def test_a_photograph_that_cannot_be_read_is_an_error_and_keeps_the_image(user, pair, tmp_path):
     broken = replace(pair.context[0], image=tmp_path / "gone.png")
     user.show(SceneEntry("broken", pair=replace(pair, context=(broken, pair.context[1]))))
@@ -573,7 +576,6 @@ def test_a_photograph_that_cannot_be_read_is_an_error_and_keeps_the_image(user, 
     assert changed_fraction(before, user.read_image()) == 0
 
 
-@once
 def test_each_display_is_another_image(user):
     images = [user.read_image()]
     for display in get_args(Display)[1:]:
@@ -585,7 +587,6 @@ def test_each_display_is_another_image(user):
     assert changed_fraction(images[0], user.read_image()) == 0
 
 
-@once
 def test_the_range_of_a_display_is_shown_and_can_be_changed(user):
     user.click("depth")
     assert 2 < user.state.settings.display_max < 6, "most Gaussians are nearer"
@@ -596,7 +597,6 @@ def test_the_range_of_a_display_is_shown_and_can_be_changed(user):
     assert changed_fraction(near, user.read_image()) > 0.5
 
 
-@once
 def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, small_scene, monkeypatch):
     viewer, go = user.viewer, threading.Event()
 
@@ -654,6 +654,7 @@ def test_a_scene_without_photographs_has_no_comparison_with_one(user):
     assert changed_fraction(before, user.read_image()) == 0
 
 
+@both
 def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 128)
     image = user.read_image()
@@ -684,6 +685,7 @@ def test_screenshot_without_memory_is_reported(user, monkeypatch):
     assert user.data.error is None
 
 
+@both
 def test_exr_screenshot_holds_color_and_radial_depth(user):
     user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
     user.click("EXR + depth")
@@ -695,6 +697,7 @@ def test_exr_screenshot_holds_color_and_radial_depth(user):
     assert 1.5 < np.median(depth[depth > 0]) < 4.5
 
 
+@both
 def test_focus_orbits_the_point_in_the_centre(user):
     user.settle()
     user.press(imgui.Key.f)
@@ -703,6 +706,7 @@ def test_focus_orbits_the_point_in_the_centre(user):
     assert user.state.camera.position == user.state.home.position
 
 
+@both
 def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
     user.viewer._resolution.budget_ms = 1e-3
     monkeypatch.setattr(user.viewer.renderer, "pacing", SMALL)
@@ -795,7 +799,6 @@ def test_a_cancelled_refinement_keeps_the_prediction(user, small_scene, monkeypa
 # --- window, memory and files ---
 
 
-@once
 def test_a_search_and_a_prediction_can_be_cancelled(user, monkeypatch):
     before, ended = user.read_image(), []
 
@@ -823,6 +826,7 @@ def test_a_search_and_a_prediction_can_be_cancelled(user, monkeypatch):
     assert changed_fraction(before, user.read_image()) == 0
 
 
+@both
 def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, small_scene, monkeypatch):
     before, allocate = user.read_image(), SplatRasterizer._allocate
     twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
@@ -854,6 +858,7 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
     assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"
 
 
+@both
 def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_scene, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.scene.slots._SMALL_SCENE", 0)
     go, prepare = threading.Event(), user.viewer.renderer.prepare
@@ -879,7 +884,6 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_s
     assert changed_fraction(before, user.read_image()) > 0.1
 
 
-@once
 def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair, small_scene, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.scene.slots._LARGE_SCENE", 0)
     before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
@@ -899,7 +903,6 @@ def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair,
     assert changed_fraction(photograph, image) > 0.3 and changed_fraction(before, image) > 0.1
 
 
-@once
 def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(user, monkeypatch):
     before = user.read_image()
 
@@ -916,7 +919,6 @@ def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(user, mo
     assert changed_fraction(before, user.read_image()) == 0
 
 
-@once
 def test_a_changed_file_is_announced_and_read_again(user, room):
     user.show(SceneEntry("room", file=room))
     user.draw_frames(1, 3.0)
@@ -932,7 +934,6 @@ def test_a_changed_file_is_announced_and_read_again(user, room):
     assert user.data.changed, "a missing file has changed, too"
 
 
-@once
 def test_a_folder_that_changes_is_announced_and_searched_again(user, pair, tmp_path, monkeypatch):
     image, found = tmp_path / "a.png", []
     image.write_bytes(pair.context[0].image.read_bytes())
@@ -960,7 +961,6 @@ def test_a_folder_that_changes_is_announced_and_searched_again(user, pair, tmp_p
     assert user.data.entries[user.data.current] == "pair 1" and user.data.current == 1
 
 
-@once
 def test_a_corrupt_scene_is_an_error_and_keeps_the_one_before(user, room, monkeypatch):
     before = user.read_image()
     room.write_bytes(room.read_bytes()[:2000])
@@ -974,7 +974,6 @@ def test_a_corrupt_scene_is_an_error_and_keeps_the_one_before(user, room, monkey
     assert changed_fraction(before, user.read_image()) == 0
 
 
-@once
 def test_theme_scale_and_layout_change_the_panels(user):
     user.click("Drawing")
     user.click("Window")
@@ -1006,7 +1005,6 @@ def test_theme_scale_and_layout_change_the_panels(user):
     user.click("Drawing")
 
 
-@once
 def test_a_gamepad_flies_and_looks(user):
     io = imgui.get_io()
     for key, field in (("gamepad_l_stick_up", "position"), ("gamepad_r_stick_right", "yaw_radians")):
@@ -1074,6 +1072,7 @@ def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
     assert user.panels.items["hotspots"][2] < SIZE[0]
 
 
+@both
 @pytest.mark.slow
 def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     user = tour_user
@@ -1093,7 +1092,6 @@ def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     assert max(steps) < 0.5 * exchanged, "no jump: a fade changes 30 % in 0.2 s at most"
 
 
-@once
 @pytest.mark.slow
 def test_a_flight_waits_for_a_scene_that_is_not_loaded(user, house, load_house, monkeypatch):
     go = threading.Event()
@@ -1119,7 +1117,6 @@ def test_a_flight_waits_for_a_scene_that_is_not_loaded(user, house, load_house, 
     assert find_node(user) == 2
 
 
-@once
 def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user):
     user = tour_user
     user.viewer._tour._budget, user.viewer._resolution.budget_ms = 0, 1e-3
@@ -1141,7 +1138,6 @@ def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user)
     user.press(imgui.Key.space)
 
 
-@once
 def test_a_file_of_a_tour_is_flown_along_its_edges(user, house_file, monkeypatch):
     options = LoadOptions()
     monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, *rest: load_entry(entry, options, *rest))
@@ -1161,7 +1157,6 @@ def test_a_file_of_a_tour_is_flown_along_its_edges(user, house_file, monkeypatch
     assert user.data.right_name is None, "there are no photographs"
 
 
-@once
 def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(user, house, load_house, small_scene, monkeypatch):
     requested = []
 
@@ -1190,7 +1185,6 @@ def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(user, house
     assert user.viewer._loaded.entry.name == "large" and user.viewer._tour is None
 
 
-@once
 def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, monkeypatch):
     failed = []
 
@@ -1209,7 +1203,6 @@ def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, 
     assert failed == ["room1-room2"] and user.data.error is None
 
 
-@once
 def test_a_scene_after_a_tour_does_not_fade_from_it(tour_user, pair):
     user = tour_user
     user.click_at(*user.panels.minimap.nodes[3])
@@ -1265,7 +1258,6 @@ def test_the_buttons_of_key_frames_show_replace_and_delete_them(path_user):
     assert len(user.state.path) == 0 and "Play path" not in user.panels.items
 
 
-@once
 def test_the_path_is_played_and_its_time_is_dragged(path_user):
     user = path_user
     user.click("Play path")
@@ -1283,7 +1275,6 @@ def test_the_path_is_played_and_its_time_is_dragged(path_user):
     assert changed_fraction(before, user.read_image()) > 0.1
 
 
-@once
 @pytest.mark.slow
 def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
     user = path_user
@@ -1309,7 +1300,6 @@ def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
         assert np.abs(np.asarray(file).astype(int)[IMAGE] - shown).max() <= 3, "the last frame is the last key frame"
 
 
-@once
 def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
     user, films = path_user, []
     monkeypatch.setattr(
@@ -1326,7 +1316,6 @@ def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
         assert path == user.state.path and fps == user.state.film_fps != 24
 
 
-@once
 def test_a_film_can_be_cancelled(path_user):
     user = path_user
     user.state.path = user.state.path.add(replace(user.state.path.key_frames[0], seconds=600.0))
@@ -1339,7 +1328,6 @@ def test_a_film_can_be_cancelled(path_user):
     assert user.data.film is None and user.data.error is None and len(user.viewer.screenshots) == written
 
 
-@once
 def test_a_film_of_a_tour_is_cancelled_during_a_prediction(user, house, load_house, monkeypatch):
     predicting, go = threading.Event(), threading.Event()
 

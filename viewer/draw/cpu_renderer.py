@@ -60,30 +60,19 @@ _MAX_TEXTURES = 4
 
 @dataclass(frozen=True, eq=False)
 class PreparedScene:
-    """A scene as the renderer needs it.
+    """A scene as the renderer needs it."""
 
-    Attributes:
-        splats: without `geometry` and `harmonics`, which `scene` has.
-        scene: the Gaussians.
-    """
-
-    splats: Splats
-    scene: DisplayScene
+    splats: Splats  # without `geometry` and `harmonics`, which `scene` has
+    scene: DisplayScene  # the Gaussians
 
 
 @dataclass(frozen=True, eq=False)
 class _Groups:
-    """The sets of Gaussians that the layers show.
+    """The sets of Gaussians that the layers show."""
 
-    Attributes:
-        labels: layer of each Gaussian, or `NO_LAYER`.
-        weights: of the layers.
-        visible: number of Gaussians in all layers.
-    """
-
-    labels: Int[np.ndarray, "n"]
-    weights: Float[np.ndarray, "layer"]
-    visible: int
+    labels: Int[np.ndarray, "n"]  # layer of each Gaussian, or `NO_LAYER`
+    weights: Float[np.ndarray, "layer"]  # of the layers
+    visible: int  # number of Gaussians in all layers
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,17 +80,14 @@ class _Picture:
     """A finished image.
 
     Attributes:
-        frame: its camera, size and settings.
-        pixels: at full size, bottom row first.
         groups, sums: its layers; None if it was read from cube faces.
-        stats: counts and times.
     """
 
-    frame: Frame
-    pixels: UInt32[np.ndarray, "height width"]
+    frame: Frame  # its camera, size and settings
+    pixels: UInt32[np.ndarray, "height width"]  # at full size, bottom row first
     groups: _Groups | None
     sums: Float[np.ndarray, "layer 5 height width"] | None
-    stats: FrameStats
+    stats: FrameStats  # counts and times
 
 
 @dataclass(eq=False)

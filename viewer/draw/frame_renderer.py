@@ -16,19 +16,12 @@ from pansplat_viewer.scene.settings import DrawSettings, FrameStats
 
 @dataclass(frozen=True)
 class Pacing:
-    """How a window draws with a renderer while the camera moves.
+    """How a window draws with a renderer while the camera moves."""
 
-    Attributes:
-        min_size: the image is not drawn at a lower resolution (width, height), pixels.
-        settle_seconds: after the last movement, until the image is drawn at full resolution.
-        turn_ms: time of a full image above which turns read cached faces.
-        waits_while_moving: whether a window waits for the image of each position.
-    """
-
-    min_size: tuple[int, int]
-    settle_seconds: float
-    turn_ms: float
-    waits_while_moving: bool
+    min_size: tuple[int, int]  # the image is not drawn at a lower resolution (width, height), pixels
+    settle_seconds: float  # after the last movement, until the image is drawn at full resolution
+    turn_ms: float  # time of a full image above which turns read cached faces
+    waits_while_moving: bool  # whether a window waits for the image of each position
 
 
 class FrameRenderer(Protocol):

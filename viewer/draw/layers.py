@@ -46,23 +46,14 @@ class LayerStorage(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image to draw: camera, size and settings, and the values that follow from them.
+    """One image to draw: camera, size and settings, and the values that follow from them."""
 
-    Attributes:
-        rotation: camera to world.
-        position: camera centre in the splats' moved frame.
-        world_position: camera centre, metres.
-        size: (width, height) at which the image is drawn, pixels.
-        settings: draw settings.
-        full_size: (width, height) without `settings.scale`.
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
-    position: tuple[float, float, float]
-    world_position: Float[np.ndarray, "3"]
-    size: tuple[int, int]
-    settings: DrawSettings
-    full_size: tuple[int, int]
+    rotation: Float[np.ndarray, "3 3"]  # camera to world
+    position: tuple[float, float, float]  # camera centre in the splats' moved frame
+    world_position: Float[np.ndarray, "3"]  # camera centre, metres
+    size: tuple[int, int]  # (width, height) at which the image is drawn, pixels
+    settings: DrawSettings  # draw settings
+    full_size: tuple[int, int]  # (width, height) without `settings.scale`
 
     @staticmethod
     def create(splats: Splats, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> Frame:
@@ -242,19 +233,12 @@ class TargetStore:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """The premultiplied image of one set of Gaussians, and the work that it took in this frame.
+    """The premultiplied image of one set of Gaussians, and the work that it took in this frame."""
 
-    Attributes:
-        target: the textures.
-        visible: number of Gaussians in the set.
-        drawn: number of splats drawn for this frame.
-        cached: whether all parts in view were valid before.
-    """
-
-    target: Target
-    visible: int
-    drawn: int
-    cached: bool
+    target: Target  # the textures
+    visible: int  # number of Gaussians in the set
+    drawn: int  # number of splats drawn for this frame
+    cached: bool  # whether all parts in view were valid before
 
 
 class LayerPainter:

@@ -9,42 +9,25 @@ SETTLE_AFTER = 0.2  # seconds after the last movement
 
 @dataclass(frozen=True)
 class ResolutionPlan:
-    """How one frame is rendered.
+    """How one frame is rendered."""
 
-    Attributes:
-        scale: rendered pixels over screen pixels, along each side.
-        cached: whether the image is read from cube faces that are kept for this position.
-        moving: whether the camera has just moved or turned.
-    """
-
-    scale: float
-    cached: bool
-    moving: bool = False
+    scale: float  # rendered pixels over screen pixels, along each side
+    cached: bool  # whether the image is read from cube faces that are kept for this position
+    moving: bool = False  # whether the camera has just moved or turned
 
 
 @dataclass
 class AdaptiveResolution:
-    """Chooses the resolution of each frame: full when the camera stands still, within a time budget when it moves.
+    """Chooses the resolution of each frame: full when the camera stands still, within a time budget when it moves."""
 
-    Attributes:
-        budget_ms: time of a frame while the camera moves.
-        step: index into SCALES of the scale while the camera moves.
-        full_ms: time of the last frame at full resolution.
-        last_motion: time of the last movement, seconds.
-        translated: whether the last movement changed the position.
-        settle_after: seconds after the last movement until the resolution is full.
-        turn_ms: time of a frame at full resolution above which turns read cached faces.
-        num_scales: how many of SCALES may be used, from the largest on.
-    """
-
-    budget_ms: float = BUDGET_MS
-    step: int = 0
-    full_ms: float = 0.0
-    last_motion: float = -1e9
-    translated: bool = False
-    settle_after: float = SETTLE_AFTER
-    turn_ms: float = BUDGET_MS
-    num_scales: int = len(SCALES)
+    budget_ms: float = BUDGET_MS  # time of a frame while the camera moves
+    step: int = 0  # index into SCALES of the scale while the camera moves
+    full_ms: float = 0.0  # time of the last frame at full resolution
+    last_motion: float = -1e9  # time of the last movement, seconds
+    translated: bool = False  # whether the last movement changed the position
+    settle_after: float = SETTLE_AFTER  # seconds after the last movement until the resolution is full
+    turn_ms: float = BUDGET_MS  # time of a frame at full resolution above which turns read cached faces
+    num_scales: int = len(SCALES)  # how many of SCALES may be used, from the largest on
 
     def plan(self, now: float, *, moved: bool, turned: bool, adaptive: bool = True) -> ResolutionPlan:
         """Return the plan of the frame at time `now` (seconds) after the camera moved, turned or did neither."""

@@ -32,32 +32,24 @@ class Splats:
     Attributes:
         origin: subtracted from world positions, metres, float64. Keeps float32 accurate for scenes that are far from
             the world's origin.
-        means: moved centres.
-        opacities: peak opacities.
         reach: sqrt(2 ln(255 opacity)); a Gaussian is visible up to this number of standard deviations, 0 is nowhere.
-        extent: reach times the largest standard deviation, metres.
         levels, views: labels.
-        geometry: rows that the shaders read: mean, opacity; quaternion; scales, 0.
         harmonics: coefficients; Gaussians are the last axis, so that sums over coefficients read memory in order.
-        base_colors: colours if they do not depend on the direction (degree 0), else None.
-        view_positions: camera centres of the context views in the world.
-        num_views: number of context views that have Gaussians or a camera.
-        dropped: Gaussians removed because a value in them is NaN or infinite.
     """
 
     origin: Float[np.ndarray, "3"]
-    means: Float[np.ndarray, "n 3"]
-    opacities: Float[np.ndarray, "n"]
+    means: Float[np.ndarray, "n 3"]  # moved centres
+    opacities: Float[np.ndarray, "n"]  # peak opacities
     reach: Float[np.ndarray, "n"]
-    extent: Float[np.ndarray, "n"]
+    extent: Float[np.ndarray, "n"]  # reach times the largest standard deviation, metres
     levels: Int[np.ndarray, "n"]
     views: Int[np.ndarray, "n"]
-    geometry: Float[np.ndarray, "n 12"]
+    geometry: Float[np.ndarray, "n 12"]  # rows that the shaders read: mean, opacity; quaternion; scales, 0
     harmonics: Float[np.ndarray, "k 3 n"]
-    base_colors: Float[np.ndarray, "n 4"] | None
-    view_positions: Float[np.ndarray, "view 3"]
-    num_views: int
-    dropped: int
+    base_colors: Float[np.ndarray, "n 4"] | None  # colours if they do not depend on the direction (degree 0), else None
+    view_positions: Float[np.ndarray, "view 3"]  # camera centres of the context views in the world
+    num_views: int  # number of context views that have Gaussians or a camera
+    dropped: int  # Gaussians removed because a value in them is NaN or infinite
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -193,20 +185,15 @@ class SortedSplats:
     """Splats with the order and colours of one camera position.
 
     Attributes:
-        splats: the scene.
-        position: camera centre in the splats' moved frame.
-        distances: of each mean from the camera, metres.
-        order: indices by ascending distance, ties by index.
         colors: RGB and padding as seen from the position, or None if colours do not depend on it.
-        milliseconds: time of sorting and colours.
     """
 
-    splats: Splats
-    position: tuple[float, float, float]
-    distances: Float[np.ndarray, "n"]
-    order: UInt[np.ndarray, "n"]
+    splats: Splats  # the scene
+    position: tuple[float, float, float]  # camera centre in the splats' moved frame
+    distances: Float[np.ndarray, "n"]  # of each mean from the camera, metres
+    order: UInt[np.ndarray, "n"]  # indices by ascending distance, ties by index
     colors: Float[np.ndarray, "n 4"] | None
-    milliseconds: float = 0.0
+    milliseconds: float = 0.0  # time of sorting and colours
 
     def cull(
         self, camera: Pinhole, selected: Bool[np.ndarray, "n"], filter_variance: float, *, bounded: bool

@@ -24,20 +24,15 @@ class Camera:
     """The interactive camera: position, viewing direction and field of view.
 
     Attributes:
-        position: centre in the world, metres.
-        yaw_radians: heading, to the right of the forward axis of `level`.
-        pitch_radians: angle above the horizon.
-        vertical_fov_degrees: vertical field of view.
         level: columns are right, down and forward of a camera with yaw and pitch 0, in world axes.
-        distance: from the camera to the orbit centre ahead, metres.
     """
 
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    yaw_radians: float = 0.0
-    pitch_radians: float = 0.0
-    vertical_fov_degrees: float = 75.0
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # centre in the world, metres
+    yaw_radians: float = 0.0  # heading, to the right of the forward axis of `level`
+    pitch_radians: float = 0.0  # angle above the horizon
+    vertical_fov_degrees: float = 75.0  # vertical field of view
     level: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    distance: float = 2.0
+    distance: float = 2.0  # from the camera to the orbit centre ahead, metres
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
@@ -140,15 +135,12 @@ class Pinhole:
     """A pinhole camera with square pixels and the principal point at the image centre.
 
     Attributes:
-        rotation: camera to world, OpenCV axes.
-        position: camera centre in the splats' moved frame, metres.
-        focal: focal length, pixels.
         width, height: pixels.
     """
 
-    rotation: Float[np.ndarray, "3 3"]
-    position: tuple[float, float, float]
-    focal: float
+    rotation: Float[np.ndarray, "3 3"]  # camera to world, OpenCV axes
+    position: tuple[float, float, float]  # camera centre in the splats' moved frame, metres
+    focal: float  # focal length, pixels
     width: int
     height: int
 

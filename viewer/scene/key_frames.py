@@ -35,19 +35,12 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class KeyFrame:
-    """A camera at a time.
+    """A camera at a time."""
 
-    Attributes:
-        seconds: since the start of the path.
-        position: metres.
-        direction: where the camera looks.
-        vertical_fov_degrees: vertical field of view.
-    """
-
-    seconds: float
-    position: Vector
-    direction: Vector
-    vertical_fov_degrees: float = _DEFAULT_FOV
+    seconds: float  # since the start of the path
+    position: Vector  # metres
+    direction: Vector  # where the camera looks
+    vertical_fov_degrees: float = _DEFAULT_FOV  # vertical field of view
 
     @staticmethod
     def of_camera(camera: Camera, seconds: float) -> KeyFrame:

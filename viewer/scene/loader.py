@@ -29,20 +29,15 @@ class SceneEntry:
     """A scene that can be shown: a tour, a pair of panoramas to predict from, or a scene file.
 
     Attributes:
-        name: shown in the list of scenes and used for output folders.
         pair: the pair, or the panoramas of one scene of a tour; None for a scene file and for a whole tour.
-        file: the scene file, or None.
-        tour: the tour, or None.
-        views: of one scene of a tour: numbers of its panoramas in the tour.
-        merged: of a tour from a file: the scene in it, of all panoramas.
     """
 
-    name: str
+    name: str  # shown in the list of scenes and used for output folders
     pair: "Pair | None" = None
-    file: Path | None = None
-    tour: "TourGraph | None" = None
-    views: tuple[int, ...] = ()
-    merged: "Scene | None" = None
+    file: Path | None = None  # the scene file, or None
+    tour: "TourGraph | None" = None  # the tour, or None
+    views: tuple[int, ...] = ()  # of one scene of a tour: numbers of its panoramas in the tour
+    merged: "Scene | None" = None  # of a tour from a file: the scene in it, of all panoramas
 
     @property
     def panoramas(self) -> "tuple[Panorama, ...]":
@@ -210,16 +205,11 @@ def _load_tour_scene(
 
 @dataclass
 class _Request:
-    """An entry that is loaded.
-
-    Attributes:
-        preview: its prediction, which is being refined.
-        is_shown: whether `poll` has returned the prediction.
-    """
+    """An entry that is loaded."""
 
     entry: SceneEntry
-    preview: LoadedScene | None = None
-    is_shown: bool = False
+    preview: LoadedScene | None = None  # its prediction, which is being refined
+    is_shown: bool = False  # whether `poll` has returned the prediction
 
     def show(self, preview: LoadedScene) -> None:
         self.preview = preview

@@ -21,29 +21,20 @@ class PickedPoint:
     """A point on the surface that one pixel shows.
 
     Attributes:
-        position: in the world, metres.
-        depth: radial distance from the camera, metres: the mean of the Gaussians on the ray, by weight.
-        alpha: opacity of the pixel.
-        count: Gaussians that contribute to the pixel.
-        gaussian: index of the one that contributes most, and its parameters:
         level, view: its labels.
-        opacity: its peak opacity.
-        scales: its standard deviations, metres.
-        mean: its centre in the world, metres.
-        quat: its rotation, wxyz.
     """
 
-    position: tuple[float, float, float]
-    depth: float
-    alpha: float
-    count: int
-    gaussian: int
+    position: tuple[float, float, float]  # in the world, metres
+    depth: float  # radial distance from the camera, metres: the mean of the Gaussians on the ray, by weight
+    alpha: float  # opacity of the pixel
+    count: int  # Gaussians that contribute to the pixel
+    gaussian: int  # index of the one that contributes most, and its parameters:
     level: int
     view: int
-    opacity: float
-    scales: tuple[float, float, float]
-    mean: tuple[float, float, float]
-    quat: tuple[float, float, float, float]
+    opacity: float  # its peak opacity
+    scales: tuple[float, float, float]  # its standard deviations, metres
+    mean: tuple[float, float, float]  # its centre in the world, metres
+    quat: tuple[float, float, float, float]  # its rotation, wxyz
 
     def describe(self) -> list[str]:
         """Lines of text for the panel."""

@@ -41,26 +41,18 @@ class DrawSettings:
             filter of 3DGS; OpenGL only.
         mode: `joint` draws all Gaussians together. `view` draws those of one context view. `deferred` draws each
             context view separately and blends the images per pixel by distance.
-        view: the context view of mode `view`.
         view_weights: factors of the context views in mode `deferred`, at least 0; views beyond the last one have 1.
             Views of factor 0 are not drawn, unless all are 0, which is the same as all 1.
-        levels: pyramid levels to draw; None draws all.
-        opacity_threshold: Gaussians of lower opacity are not drawn.
         display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `normals`, the shortest
             axes of the Gaussians, towards their camera, with 0.5 + 0.5 (x, y, z) of the world as RGB; `levels` and
             `views`, a colour for each label; `count`, the Gaussians that reach the alpha cut at the pixel;
             `ellipsoids`, the nearest Gaussian within one standard deviation, opaque and shaded. The last two draw all
             views together in mode `deferred`.
         display_max: of `depth`, `opacity` and `count`, the number with the last colour of the map; the first is 0.
-        background: RGB in [0, 1].
-        near: Gaussians whose mean is nearer than this radial distance, metres, are not drawn.
-        vertical_fov_degrees: of layout `pinhole`, in (0, 180).
-        layout: `pinhole`, or `equirect` stitched from six cube faces.
         eye_offset: of layout `equirect`: radius of the viewing circle of omni-directional stereo, metres; negative for
             the left eye. `CpuRenderer` only.
         stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, the left above the right,
             or the left in red and the right in green and blue.
-        eye_distance: metres.
         face_size: side of a cube face in pixels. None matches the resolution at the panorama's equator
             (2 height / pi), or at the centre of a pinhole image that is drawn from cached faces.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
@@ -72,19 +64,19 @@ class DrawSettings:
 
     preset: Preset = "exact"
     mode: Mode = "joint"
-    view: int = 0
+    view: int = 0  # the context view of mode `view`
     view_weights: tuple[float, ...] = ()
-    levels: frozenset[int] | None = None
-    opacity_threshold: float = 0.0
+    levels: frozenset[int] | None = None  # pyramid levels to draw; None draws all
+    opacity_threshold: float = 0.0  # Gaussians of lower opacity are not drawn
     display: Display = "color"
     display_max: float = 1.0
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    near: float = NEAR
-    vertical_fov_degrees: float = 90.0
-    layout: Layout = "pinhole"
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
+    near: float = NEAR  # Gaussians whose mean is nearer than this radial distance, metres, are not drawn
+    vertical_fov_degrees: float = 90.0  # of layout `pinhole`, in (0, 180)
+    layout: Layout = "pinhole"  # `pinhole`, or `equirect` stitched from six cube faces
     eye_offset: float = 0.0
     stereo: Stereo = "mono"
-    eye_distance: float = EYE_DISTANCE
+    eye_distance: float = EYE_DISTANCE  # metres
     face_size: int | None = None
     cached: bool = False
     scale: float = 1.0
@@ -145,29 +137,23 @@ class FrameStats:
     """Counts and times of the last frame.
 
     Attributes:
-        total: Gaussians of the scene on the GPU.
-        dropped: Gaussians removed at upload because a value in them is NaN or infinite.
         visible: Gaussians selected by view, level and opacity threshold; in mode `deferred`, summed over the views.
         drawn: splats sent to the GPU for this frame after culling, summed over faces and views; 0 if all layers
             were cached.
         sort_ms: time of the last sort and of the colours that depend on the position, possibly in the background.
-        frame_ms: from the call of `render` until the GPU had finished.
-        tier: `gl33`, `gl43` or `cpu`.
-        cached: whether the frame used cached layers only.
         settled: False if the frame used the order and colours of an earlier position because the new ones are not
             ready, or the last image because the new one is not ready; render again to get it.
         stages: milliseconds of each stage, where the renderer measures them.
-        size: (width, height) at which the image was drawn, pixels.
     """
 
-    total: int = 0
-    dropped: int = 0
+    total: int = 0  # Gaussians of the scene on the GPU
+    dropped: int = 0  # Gaussians removed at upload because a value in them is NaN or infinite
     visible: int = 0
     drawn: int = 0
     sort_ms: float = 0.0
-    frame_ms: float = 0.0
-    tier: str = "gl33"
-    cached: bool = False
+    frame_ms: float = 0.0  # from the call of `render` until the GPU had finished
+    tier: str = "gl33"  # `gl33`, `gl43` or `cpu`
+    cached: bool = False  # whether the frame used cached layers only
     settled: bool = True
     stages: Mapping[str, float] = field(default_factory=dict)
-    size: tuple[int, int] = (0, 0)
+    size: tuple[int, int] = (0, 0)  # (width, height) at which the image was drawn, pixels

@@ -28,65 +28,45 @@ class ViewerState:
     """Everything that a user can change, and the scene's cameras and levels.
 
     Attributes:
-        camera: the current camera; `home` is the camera that R restores.
-        orbiting: whether the camera orbits (True) or flies (False).
-        settings: draw settings; the field of view is the camera's.
-        flight: fraction of the flight between the panoramas in [0, 1]; `playing` while it is played.
         overlay, help: whether panels and key help are shown.
-        comparison: what is shown right of the divider at `split` (fraction of the width).
-        photograph: number of the photograph of the comparison; None is the nearest one.
-        max_error: the difference from a photograph with the last colour of the map.
-        refined: whether the refined scene is shown, where there is one, or the prediction.
-        adaptive: whether the resolution is lowered while the camera moves.
-        speed: of flying, metres per second.
         context: poses of the input cameras; empty for a file without cameras. Of a tour, of all panoramas.
-        num_views: number of input cameras of the scene that is shown.
-        route: the flight through a tour; None if none is planned, and in other scenes.
-        target: the panorama of a tour to fly to; None if there is none.
         minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
-        path: key frames of the camera path that is edited.
-        path_seconds: time on the path that the panel shows; `path_playing` while it is played.
         film_suffix, film_fps, film_projection: of the film of the path.
-        depth_max: distance within which most Gaussians are, metres; the range of the display of depths.
-        levels: pyramid levels of the scene, ascending.
-        points: the last picked points, two at most.
-        message: a text to show until `message_until` (seconds of the viewer's clock).
-        quit: whether to close the viewer.
     """
 
-    camera: Camera = field(default_factory=Camera)
+    camera: Camera = field(default_factory=Camera)  # the current camera; `home` is the camera that R restores
     home: Camera = field(default_factory=Camera)
-    orbiting: bool = False
-    settings: DrawSettings = field(default_factory=DrawSettings)
-    flight: float = 0.0
+    orbiting: bool = False  # whether the camera orbits (True) or flies (False)
+    settings: DrawSettings = field(default_factory=DrawSettings)  # draw settings; the field of view is the camera's
+    flight: float = 0.0  # fraction of the flight between the panoramas in [0, 1]; `playing` while it is played
     playing: bool = False
     overlay: bool = True
     help: bool = False
-    comparison: Comparison = "off"
+    comparison: Comparison = "off"  # what is shown right of the divider at `split` (fraction of the width)
     split: float = 0.5
-    photograph: int | None = None
-    max_error: float = 0.25
-    refined: bool = True
-    adaptive: bool = True
-    speed: float = 1.0
+    photograph: int | None = None  # number of the photograph of the comparison; None is the nearest one
+    max_error: float = 0.25  # the difference from a photograph with the last colour of the map
+    refined: bool = True  # whether the refined scene is shown, where there is one, or the prediction
+    adaptive: bool = True  # whether the resolution is lowered while the camera moves
+    speed: float = 1.0  # of flying, metres per second
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    num_views: int = 0
-    route: Route | None = None
-    target: int | None = None
+    num_views: int = 0  # number of input cameras of the scene that is shown
+    route: Route | None = None  # the flight through a tour; None if none is planned, and in other scenes
+    target: int | None = None  # the panorama of a tour to fly to; None if there is none
     minimap: bool = True
     hotspots: bool = True
-    path: CameraPath = field(default_factory=CameraPath)
-    path_seconds: float = 0.0
+    path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
+    path_seconds: float = 0.0  # time on the path that the panel shows; `path_playing` while it is played
     path_playing: bool = False
     film_suffix: str = ".mp4"
     film_fps: float = 24.0
     film_projection: Projection = "perspective"
-    depth_max: float = 1.0
-    levels: tuple[int, ...] = ()
-    points: list[PickedPoint] = field(default_factory=list)
-    message: str = ""
+    depth_max: float = 1.0  # distance within which most Gaussians are, metres; the range of the display of depths
+    levels: tuple[int, ...] = ()  # pyramid levels of the scene, ascending
+    points: list[PickedPoint] = field(default_factory=list)  # the last picked points, two at most
+    message: str = ""  # a text to show until `message_until` (seconds of the viewer's clock)
     message_until: float = 0.0
-    quit: bool = False
+    quit: bool = False  # whether to close the viewer
 
     @property
     def draw_settings(self) -> DrawSettings:

@@ -209,19 +209,12 @@ class CrossFade:
 
 @dataclass(frozen=True)
 class Hotspot:
-    """The place of a panorama in the image, on the floor below its camera.
+    """The place of a panorama in the image, on the floor below its camera."""
 
-    Attributes:
-        node: number of the panorama.
-        center: pixels, from the left and from the top.
-        radius: pixels, within which a click is meant.
-        ring: corners of the circle on the floor.
-    """
-
-    node: int
-    center: tuple[float, float]
-    radius: float
-    ring: tuple[tuple[float, float], ...]
+    node: int  # number of the panorama
+    center: tuple[float, float]  # pixels, from the left and from the top
+    radius: float  # pixels, within which a click is meant
+    ring: tuple[tuple[float, float], ...]  # corners of the circle on the floor
 
 
 def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> list[Hotspot]:

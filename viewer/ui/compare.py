@@ -20,17 +20,11 @@ from pansplat_viewer.ui.presenter import RightSide
 
 @dataclass(frozen=True, eq=False)
 class PinnedImage:
-    """A scene and the settings with which it is drawn right of the divider.
+    """A scene and the settings with which it is drawn right of the divider."""
 
-    Attributes:
-        slot: the scene, with a renderer of its own.
-        settings: the field of view is the camera's.
-        name: for the screen.
-    """
-
-    slot: SceneSlot
-    settings: DrawSettings
-    name: str
+    slot: SceneSlot  # the scene, with a renderer of its own
+    settings: DrawSettings  # the field of view is the camera's
+    name: str  # for the screen
 
 
 class Comparer:

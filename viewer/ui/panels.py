@@ -58,42 +58,28 @@ class PanelData:
     Attributes:
         entries: names of the scenes to choose from; `current` is the index of the scene that is shown.
         stats: of the last image; `frame_ms` is the time of a whole frame, smoothed.
-        size: of the rendered image, pixels; smaller than the window while the camera moves.
-        photographs: their names.
-        photograph_distance: from the camera to that of the photograph of the comparison, metres.
-        right_name: of what is shown right of the divider; None if there is nothing.
-        pinned: whether an image is pinned.
-        loading: name, task, fraction done; None if nothing is loading.
-        refinement: fraction done; 1 if the refined scene is there, None if there is no refinement.
-        error: message of the last failure.
         reduced: number of Gaussians that are offered in place of a scene that did not fit; None if there is none.
-        changed: whether a file of the scene has changed since it was loaded.
-        preferences: the remembered values.
-        film: fraction of the film that is written; None if none is being written.
-        tour: the scenes of the tour that is shown; None for other scenes.
-        hotspots: places of its panoramas in the image.
-        background: work of the loader on the tour, and the fraction done.
     """
 
     entries: list[str] = field(default_factory=list)
     current: int = -1
     stats: FrameStats = field(default_factory=FrameStats)
     frame_ms: float = 0.0
-    size: tuple[int, int] = (0, 0)
-    photographs: list[str] = field(default_factory=list)
-    photograph_distance: float = 0.0
-    right_name: str | None = None
-    pinned: bool = False
-    loading: tuple[str, str, float] | None = None
-    refinement: float | None = None
-    error: str | None = None
+    size: tuple[int, int] = (0, 0)  # of the rendered image, pixels; smaller than the window while the camera moves
+    photographs: list[str] = field(default_factory=list)  # their names
+    photograph_distance: float = 0.0  # from the camera to that of the photograph of the comparison, metres
+    right_name: str | None = None  # of what is shown right of the divider; None if there is nothing
+    pinned: bool = False  # whether an image is pinned
+    loading: tuple[str, str, float] | None = None  # name, task, fraction done; None if nothing is loading
+    refinement: float | None = None  # fraction done; 1 if the refined scene is there, None if there is no refinement
+    error: str | None = None  # message of the last failure
     reduced: int | None = None
-    changed: bool = False
-    preferences: Preferences = field(default_factory=Preferences)
-    film: float | None = None
-    tour: TourScenes | None = None
-    hotspots: list[Hotspot] = field(default_factory=list)
-    background: tuple[str, float] | None = None
+    changed: bool = False  # whether a file of the scene has changed since it was loaded
+    preferences: Preferences = field(default_factory=Preferences)  # the remembered values
+    film: float | None = None  # fraction of the film that is written; None if none is being written
+    tour: TourScenes | None = None  # the scenes of the tour that is shown; None for other scenes
+    hotspots: list[Hotspot] = field(default_factory=list)  # places of its panoramas in the image
+    background: tuple[str, float] | None = None  # work of the loader on the tour, and the fraction done
 
 
 class Panels:

@@ -24,17 +24,13 @@ class RightSide:
 
     Attributes:
         comparison: `photograph`; `error`, its mean absolute difference from the image; or `pinned`, another image.
-        texture: the photograph, top row first, or the other image.
-        pose: of the photograph, camera to world.
-        split: place of the divider, a fraction of the width.
-        max_error: the difference with the last colour of the map.
     """
 
     comparison: Comparison
-    texture: moderngl.Texture
-    pose: Float[np.ndarray, "4 4"] | None = None
-    split: float = 0.5
-    max_error: float = 0.25
+    texture: moderngl.Texture  # the photograph, top row first, or the other image
+    pose: Float[np.ndarray, "4 4"] | None = None  # of the photograph, camera to world
+    split: float = 0.5  # place of the divider, a fraction of the width
+    max_error: float = 0.25  # the difference with the last colour of the map
 
 
 class Presenter:

@@ -51,24 +51,18 @@ class Input:
     """Keys and mouse in one frame.
 
     Attributes:
-        seconds: since the last frame.
-        held: names of the keys that are down (lower case: "w", "shift", ...).
-        pressed: names of the keys that went down in this frame.
         drag: pointer movement over the image with the left button held, pixels (right, down).
-        pan: the same with the right or middle button.
         click: place of a click on the image without a drag, as fractions of width and height; None without a click.
-        scroll: wheel steps; positive is scrolling up.
-        height: of the window, pixels.
         sticks: of a gamepad, -1 to 1: fly right, up and forward, turn right and up.
     """
 
-    seconds: float = 1 / 60
-    held: frozenset[str] = frozenset()
-    pressed: frozenset[str] = frozenset()
+    seconds: float = 1 / 60  # since the last frame
+    held: frozenset[str] = frozenset()  # names of the keys that are down (lower case: "w", "shift", ...)
+    pressed: frozenset[str] = frozenset()  # names of the keys that went down in this frame
     drag: tuple[float, float] = (0.0, 0.0)
-    pan: tuple[float, float] = (0.0, 0.0)
-    scroll: float = 0.0
-    height: int = 720
+    pan: tuple[float, float] = (0.0, 0.0)  # the same with the right or middle button
+    scroll: float = 0.0  # wheel steps; positive is scrolling up
+    height: int = 720  # of the window, pixels
     click: tuple[float, float] | None = None
     sticks: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -79,46 +73,30 @@ class Commands:
 
     Attributes:
         png, exr, panorama: write a screenshot.
-        pin: pin the image.
-        go_to_photograph: move to the camera of the photograph of the comparison.
-        focus: orbit the point in the image centre.
-        pick: show the point at this place, as fractions of width and height.
-        choose: show the entry of this index.
-        open: show the scenes at this path.
-        reload: load the entry again.
-        reduce: show the scene that did not fit, with this number of Gaussians.
-        theme: choose these colours.
-        reset_layout: restore the default layout of the panels.
-        visit: fly to this panorama of the tour.
         save_path, open_path: write or read the key frames, to or from this file.
-        film: write the film of the path.
-        cancel_film: end the film that is being written.
-        dismiss_error: close the error message.
-        cancel_loading: end the search for scenes, or the prediction.
-        cancel_refinement: keep the prediction.
     """
 
     png: bool = False
     exr: bool = False
     panorama: bool = False
-    pin: bool = False
-    go_to_photograph: bool = False
-    focus: bool = False
-    pick: tuple[float, float] | None = None
-    choose: int | None = None
-    open: str | None = None
-    reload: bool = False
-    reduce: int | None = None
-    theme: Theme | None = None
-    reset_layout: bool = False
-    visit: int | None = None
+    pin: bool = False  # pin the image
+    go_to_photograph: bool = False  # move to the camera of the photograph of the comparison
+    focus: bool = False  # orbit the point in the image centre
+    pick: tuple[float, float] | None = None  # show the point at this place, as fractions of width and height
+    choose: int | None = None  # show the entry of this index
+    open: str | None = None  # show the scenes at this path
+    reload: bool = False  # load the entry again
+    reduce: int | None = None  # show the scene that did not fit, with this number of Gaussians
+    theme: Theme | None = None  # choose these colours
+    reset_layout: bool = False  # restore the default layout of the panels
+    visit: int | None = None  # fly to this panorama of the tour
     save_path: str | None = None
     open_path: str | None = None
-    film: bool = False
-    cancel_film: bool = False
-    dismiss_error: bool = False
-    cancel_loading: bool = False
-    cancel_refinement: bool = False
+    film: bool = False  # write the film of the path
+    cancel_film: bool = False  # end the film that is being written
+    dismiss_error: bool = False  # close the error message
+    cancel_loading: bool = False  # end the search for scenes, or the prediction
+    cancel_refinement: bool = False  # keep the prediction
 
 
 _KEYS = {

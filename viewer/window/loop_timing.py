@@ -34,19 +34,12 @@ _WAIT_SECONDS = 0.05  # as the window waits for an image
 
 @dataclass(frozen=True)
 class LoopTimes:
-    """Medians of a mode.
+    """Medians of a mode."""
 
-    Attributes:
-        moving_ms: time of a frame of a flight.
-        moving_size: (width, height) at which its images are drawn, pixels.
-        sharp_seconds: from the last input of a flight until the full image is shown.
-        turning_ms: time of a frame of a turn whose cube faces are finished.
-    """
-
-    moving_ms: float
-    moving_size: tuple[int, int]
-    sharp_seconds: float
-    turning_ms: float
+    moving_ms: float  # time of a frame of a flight
+    moving_size: tuple[int, int]  # (width, height) at which its images are drawn, pixels
+    sharp_seconds: float  # from the last input of a flight until the full image is shown
+    turning_ms: float  # time of a frame of a turn whose cube faces are finished
 
     def __str__(self) -> str:
         (width, height), sharp = self.moving_size, self.sharp_seconds

@@ -22,17 +22,11 @@ _MAX_RECENT = 10
 
 @dataclass(frozen=True)
 class Preferences:
-    """The remembered values.
+    """The remembered values."""
 
-    Attributes:
-        theme: colours of the panels.
-        recent: paths that were opened, the last one first.
-        layout: sizes, places and docking of the panels, as imgui's text; empty is the default layout.
-    """
-
-    theme: Theme = "dark"
-    recent: tuple[str, ...] = ()
-    layout: str = ""
+    theme: Theme = "dark"  # colours of the panels
+    recent: tuple[str, ...] = ()  # paths that were opened, the last one first
+    layout: str = ""  # sizes, places and docking of the panels, as imgui's text; empty is the default layout
 
     def add_recent(self, path: Path) -> Preferences:
         """The preferences with a path as the last one that was opened."""
