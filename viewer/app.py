@@ -257,7 +257,7 @@ def _write_film(
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from pansplat.tours import plan_route
-    from pansplat_viewer.capture import Film, SceneFrames, TourFrames, write_flythrough, write_path_film, write_tour
+    from pansplat_viewer.capture import Film, TourFrames, open_frames, write_flythrough, write_path_film, write_tour
     from pansplat_viewer.draw.cpu_renderer import create_renderer
     from pansplat_viewer.scene.state import create_level_camera, fit_settings
     from pansplat_viewer.scene.tour import TourScenes
@@ -286,28 +286,23 @@ def _write_film(
             bars.update(draw, description="film" if task in ("film", "done") else f"film: {task}", completed=done)
 
         tour, settings = loaded.entry.tour, fit_settings(options.settings, loaded.scene)
-        renderers = [create_renderer(ctx, choice, color_bits=32) for _ in range(1 if tour is None else 2)]
+        scenes = None if tour is None else TourScenes(tour, memory=options.memory, merged=loaded.entry.merged)
+        if scenes is not None:
+            scenes.add(loaded)
+        format_, create = options.image_format, lambda: create_renderer(ctx, choice, color_bits=32)
         try:
-            merged = loaded.entry.merged
-            scenes = None if tour is None else TourScenes(tour, memory=options.memory, merged=merged)
-            if scenes is None:
-                frames = SceneFrames(renderers[0], loaded.scene, pixels, settings, options.image_format)
-            else:
-                scenes.add(loaded)
-                frames = TourFrames(renderers, scenes, load, pixels, settings, options.image_format)
-            if path is not None:
-                assert options.out is not None
-                level = create_level_camera(loaded.scene, tour)
-                written = write_path_film(frames, path, level, options.out, options.fps, show_progress)
-            elif scenes is not None:
-                assert isinstance(frames, TourFrames)
-                route = plan_route(scenes.tour, scenes.tour.plan_walk())
-                written = write_tour(frames, scenes, route, folder, film, show_progress)
-            else:
-                written = write_flythrough(renderers[0], loaded.scene, folder, film, settings, show_progress)
+            with open_frames(create, loaded.scene, scenes, load, pixels, settings, format_) as frames:
+                if path is not None:
+                    assert options.out is not None
+                    level = create_level_camera(loaded.scene, tour)
+                    written = write_path_film(frames, path, level, options.out, options.fps, show_progress)
+                elif isinstance(frames, TourFrames):
+                    assert scenes is not None
+                    route = plan_route(scenes.tour, scenes.tour.plan_walk())
+                    written = write_tour(frames, scenes, route, folder, film, show_progress)
+                else:
+                    written = write_flythrough(frames, loaded.scene, folder, film, show_progress)
         finally:
-            for renderer in renderers:
-                renderer.release()
             if ctx is not None:
                 ctx.release()
     for file in written:

@@ -1,5 +1,8 @@
 """Files that the viewer writes: screenshots, the fly-through of a pair, and films of tours and of camera paths."""
 
+from __future__ import annotations
+
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -92,47 +95,41 @@ def compute_panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4
 
 
 def write_flythrough(
-    renderer: FrameRenderer,
-    scene: Scene,
-    folder: Path,
-    film: Film,
-    settings: DrawSettings,
-    progress: Callable[[str, float], None],
+    frames: SceneFrames, scene: Scene, folder: Path, film: Film, progress: Callable[[str, float], None]
 ) -> list[Path]:
     """Render film, stills and panorama into `folder`; returns the files, each written completely or not at all.
 
     Args:
-        renderer: on any context; the scene is uploaded to it.
+        frames: of the scene.
         scene: the scene.
         folder: created if it does not exist.
         film: sizes and times.
-        settings: draw settings; the film's field of view and layout replace theirs.
         progress: called with the task and the fraction done.
 
     Raises:
         InputError: the folder cannot be written, or the scene is empty.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    renderer.upload(scene)
-    settings = replace(settings, vertical_fov_degrees=film.vertical_fov_degrees, layout="pinhole", cached=False)
     num_frames = film.count_frames()
     steps = num_frames + len(STILLS) + 1
     written = []
+
+    def draw(fraction: float) -> np.ndarray:
+        return frames.draw(compute_flight_pose(scene, fraction), film.vertical_fov_degrees, 0.0)[0]
+
     for done, fraction in enumerate(STILLS):
         progress("stills", done / steps)
         written.append(folder / f"view_{round(100 * fraction):03d}.png")
-        write_image(written[-1], _render(renderer, compute_flight_pose(scene, fraction), film.size, settings))
+        write_image(written[-1], draw(fraction))
     progress("panorama", len(STILLS) / steps)
-    height = film.panorama_height or scene.height
     written.append(folder / f"panorama_{round(100 * film.at):03d}.png")
-    equirect = replace(settings, layout="equirect")
-    write_image(written[-1], _render(renderer, compute_panorama_pose(scene, film.at), (2 * height, height), equirect))
+    height = film.panorama_height or scene.height
+    write_image(written[-1], frames.draw_panorama(compute_panorama_pose(scene, film.at), height))
 
     def render_frames() -> Iterator[np.ndarray]:
         for frame in range(num_frames):
             progress("film", (len(STILLS) + 1 + frame) / steps)
-            pose = compute_flight_pose(scene, frame / (num_frames - 1))
-            yield to_bytes(_render(renderer, pose, film.size, settings))
+            yield to_bytes(draw(frame / (num_frames - 1)))
 
     written.append(folder / "flythrough.mp4")
     write_video(written[-1], render_frames(), film.fps)
@@ -167,6 +164,11 @@ class SceneFrames:
         """Colour of a pose at a time of the film, in seconds, and radial depth in metres if it is asked for."""
         settings = replace(self._settings, vertical_fov_degrees=vertical_fov_degrees)
         return render_image(self._renderer, pose, self._size, settings, self.image_format, with_depth=with_depth)
+
+    def draw_panorama(self, pose: Float[np.ndarray, "4 4"], height: int) -> Float[np.ndarray, "height width 3"]:
+        """Colour of all directions from a pose."""
+        size, image_format = (2 * height, height), ImageFormat("equirect")
+        return render_image(self._renderer, pose, size, self._settings, image_format)[0]
 
 
 class TourFrames:
@@ -237,6 +239,28 @@ class TourFrames:
                 )
                 color, depth = color + part * image, depth if image_depth is None else image_depth
         return np.asarray(color), depth
+
+
+@contextlib.contextmanager
+def open_frames(
+    create_renderer: Callable[[], FrameRenderer],
+    scene: Scene,
+    scenes: TourScenes | None,
+    load: Callable[[SceneEntry], LoadedScene],
+    size: tuple[int, int],
+    settings: DrawSettings,
+    image_format: ImageFormat,
+) -> Iterator[SceneFrames | TourFrames]:
+    """The frames of a film in a scene, or in a tour whose `scenes` are given; the renderers are released at the end."""
+    renderers = [create_renderer() for _ in range(1 if scenes is None else 2)]
+    try:
+        if scenes is None:
+            yield SceneFrames(renderers[0], scene, size, settings, image_format)
+        else:
+            yield TourFrames(renderers, scenes, load, size, settings, image_format)
+    finally:
+        for renderer in renderers:
+            renderer.release()
 
 
 def write_tour(
@@ -334,10 +358,3 @@ def name_frame(file: Path, frame: int) -> Path:
 def to_bytes(color: Float[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
     """Colours in [0, 1] as 8 bits."""
     return (color * 255 + 0.5).astype(np.uint8)
-
-
-def _render(
-    renderer: FrameRenderer, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
-) -> Float[np.ndarray, "height width 3"]:
-    renderer.render(cam2world, size, settings, wait=True)
-    return np.clip(renderer.read_color()[..., :3], 0.0, 1.0)

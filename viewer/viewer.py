@@ -16,9 +16,8 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.tours import plan_route
 from pansplat_viewer.capture import (
-    SceneFrames,
-    TourFrames,
     find_free_name,
+    open_frames,
     write_path_film,
     write_screenshot,
 )
@@ -666,17 +665,9 @@ class Viewer:
             def load(entry: SceneEntry) -> LoadedScene:  # a film that is cancelled does not wait for a prediction
                 return self.loader.load(entry, lambda task, done: progress())
 
-            renderers = [CpuRenderer(None) for _ in range(1 if tour is None else 2)]
-            try:
-                if tour is None:
-                    frames = SceneFrames(renderers[0], scene, size, settings, image_format)
-                else:
-                    scenes = TourScenes(tour.tour, memory=memory, merged=loaded.entry.merged)
-                    frames = TourFrames(renderers, scenes, load, size, settings, image_format)
+            scenes = None if tour is None else TourScenes(tour.tour, memory=memory, merged=loaded.entry.merged)
+            with open_frames(lambda: CpuRenderer(None), scene, scenes, load, size, settings, image_format) as frames:
                 return write_path_film(frames, path, level, file, fps, progress)
-            finally:
-                for renderer in renderers:
-                    renderer.release()
 
         self._films.start(write)
 

@@ -1072,7 +1072,6 @@ def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
     assert user.panels.items["hotspots"][2] < SIZE[0]
 
 
-@both
 @pytest.mark.slow
 def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     user = tour_user
@@ -1206,10 +1205,10 @@ def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, 
 def test_a_scene_after_a_tour_does_not_fade_from_it(tour_user, pair):
     user = tour_user
     user.click_at(*user.panels.minimap.nodes[3])
-    fly(user)
+    fly(user, 1.0)
     while user.viewer._fade.front == 0:
         user.click_at(*user.panels.minimap.nodes[2 if find_node(user) == 0 else 0])
-        fly(user)
+        fly(user, 1.0)
     user.viewer.show(user.entries, 0)
     user.draw_until(lambda: user.viewer._tour is None, "pair")
     assert user.viewer._fade.compute_weight(user.clock[0]) == 1

@@ -63,7 +63,7 @@ class PreparedScene:
     """A scene as the renderer needs it."""
 
     splats: Splats  # without `geometry` and `harmonics`, which `scene` has
-    scene: DisplayScene  # the Gaussians
+    scene: DisplayScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class _Picture:
     pixels: UInt32[np.ndarray, "height width"]  # at full size, bottom row first
     groups: _Groups | None
     sums: Float[np.ndarray, "layer 5 height width"] | None
-    stats: FrameStats  # counts and times
+    stats: FrameStats
 
 
 @dataclass(eq=False)

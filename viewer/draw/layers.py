@@ -52,7 +52,7 @@ class Frame:
     position: tuple[float, float, float]  # camera centre in the splats' moved frame
     world_position: Float[np.ndarray, "3"]  # camera centre, metres
     size: tuple[int, int]  # (width, height) at which the image is drawn, pixels
-    settings: DrawSettings  # draw settings
+    settings: DrawSettings
     full_size: tuple[int, int]  # (width, height) without `settings.scale`
 
     @staticmethod
@@ -235,7 +235,7 @@ class TargetStore:
 class Layer:
     """The premultiplied image of one set of Gaussians, and the work that it took in this frame."""
 
-    target: Target  # the textures
+    target: Target
     visible: int  # number of Gaussians in the set
     drawn: int  # number of splats drawn for this frame
     cached: bool  # whether all parts in view were valid before

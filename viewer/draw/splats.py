@@ -188,7 +188,7 @@ class SortedSplats:
         colors: RGB and padding as seen from the position, or None if colours do not depend on it.
     """
 
-    splats: Splats  # the scene
+    splats: Splats
     position: tuple[float, float, float]  # camera centre in the splats' moved frame
     distances: Float[np.ndarray, "n"]  # of each mean from the camera, metres
     order: UInt[np.ndarray, "n"]  # indices by ascending distance, ties by index

@@ -24,7 +24,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import moderngl
 import numpy as np
 
 from pansplat.errors import InputError
@@ -32,7 +31,6 @@ from pansplat.gaussians.ply import load_ply
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
-from pansplat_viewer.draw.programs import choose_tier
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
 
 _TURN_RADIANS = 5e-3  # between frames of a camera that turns
@@ -65,7 +63,7 @@ def run_job(job: dict[str, Any]) -> Iterator[dict[str, object]]:
     try:
         for tier in job["tiers"]:
             try:
-                renderer = CpuRenderer(ctx) if tier == "cpu" else _create_gl_renderer(ctx, tier)
+                renderer = CpuRenderer(ctx) if tier == "cpu" else SplatRenderer(ctx, tier=tier, color_bits=32)
             except InputError:
                 continue
             try:
@@ -79,11 +77,6 @@ def run_job(job: dict[str, Any]) -> Iterator[dict[str, object]]:
                 renderer.release()
     finally:
         ctx.release()
-
-
-def _create_gl_renderer(ctx: moderngl.Context, tier: str) -> SplatRenderer:
-    choose_tier(ctx, tier)
-    return SplatRenderer(ctx, tier=tier, color_bits=32)  # type: ignore[arg-type]
 
 
 def _measure(
