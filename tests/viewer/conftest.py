@@ -129,6 +129,19 @@ def pose() -> np.ndarray:
     return cam2world
 
 
+@pytest.fixture(scope="session")
+def turn() -> Callable[[np.ndarray, float], np.ndarray]:
+    """Returns a pose that is turned to the right by degrees."""
+
+    def turn(pose: np.ndarray, degrees: float) -> np.ndarray:
+        angle, turned = np.radians(degrees), pose.copy()
+        about_y = np.array(((np.cos(angle), 0, np.sin(angle)), (0, 1, 0), (-np.sin(angle), 0, np.cos(angle))))
+        turned[:3, :3] = pose[:3, :3] @ about_y
+        return turned
+
+    return turn
+
+
 def _rasterize_reference(
     scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings, panorama: str = "cubemap"
 ) -> Rendering:

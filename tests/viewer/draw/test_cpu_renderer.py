@@ -1,6 +1,5 @@
 """Images drawn on the processor: pixels, cube faces of a position, work without waiting, and the choice of renderer."""
 
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -28,13 +27,9 @@ def renderer(ctx, small_scene):
 
 
 @pytest.fixture
-def turned(pose):
+def turned(pose, turn):
     """The same position, turned by 100 degrees."""
-    angle = math.radians(100)
-    turn = np.array(((math.cos(angle), 0, math.sin(angle)), (0, 1, 0), (-math.sin(angle), 0, math.cos(angle))))
-    result = pose.copy()
-    result[:3, :3] = turn @ pose[:3, :3]
-    return result
+    return turn(pose, 100)
 
 
 def read_pixels(texture) -> np.ndarray:

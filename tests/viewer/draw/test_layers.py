@@ -15,15 +15,6 @@ CACHED = DrawSettings(cached=True, background=(0.3, 0.2, 0.1))
 STORAGES = (CACHED, replace(CACHED, cached=False), replace(CACHED, cached=False, layout="equirect"))
 
 
-def turn_right(pose, degrees):
-    """The camera turned to the right."""
-    angle = np.radians(degrees)
-    c, s = np.cos(angle), np.sin(angle)
-    result = pose.copy()
-    result[:3, :3] = pose[:3, :3] @ np.array(((c, 0, s), (0, 1, 0), (-s, 0, c)))
-    return result
-
-
 def enlarge_gaussians(scene):
     """The scene with Gaussians of several pixels, which resampling hardly blurs."""
     return replace(scene, gaussians=replace(scene.gaussians, scales=scene.gaussians.scales.clamp_min(0.15)))
@@ -36,11 +27,11 @@ def render_image(renderer, pose, settings, size=SIZE):
 
 @pytest.mark.parametrize("color_bits", [16, 32])
 @pytest.mark.parametrize("mode", ["joint", "deferred"])
-def test_cached_faces_give_the_image_of_direct_drawing(make_renderer, random_scene, pose, mode, color_bits):
+def test_cached_faces_give_the_image_of_direct_drawing(make_renderer, random_scene, pose, turn, mode, color_bits):
     scene = enlarge_gaussians(random_scene(150))
     kept, direct = make_renderer(scene, color_bits=color_bits, slot=1), make_renderer(scene)
     for degrees in (0, 40, 100, 170, 260):
-        camera = turn_right(pose, degrees)
+        camera = turn(pose, degrees)
         settings = replace(CACHED, mode=mode)
         error = np.abs(
             render_image(kept, camera, settings) - render_image(direct, camera, replace(settings, cached=False))
@@ -57,11 +48,11 @@ def test_cached_faces_give_the_depth_of_direct_drawing(make_renderer, random_sce
     assert np.abs(kept.read_depth() - direct.read_depth()).mean() < 0.01
 
 
-def test_rotation_draws_each_face_once(make_renderer, random_scene, pose):
+def test_rotation_draws_each_face_once(make_renderer, random_scene, pose, turn):
     renderer = make_renderer(random_scene())
     for degrees in range(0, 360, 30):
-        renderer.render(turn_right(pose, degrees), SIZE, CACHED)
-    renderer.render(turn_right(pose, 90), SIZE, CACHED)
+        renderer.render(turn(pose, degrees), SIZE, CACHED)
+    renderer.render(turn(pose, 90), SIZE, CACHED)
     assert renderer.stats.cached and renderer.stats.drawn == 0
     renderer.render(pose, SIZE, replace(CACHED, background=(1, 1, 1)))
     assert renderer.stats.cached, "layers do not depend on the background"

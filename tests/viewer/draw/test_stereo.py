@@ -154,13 +154,6 @@ def read_texture(texture) -> np.ndarray:
     return pixels / 255 if texture.dtype == "f1" else pixels
 
 
-def turn(pose: np.ndarray, degrees: float) -> np.ndarray:
-    angle, turned = np.radians(degrees), pose.copy()
-    about_y = np.array(((np.cos(angle), 0, np.sin(angle)), (0, 1, 0), (-np.sin(angle), 0, np.cos(angle))))
-    turned[:3, :3] = pose[:3, :3] @ about_y
-    return turned
-
-
 @pytest.mark.gl
 def test_the_window_shows_the_images_of_both_eyes(stereo_renderer, pose):
     for stereo in ("mono", "side-by-side", "top-bottom", "anaglyph"):
@@ -178,7 +171,7 @@ def test_the_window_shows_the_images_of_both_eyes(stereo_renderer, pose):
 
 
 @pytest.mark.gl
-def test_turning_reads_cached_faces_of_both_eyes_until_they_are_out_of_place(stereo_renderer, pose):
+def test_turning_reads_cached_faces_of_both_eyes_until_they_are_out_of_place(stereo_renderer, pose, turn):
     settings = DrawSettings(stereo="side-by-side", eye_distance=0.2, cached=True, vertical_fov_degrees=40)
     stereo_renderer.render(pose, (48, 32), settings)
     for degrees in (-15, 15):  # the first turns may need another face
@@ -196,7 +189,9 @@ def test_turning_reads_cached_faces_of_both_eyes_until_they_are_out_of_place(ste
 @pytest.mark.gl
 @pytest.mark.parametrize("stereo_renderer", ["cpu"], indirect=True)
 @pytest.mark.parametrize("direction", [-1, 1])
-def test_the_faces_at_the_next_places_of_the_eyes_are_drawn_during_a_turn(stereo_renderer, pose, direction, wait_until):
+def test_the_faces_at_the_next_places_of_the_eyes_are_drawn_during_a_turn(
+    stereo_renderer, pose, turn, direction, wait_until
+):
     settings, size = DrawSettings(stereo="anaglyph", eye_distance=0.2, cached=True, vertical_fov_degrees=40), (48, 32)
     for degrees in (0, 4, 8, 16):
         turned = turn(pose, direction * degrees)
@@ -213,7 +208,7 @@ def test_the_faces_at_the_next_places_of_the_eyes_are_drawn_during_a_turn(stereo
 
 
 @pytest.mark.gl
-def test_images_of_both_eyes_are_shown_when_both_are_finished(stereo_renderer, random_scene, pose, wait_until):
+def test_images_of_both_eyes_are_shown_when_both_are_finished(stereo_renderer, random_scene, pose, turn, wait_until):
     settings = DrawSettings(stereo="anaglyph", eye_distance=0.2)
     stereo_renderer.render(pose, (24, 16), DrawSettings(), wait=False)
     for place, size in ((pose, (24, 16)), (turn(pose, 20), (48, 32))):

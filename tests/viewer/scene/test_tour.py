@@ -146,6 +146,7 @@ def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house,
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
+    monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: replace(tour, overlaps=house.overlaps))
     arguments = ["--offscreen", str(tmp_path), "--size", "64x32", "--seconds", "0.5", "--renderer", "cpu"]
     assert run([str(house.folder), *arguments]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["floor_plan.png", "tour.mp4"]
