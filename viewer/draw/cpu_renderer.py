@@ -334,7 +334,7 @@ class CpuRenderer:
         )
         options = RasterOptions(near=frame.settings.near)
         deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
-        selection = Selection(camera.compute_side_normals(), deviation, bounded=True)
+        selection = Selection(camera.compute_side_normals(), deviation)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,

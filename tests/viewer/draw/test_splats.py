@@ -4,29 +4,14 @@ import threading
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from pansplat_viewer.draw import splats as splats_module
-from pansplat_viewer.draw.splats import Splats, SplatSorter, radix_argsort, sort_splats
-
-_FLOATS = st.floats(width=32, allow_nan=False)
+from pansplat_viewer.draw.splats import Splats, SplatSorter, sort_splats
 
 
 @pytest.fixture
 def splats(random_scene) -> Splats:
     return Splats.from_scene(random_scene(20))
-
-
-@given(hnp.arrays(np.float32, st.integers(0, 200), elements=_FLOATS))
-def test_radix_order_of_any_floats_is_the_stable_order(keys):
-    assert np.array_equal(radix_argsort(keys), np.argsort(keys, kind="stable"))
-
-
-def test_radix_order_of_many_keys_with_ties_is_the_stable_order():
-    keys = np.random.default_rng(0).integers(0, 5000, 200_000).astype(np.float32) / 7
-    assert np.array_equal(radix_argsort(keys), np.argsort(keys, kind="stable"))
 
 
 def test_splats_are_sorted_by_distance_from_the_position(random_scene):
