@@ -1,6 +1,4 @@
-"""Scenes of the raster benchmark: a synthetic furnished room of any size, and discs on the known depth of a pair.
-
-Both have one Gaussian at every point of every level's lattice.
+"""The synthetic furnished room of the benchmarks, of any size: one Gaussian at every point of every level's lattice.
 
 Source: PanSplat, section 3.3 (lattices and levels). The counts are the paper's: 886,580 Gaussians at a height of
 512, of two views and four levels.
@@ -12,17 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pansplat.data.views import Views
-from pansplat.errors import InputError
-from pansplat.gaussians.harmonics import harmonics_basis
-from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.equirect import (
-    pad_equirect,
-    pixel_directions,
-    resize_equirect,
-    sample_equirect,
-    uv_from_directions,
-)
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
 
@@ -180,72 +168,3 @@ def _make_harmonics(
     harmonics = 0.1 * torch.randn(len(points), (degree + 1) ** 2, 3, generator=generator)
     harmonics[:, 0] = (2.4 * (palette[surface] - 0.5) + 0.5 * stripes[:, None] + grain).float()
     return harmonics
-
-
-def lift_depth(views: Views) -> Scene:
-    """A scene of discs on the surfaces of the views' depth maps, one for each lattice point.
-
-    Sizes and opacities are as in `full_lattice_room`, colours are those of the images. Unknown depth is replaced by
-    the view's median. The order is level, view, lattice point.
-
-    Args:
-        views: with depths; the height is a multiple of 8.
-
-    Returns:
-        A scene of float32 Gaussians, 886,580 of two views at a height of 512.
-
-    Raises:
-        InputError: the views have no depth.
-    """
-    if views.depths is None:
-        raise InputError(
-            "a scene from depth needs a depth map for each panorama, got none; choose --scene-from prediction"
-        )
-    height = views.images.shape[-2]
-    generator = torch.Generator().manual_seed(0)  # of sizes and opacities
-    depths = [torch.where(known > 0, known, known[known > 0].median()) for known in views.depths.double()]
-    parts = [
-        _lift_level(views.images[view], depth, views.cam2world[view], level, view, generator)
-        for level in range(NUM_LEVELS)
-        for view, depth in enumerate(depths)
-    ]
-    return Scene(Gaussians.cat(parts), views.cam2world, views.near, views.far, views.names, "depth", height)
-
-
-def _lift_level(
-    image: Float[Tensor, "3 height width"],
-    depth: Float[Tensor, "height width"],
-    pose: Float[Tensor, "4 4"],
-    level: int,
-    view: int,
-    generator: torch.Generator,
-) -> Gaussians:
-    """The discs of one view's lattice of one level."""
-    height = image.shape[-2] >> level
-    maps = torch.cat((image.double(), 1 / depth[None]))
-    maps = resize_equirect(maps[None], (height, 2 * height))[0]
-    maps = torch.cat((maps, _compute_normals(1 / maps[3])))
-    rays = fibonacci_directions(lattice_size(2 * height))
-    samples = sample_equirect(maps, uv_from_directions(rays)).T
-    distance = 1 / samples[:, 3]
-    normals = torch.nn.functional.normalize(samples[:, 4:], dim=1)
-    rotation = pose[:3, :3]
-    return make_flat_discs(
-        rays @ rotation.T,
-        (distance[:, None] * rays) @ rotation.T + pose[:3, 3],
-        normals @ rotation.T,
-        sample_disc_sizes(len(rays), generator),
-        distance * math.pi / height,
-        ((samples[:, :3] - 0.5) / harmonics_basis(rays, 0))[:, None, :],
-        level,
-        view,
-    )
-
-
-def _compute_normals(depth: Float[Tensor, "height width"]) -> Float[Tensor, "3 height width"]:
-    """Unit normals of the surface, from the points of neighbouring pixels."""
-    points = (pixel_directions(*depth.shape, dtype=torch.float64) * depth[..., None]).permute(2, 0, 1)
-    around = pad_equirect(points, 1, "sphere")
-    east = around[:, 1:-1, 2:] - around[:, 1:-1, :-2]
-    south = around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
-    return torch.nn.functional.normalize(torch.linalg.cross(east, south, dim=0), dim=0)

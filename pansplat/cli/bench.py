@@ -41,9 +41,7 @@ class BenchRaster:
     """Measure the rasterisers: time and memory against error, for every choice of kernel, order, filter and faces."""
 
     scene: Positional[Path | None] = None
-    """A scene file, or the folder of a pair; by default a synthetic room, and the sample if it is there."""
-    scene_from: Literal["prediction", "depth"] = "prediction"
-    """How a pair becomes a scene: predicted by `sweep`, or from depth maps with a Gaussian at every lattice point."""
+    """A scene file, or the folder of a pair for `sweep`; by default a synthetic room, and the sample if it is there."""
     quick: bool = False
     """Some minutes on two cores instead of an hour: all choices at reduced height only."""
     json: Path | None = None
@@ -125,17 +123,12 @@ class BenchRaster:
         return lambda _: BenchScene(path.stem, lambda: scene.gaussians, pose)
 
     def _read_scene(self, path: Path, height: int) -> Scene:
-        """The scene of a file, or the scene of a pair's folder by `sweep` or from its depth maps."""
+        """The scene of a file, or the prediction of a pair's folder by `sweep`."""
         from pansplat import pipeline
-        from pansplat.bench.scenes import lift_depth
 
         if is_scene_file(path):
-            if self.scene_from == "depth":
-                raise InputError(f"--scene-from depth needs a pair's folder with depth maps, got {path}; leave it out")
             return pipeline.load(path)
         pair = choose_pair(path, PairChoice())
-        if self.scene_from == "depth":
-            return lift_depth(pair.load_context(height))
         model = pipeline.load_model("sweep")
         return predict_scene(pair, model, max(height, _MIN_SWEEP_HEIGHT), cache=True)
 

@@ -5,14 +5,8 @@ import math
 import pytest
 import torch
 
-from pansplat.bench.scenes import full_lattice_room, lattice_room_size, lift_depth, make_room_cameras
-from pansplat.data.views import Views
-from pansplat.errors import InputError
-from pansplat.geometry.equirect import pixel_directions
+from pansplat.bench.scenes import full_lattice_room, lattice_room_size, make_room_cameras
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.rendering import rasterize
-
-HEIGHT = 64
 
 
 def test_counts_are_those_of_the_paper():
@@ -57,49 +51,3 @@ def test_furniture_hides_the_walls():
 def test_heights_that_are_not_multiples_of_8_are_refused():
     with pytest.raises(ValueError, match="multiple of 8, got 20"):
         full_lattice_room(20)
-
-
-def views_in_a_sphere(radius: float = 2.0) -> Views:
-    """Two rotated panoramas from the centre of a sphere whose colours are linear in the direction."""
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[1, :3, :3] = rotations_from_quats(torch.tensor((0.6, 0.0, 0.8, 0.0), dtype=torch.float64))
-    directions = pixel_directions(HEIGHT, 2 * HEIGHT, dtype=torch.float64)
-    images = torch.stack([(0.5 + 0.4 * directions @ pose[:3, :3].T).permute(2, 0, 1) for pose in poses]).float()
-    depths = torch.full((2, HEIGHT, 2 * HEIGHT), radius)
-    return Views(images, poses, torch.ones_like(depths, dtype=torch.bool), 0.5, 5.0, ("a", "b"), depths)
-
-
-def test_every_lattice_point_is_lifted_to_the_surface():
-    gaussians = lift_depth(views_in_a_sphere()).gaussians
-    assert len(gaussians) == lattice_room_size(HEIGHT)
-    assert torch.allclose(gaussians.means.norm(dim=1), torch.full((len(gaussians),), 2.0))
-
-
-def test_lifted_discs_lie_flat_on_the_surface():
-    gaussians = lift_depth(views_in_a_sphere()).gaussians
-    normals = rotations_from_quats(gaussians.quats.double())[:, :, 2]
-    cosines = (normals * gaussians.means.double() / 2).sum(dim=1).abs()
-    # Normals from neighbouring pixels are exact except near the poles.
-    assert cosines.median() > 0.999 and cosines.min() > math.cos(math.radians(20))
-
-
-def test_a_scene_from_depth_looks_like_its_images():
-    views = views_in_a_sphere()
-    scene = lift_depth(views)
-    for image, pose in zip(views.images, views.cam2world, strict=True):
-        rendered = rasterize(scene.gaussians, pose, size=(HEIGHT, 2 * HEIGHT)).color
-        error = (rendered - image).abs()  # colours span 0.8
-        assert error.mean() < 0.03 and error.max() < 0.1
-
-
-def test_unknown_depth_is_replaced_by_the_median():
-    views = views_in_a_sphere()
-    views.depths[0, 10:20, 30:50] = 0
-    assert torch.allclose(lift_depth(views).gaussians.means.norm(dim=1), torch.tensor(2.0))
-
-
-def test_views_without_depth_are_refused():
-    views = views_in_a_sphere()
-    without = Views(views.images, views.cam2world, views.masks, views.near, views.far, views.names)
-    with pytest.raises(InputError, match="needs a depth map"):
-        lift_depth(without)

@@ -10,7 +10,7 @@ import pytest
 from pansplat import pipeline
 from pansplat.bench import raster, raster_cases, roofline
 from pansplat.bench.raster_cases import Group
-from pansplat.bench.scenes import full_lattice_room, lattice_room_size, make_room_cameras
+from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.cli import bench, run
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -69,15 +69,6 @@ def test_a_ply_scene_is_measured(tmp_path):
     assert {row["scene"] for row in rows} == {"mine", "mine 1/16"}
 
 
-@pytest.mark.slow
-def test_the_depth_of_a_pair_gives_a_gaussian_at_every_lattice_point(tmp_path):
-    file = tmp_path / "rows.json"
-    command = ["bench", "raster", str(SAMPLE), "--scene-from", "depth", "--quick", "--height", "16"]
-    assert run([*command, "--json", str(file)]) == 0
-    headline = [row for row in json.loads(file.read_text())["rows"] if row["suite"] == "headline"]
-    assert {(row["scene"], row["num_gaussians"]) for row in headline} == {("living_room", lattice_room_size(16))}
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -87,7 +78,6 @@ def test_the_depth_of_a_pair_gives_a_gaussian_at_every_lattice_point(tmp_path):
         ("raster --json no/rows.json", "create it first"),
         ("raster --plot rows.jpg", ".png, .svg or .pdf"),
         ("raster none.ply", "none.ply"),
-        ("raster none.ply --scene-from depth", "needs a pair's folder"),
         ("model --height 80", "multiple of 64"),
         ("model --threads 0", "--threads must be a whole number of 1"),
         ("model --json no/rows.json", "create it first"),
