@@ -6,7 +6,6 @@ The rows are saved after every image, so that an interruption loses nothing.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,7 +24,6 @@ from pansplat.bench.renderers import (
     device_of,
     release_workspace,
     render_case,
-    render_in_viewer,
     render_with_graph,
     warm_up,
 )
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
-_MARKERS = {"numba": "o", "torch": "s", "triton": "D", "gl33": "^", "gl43": "v", "gsplat": "P", "dense": "X"}
+_MARKERS = {"numba": "o", "torch": "s", "triton": "D", "gsplat": "P", "dense": "X"}
 _KERNEL_COLORS = {"ray": "#1764ab", "ewa": "#c8501e"}
 _FRONT_COLOR = "#2a8c4a"
 _MIN_ERROR = 1e-8  # smaller errors are plotted at this value
@@ -176,31 +174,6 @@ class RasterBench:
             self._load(group.scene)
             with restore_threads():
                 self._measure(group)
-
-    def run_viewer(self, group: Group, repeats: int) -> None:
-        """Measure the viewer on each of its OpenGL tiers; times include the sort.
-
-        Args:
-            group: its cases have layout "cubemap" or "pinhole"; their backend is ignored.
-            repeats: frames of each case.
-
-        Raises:
-            InputError: the viewer is not installed, or there is no OpenGL.
-        """
-        self._load(group.scene)
-        with restore_threads():  # before the viewer starts, so that its times are not disturbed
-            references = [self._reference_images(group, case) for case in group.cases]
-        assert self._gaussians is not None
-        for image in render_in_viewer(group.scene, self._gaussians, group.cases, repeats):
-            case = dataclasses.replace(group.cases[image.index], backend=image.tier)
-            row = self._new_row(group, case)
-            result, frames = row.result, image.frame_ms
-            result.forward_ms, result.forward_min_ms = statistics.median(frames), min(frames)
-            result.forward_spread_ms, result.repeats = quartile_range(frames), len(frames)
-            result.stages_ms = {"sort": image.sort_ms, "draw": max(0.0, result.forward_ms - image.sort_ms)}
-            result.set_errors(case, image.color, *references[image.index])
-            row.note = f"rendered by {image.renderer}"
-            self._report.add(row)
 
     def _load(self, scene: BenchScene) -> None:
         if scene is self._scene:

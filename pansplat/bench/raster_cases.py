@@ -38,7 +38,7 @@ class RasterCase:
     """A way to render an image.
 
     Attributes:
-        backend: "torch", "numba", "triton", "dense", "gsplat", or "gl33" and "gl43" for the viewer.
+        backend: "torch", "numba", "triton", "dense" or "gsplat".
         height: pixels; a panorama is twice as wide, a pinhole image square with a field of view of 90 degrees.
         kernel, order, filter, layout: as in `pansplat.rasterize` (`filter` is its `lowpass`).
         face_size: of the faces of a cubemap, pixels.
@@ -233,17 +233,6 @@ def make_sample_group(settings: Settings, scene: BenchScene) -> Group:
     cases = [case for name in settings.sweep_backends for case in _list_main_choices(small, name)]
     cases += [RasterCase("torch", small.height)] if cases else _list_main_choices(small, "torch")
     return _make_group("scene", scene, cases, "own")
-
-
-def make_viewer_group(settings: Settings, scene: BenchScene) -> Group:
-    """The choices that the viewer supports."""
-    height = settings.choice_height
-    sizes = (default_face_size(height),) if settings.quick else settings.face_sizes
-    cases = [case for case in list_choices("gl", height, sizes, settings.threads) if case.layout == "cubemap"]
-    if settings.quick:  # exact choices, EWA with them, and all choices of the classic renderer
-        kept = [("ray", "radial", "angular"), ("ewa", "radial", "angular"), ("ewa", "z", "3dgs")]
-        cases = [case for case in cases if (case.kernel, case.order, case.filter) in kept]
-    return Group("choices", scene, tuple(cases), "own")
 
 
 def _make_group(suite: str, scene: BenchScene, cases: list[RasterCase], references: References) -> Group:

@@ -1,33 +1,19 @@
-"""Renders the cases of the raster benchmark with the backends of `pansplat.rasterize` and three other renderers.
-
-The others are a dense renderer in torch, gsplat, and the viewer's OpenGL renderer in a separate process.
-"""
+"""Renders the cases of the raster benchmark: the backends of `pansplat.rasterize`, a dense renderer, and gsplat."""
 
 from __future__ import annotations
 
-import importlib.util
-import json
 import math
-import os
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from pansplat.bench.raster_cases import BenchScene, RasterCase
+from pansplat.bench.raster_cases import RasterCase
 from pansplat.constants import ALPHA_CUT, FILTER_VARIANCE, MAX_ALPHA, NEAR
 from pansplat.errors import InputError
-from pansplat.gaussians.ply import save_ply
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import invert_pose
@@ -38,8 +24,6 @@ from pansplat.rendering.projection import project_gaussians
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 _CUDA_BACKENDS = ("triton", "gsplat")
 _DENSE_BLOCK_SIZE = 16  # pixels; float32 resolves the differences of directions within a block
-_VIEWER_TIERS = ("gl33", "gl43")
-_VIEWER_PACKAGE = "pansplat_viewer"
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,87 +224,3 @@ def render_gsplat(
         rasterize_mode="antialiased" if case.filter == "angular" else "classic",
     )
     return stitch_faces(colors.permute(0, 3, 1, 2), case.size, stitching=case.stitching)
-
-
-@dataclass(frozen=True, eq=False)
-class ViewerImage:
-    """An image that the viewer rendered.
-
-    Attributes:
-        index: of the case.
-        tier: of OpenGL, "gl33" or "gl43".
-        frame_ms: frames of a moving camera, the sort included.
-        sort_ms: the sort alone.
-        renderer: OpenGL's name of the device.
-    """
-
-    index: int
-    tier: str
-    color: Float[Tensor, "3 height width"]
-    frame_ms: list[float]
-    sort_ms: float
-    renderer: str
-
-
-def render_in_viewer(
-    scene: BenchScene, gaussians: Gaussians, cases: Sequence[RasterCase], repeats: int
-) -> Iterator[ViewerImage]:
-    """Render the cases, of layout "cubemap" or "pinhole", on each OpenGL tier that is available.
-
-    The viewer runs as a command because no module may import it.
-
-    Raises:
-        InputError: the viewer is not installed, or there is no OpenGL.
-    """
-    if importlib.util.find_spec(_VIEWER_PACKAGE) is None:
-        raise InputError("the viewer is not installed; install all of pansplat to measure it")
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        save_ply(Scene(gaussians, scene.pose[None], near=0.1, far=100.0), folder / "scene.ply")
-        job = {
-            "scene": str(folder / "scene.ply"),
-            "pose": scene.pose.tolist(),
-            "size": cases[0].size[::-1],
-            "repeats": repeats,
-            "folder": name,
-            "tiers": _VIEWER_TIERS,
-            "settings": [_viewer_settings(case) for case in cases],
-        }
-        (folder / "job.json").write_text(json.dumps(job))
-        for line in read_viewer_output(folder / "job.json", cases[0].threads):
-            color = torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1)
-            yield ViewerImage(
-                line["settings"], line["tier"], color, line["frame_ms"], line["sort_ms"], line["renderer"]
-            )
-
-
-def _viewer_settings(case: RasterCase) -> dict[str, object]:
-    """The viewer's `DrawSettings` of a case."""
-    layout = {"cubemap": "equirect", "pinhole": "pinhole"}[case.layout]
-    return {
-        "kernel": case.kernel,
-        "order": case.order,
-        "lowpass": case.filter,
-        "layout": layout,
-        "face_size": case.face_size,
-    }
-
-
-def read_viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
-    """Yield the lines that the viewer's command prints, each as soon as it is printed."""
-    environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # of Mesa's software OpenGL
-    command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.draw.timing", str(job)]
-    with (
-        tempfile.TemporaryFile("w+") as errors,
-        subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=errors) as program,
-    ):
-        assert program.stdout is not None
-        try:
-            for line in program.stdout:
-                yield json.loads(line)
-        finally:
-            program.terminate()
-        if program.wait() != 0:
-            errors.seek(0)
-            messages = errors.read().strip().splitlines()
-            raise InputError(f"the viewer rendered nothing: {messages[-1] if messages else 'no message'}")

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import statistics
+import subprocess
+import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -23,7 +26,6 @@ from torch import Tensor
 from pansplat.bench.fidelity import measure_fidelity
 from pansplat.bench.harness import quartile_range
 from pansplat.bench.raster_cases import BenchScene, make_room_scene
-from pansplat.bench.renderers import read_viewer_output
 from pansplat.bench.report import Column, Report, Row, format_number, read_row, result_column
 from pansplat.bench.scenes import make_room_cameras
 from pansplat.errors import InputError
@@ -206,6 +208,26 @@ class ViewerBench:
                 error = measure_fidelity(image, reference, panorama=case.view == "panorama")
                 result.psnr_db, result.max_error = error.psnr_db, error.max_error
             self._report.add(Row("viewer", room.name, case, result))
+
+
+def read_viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
+    """Yield the lines that the viewer's command prints, each as soon as it is printed."""
+    environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # of Mesa's software OpenGL
+    command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.draw.timing", str(job)]
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=errors) as program,
+    ):
+        assert program.stdout is not None
+        try:
+            for line in program.stdout:
+                yield json.loads(line)
+        finally:
+            program.terminate()
+        if program.wait() != 0:
+            errors.seek(0)
+            messages = errors.read().strip().splitlines()
+            raise InputError(f"the viewer rendered nothing: {messages[-1] if messages else 'no message'}")
 
 
 def _image_key(case: ViewerCase) -> tuple[object, ...]:

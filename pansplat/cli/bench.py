@@ -62,7 +62,6 @@ class BenchRaster:
             list_raster_groups,
             make_room_scene,
             make_sample_group,
-            make_viewer_group,
         )
         from pansplat.bench.roofline import describe_machine
 
@@ -77,11 +76,6 @@ class BenchRaster:
             if self.scene is None and _SAMPLE.is_dir():
                 small = settings.choice_height
                 bench.run([make_sample_group(settings, self._scene_of(_SAMPLE, small)(small))])
-            try:
-                group = make_viewer_group(settings, scene_of(settings.choice_height))
-                bench.run_viewer(group, repeats=2 if self.quick else 5)
-            except InputError as error:
-                print(f"without the viewer: {error}")
         return 0
 
     def _files(self) -> tuple[Path | None, Path | None, Path | None]:

@@ -23,7 +23,6 @@ from pansplat.bench.raster import (
     plot_sweeps,
 )
 from pansplat.bench.raster_cases import Group, RasterCase, default_face_size, make_official_case, make_room_scene
-from pansplat.bench.renderers import ViewerImage
 
 HEIGHT = 16
 FACTS = {"cpu": "some", "threads": 2, "gpu": None}
@@ -134,25 +133,6 @@ def test_an_interruption_keeps_the_rows_and_restores_the_threads(rendered, tmp_p
     assert torch.get_num_threads() == threads
 
 
-def test_rows_of_the_viewer_have_its_times_and_errors(monkeypatch):
-    def render_in_viewer(scene, gaussians, cases, repeats):
-        assert scene.name == f"room {HEIGHT}" and len(gaussians) == 862 and repeats == 3
-        for index, _ in enumerate(cases):
-            yield ViewerImage(
-                index, "gl33", torch.full((3, HEIGHT, 2 * HEIGHT), 0.1 * index), [5.0, 7.0, 6.0], 2.0, "Mesa"
-            )
-
-    monkeypatch.setattr(raster, "render_in_viewer", render_in_viewer)
-    report = make_raster_report(MACHINE)
-    RasterBench(report).run_viewer(group(replace(FACES, backend="gl"), replace(FACES, backend="gl", order="z")), 3)
-    rows = [row for row in report.rows if row.case.backend == "gl33"]
-    assert [row.case.order for row in rows] == ["radial", "z"]
-    for row in rows:
-        assert (row.result.forward_ms, row.result.forward_min_ms, row.result.repeats) == (6, 5, 3)
-        assert row.result.stages_ms == {"sort": 2, "draw": 4} and row.note == "rendered by Mesa"
-    assert rows[0].result.own_psnr_db != rows[1].result.own_psnr_db
-
-
 # Findings, tables and plots of given rows.
 
 
@@ -239,7 +219,7 @@ def test_plots_are_made_of_the_rows_of_their_suites(row, tmp_path):
     choices = [
         change(row, suite="choices"),
         change(row, suite="choices", backend="torch", precision="float64", psnr_db=math.inf),
-        change(row, suite="choices", backend="gl33", kernel="ewa", layout="cubemap", face_size=8, filter="3dgs"),
+        change(row, suite="choices", backend="numba", kernel="ewa", layout="cubemap", face_size=8, filter="3dgs"),
     ]
     counts = [change(row, suite="count"), change(row, suite="count", num_gaussians=20, backward_min_ms=9.0)]
     sweeps = counts + [change(one, suite="resolution", height=16 * n) for n, one in enumerate(counts, 1)]

@@ -14,7 +14,6 @@ from pansplat.bench.raster_cases import (
     make_official_case,
     make_room_scene,
     make_sample_group,
-    make_viewer_group,
 )
 from pansplat.bench.scenes import full_lattice_room
 
@@ -89,11 +88,6 @@ def test_without_a_fast_backend_torch_is_measured():
 def test_gsplat_has_only_the_cases_that_it_supports():
     cases = [case for case in cases_of(replace(QUICK, backends=("gsplat",)), "choices") if case.backend == "gsplat"]
     assert cases and all((case.layout, case.kernel, case.order) == ("cubemap", "ewa", "z") for case in cases)
-
-
-def test_the_viewer_has_cubemaps_only():
-    quick, full = (make_viewer_group(settings, make_room_scene(192)).cases for settings in (QUICK, FULL))
-    assert {case.layout for case in (*quick, *full)} == {"cubemap"} and len(quick) == 3 and len(full) == 24
 
 
 def test_official_choices():

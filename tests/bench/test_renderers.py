@@ -1,21 +1,18 @@
 """The dense renderer equals the reference; unavailable renderers give a reason."""
 
-import os
 import sys
 from dataclasses import replace
 
 import pytest
 import torch
 
-from pansplat.bench import renderers
-from pansplat.bench.raster_cases import RasterCase, make_room_scene
-from pansplat.bench.renderers import render_case, render_dense, render_in_viewer, unavailable_reason
+from pansplat.bench.raster_cases import RasterCase
+from pansplat.bench.renderers import render_case, render_dense, unavailable_reason
 from pansplat.bench.scenes import full_lattice_room
 from pansplat.errors import InputError
 from pansplat.rendering import rasterize
 
 HEIGHT = 16
-VIEWER_CASE = RasterCase("gl", HEIGHT, layout="cubemap", face_size=10, threads=2)
 
 
 @pytest.fixture
@@ -69,35 +66,3 @@ def test_missing_gsplat_is_named(monkeypatch, pose):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(InputError, match="needs the package gsplat"):
         render_case(RasterCase("gsplat", 8, "ewa", "z", layout="cubemap", face_size=4), full_lattice_room(8), pose)
-
-
-@pytest.mark.slow
-@pytest.mark.gl
-def test_the_viewer_renders_each_case():
-    scene, cases = make_room_scene(HEIGHT), [VIEWER_CASE, replace(VIEWER_CASE, kernel="ewa")]
-    gaussians = scene.load()
-    try:
-        images = list(render_in_viewer(scene, gaussians, cases, repeats=2))
-    except InputError as error:
-        if os.environ.get("CI"):
-            raise
-        pytest.skip(str(error))
-    images = [image for image in images if image.tier == "gl33"]
-    assert [image.index for image in images] == [0, 1]
-    for image in images:
-        expected = render_case(cases[image.index].reference, gaussians.to(dtype=torch.float64), scene.pose).color
-        assert float((image.color - expected).abs().max()) < 5e-3
-        assert len(image.frame_ms) == 2 and min(image.frame_ms) > 0 and image.sort_ms >= 0 and image.renderer
-
-
-def test_a_missing_viewer_is_an_error(monkeypatch):
-    monkeypatch.setattr(renderers, "_VIEWER_PACKAGE", "no_such_viewer")
-    with pytest.raises(InputError, match="not installed"):
-        next(render_in_viewer(make_room_scene(8), full_lattice_room(8), [VIEWER_CASE], repeats=1))
-
-
-@pytest.mark.slow
-def test_an_error_of_the_viewer_is_passed_on(tmp_path):
-    (tmp_path / "job.json").write_text("{}")
-    with pytest.raises(InputError, match="the viewer rendered nothing: error: 'scene'"):
-        list(renderers.read_viewer_output(tmp_path / "job.json", 1))

@@ -110,3 +110,10 @@ def test_facts_and_plot_need_no_complete_rows():
     rows.append(replace(rows[0], case=replace(case, renderer="gl33"), result=ViewerResult(45.0, 1.0, 40.0, 500)))
     assert find_viewer_facts(rows) == ["500 Gaussians: cpu draws a frame in 10 ms, OpenGL in 40 ms."]
     assert len(plot_viewer(rows, "title").axes) == 1
+
+
+@pytest.mark.slow
+def test_an_error_of_the_viewer_is_passed_on(tmp_path):
+    (tmp_path / "job.json").write_text("{}")
+    with pytest.raises(InputError, match="the viewer rendered nothing: error: 'scene'"):
+        list(viewer.read_viewer_output(tmp_path / "job.json", 1))
