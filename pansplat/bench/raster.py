@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
-_MARKERS = {"numba": "o", "torch": "s", "triton": "D", "gsplat": "P", "dense": "X"}
+_MARKERS = {"numba": "o", "torch": "s", "triton": "D", "dense": "X"}
 _KERNEL_COLORS = {"ray": "#1764ab", "ewa": "#c8501e"}
 _FRONT_COLOR = "#2a8c4a"
 _MIN_ERROR = 1e-8  # smaller errors are plotted at this value

@@ -38,7 +38,7 @@ class RasterCase:
     """A way to render an image.
 
     Attributes:
-        backend: "torch", "numba", "triton", "dense" or "gsplat".
+        backend: "torch", "numba", "triton" or "dense".
         height: pixels; a panorama is twice as wide, a pinhole image square with a field of view of 90 degrees.
         kernel, order, filter, layout: as in `pansplat.rasterize` (`filter` is its `lowpass`).
         face_size: of the faces of a cubemap, pixels.
@@ -66,12 +66,8 @@ class RasterCase:
 
     @property
     def is_supported(self) -> bool:
-        """Whether the backend renders such an image; gsplat and the dense renderer have one kind only."""
-        if self.backend == "gsplat":
-            return (self.layout, self.kernel, self.order) == ("cubemap", "ewa", "z")
-        if self.backend == "dense":
-            return self.exact == self.reference
-        return True
+        """Whether the backend renders such an image; the dense renderer has one kind only."""
+        return self.backend != "dense" or self.exact == self.reference
 
     @property
     def reference(self) -> RasterCase:

@@ -1,4 +1,4 @@
-"""Renders the cases of the raster benchmark: the backends of `pansplat.rasterize`, a dense renderer, and gsplat."""
+"""Renders the cases of the raster benchmark: the backends of `pansplat.rasterize` and a dense renderer."""
 
 from __future__ import annotations
 
@@ -14,15 +14,11 @@ from pansplat.bench.raster_cases import RasterCase
 from pansplat.constants import ALPHA_CUT, FILTER_VARIANCE, MAX_ALPHA, NEAR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.pose import invert_pose
 from pansplat.rendering import rasterize
-from pansplat.rendering.image_planes import stitch_faces
 from pansplat.rendering.projection import project_gaussians
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
-_CUDA_BACKENDS = ("triton", "gsplat")
 _DENSE_BLOCK_SIZE = 16  # pixels; float32 resolves the differences of directions within a block
 
 
@@ -36,7 +32,7 @@ class RenderedImage:
 
 def device_of(backend: str) -> torch.device:
     """The device that a backend renders on."""
-    return torch.device("cuda" if backend in _CUDA_BACKENDS else "cpu")
+    return torch.device("cuda" if backend == "triton" else "cpu")
 
 
 def render_case(case: RasterCase, gaussians: Gaussians, pose: Float[Tensor, "4 4"]) -> RenderedImage:
@@ -51,8 +47,6 @@ def render_case(case: RasterCase, gaussians: Gaussians, pose: Float[Tensor, "4 4
     """
     if case.backend == "dense":
         return RenderedImage(render_dense(gaussians, pose, case.height))
-    if case.backend == "gsplat":
-        return RenderedImage(render_gsplat(case, gaussians, pose))
     rendered = rasterize(
         gaussians,
         pose,
@@ -82,7 +76,7 @@ def render_with_graph(
 
 def unavailable_reason(backend: str) -> str | None:
     """Why a backend cannot render here; None if it can. Compiles its kernels."""
-    if backend in _CUDA_BACKENDS and not torch.cuda.is_available():
+    if backend == "triton" and not torch.cuda.is_available():
         return "there is no CUDA device"
     trials = [
         RasterCase(backend, 8),
@@ -186,41 +180,3 @@ def _render_dense_block(
     transmittance = torch.cumprod(1 - alpha, dim=0)
     weights = alpha * torch.cat((torch.ones_like(transmittance[:1]), transmittance[:-1]))
     return weights.T @ values
-
-
-def render_gsplat(
-    case: RasterCase, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"]
-) -> Float[Tensor, "channel height width"]:
-    """A panorama from six cube faces by gsplat (CUDA only), EWA kernel and z order, stitched like pansplat's.
-
-    Not tested. The options follow gsplat's documentation of `rasterization`.
-
-    Raises:
-        InputError: gsplat is not installed, or does not render such an image.
-    """
-    try:
-        from gsplat import rasterization
-    except ImportError as error:
-        raise InputError("backend 'gsplat' needs the package gsplat; install it, or leave it out") from error
-    if not case.is_supported or case.face_size is None:
-        raise InputError("backend 'gsplat' renders layout 'cubemap' with kernel 'ewa' and order 'z' only")
-    device, side = gaussians.means.device, case.face_size
-    half = 0.5 * side
-    intrinsics = torch.tensor(((half, 0, half), (0, half, half), (0, 0, 1)), device=device)
-    colors, _, _ = rasterization(
-        means=gaussians.means,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        opacities=gaussians.opacities,
-        colors=gaussians.harmonics,
-        viewmats=invert_pose(face_poses(cam2world.double())).float().to(device),
-        Ks=intrinsics.expand(6, 3, 3),
-        width=side,
-        height=side,
-        near_plane=NEAR,
-        eps2d=FILTER_VARIANCE[case.filter],
-        sh_degree=gaussians.degree,
-        packed=False,
-        rasterize_mode="antialiased" if case.filter == "angular" else "classic",
-    )
-    return stitch_faces(colors.permute(0, 3, 1, 2), case.size, stitching=case.stitching)

@@ -44,7 +44,7 @@ BACKWARD_OPERATIONS = 103
 """Likewise: 38 to recompute alpha and weight, 12 for the gradient of alpha, 20 for A, B, L and q, 25 for their sums, 8
 for those of the values."""
 
-_PACKAGES = ("pansplat", "torch", "numpy", "numba", "triton", "gsplat")
+_PACKAGES = ("pansplat", "torch", "numpy", "numba", "triton")
 
 _CHAINS = 12  # more than latency x units of common processors, few enough for 16 registers
 _STEPS = 1 << 22

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
-_RASTER_BACKENDS = ("numba", "triton", "gsplat")
+_RASTER_BACKENDS = ("numba", "triton")
 _DEFAULT_MEMORY = 16e9  # bytes, if the system does not report its memory
 _LatticeHeight = Annotated[int, Range(16, 4096, "pixels", multiple=8), WHOLE]
 _WindowSide = Annotated[int, Range(64, 8192, "pixels"), WHOLE]

@@ -50,7 +50,7 @@ def test_sweeps_cover_the_papers_counts_and_heights():
     assert counts[0] == "room 128" and counts[-1] == "room 512" and len(counts) == 5
     assert [case.height for case in cases_of(QUICK, "resolution") if case.backend == "numba"] == [128, 256, 512, 1024]
     assert {case.height for case in cases_of(QUICK, "count")} == {512}
-    both = replace(QUICK, backends=("numba", "triton", "gsplat"))
+    both = replace(QUICK, backends=("numba", "triton"))
     assert {case.backend for case in cases_of(both, "resolution") if case.height > 256} == {"numba", "triton"}
 
 
@@ -83,11 +83,6 @@ def test_without_a_fast_backend_torch_is_measured():
     alone = replace(QUICK, backends=())
     assert {case.backend for case in cases_of(alone, "count")} == {"torch"}
     assert {case.backend for case in make_sample_group(alone, make_room_scene(64)).cases} == {"torch"}
-
-
-def test_gsplat_has_only_the_cases_that_it_supports():
-    cases = [case for case in cases_of(replace(QUICK, backends=("gsplat",)), "choices") if case.backend == "gsplat"]
-    assert cases and all((case.layout, case.kernel, case.order) == ("cubemap", "ewa", "z") for case in cases)
 
 
 def test_official_choices():

@@ -26,7 +26,7 @@ def small(monkeypatch):
     monkeypatch.setattr(roofline, "_STEPS", 1 << 12)
     monkeypatch.setattr(roofline, "_ELEMENTS", 1 << 12)
     monkeypatch.setattr(bench, "_SAMPLE", Path("no such folder"))
-    monkeypatch.setattr(bench, "_RASTER_BACKENDS", ("triton", "gsplat"))
+    monkeypatch.setattr(bench, "_RASTER_BACKENDS", ("triton",))
     monkeypatch.setattr(raster_cases, "list_raster_groups", _one_per_suite)
 
 
