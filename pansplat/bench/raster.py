@@ -11,7 +11,7 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
-_MARKERS = {"numba": "o", "torch": "s", "triton": "D", "dense": "X"}
+_MARKERS = {"numba": "o", "torch": "s", "triton": "D"}
 _KERNEL_COLORS = {"ray": "#1764ab", "ewa": "#c8501e"}
 _FRONT_COLOR = "#2a8c4a"
 _MIN_ERROR = 1e-8  # smaller errors are plotted at this value
@@ -371,8 +371,8 @@ RASTER_COLUMNS: tuple[Column[RasterRow], ...] = (
 
 
 def list_findings(rows: Sequence[RasterRow]) -> list[str]:
-    """The main results as sentences: speed against torch and the dense renderer, and fractions of the peaks."""
-    return [*_compare_with_torch(rows), *_compare_with_dense(rows), *_compare_with_peaks(rows)]
+    """The main results as sentences: speed against torch, and fractions of the peaks."""
+    return [*_compare_with_torch(rows), *_compare_with_peaks(rows)]
 
 
 def _direct_rows(rows: Sequence[RasterRow], suite: str, backend: str) -> list[RasterRow]:
@@ -394,26 +394,6 @@ def _compare_with_torch(rows: Sequence[RasterRow]) -> list[str]:
         for torch_row in _direct_rows(rows, "headline", "torch")[:1]
         for row in (*_direct_rows(rows, "headline", "numba"), *_direct_rows(rows, "headline", "triton"))
     ]
-
-
-def _compare_with_dense(rows: Sequence[RasterRow]) -> list[str]:
-    """At the dense renderer's small size, and scaled by pixels times Gaussians to the headline's size."""
-    sentences = []
-    for dense in _direct_rows(rows, "dense", "dense")[:1]:
-        for row in (*_direct_rows(rows, "dense", "torch")[:1], *_direct_rows(rows, "dense", "numba")[:1]):
-            speedup = _speedup(dense, row)
-            sentences.append(
-                f"{row.case.backend} on one thread is {speedup} as fast as the dense renderer, {_size(row)}."
-            )
-        for row in _direct_rows(rows, "headline", "numba")[:1]:
-            scale = (row.case.height / dense.case.height) ** 2 * row.result.num_gaussians / dense.result.num_gaussians
-            dense_ms = scale * cast("float", dense.result.forward_ms)
-            sentences.append(
-                f"Scaled by pixels times Gaussians (not measured), the dense renderer would take "
-                f"{dense_ms / 1e3:,.0f} s forward at {row.case.height}x{2 * row.case.height}, "
-                f"{_quotient(dense_ms, row.result.forward_ms)} times numba's time."
-            )
-    return sentences
 
 
 def _compare_with_peaks(rows: Sequence[RasterRow]) -> list[str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -26,7 +26,6 @@ from pansplat.rendering.rasterize import Kernel, Lowpass, Order
 Precision = Literal["float32", "float64"]
 References = Literal["own", "exact", "none"]
 
-DENSE_HEIGHT = 64  # at which a renderer without tiles takes seconds
 _BYTES_PER_GAUSSIAN = 600  # upper bound: the scene, its gradients and the renderer's buffers
 _MAX_TORCH_GAUSSIANS = 4_000_000  # the torch reference renders them in minutes
 _MAX_CHOICE_HEIGHT = 512  # pixels: every choice needs a float64 reference of its own
@@ -38,7 +37,7 @@ class RasterCase:
     """A way to render an image.
 
     Attributes:
-        backend: "torch", "numba", "triton" or "dense".
+        backend: "torch", "numba" or "triton".
         height: pixels; a panorama is twice as wide, a pinhole image square with a field of view of 90 degrees.
         kernel, order, filter, layout: as in `pansplat.rasterize` (`filter` is its `lowpass`).
         face_size: of the faces of a cubemap, pixels.
@@ -63,11 +62,6 @@ class RasterCase:
     def size(self) -> tuple[int, int]:
         """Height and width of the image."""
         return self.height, self.height if self.layout == "pinhole" else 2 * self.height
-
-    @property
-    def is_supported(self) -> bool:
-        """Whether the backend renders such an image; the dense renderer has one kind only."""
-        return self.backend != "dense" or self.exact == self.reference
 
     @property
     def reference(self) -> RasterCase:
@@ -106,14 +100,14 @@ class Group:
     """Cases that are rendered in turns, so that other load on the machine affects all of them.
 
     Attributes:
-        suite: the question: "headline", "choices", "dense", "count", "resolution" or "scene".
+        suite: the question: "headline", "choices", "count", "resolution" or "scene".
         references: images to compare with: "own" is the exact image and the float64 image of the same choices, "exact"
             the exact one alone.
     """
 
     suite: str
     scene: BenchScene
-    cases: tuple[RasterCase, ...]
+    cases: Sequence[RasterCase]
     references: References
 
 
@@ -206,20 +200,16 @@ def list_raster_groups(settings: Settings, scene_of: Callable[[int], BenchScene]
     height, small = settings.height, settings.choice_height
     references = ("exact" if settings.quick else "own") if settings.with_torch else "none"
     groups = [
-        _make_group("headline", scene_of(height), _list_headline_cases(settings), references),
-        _make_group("choices", scene_of(small), _list_choice_cases(settings), "own"),
+        Group("headline", scene_of(height), _list_headline_cases(settings), references),
+        Group("choices", scene_of(small), _list_choice_cases(settings), "own"),
     ]
-    if synthetic:
-        dense = RasterCase("dense", DENSE_HEIGHT)
-        others = [replace(dense, backend=name) for name in ("torch", *settings.backends)]
-        groups.append(_make_group("dense", make_room_scene(DENSE_HEIGHT), [dense, *others], "own"))
     for index, scene in enumerate(_list_count_scenes(settings, scene_of, synthetic)):
         cases = _list_sweep_cases(settings, height, with_torch=index == 0 and not settings.quick)
-        groups.append(_make_group("count", scene, cases, "none"))
+        groups.append(Group("count", scene, cases, "none"))
     for index, scene_height in enumerate(_list_sweep_heights(settings)):
         if not synthetic or lattice_room_size(scene_height) * _BYTES_PER_GAUSSIAN < settings.memory:
             cases = _list_sweep_cases(settings, scene_height, with_torch=index < 2)
-            groups.append(_make_group("resolution", scene_of(scene_height), cases, "none"))
+            groups.append(Group("resolution", scene_of(scene_height), cases, "none"))
     return [group for group in groups if group.cases]
 
 
@@ -228,11 +218,7 @@ def make_sample_group(settings: Settings, scene: BenchScene) -> Group:
     small = replace(settings, height=settings.choice_height)
     cases = [case for name in settings.sweep_backends for case in _list_main_choices(small, name)]
     cases += [RasterCase("torch", small.height)] if cases else _list_main_choices(small, "torch")
-    return _make_group("scene", scene, cases, "own")
-
-
-def _make_group(suite: str, scene: BenchScene, cases: list[RasterCase], references: References) -> Group:
-    return Group(suite, scene, tuple(case for case in cases if case.is_supported), references)
+    return Group("scene", scene, cases, "own")
 
 
 def _list_main_choices(settings: Settings, backend: str) -> list[RasterCase]:

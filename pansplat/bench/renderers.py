@@ -1,25 +1,20 @@
-"""Renders the cases of the raster benchmark: the backends of `pansplat.rasterize` and a dense renderer."""
+"""Renders the cases of the raster benchmark with the backends of `pansplat.rasterize`."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from pansplat.bench.raster_cases import RasterCase
-from pansplat.constants import ALPHA_CUT, FILTER_VARIANCE, MAX_ALPHA, NEAR
+from pansplat.constants import NEAR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.equirect import pixel_directions
 from pansplat.rendering import rasterize
-from pansplat.rendering.projection import project_gaussians
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
-_DENSE_BLOCK_SIZE = 16  # pixels; float32 resolves the differences of directions within a block
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +40,6 @@ def render_case(case: RasterCase, gaussians: Gaussians, pose: Float[Tensor, "4 4
     Raises:
         InputError: the backend is not available or does not render such an image.
     """
-    if case.backend == "dense":
-        return RenderedImage(render_dense(gaussians, pose, case.height))
     rendered = rasterize(
         gaussians,
         pose,
@@ -85,7 +78,7 @@ def unavailable_reason(backend: str) -> str | None:
     ]
     try:
         gaussians = _single_gaussian().to(device=device_of(backend))
-        for case in (trial for trial in trials if trial.is_supported):
+        for case in trials:
             image, leaves, grad_color = render_with_graph(case, gaussians, torch.eye(4, dtype=torch.float64))
             torch.autograd.grad(image.color, leaves, grad_color)
     except (ImportError, AttributeError, InputError) as error:
@@ -120,63 +113,3 @@ def _single_gaussian() -> Gaussians:
         levels=labels,
         views=labels,
     )
-
-
-def render_dense(
-    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], height: int, *, near: float = NEAR
-) -> Float[Tensor, "channel height width"]:
-    """A panorama on black from every pair of a pixel and a Gaussian, without tiles or boxes; differentiable.
-
-    Exact kernel, radial order, angular filter.
-
-    Source: docs/rendering.md, sections 3 and 4.
-
-    Args:
-        gaussians: all finite.
-        cam2world: rigid, metres.
-        height: of the panorama, pixels.
-        near: Gaussians whose mean is nearer are left out, metres.
-    """
-    pose = cam2world.double()
-    radius = torch.linalg.vector_norm(gaussians.means.detach().double() - pose[:3, 3], dim=1)
-    index = torch.argsort(radius, stable=True)
-    gaussians = gaussians.select(index[radius[index] >= near])
-    variance = FILTER_VARIANCE["angular"] * (math.pi / height) ** 2
-    seen = project_gaussians(gaussians, None, pose, filter_variance=variance, compensate=True, exact=True)
-    footprints = seen.rows, seen.radial_variance, seen.peak, seen.values[:, :-1]
-    directions = pixel_directions(height, 2 * height, dtype=torch.float64)
-    rows = []
-    for strip in directions.split(_DENSE_BLOCK_SIZE):
-        blocks = []
-        for block in strip.split(_DENSE_BLOCK_SIZE, dim=1):
-            arguments = (*footprints, seen.direction, block.reshape(-1, 3))
-            if torch.is_grad_enabled():
-                sums = checkpoint(_render_dense_block, *arguments, use_reentrant=False)
-            else:
-                sums = _render_dense_block(*arguments)
-            blocks.append(sums.reshape(*block.shape[:2], -1))
-        rows.append(torch.cat(blocks, dim=1))
-    return torch.cat(rows).permute(2, 0, 1)
-
-
-def _render_dense_block(
-    footprint_rows: Float[Tensor, "n 3 3"],
-    radial_variance: Float[Tensor, "n"],
-    peak: Float[Tensor, "n"],
-    values: Float[Tensor, "n channel"],
-    direction: Float[Tensor, "n 3"],
-    pixels: Float[Tensor, "pixel 3"],
-) -> Float[Tensor, "pixel channel"]:
-    """Colours of a block of pixels; the Gaussians are sorted front to back."""
-    centre = pixels.mean(dim=0)
-    offsets = (pixels - centre).to(footprint_rows.dtype)
-    constant = -(footprint_rows @ (direction - centre).to(footprint_rows.dtype)[:, :, None])
-    a, b, front = (footprint_rows @ offsets.T + constant).unbind(1)
-    front = 1 + front
-    square = a * a + b * b
-    q = square / (front.clamp_min(1e-3).square() + radial_variance[:, None] * square)
-    alpha = (peak[:, None] * torch.exp(-0.5 * q)).clamp_max(MAX_ALPHA)
-    alpha = torch.where((front > 0) & (alpha >= ALPHA_CUT), alpha, 0)
-    transmittance = torch.cumprod(1 - alpha, dim=0)
-    weights = alpha * torch.cat((torch.ones_like(transmittance[:1]), transmittance[:-1]))
-    return weights.T @ values

@@ -20,8 +20,7 @@ _raster_groups = raster_cases.list_raster_groups
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Seconds instead of minutes: a small dense image, one repeat, few cases, no sample."""
-    monkeypatch.setattr(raster_cases, "DENSE_HEIGHT", 8)
+    """Seconds instead of minutes: one repeat, few cases, no sample."""
     monkeypatch.setattr(raster, "_MAX_REPEATS", 1)
     monkeypatch.setattr(roofline, "_STEPS", 1 << 12)
     monkeypatch.setattr(roofline, "_ELEMENTS", 1 << 12)
@@ -41,14 +40,14 @@ def test_the_quick_run_writes_rows_and_plots_and_prints_the_tables(tmp_path, cap
     out = tmp_path / "out"
     assert run(["bench", "raster", "--quick", "--height", "16", "--out", str(out), "--threads", "1"]) == 0
     content = json.loads((out / "raster.json").read_text())
-    assert {row["suite"] for row in content["rows"]} == {"headline", "choices", "dense", "count", "resolution"}
+    assert {row["suite"] for row in content["rows"]} == {"headline", "choices", "count", "resolution"}
     assert all(row["forward_ms"] > 0 for row in content["rows"])
     assert content["machine"]["threads"] == 1
     assert sorted(file.name for file in out.iterdir()) == [
         *("raster.json", "raster.md", "raster.png", "raster_sweeps.png")
     ]
     printed = capsys.readouterr().out
-    for word in ("headline", "choices", "PSNR dB", "dense renderer"):
+    for word in ("headline", "choices", "PSNR dB"):
         assert word in printed
 
 
