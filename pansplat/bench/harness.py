@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib.metadata
 import json
 import os
+import platform
 import re
 import signal
 import statistics
@@ -31,6 +33,7 @@ Numbers = Mapping[str, object]
 Tensors = Mapping[str, Tensor]
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_PACKAGES = ("pansplat", "torch", "numpy", "numba", "triton")
 _POLL_INTERVAL = 0.05  # seconds between two checks of a child process
 
 
@@ -113,6 +116,44 @@ def restore_threads() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def describe_machine(threads: int) -> dict[str, object]:
+    """The processor, the GPU (None if there is none), the number of threads, and versions."""
+    return {
+        "cpu": _read_processor_name(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": threads,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "versions": _read_package_versions(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }
+
+
+def _read_processor_name() -> str:
+    """The processor's name, with its widest vector extension on Linux."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    facts: dict[str, str] = {}
+    for line in lines:
+        name, _, value = line.partition(":")
+        facts.setdefault(name.strip(), value.strip())
+    flags = facts.get("flags", facts.get("Features", "")).split()
+    widest = next((flag for flag in ("avx512f", "avx2", "avx", "asimd") if flag in flags), "")
+    model = facts.get("model name") or platform.processor() or platform.machine()
+    return f"{model} ({widest})" if widest else model
+
+
+def _read_package_versions() -> dict[str, str]:
+    """Versions of the installed packages that render."""
+    versions = {}
+    for name in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions
 
 
 class CaseFailedError(Exception):

@@ -274,7 +274,7 @@ def make_model_report(
         lambda row: f"{network}, {size}, {row.result.num_gaussians or 0:,} Gaussians",
         machine,
         header={"network": network},
-        facts=("cpu", "threads", "fma_gflops"),
+        facts=("cpu", "threads"),
         json_file=json,
         page=None if out is None else out / "model.md",
         plots={} if out is None else {out / "model.png": lambda rows: plot_model(rows, f"{size}, {machine['cpu']}")},

@@ -28,10 +28,7 @@ from pansplat.bench.renderers import (
     warm_up,
 )
 from pansplat.bench.report import Column, Report, Row, format_threads, result_column
-from pansplat.bench.roofline import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, count_panorama_work
-from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.rasterize import RasterOptions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,9 +60,6 @@ class RasterResult:
         backward_peak_mb: likewise, of forward and backward together.
         psnr_db, max_error, seam_jump, energy_error: see `fidelity.Fidelity`.
         stages_ms: by the backend's own clock, of the fastest forward pass.
-        pairs: pixel centres in the Gaussians' boxes, see `roofline`.
-        fma_fraction, backward_fma_fraction: their arithmetic over the processor time, of one thread's peak.
-        bandwidth_fraction: the least traffic over the minimum time, of the peak of as many threads.
     """
 
     num_gaussians: int
@@ -87,10 +81,6 @@ class RasterResult:
     own_psnr_db: float | None = None
     own_max_error: float | None = None
     stages_ms: dict[str, float] = field(default_factory=dict)
-    pairs: int | None = None
-    fma_fraction: float | None = None
-    backward_fma_fraction: float | None = None
-    bandwidth_fraction: float | None = None
 
     def set_times(self, name: str, timings: Sequence[Timing]) -> None:
         """Set the fields of the forward or backward pass from its timings."""
@@ -160,7 +150,6 @@ class RasterBench:
         """
         self._report, self._budget, self._slow = report, budget, slow
         self._references: dict[tuple[str, RasterCase], Tensor] = {}  # by the name of the scene
-        self._work: dict[tuple[str, RasterCase], Work] = {}
         self._scene: BenchScene | None = None
         self._gaussians: Gaussians | None = None
 
@@ -199,8 +188,6 @@ class RasterBench:
                     step = f"{len(measurement.forward) + 1} of {measurement.repeats}"
                     self._report.update(f"{measurement.case}: {step}")
                     self._render_again(measurement)
-        for measurement in measurements:
-            self._set_fractions_of_peaks(measurement)
         self._report.update()
 
     def _reference_images(self, group: Group, case: RasterCase) -> tuple[Tensor | None, Tensor | None]:
@@ -277,28 +264,6 @@ class RasterBench:
         timing, _ = time_call(lambda: torch.autograd.grad(image.color, leaves, grad_color), device)
         return timing
 
-    def _set_fractions_of_peaks(self, measurement: _Measurement) -> None:
-        """Set the fractions of the machine's arithmetic and bandwidth that a direct panorama reached."""
-        case, result = measurement.case, measurement.row.result
-        if case.layout != "equirect" or case.backend not in ("torch", "numba"):
-            return
-        if not result.forward_cpu_ms or not result.forward_min_ms:  # the clock may be too coarse for small images
-            return
-        assert self._scene is not None and self._gaussians is not None
-        key = self._scene.name, case.reference
-        if key not in self._work:
-            self._report.update(f"{case}: counting its work")
-            options = RasterOptions(case.kernel, case.order, case.filter, NEAR, strict=False)
-            self._work[key] = count_panorama_work(self._gaussians, self._scene.pose, case.height, options)
-        work, machine = self._work[key], self._report.machine
-        result.pairs = work.pairs
-        flops_per_ms = 1e6 * machine["fma_gflops"]["1"]
-        result.fma_fraction = FORWARD_OPERATIONS * work.pairs / flops_per_ms / result.forward_cpu_ms
-        bytes_per_ms = 1e6 * machine["bandwidth_gb_s"][str(case.threads)]
-        result.bandwidth_fraction = work.bytes / bytes_per_ms / result.forward_min_ms
-        if result.backward_cpu_ms:
-            result.backward_fma_fraction = BACKWARD_OPERATIONS * work.pairs / flops_per_ms / result.backward_cpu_ms
-
 
 def make_raster_report(
     machine: Mapping[str, Any], *, json: Path | None = None, plot: Path | None = None, page: Path | None = None
@@ -306,7 +271,7 @@ def make_raster_report(
     """The report of a run.
 
     Args:
-        machine: from `describe_machine`; the rows are compared with its peaks.
+        machine: from `describe_machine`.
         json: file of the rows.
         plot: time against error; the costs over counts and resolutions go to a second file, NAME_sweeps.
         page: tables in Markdown.
@@ -318,7 +283,7 @@ def make_raster_report(
         RASTER_COLUMNS,
         _section,
         machine,
-        facts=("cpu", "threads", "gpu", "fma_gflops", "bandwidth_gb_s"),
+        facts=("cpu", "threads", "gpu"),
         findings=list_findings,
         json_file=json,
         page=page,
@@ -370,11 +335,6 @@ RASTER_COLUMNS: tuple[Column[RasterRow], ...] = (
 )
 
 
-def list_findings(rows: Sequence[RasterRow]) -> list[str]:
-    """The main results as sentences: speed against torch, and fractions of the peaks."""
-    return [*_compare_with_torch(rows), *_compare_with_peaks(rows)]
-
-
 def _direct_rows(rows: Sequence[RasterRow], suite: str, backend: str) -> list[RasterRow]:
     """Timed float32 rows of the exact direct panorama, by number of threads."""
     chosen = [
@@ -387,31 +347,14 @@ def _direct_rows(rows: Sequence[RasterRow], suite: str, backend: str) -> list[Ra
     return sorted(chosen, key=lambda row: row.case.threads)
 
 
-def _compare_with_torch(rows: Sequence[RasterRow]) -> list[str]:
+def list_findings(rows: Sequence[RasterRow]) -> list[str]:
+    """Speed against torch, as sentences."""
     return [
         f"{row.case.backend} on {format_threads(row.case.threads)} is {_speedup(torch_row, row)} as fast as the tiled "
         f"torch reference on one, {_size(row)}."
         for torch_row in _direct_rows(rows, "headline", "torch")[:1]
         for row in (*_direct_rows(rows, "headline", "numba"), *_direct_rows(rows, "headline", "triton"))
     ]
-
-
-def _compare_with_peaks(rows: Sequence[RasterRow]) -> list[str]:
-    """Fractions of the machine's peaks; by processor time, which other load on the machine hardly affects."""
-    sentences = []
-    for row in _direct_rows(rows, "headline", "numba"):
-        result = row.result
-        if result.fma_fraction is None or result.bandwidth_fraction is None or result.forward_cpu_ms is None:
-            continue
-        threads = format_threads(row.case.threads)
-        text = f"numba on {threads} reaches {result.fma_fraction:.0%} of the multiply-add peak forward"
-        if result.stages_ms.get("raster"):
-            ratio = result.forward_cpu_ms / row.case.threads / result.stages_ms["raster"]
-            text += f" ({result.fma_fraction * ratio:.0%} in the raster stage)"
-        if result.backward_fma_fraction is not None:
-            text += f", {result.backward_fma_fraction:.0%} backward"
-        sentences.append(f"{text}, and {result.bandwidth_fraction:.0%} of the memory bandwidth forward.")
-    return sentences
 
 
 def _speedup(slow: RasterRow, fast: RasterRow) -> str:

@@ -57,13 +57,13 @@ class BenchRaster:
 
     def run(self) -> int:
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
+        from pansplat.bench.harness import describe_machine
         from pansplat.bench.raster import RasterBench, make_raster_report
         from pansplat.bench.raster_cases import (
             list_raster_groups,
             make_room_scene,
             make_sample_group,
         )
-        from pansplat.bench.roofline import describe_machine
 
         json, plot, page = self._files()
         settings = self._settings()
@@ -148,8 +148,8 @@ class BenchModel:
 
     def run(self) -> int:
         """Measure, print the table and write the files; an interruption keeps the measured rows."""
+        from pansplat.bench.harness import describe_machine
         from pansplat.bench.model import list_model_cases, make_model_report, measure_model
-        from pansplat.bench.roofline import describe_machine
         from pansplat.model.network import has_bfloat16
 
         json = _choose_rows_file(self.json, self.out, "model.json")
@@ -216,9 +216,9 @@ class BenchMemory:
 
     def run(self) -> int:
         """Measure, print the table and write the files; an interruption keeps the measured rows."""
+        from pansplat.bench.harness import describe_machine
         from pansplat.bench.memory import MemoryBench, list_memory_cases, make_memory_report, read_rows
         from pansplat.bench.model import save_random_weights
-        from pansplat.bench.roofline import describe_machine
         from pansplat.training.network import network_config
 
         setting = self._setting()
@@ -271,8 +271,8 @@ class BenchRefine:
         import torch
 
         from pansplat import pipeline
+        from pansplat.bench.harness import describe_machine
         from pansplat.bench.refine import RefineBench, list_refine_cases, make_refine_report
-        from pansplat.bench.roofline import describe_machine
 
         json = _choose_rows_file(self.json, self.out, "refine.json")
         if not self.paths and not _SAMPLE.is_dir():
@@ -315,7 +315,7 @@ class BenchViewer:
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
         import torch
 
-        from pansplat.bench.roofline import describe_machine
+        from pansplat.bench.harness import describe_machine
         from pansplat.bench.viewer import ViewerBench, list_viewer_cases, make_viewer_report, read_viewer_rows
 
         json = _choose_rows_file(None, self.out, "viewer.json")
@@ -351,8 +351,8 @@ class BenchPose:
         """Measure, print the tables and write the files; exit status 1 if a wrong pose passed the check."""
         import torch
 
+        from pansplat.bench.harness import describe_machine
         from pansplat.bench.pose import make_pose_report, measure_poses, summarise
-        from pansplat.bench.roofline import describe_machine
         from pansplat.data.folders import load_pairs
 
         json = _choose_rows_file(self.json, self.out, "pose.json")
@@ -409,22 +409,6 @@ class BenchFormats:
 
 
 @dataclass(frozen=True)
-class BenchMachine:
-    """Measure the machine's peaks: multiply-adds and memory bandwidth."""
-
-    threads: Threads | None = None
-    """The largest number of threads to use; by default torch's."""
-
-    def run(self) -> int:
-        """Print the machine and its peaks."""
-        from pansplat.bench.report import print_facts
-        from pansplat.bench.roofline import describe_machine
-
-        print_facts(describe_machine(_choose_threads(self.threads)))
-        return 0
-
-
-@dataclass(frozen=True)
 class Bench:
     """Measure speed, memory and error on this machine."""
 
@@ -436,7 +420,6 @@ class Bench:
         | Annotated[BenchViewer, subcommand("viewer")]
         | Annotated[BenchPose, subcommand("pose")]
         | Annotated[BenchFormats, subcommand("formats")]
-        | Annotated[BenchMachine, subcommand("machine")]
     )
 
     def run(self) -> int:

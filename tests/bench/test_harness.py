@@ -10,6 +10,7 @@ from pansplat.bench.harness import (
     CaseFailedError,
     OverLimitError,
     _make_error,
+    describe_machine,
     measure_peak_memory,
     quartile_range,
     time_call,
@@ -36,6 +37,12 @@ def test_peak_memory_is_the_memory_that_the_call_holds_at_once(count):
 def test_time_call_returns_the_result_of_the_call():
     timing, result = time_call(lambda: sum(range(200_000)) * 0 + 7, CPU)
     assert result == 7 and timing.wall > 0 and timing.cpu > 0
+
+
+def test_the_machine_is_described():
+    machine = describe_machine(2)
+    assert set(machine) >= {"cpu", "cores", "system", "python", "gpu"}
+    assert machine["threads"] == 2 and machine["versions"]["torch"] == torch.__version__
 
 
 def test_outliers_hardly_change_the_quartile_range():

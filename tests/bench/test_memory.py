@@ -40,7 +40,7 @@ def invent_result(case: MemoryCase) -> tuple[MemoryResult, dict[str, torch.Tenso
 
 
 @pytest.fixture
-def measured(monkeypatch: pytest.MonkeyPatch, fast_peaks: None) -> list[MemoryCase]:
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[MemoryCase]:
     """The measured cases; their results are made up."""
     cases: list[MemoryCase] = []
 

@@ -44,7 +44,7 @@ PLAIN = ModelCase("fixed", "float32", "float32", 1, 1)
 
 
 @pytest.fixture
-def measured(monkeypatch: pytest.MonkeyPatch, fast_peaks: None) -> list[ModelCase]:
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[ModelCase]:
     """The measured cases; results are made up, with an error that increases from row to row."""
     cases: list[ModelCase] = []
 

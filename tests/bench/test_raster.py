@@ -25,8 +25,7 @@ from pansplat.bench.raster import (
 from pansplat.bench.raster_cases import Group, RasterCase, default_face_size, make_official_case, make_room_scene
 
 HEIGHT = 16
-FACTS = {"cpu": "some", "threads": 2, "gpu": None}
-MACHINE = FACTS | {"fma_gflops": {"1": 100.0, "2": 200.0}, "bandwidth_gb_s": {"1": 30.0, "2": 30.0}}
+MACHINE = {"cpu": "some", "threads": 2, "gpu": None}
 DIRECT = RasterCase("torch", HEIGHT)
 FACES = replace(DIRECT, layout="cubemap", face_size=default_face_size(HEIGHT))
 NUMBER = st.integers(1, 6).map(float)
@@ -48,7 +47,7 @@ def results(rows: list[RasterRow]) -> Mapping[tuple, RasterResult]:
     return {(row.case.kernel, row.case.order, row.case.layout, row.case.precision): row.result for row in rows}
 
 
-def test_rows_hold_times_memory_errors_and_fractions_of_the_peaks():
+def test_rows_hold_times_memory_and_errors():
     reference, row = measure(group(DIRECT, backward=True), budget=0.1)
     assert (reference.case.precision, reference.result.max_error, reference.result.repeats) == ("float64", 0, 1)
     result = row.result
@@ -56,8 +55,6 @@ def test_rows_hold_times_memory_errors_and_fractions_of_the_peaks():
     assert result.forward_cpu_ms > 0 and result.backward_cpu_ms > 0
     assert result.num_gaussians == 862 and result.repeats >= 1
     assert 0 < result.max_error < 1e-5 and result.psnr_db > 120 and result.own_max_error == result.max_error
-    assert 0 < result.fma_fraction < 1 and 0 < result.bandwidth_fraction < 1 and result.pairs > 0
-    assert result.fma_fraction == pytest.approx(46 * result.pairs / (1e-3 * result.forward_cpu_ms) / 100e9)
     values = row.as_json()
     for kind, names in (
         (str, "suite scene backend kernel order filter layout stitching precision"),
@@ -146,9 +143,6 @@ def row() -> RasterRow:
         forward_cpu_ms=90.0,
         max_error=1e-6,
         psnr_db=130.0,
-        fma_fraction=0.5,
-        backward_fma_fraction=0.4,
-        bandwidth_fraction=0.1,
         stages_ms={"sort": 20.0, "raster": 80.0},
     )
     return RasterRow("headline", "room 512", RasterCase("numba", 512), result)
@@ -192,10 +186,6 @@ def test_findings_compare_rows_of_the_same_kind(row):
     text = "\n".join(list_findings(rows))
     assert "numba on one thread is 100 times (backward 150 times) [by processor time 90] as fast" in text
     assert "numba on 2 threads is 200 times" in text
-    peaks = (
-        "reaches 50% of the multiply-add peak forward (56% in the raster stage), 40% backward, and 10% of the memory"
-    )
-    assert peaks in text
     assert list_findings([]) == []
 
 

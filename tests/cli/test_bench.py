@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from pansplat import pipeline
-from pansplat.bench import raster, raster_cases, roofline
+from pansplat.bench import raster, raster_cases
 from pansplat.bench.raster_cases import Group
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.cli import bench, run
@@ -22,8 +22,6 @@ _raster_groups = raster_cases.list_raster_groups
 def small(monkeypatch):
     """Seconds instead of minutes: one repeat, few cases, no sample."""
     monkeypatch.setattr(raster, "_MAX_REPEATS", 1)
-    monkeypatch.setattr(roofline, "_STEPS", 1 << 12)
-    monkeypatch.setattr(roofline, "_ELEMENTS", 1 << 12)
     monkeypatch.setattr(bench, "_SAMPLE", Path("no such folder"))
     monkeypatch.setattr(bench, "_RASTER_BACKENDS", ("triton",))
     monkeypatch.setattr(raster_cases, "list_raster_groups", _one_per_suite)
@@ -88,9 +86,3 @@ def test_invalid_arguments_are_refused_before_the_work(arguments, message, refus
     if "--model" in arguments:
         monkeypatch.setattr(bench, "_SAMPLE", SAMPLE)
     assert message in refusal("bench", *arguments.split())
-
-
-def test_the_machine_is_described(capsys):
-    assert run(["bench", "machine", "--threads", "1"]) == 0
-    printed = capsys.readouterr().out
-    assert "fma_gflops" in printed and "1: " in printed

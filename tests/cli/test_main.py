@@ -18,7 +18,7 @@ def test_help_does_not_import_torch() -> None:
     program = (
         "import sys\nfrom pansplat.cli import run\n"
         "commands = ['predict', 'render', 'evaluate', 'check', 'info', 'convert', 'bench']\n"
-        "benches = [['bench', name] for name in ('raster', 'model', 'memory', 'machine')]\n"
+        "benches = [['bench', name] for name in ('raster', 'model', 'memory', 'pose')]\n"
         "for arguments in ([], *([name] for name in commands), *benches):\n"
         "    try: run([*arguments, '--help'])\n    except SystemExit as stop: assert stop.code == 0, stop.code\n"
         "heavy = {'torch', 'numpy', 'scipy', 'cv2', 'numba', 'matplotlib'} & set(sys.modules)\n"
@@ -26,7 +26,7 @@ def test_help_does_not_import_torch() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    for command in ("predict", "render", "evaluate", "check", "info", "convert", "bench memory", "bench machine"):
+    for command in ("predict", "render", "evaluate", "check", "info", "convert", "bench memory", "bench pose"):
         assert f"usage: pansplat {command} " in done.stdout
 
 
