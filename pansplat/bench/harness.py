@@ -1,4 +1,4 @@
-"""Time and memory of one call, in this process or in a child process.
+"""Time, memory and errors of one call, in this process or in a child process.
 
 In a child process, memory of earlier cases does not count, and the number of threads is its own.
 """
@@ -9,6 +9,7 @@ import contextlib
 import ctypes
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import re
@@ -33,7 +34,7 @@ Numbers = Mapping[str, object]
 Tensors = Mapping[str, Tensor]
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-_PACKAGES = ("pansplat", "torch", "numpy", "numba", "triton")
+_PACKAGES = ("pansplat", "torch", "numpy", "numba")
 _POLL_INTERVAL = 0.05  # seconds between two checks of a child process
 
 
@@ -118,42 +119,54 @@ def restore_threads() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def describe_machine(threads: int) -> dict[str, object]:
-    """The processor, the GPU (None if there is none), the number of threads, and versions."""
-    return {
-        "cpu": _read_processor_name(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "threads": threads,
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        "versions": _read_package_versions(),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-    }
+def compare_images(image: Tensor, reference: Tensor) -> dict[str, float]:
+    """`max_error`, the largest absolute difference of the colours, and `psnr_db`, unclamped and for a peak of 1.
+
+    Raises:
+        ValueError: the shapes differ.
+    """
+    if image.shape != reference.shape:
+        raise ValueError(f"`image` must have the reference's shape {tuple(reference.shape)}, got {tuple(image.shape)}")
+    error = image.detach().double().cpu() - reference.double().cpu()
+    mean_square = float(error.square().mean())
+    psnr_db = -10 * math.log10(mean_square) if mean_square > 0 else math.inf
+    return {"psnr_db": psnr_db, "max_error": float(error.abs().max())}
 
 
-def _read_processor_name() -> str:
-    """The processor's name, with its widest vector extension on Linux."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
+def relative_deviation(result: Mapping[str, Tensor], reference: Mapping[str, Tensor], *, together: bool) -> float:
+    """|result - reference| / |reference|, Euclidean norms.
+
+    Args:
+        together: of all tensors as one vector; else the largest value among the tensors.
+
+    Raises:
+        ValueError: the names differ.
+    """
+    if result.keys() != reference.keys():
+        raise ValueError(f"`result` must hold {sorted(reference)}, got {sorted(result)}")
+    errors = {name: float((result[name].double() - reference[name].double()).norm()) for name in reference}
+    norms = {name: float(reference[name].double().norm()) for name in reference}
+    if together:
+        return math.hypot(*errors.values()) / max(math.hypot(*norms.values()), 1e-300)
+    return max(errors[name] / max(norms[name], 1e-300) for name in reference)
+
+
+def describe_machine() -> dict[str, object]:
+    """The processor with its widest vector extension, the GPU (or None), torch's number of threads, and versions."""
     facts: dict[str, str] = {}
-    for line in lines:
-        name, _, value = line.partition(":")
-        facts.setdefault(name.strip(), value.strip())
+    with contextlib.suppress(OSError):  # Linux only
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            name, _, value = line.partition(":")
+            facts.setdefault(name.strip(), value.strip())
     flags = facts.get("flags", facts.get("Features", "")).split()
-    widest = next((flag for flag in ("avx512f", "avx2", "avx", "asimd") if flag in flags), "")
-    model = facts.get("model name") or platform.processor() or platform.machine()
-    return f"{model} ({widest})" if widest else model
-
-
-def _read_package_versions() -> dict[str, str]:
-    """Versions of the installed packages that render."""
-    versions = {}
-    for name in _PACKAGES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions
+    widest = next((f" ({flag})" for flag in ("avx512f", "avx2", "avx", "asimd") if flag in flags), "")
+    return {
+        "cpu": (facts.get("model name") or platform.processor() or platform.machine()) + widest,
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "threads": torch.get_num_threads(),
+        "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+    }
 
 
 class CaseFailedError(Exception):

@@ -2,6 +2,11 @@
 
 Every case is one training step or one prediction in a process of its own, `python -m pansplat.bench.memory`.
 
+Values of a row: `base_gib` is the memory held before: Python, libraries, weights, input.
+`peak_gib` is the largest memory, `taken_gib` their difference, all in 2^30 bytes. `wall_s` are elapsed seconds,
+`processor_s` those of all threads. `deviation` is |result - reference| / |reference|, Euclidean norms: of all gradients
+together, or the largest among the prediction's means, opacities and image.
+
 Source: PanSplat, section 3.4 and its figure of GPU memory.
 """
 
@@ -9,36 +14,33 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import math
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-import safetensors.torch
 import torch
 from torch import Tensor
 
-from pansplat.atomic import replacing
-from pansplat.bench.fidelity import relative_deviation
 from pansplat.bench.harness import (
     CaseFailedError,
     OverLimitError,
     measure_peak_memory,
     read_resident_memory,
+    relative_deviation,
     reset_resident_peak,
     run_child,
     serve_job,
     time_call,
 )
-from pansplat.bench.report import Column, Report, Row, error_column, read_row, result_column
+from pansplat.bench.report import Benchmark, Column, Header, Report, Row, error_or_reference, make_axes
 from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.heads import merge_tiles
 from pansplat.model.pansplat import PanSplat
 from pansplat.rendering.cpu.runtime import release_idle_memory
-from pansplat.strict_json import read_json
 from pansplat.training.config import MemoryConfig, NetworkShape, Style
 from pansplat.training.losses import LossWeights, PerceptualName, choose_perceptual
 from pansplat.training.network import freeze, network_config, read_weights, set_training_mode, trainable_parameters
@@ -46,17 +48,17 @@ from pansplat.training.rendering import TargetRenderer
 from pansplat.training.step import TrainingStep, accumulate_gradients
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Work = Literal["inference", "plain", "one-step", "two-step"]
 
+_WORKS: tuple[Work, ...] = get_args(Work)
 _TILES = (1, 2, 4)
-_MAX_GROWTH = 4.0  # of memory when the height doubles
 _MAX_MATCHING_HEIGHT = 512  # above it only the heads are trained, as in the paper's stages
 _WARM_UP_HEIGHT = 64
 _SPHERE_RADIUS = 3.0  # metres
 _SCENE = "painted sphere"
+_CPU = torch.device("cpu")
 
 PAPER_POINTS: tuple[tuple[str, str, int, float], ...] = (
     ("training", "untiled", 512, 36.0),
@@ -73,8 +75,7 @@ _WORK_COLORS: dict[Work, str] = {
     "inference": "#1764ab", "plain": "#444444", "one-step": "#e0a030", "two-step": "#c8501e"
 }  # fmt: skip
 _PAPER_STYLE: dict[str, Any] = {"color": "#2a8c4a", "markersize": 13, "markerfacecolor": "none"}
-_TILE_LINES = {1: "-", 2: "--", 4: ":"}
-_TILE_MARKERS = {1: "o", 2: "s", 4: "D"}
+_TILE_STYLES = {1: "o-", 2: "s--", 4: "D:"}
 
 
 @dataclass(frozen=True)
@@ -111,42 +112,14 @@ class MemorySetting:
         style: how images are rendered.
         perceptual: part of the loss.
         threads: of the processor.
-        device: "cpu" or "cuda".
-        limit_gib: a process that takes more is ended, 2^30 bytes; on a GPU its allocator refuses more.
+        limit_gib: a process that takes more is ended, 2^30 bytes.
     """
 
     network: NetworkShape
     style: Style
     perceptual: PerceptualName
     threads: int
-    device: str
     limit_gib: float
-
-
-@dataclass
-class MemoryResult:
-    """Memory and time of a case.
-
-    Attributes:
-        base_gib: held before the case: Python, libraries, weights, input; on a GPU weights and input. 2^30 bytes.
-        peak_gib: largest memory, the base included.
-        taken_gib: their difference.
-        wall_s, processor_s: elapsed seconds, and those of all threads together.
-        num_gaussians: of the prediction.
-        deviation: |result - reference| / |reference|, Euclidean norms: of all gradients together, or the largest among
-            the prediction's means, opacities and image.
-    """
-
-    base_gib: float | None = None
-    peak_gib: float | None = None
-    taken_gib: float | None = None
-    wall_s: float | None = None
-    processor_s: float | None = None
-    num_gaussians: int | None = None
-    deviation: float | None = None
-
-
-MemoryRow = Row[MemoryCase, MemoryResult]
 
 
 def list_memory_cases(heights: Sequence[int], *, quick: bool) -> list[MemoryCase]:
@@ -155,10 +128,13 @@ def list_memory_cases(heights: Sequence[int], *, quick: bool) -> list[MemoryCase
     Args:
         quick: leave out one-step backpropagation and the middle number of tiles.
     """
-    tiles = (1, 4) if quick else _TILES
-    works: tuple[Work, ...] = ("inference", "plain", "two-step") if quick else get_args(Work)
-    kinds: list[tuple[Work, int]] = [(work, count) for work in works for count in (tiles if work != "plain" else (1,))]
-    return [MemoryCase(work, count, height) for height in sorted(heights) for work, count in kinds]
+    return [
+        MemoryCase(work, tiles, height)
+        for height in sorted(heights)
+        for work in _WORKS
+        for tiles in (_TILES if work != "plain" else (1,))
+        if not quick or (work != "one-step" and tiles != 2)
+    ]
 
 
 @dataclass(frozen=True)
@@ -167,113 +143,50 @@ class MemoryBench:
 
     Attributes:
         weights: file of the network's weights.
-        references: folder for the results of reference rows, so that an interrupted run can continue.
         report: its rows may hold those of earlier runs.
     """
 
     setting: MemorySetting
     weights: Path
-    references: Path
-    report: Report[MemoryRow]
+    report: Report
 
     def run(self, cases: Sequence[MemoryCase]) -> None:
-        """Measure the cases that have no measured row. The report's rows have the order of `list_memory_cases`."""
-        rows = self.report.rows
-        rows[:] = [row for row in rows if row.status == "measured" or row.case not in cases]
-        self._drop_lost_references(cases)
-        for index, case in enumerate(cases, start=1):
-            if case not in [row.case for row in rows]:
-                self.report.update(f"{index} of {len(cases)}: {case}")
-                rows.append(self._measure(case, cases))
-                rows.sort(key=lambda row: (row.case.height, get_args(Work).index(row.case.work), row.case.tiles))
-            self.report.update()
+        """Measure the cases. The report's rows have the order of `list_memory_cases`.
 
-    def _drop_lost_references(self, cases: Sequence[MemoryCase]) -> None:
-        """Drop reference rows whose result is needed and not stored, so that they are measured again."""
-        done = {row.case for row in self.report.rows}
-        needed = {(case.kind, case.height) for case in cases if case not in done}
+        Cases of one height and kind are compared with the first that succeeds, so they are measured in one run: they
+        are skipped only if all of them were measured before.
+        """
+        measured = {row.case for row in self.report.rows if row.status == "measured"}
+        for _, group in itertools.groupby(cases, key=lambda case: (case.height, case.kind)):
+            comparable = list(group)
+            if measured.issuperset(comparable):
+                continue
+            self.report.rows[:] = [row for row in self.report.rows if row.case not in comparable]
+            reference: dict[str, Tensor] = {}
+            for case in comparable:
+                self.report.step(str(case))
+                self.report.rows.append(self._measure(case, reference))
+                self.report.rows.sort(key=lambda row: (row.case.height, _WORKS.index(row.case.work), row.case.tiles))
+                self.report.save()
 
-        def is_lost(row: MemoryRow) -> bool:
-            is_needed = row.is_reference and (row.case.kind, row.case.height) in needed
-            return is_needed and not self._reference_file(row.case).is_file()
-
-        self.report.rows[:] = [row for row in self.report.rows if not is_lost(row)]
-
-    def _reference_file(self, case: MemoryCase) -> Path:
-        return self.references / f"{case.kind}_{case.height}.safetensors"
-
-    def _measure(self, case: MemoryCase, cases: Sequence[MemoryCase]) -> MemoryRow:
-        row = MemoryRow("memory", _SCENE, case, MemoryResult())
-        # Failures of earlier runs do not count: their limit may have been lower.
-        known = [row for row in self.report.rows if row.status == "measured" or row.case in cases]
-        expected = estimate_gib(case, known)
-        if expected > self.setting.limit_gib:
-            row.status = "not tried"
-            row.note = f"{expected:.1f} GiB expected" if math.isfinite(expected) else "a smaller height failed"
-            return row
+    def _measure(self, case: MemoryCase, reference: dict[str, Tensor]) -> Row:
+        """The row of a case; its tensors become the reference if that is empty."""
+        row = Row("memory", _SCENE, case)
         try:
             row.result, tensors = measure_case(case, self.setting, self.weights)
         except CaseFailedError as error:
             row.status = "over the limit" if isinstance(error, OverLimitError) else "died"
             row.note = str(error)
             return row
-        file = self._reference_file(case)
-        row.is_reference = not file.is_file()  # the first of its kind that succeeded
-        if row.is_reference:
-            with replacing(file) as partial:
-                safetensors.torch.save_file(tensors, partial)
+        row.is_reference = not reference
+        if reference:
+            row.result["deviation"] = relative_deviation(tensors, reference, together=case.kind == "training")
         else:
-            reference = safetensors.torch.load_file(file)
-            row.result.deviation = relative_deviation(tensors, reference, together=case.kind == "training")
+            reference |= tensors
         return row
 
 
-def estimate_gib(case: MemoryCase, rows: Sequence[MemoryRow]) -> float:
-    """Upper bound of a case's memory from the same work at the next smaller height; 0 if that is unknown.
-
-    Above some height only a part of the network is trained, so rows at or below it do not bound training above it.
-    """
-    smaller = [
-        row
-        for row in rows
-        if dataclasses.replace(row.case, height=case.height) == case and row.case.height < case.height
-    ]
-    if case.kind == "training" and case.height > _MAX_MATCHING_HEIGHT:
-        smaller = [row for row in smaller if row.case.height > _MAX_MATCHING_HEIGHT]
-    if not smaller:
-        return 0.0
-    row = max(smaller, key=lambda row: row.case.height)
-    if row.result.taken_gib is None or row.result.base_gib is None:
-        return math.inf
-    return row.result.base_gib + row.result.taken_gib * _MAX_GROWTH ** math.log2(case.height / row.case.height)
-
-
-def read_rows(path: Path, setting: MemorySetting) -> list[MemoryRow]:
-    """The rows of an earlier run with the same setting, failed ones included; none if there is no file.
-
-    Raises:
-        InputError: the file has another setting, or is not a file of rows.
-    """
-    if not path.is_file():
-        return []
-    try:
-        content = read_json(path)
-        before = content["setting"]
-        rows = [read_row(values, MemoryCase, MemoryResult) for values in content["rows"]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: needed rows of `pansplat bench memory`, got {error!r}; delete it.") from error
-    now = dataclasses.asdict(setting)
-    changed = [
-        f"{name} was {before.get(name)}, now {now[name]}"
-        for name in now
-        if name != "limit_gib" and before.get(name) != now[name]
-    ]
-    if changed:
-        raise InputError(f"{path}: has another setting ({'; '.join(changed)}); give another --out, or delete the file.")
-    return rows
-
-
-def measure_case(case: MemoryCase, setting: MemorySetting, weights: Path) -> tuple[MemoryResult, dict[str, Tensor]]:
+def measure_case(case: MemoryCase, setting: MemorySetting, weights: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Measure a case in a child process.
 
     Returns:
@@ -284,40 +197,34 @@ def measure_case(case: MemoryCase, setting: MemorySetting, weights: Path) -> tup
         CaseFailedError: it failed otherwise.
     """
     job = {"case": dataclasses.asdict(case), "setting": dataclasses.asdict(setting), "weights": str(weights)}
-    limit = setting.limit_gib if setting.device == "cpu" else None
-    numbers, tensors = run_child("pansplat.bench.memory", job, threads=setting.threads, limit_gib=limit)
-    return MemoryResult(**numbers), tensors
+    return run_child("pansplat.bench.memory", job, threads=setting.threads, limit_gib=setting.limit_gib)
 
 
 def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, Tensor]]:
     """Measure the job of a child process."""
     case, setting = MemoryCase(**job["case"]), MemorySetting(**job["setting"])
-    device = torch.device(setting.device)
-    if device.type == "cuda":
-        total = torch.cuda.get_device_properties(device).total_memory
-        torch.cuda.set_per_process_memory_fraction(min(1.0, setting.limit_gib * 2**30 / total))
     network = PanSplat(network_config(setting.network), "fixed")
     network.load_state_dict(read_weights(Path(job["weights"])).tensors)
-    work = _prepare_work(case, setting, network.to(device))
-    work(make_painted_sphere(_WARM_UP_HEIGHT).to(device))  # compiles kernels and loads libraries
-    batch = make_painted_sphere(case.height).to(device)
+    work = _prepare_work(case, setting, network)
+    work(make_painted_sphere(_WARM_UP_HEIGHT))  # compiles kernels and loads libraries
+    batch = make_painted_sphere(case.height)
     gc.collect()
     release_idle_memory()
     reset_resident_peak()
-    base = torch.cuda.memory_allocated(device) if device.type == "cuda" else read_resident_memory()
-    taken_mb, (timing, (count, tensors)) = measure_peak_memory(lambda: time_call(lambda: work(batch), device), device)
+    base_gib = read_resident_memory() / 2**30
+    taken_mb, (timing, (count, tensors)) = measure_peak_memory(lambda: time_call(lambda: work(batch), _CPU), _CPU)
     if taken_mb is None:
         raise InputError("this system does not report a process's peak memory; run the benchmark on Linux")
-    base_gib, taken_gib = base / 2**30, 1e6 * taken_mb / 2**30
-    result = MemoryResult(base_gib, base_gib + taken_gib, taken_gib, timing.wall, timing.cpu, count)
-    return dataclasses.asdict(result), tensors
+    taken_gib = 1e6 * taken_mb / 2**30
+    memory = {"base_gib": base_gib, "peak_gib": base_gib + taken_gib, "taken_gib": taken_gib}
+    return {**memory, "wall_s": timing.wall, "processor_s": timing.cpu, "num_gaussians": count}, tensors
 
 
 def _prepare_work(
     case: MemoryCase, setting: MemorySetting, network: PanSplat
 ) -> Callable[[Batch], tuple[int, dict[str, Tensor]]]:
     """A function that predicts or trains on a batch; it returns the number of Gaussians and the resulting tensors."""
-    perceptual = choose_perceptual(setting.perceptual, device=torch.device(setting.device))
+    perceptual = choose_perceptual(setting.perceptual, device=_CPU)
     if case.work == "inference":
         network.eval()
         return lambda batch: _predict(network, batch, case.tiles, setting.style)
@@ -376,111 +283,60 @@ def make_painted_sphere(height: int) -> Batch:
     return collate([Sample("sphere", views((-0.5, 0.5)), views((0.1,)))])
 
 
-def make_memory_report(
-    machine: Mapping[str, Any], setting: MemorySetting, cases: Sequence[MemoryCase], out: Path | None
-) -> Report[MemoryRow]:
-    """The report of a run.
-
-    Args:
-        machine: from `describe_machine`.
-        cases: of the run.
-        out: folder for memory.json, memory.md and memory.png.
-    """
-    device = machine["gpu"] if setting.device == "cuda" else machine["cpu"]
-    title = f"{setting.network} network, batch 1, {setting.style} images, {setting.perceptual} loss; {device}"
-
-    def missing_rows(rows: Sequence[MemoryRow]) -> list[str]:
-        missing = len(set(cases) - {row.case for row in rows})
-        return [f"{missing} of {len(cases)} rows are still to be measured"] if missing else []
-
-    return Report(
-        MEMORY_COLUMNS,
-        lambda row: title,
-        machine,
-        header={"setting": dataclasses.asdict(setting)},
-        findings=missing_rows,
-        json_file=None if out is None else out / "memory.json",
-        page=None if out is None else out / "memory.md",
-        plots={} if out is None else {out / "memory.png": lambda rows: plot_memory(rows, title)},
-        print_steps=True,
-    )
-
-
 def _tile_count(tiles: int) -> str:
     return "untiled" if tiles == 1 else f"{tiles**2} tiles"
 
 
-MEMORY_COLUMNS: tuple[Column[MemoryRow], ...] = (
-    Column("height", lambda row: str(row.case.height)),
-    Column("work", lambda row: row.case.work, "left"),
-    Column("tiles", lambda row: str(row.case.tiles**2)),
-    result_column("base GiB", "{:.2f}", "base_gib"),
-    result_column("peak GiB", "{:.2f}", "peak_gib"),
-    result_column("taken GiB", "{:.2f}", "taken_gib"),
-    result_column("seconds", "{:.1f}", "wall_s"),
-    result_column("processor s", "{:.1f}", "processor_s"),
-    error_column("deviation", "{:.1e}", "deviation"),
-    Column("", lambda row: "" if row.status == "measured" else f"{row.status}: {row.note}", "left"),
-)
-
-
-def plot_memory(rows: Sequence[MemoryRow], title: str) -> Figure | None:
+def plot_memory(rows: Sequence[Row], header: Header) -> Figure | None:
     """Plot the taken memory over the height for training and for inference; None if there is nothing to plot."""
-    shown = [row for row in rows if row.result.taken_gib]
+    shown = sorted((row for row in rows if row.get("taken_gib")), key=lambda row: row.case.height)
     if not shown:
         return None
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 5.5), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    _plot_kind(left, [row for row in shown if row.case.kind == "training"], "training")
-    _plot_kind(right, [row for row in shown if row.case.kind == "inference"], "inference")
-    left.set_ylabel("GiB beyond Python, weights and input")
+    figure, both = make_axes(2, (11, 5.5), sharey=True)
     heights = sorted({row.case.height for row in shown} | {point[2] for point in PAPER_POINTS})
-    for axes in (left, right):
+    for axes, kind in zip(both, ("training", "inference"), strict=True):
+        of_kind = [row for row in shown if row.case.kind == kind]
+        for work, tiles in dict.fromkeys((row.case.work, row.case.tiles) for row in of_kind):
+            curve = [row for row in of_kind if (row.case.work, row.case.tiles) == (work, tiles)]
+            x, y = [row.case.height for row in curve], [row.get("taken_gib") for row in curve]
+            style = {"color": _WORK_COLORS[work], "markersize": 4, "label": f"{work}, {_tile_count(tiles)}"}
+            axes.plot(x, y, _TILE_STYLES[tiles], **style)
+        for _, text, height, gigabytes in (point for point in PAPER_POINTS if point[0] == kind):
+            point = (height, gigabytes * 1e9 / 2**30)
+            axes.plot(*point, "*", **_PAPER_STYLE)
+            axes.annotate(f"{text} ", point, ha="right", va="center", fontsize=8, color=_PAPER_STYLE["color"])
+        axes.plot([], [], "*", **_PAPER_STYLE, label="the paper: its network, a GPU")
         axes.set_xscale("log", base=2)
         axes.set_yscale("log", base=2)
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.set_xticks(heights, [f"{height}\nx{2 * height}" for height in heights])
         axes.minorticks_off()
-        axes.grid(alpha=0.25)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+        axes.set(title=kind, xlabel="panorama, pixels", ylabel="GiB beyond Python, weights and input")
+        axes.legend(fontsize=8, loc="lower right")
+    setting = header["setting"]
+    title = f"{setting['network']} network, batch 1, {setting['style']} images, {setting['perceptual']} loss"
+    figure.suptitle(f"{title}; {header['machine']['cpu']}", x=0.01, ha="left", fontsize=10)
     return figure
 
 
-def _plot_kind(axes: Axes, rows: Sequence[MemoryRow], kind: str) -> None:
-    """A curve for each kind of backpropagation and number of tiles, and the paper's points."""
-    curves: dict[tuple[Work, int], list[MemoryRow]] = {}
-    for row in sorted(rows, key=lambda row: row.case.height):
-        curves.setdefault((row.case.work, row.case.tiles), []).append(row)
-    for (work, tiles), curve in curves.items():
-        name = kind if work == "inference" else work
-        axes.plot(
-            [row.case.height for row in curve],
-            [row.result.taken_gib or 0.0 for row in curve],
-            _TILE_LINES[tiles],
-            color=_WORK_COLORS[work],
-            marker=_TILE_MARKERS[tiles],
-            markersize=4,
-            label=f"{name}, {_tile_count(tiles)}",
-        )
-    for _, text, height, gigabytes in (point for point in PAPER_POINTS if point[0] == kind):
-        point = (height, gigabytes * 1e9 / 2**30)
-        axes.plot(*point, "*", **_PAPER_STYLE)
-        axes.annotate(
-            text,
-            point,
-            xytext=(-8, 0),
-            textcoords="offset points",
-            ha="right",
-            va="center",
-            fontsize=8,
-            color=_PAPER_STYLE["color"],
-        )
-    axes.plot([], [], "*", **_PAPER_STYLE, label="the paper: its network, a GPU")
-    axes.set_title(kind, loc="left")
-    axes.set_xlabel("panorama, pixels")
-    axes.legend(fontsize=8, loc="lower right")
+MEMORY = Benchmark(
+    "memory",
+    (
+        Column("height", "height", "{:d}"),
+        Column("work", "work"),
+        Column("tiles", lambda row: row.case.tiles**2, "{:d}"),
+        Column("base GiB", "base_gib", "{:.2f}"),
+        Column("peak GiB", "peak_gib", "{:.2f}"),
+        Column("taken GiB", "taken_gib", "{:.2f}"),
+        Column("seconds", "wall_s", "{:.1f}"),
+        Column("processor s", "processor_s", "{:.1f}"),
+        Column("deviation", error_or_reference("deviation"), "{:.1e}"),
+        Column("", lambda row: "" if row.status == "measured" else f"{row.status}: {row.note}"),
+    ),
+    lambda row: "one prediction or training step of each row",
+    {"": plot_memory},
+    width=150,
+)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,11 @@
 
 A row is a pair of panoramas, or all panoramas of a folder. A pose is wrong if its rotation differs by more than 3
 degrees or its direction by more than 10; a wrong pose that passes the check of the estimate is the error to avoid.
+
+Values of a row: `outcome` is "solved", "flagged" (no pose passed the check), or "wrong" (a wrong pose passed it);
+`rotation_degrees` and `direction_degrees` are errors of the relative pose, for a tour medians over all pairs;
+`scale_percent` that of the distances; `position_cm` the largest error of a position after similarity alignment;
+`places` match in the weakest pair; `seconds` of the estimate.
 """
 
 from __future__ import annotations
@@ -18,7 +23,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from pansplat.bench.report import Column, Report, Row, result_column
+from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
+from pansplat.data.folders import load_pairs
 from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.poses.estimate import PoseEstimate, estimate_poses
@@ -43,32 +49,25 @@ class PoseCase:
     baseline_m: float
 
 
-@dataclass
-class PoseResult:
-    """Errors of an estimate; None where there is no pose.
+def measure_folder(path: Path, report: Report, *, camera_height: float, tours: bool) -> None:
+    """Add a row for each pair of a folder, and for all its panoramas together.
 
-    Attributes:
-        outcome: "solved", "flagged" (no pose passed the check), or "wrong" (a wrong pose passed it).
-        rotation_degrees, direction_degrees: of the relative pose; for a tour, medians over all pairs.
-        scale_percent: of the distances, relative to the known ones.
-        position_cm: largest error of a position after similarity alignment.
-        places: that match, of the weakest pair.
-        seconds: of the estimate.
+    Args:
+        camera_height: mean height of the cameras over the floor, metres.
+        tours: also estimate all panoramas together.
     """
-
-    outcome: str
-    rotation_degrees: float | None = None
-    direction_degrees: float | None = None
-    scale_percent: float | None = None
-    position_cm: float | None = None
-    places: float | None = None
-    seconds: float = 0.0
-
-
-PoseRow = Row[PoseCase, PoseResult]
+    pairs = load_pairs(path)
+    contexts = {frozenset(view.image for view in pair.context): pair for pair in pairs}
+    for pair in contexts.values():
+        report.step(pair.name)
+        report.add(measure_poses(pair.name, pair.context, camera_height))
+    if tours:
+        views = {view.image: view for pair in pairs for view in (*pair.context, *pair.targets)}
+        report.step(f"all {len(views)} panoramas")
+        report.add(measure_poses(path.resolve().name, list(views.values()), camera_height, "tour"))
 
 
-def measure_poses(name: str, panoramas: Sequence[Panorama], camera_height: float, suite: str = "pair") -> PoseRow:
+def measure_poses(name: str, panoramas: Sequence[Panorama], camera_height: float, suite: str = "pair") -> Row:
     """Estimate the poses of panoramas and compare them with the known ones."""
     truth = {panorama.image: panorama.cam2world.numpy() for panorama in panoramas}
     centres = np.stack([pose[:3, 3] for pose in truth.values()])
@@ -78,15 +77,14 @@ def measure_poses(name: str, panoramas: Sequence[Panorama], camera_height: float
     try:
         estimate = estimate_poses(list(truth), camera_height=camera_height)
     except InputError as error:
-        return Row(suite, name, case, PoseResult("flagged", seconds=time.perf_counter() - start), note=str(error))
-    seconds = time.perf_counter() - start
-    result = _compare(estimate, truth)
-    result.seconds = seconds
+        flagged = {"outcome": "flagged", "seconds": time.perf_counter() - start}
+        return Row(suite, name, case, flagged, note=str(error))
+    result = {"seconds": time.perf_counter() - start, **_compare(estimate, truth)}
     note = "; ".join(f"{image.name}: {reason}" for image, reason in estimate.unplaced.items())
     return Row(suite, name, case, result, note=note)
 
 
-def _compare(estimate: PoseEstimate, truth: Mapping[Path, Array]) -> PoseResult:
+def _compare(estimate: PoseEstimate, truth: Mapping[Path, Array]) -> dict[str, Any]:
     rotations, directions, ratios = [], [], []
     for first, second in itertools.combinations(estimate.poses, 2):
         found, known = (np.linalg.inv(p[second]) @ p[first] for p in (estimate.poses, truth))
@@ -96,14 +94,15 @@ def _compare(estimate: PoseEstimate, truth: Mapping[Path, Array]) -> PoseResult:
     is_wrong = max(rotations) > _WRONG_ROTATION or max(directions) > _WRONG_DIRECTION
     places = [relation.places for relation in estimate.relations.values() if relation.is_reliable]
     positions = [np.stack([poses[image][:3, 3] for image in estimate.poses]) for poses in (estimate.poses, truth)]
-    return PoseResult(
-        "wrong" if is_wrong else "solved",
-        float(np.median(rotations)),
-        float(np.median(directions)),
-        None if estimate.scale_source.startswith("unknown") else 100 * (float(np.median(ratios)) - 1),
-        100 * float(_aligned_errors(*positions).max()) if len(positions[0]) > 2 else None,
-        min(places),
-    )
+    known_scale = not estimate.scale_source.startswith("unknown")
+    return {
+        "outcome": "wrong" if is_wrong else "solved",
+        "rotation_degrees": float(np.median(rotations)),
+        "direction_degrees": float(np.median(directions)),
+        "scale_percent": 100 * (float(np.median(ratios)) - 1) if known_scale else None,
+        "position_cm": 100 * float(_aligned_errors(*positions).max()) if len(positions[0]) > 2 else None,
+        "places": min(places),
+    }
 
 
 def _aligned_errors(found: Float[Array, "n 3"], known: Float[Array, "n 3"]) -> Float[Array, "n"]:
@@ -115,69 +114,49 @@ def _aligned_errors(found: Float[Array, "n 3"], known: Float[Array, "n 3"]) -> F
     return np.linalg.norm(b - scale * a @ (u @ np.diag(sign) @ vt).T, axis=1)
 
 
-POSE_COLUMNS: tuple[Column[PoseRow], ...] = (
-    Column("panoramas", lambda row: row.scene, "left"),
-    Column("baseline m", lambda row: f"{row.case.baseline_m:.2f}"),
-    Column("outcome", lambda row: row.result.outcome, "left"),
-    result_column("rotation deg", "{:.3f}", "rotation_degrees"),
-    result_column("direction deg", "{:.2f}", "direction_degrees"),
-    result_column("scale %", "{:+.1f}", "scale_percent"),
-    result_column("position cm", "{:.1f}", "position_cm"),
-    result_column("places", "{:.0f}", "places"),
-    result_column("s", "{:.1f}", "seconds"),
-)
-
-
-def summarise(rows: Sequence[PoseRow]) -> str:
-    """One line: outcomes, medians and 95 % quantiles of the solved pairs."""
-    counts = {name: sum(row.result.outcome == name for row in rows) for name in ("solved", "flagged", "wrong")}
-    solved = [row.result for row in rows if row.result.outcome == "solved"]
+def summarise(rows: Sequence[Row]) -> list[str]:
+    """One line about the pairs: outcomes, medians and 95 % quantiles of the solved ones."""
+    results = [row.result for row in rows if row.suite == "pair"]
+    solved = [result for result in results if result["outcome"] == "solved"]
+    counts = {name: sum(result["outcome"] == name for result in results) for name in ("solved", "flagged", "wrong")}
     parts = [", ".join(f"{count} {name}" for name, count in counts.items())]
-    for title, values in (
-        ("rotation", [result.rotation_degrees for result in solved]),
-        ("direction", [result.direction_degrees for result in solved]),
-    ):
-        if values:
-            median, high = np.quantile(np.array(values, float), (0.5, 0.95))
-            parts.append(f"{title} median {median:.3f}, 95 % {high:.3f} degrees")
-    return "; ".join(parts)
+    for name in ("rotation", "direction") if solved else ():
+        median, high = np.quantile([result[f"{name}_degrees"] for result in solved], (0.5, 0.95))
+        parts.append(f"{name} median {median:.3f}, 95 % {high:.3f} degrees")
+    return ["; ".join(parts)] if results else []
 
 
-def make_pose_report(
-    machine: Mapping[str, Any], *, json: Path | None = None, out: Path | None = None
-) -> Report[PoseRow]:
-    """The report of a run, with pose.md and pose.png in the folder `out`."""
-    return Report(
-        POSE_COLUMNS,
-        lambda row: row.suite,
-        machine,
-        facts=("cpu", "threads"),
-        json_file=json,
-        page=None if out is None else out / "pose.md",
-        plots={} if out is None else {out / "pose.png": plot_poses},
-        print_steps=True,
-    )
-
-
-def plot_poses(rows: Sequence[PoseRow]) -> Figure:
+def plot_poses(rows: Sequence[Row], header: Header) -> Figure:
     """Plot the errors of rotation and direction over the baseline, and the cumulative distributions."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 4), layout="constrained")
-    axes = figure.subplots(1, 2)
+    figure, axes = make_axes(2, (12, 4))
     for outcome, marker in (("solved", "o"), ("wrong", "x")):
-        chosen = [row for row in rows if row.result.outcome == outcome and row.case.count == 2]
-        for field in ("rotation_degrees", "direction_degrees"):
-            values = [getattr(row.result, field) for row in chosen]
-            baselines = [row.case.baseline_m for row in chosen]
-            label = f"{field.split('_')[0]}, {outcome}"
-            if values:
-                axes[0].semilogy(baselines, values, marker, label=label)
-                axes[1].plot(np.sort(values), np.linspace(0, 1, len(values)), label=label)
+        chosen = [row for row in rows if row.get("outcome") == outcome and row.case.count == 2]
+        for name in ("rotation", "direction") if chosen else ():
+            values = [row.get(f"{name}_degrees") for row in chosen]
+            axes[0].semilogy([row.case.baseline_m for row in chosen], values, marker, label=f"{name}, {outcome}")
+            axes[1].plot(np.sort(values), np.linspace(0, 1, len(values)), label=f"{name}, {outcome}")
+            axes[0].legend(fontsize=8)
     axes[0].set(xlabel="distance of the cameras, m", ylabel="error, degrees")
     axes[1].set(xlabel="error, degrees", ylabel="fraction of the pairs", xlim=(0, 2))
-    for ax in axes:
-        ax.grid(alpha=0.25)
-        if ax.get_legend_handles_labels()[0]:
-            ax.legend(fontsize=8)
+    figure.suptitle(header["machine"]["cpu"], x=0.01, ha="left", fontsize=9)
     return figure
+
+
+POSE = Benchmark(
+    "pose",
+    (
+        Column("panoramas", lambda row: row.scene),
+        Column("baseline m", "baseline_m", "{:.2f}"),
+        Column("outcome", "outcome"),
+        Column("rotation deg", "rotation_degrees", "{:.3f}"),
+        Column("direction deg", "direction_degrees", "{:.2f}"),
+        Column("scale %", "scale_percent", "{:+.1f}"),
+        Column("position cm", "position_cm", "{:.1f}"),
+        Column("places", "places", "{:.0f}"),
+        Column("s", "seconds", "{:.1f}"),
+    ),
+    lambda row: row.suite,
+    {"": plot_poses},
+    summarise,
+    width=150,
+)

@@ -2,23 +2,25 @@
 
 A row is a pair, a predictor, a height, a time limit of the refinement and a limit of Gaussians. Its errors are those of
 the panoramas between the inputs. The cross-fade of the inputs is the row without geometry.
+
+Values of a row: `ws_psnr_db` and `lpips` of the panoramas between the inputs; `inputs_db`, WS-PSNR at the input cameras
+over unmasked pixels; `predict_s` and `refine_s`; `steps` of the refinement; `num_gaussians` of the scene.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from pansplat import pipeline
-from pansplat.bench.report import Column, Report, Row, format_number, result_column
+from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.evaluation.lpips import Lpips
@@ -58,30 +60,6 @@ class RefineCase:
         return f"{self.model}{refined}, {self.height}x{2 * self.height}{limit}"
 
 
-@dataclass
-class RefineResult:
-    """Errors, times and size of a scene.
-
-    Attributes:
-        ws_psnr_db, lpips: of the panoramas between the inputs; LPIPS is None if it was not measured.
-        inputs_db: WS-PSNR at the input cameras, over unmasked pixels; None for the cross-fade.
-        predict_s, refine_s: seconds.
-        steps: of the refinement.
-        num_gaussians: of the scene.
-    """
-
-    ws_psnr_db: float
-    lpips: float | None = None
-    inputs_db: float | None = None
-    predict_s: float = 0.0
-    refine_s: float = 0.0
-    steps: float = 0.0
-    num_gaussians: float = 0.0
-
-
-RefineRow = Row[RefineCase, RefineResult]
-
-
 def list_refine_cases(*, quick: bool) -> list[RefineCase]:
     """The cases; with `quick`, two of the default predictor at height 256."""
     if quick:
@@ -101,7 +79,7 @@ class RefineBench:
         lpips: None for no LPIPS.
     """
 
-    def __init__(self, report: Report[RefineRow], lpips: Lpips | None) -> None:
+    def __init__(self, report: Report, lpips: Lpips | None) -> None:
         self._report, self._lpips = report, lpips
         self._predictors: dict[str, Predictor] = {}
 
@@ -110,11 +88,11 @@ class RefineBench:
         for pair in pairs:
             predicted: dict[tuple[str, int], tuple[Scene, float]] = {}
             for case in cases:
-                self._report.update(f"{pair.name}: {case}")
+                self._report.step(f"{pair.name}: {case}")
                 context, targets = pair.load_context(case.height), pair.load_targets(case.height)
                 self._report.add(Row("refine", pair.name, case, self._measure(case, context, targets, predicted)))
         if len(pairs) > 1:
-            for row in list(average_rows(self._report.rows)):
+            for row in average_rows(list(self._report.rows)):
                 self._report.add(row)
 
     def _measure(
@@ -123,9 +101,10 @@ class RefineBench:
         context: Views,
         targets: Views,
         predicted: dict[tuple[str, int], tuple[Scene, float]],
-    ) -> RefineResult:
+    ) -> dict[str, float]:
         if case.model == CROSS_FADE:
-            return RefineResult(*self._compare(partial(cross_fade, context.images, context.cam2world), targets))
+            errors = self._compare(partial(cross_fade, context.images, context.cam2world), targets)
+            return {**errors, "predict_s": 0.0, "refine_s": 0.0, "steps": 0, "num_gaussians": 0}
         if (case.model, case.height) not in predicted:
             predicted[case.model, case.height] = self._predict(case.model, context)
         scene, predict_s = predicted[case.model, case.height]
@@ -137,10 +116,11 @@ class RefineBench:
             scene, refine_s = refinement.scene(), time.perf_counter() - start
 
         render = partial(pipeline.render, size=(case.height, 2 * case.height))
-        inputs_db = measure_own_views(scene, context, render)
         with torch.no_grad():
-            error = self._compare(lambda pose: render(scene, pose).color.float(), targets)
-        return RefineResult(*error, inputs_db, predict_s, refine_s, steps, len(scene.gaussians))
+            errors = self._compare(lambda pose: render(scene, pose).color.float(), targets)
+        inputs_db, count = measure_own_views(scene, context, render), len(scene.gaussians)
+        times = {"predict_s": predict_s, "refine_s": refine_s}
+        return {**errors, "inputs_db": inputs_db, **times, "steps": steps, "num_gaussians": count}
 
     def _predict(self, model: str, context: Views) -> tuple[Scene, float]:
         if model not in self._predictors:
@@ -150,93 +130,66 @@ class RefineBench:
         scene = pipeline.predict(context, self._predictors[model])
         return scene, time.perf_counter() - start
 
-    def _compare(self, draw: Callable[[Tensor], Tensor], targets: Views) -> tuple[float, float | None]:
+    def _compare(self, draw: Callable[[Tensor], Tensor], targets: Views) -> dict[str, float]:
         """Mean WS-PSNR and LPIPS of the targets."""
-        images = [draw(pose) for pose in targets.cam2world]
-        errors = [ws_psnr(image, target) for image, target in zip(images, targets.images, strict=True)]
-        if self._lpips is None:
-            return statistics.fmean(errors), None
-        distances = [self._lpips.distance(image, target) for image, target in zip(images, targets.images, strict=True)]
-        return statistics.fmean(errors), statistics.fmean(distances)
+        images = [(draw(pose), target) for pose, target in zip(targets.cam2world, targets.images, strict=True)]
+        errors = {"ws_psnr_db": statistics.fmean(ws_psnr(*pair) for pair in images)}
+        if self._lpips is not None:
+            errors["lpips"] = statistics.fmean(self._lpips.distance(*pair) for pair in images)
+        return errors
 
 
-def average_rows(rows: Sequence[RefineRow]) -> Iterator[RefineRow]:
-    """For each case, the mean of its rows."""
+def average_rows(rows: Sequence[Row]) -> Iterator[Row]:
+    """For each case, the mean of its rows; values that not all of them have are left out."""
     for case in dict.fromkeys(row.case for row in rows):
         results = [row.result for row in rows if row.case == case and row.scene != MEAN]
-        columns = {name: [getattr(result, name) for result in results] for name in vars(results[0])}
-        means = {name: None if None in values else statistics.fmean(values) for name, values in columns.items()}
-        yield Row("refine", MEAN, case, RefineResult(**means))  # type: ignore[arg-type]
+        names = [name for name in results[0] if all(name in result for result in results)]
+        yield Row("refine", MEAN, case, {name: statistics.fmean(each[name] for each in results) for name in names})
 
 
-REFINE_COLUMNS: tuple[Column[RefineRow], ...] = (
-    Column("model", lambda row: row.case.model, "left"),
-    Column("height", lambda row: str(row.case.height)),
-    Column("refinement", lambda row: f"{row.case.limit_s:g} s" if row.case.limit_s else "none"),
-    Column("limit", lambda row: f"{row.case.limit_gaussians:,}" if row.case.limit_gaussians else ""),
-    result_column("Gaussians", "{:,.0f}", "num_gaussians"),
-    result_column("predict s", "{:.1f}", "predict_s"),
-    result_column("refine s", "{:.1f}", "refine_s"),
-    result_column("steps", "{:.0f}", "steps"),
-    result_column("WS-PSNR dB", "{:.2f}", "ws_psnr_db"),
-    result_column("LPIPS", "{:.3f}", "lpips"),
-    Column("at inputs dB", lambda row: format_number(row.result.inputs_db, "{:.2f}")),
-)
-
-
-def make_refine_report(
-    machine: Mapping[str, Any], lpips: str | None, *, json: Path | None = None, out: Path | None = None
-) -> Report[RefineRow]:
-    """The report of a run.
-
-    Args:
-        machine: from `describe_machine`.
-        lpips: name of the LPIPS that is measured.
-        json: file of the rows.
-        out: folder for refine.md and refine.png.
-    """
-    return Report(
-        REFINE_COLUMNS,
-        lambda row: row.scene,
-        machine,
-        header={"lpips": lpips},
-        facts=("cpu", "threads"),
-        json_file=json,
-        page=None if out is None else out / "refine.md",
-        plots={} if out is None else {out / "refine.png": lambda rows: plot_refine(rows, str(machine["cpu"]), lpips)},
-        print_steps=True,
-    )
-
-
-def plot_refine(rows: Sequence[RefineRow], title: str, lpips: str | None) -> Figure:
+def plot_refine(rows: Sequence[Row], header: Header) -> Figure:
     """Plot the mean WS-PSNR and LPIPS over the seconds, and WS-PSNR over the number of Gaussians."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter
-
     means = list(average_rows([row for row in rows if row.scene != MEAN]))
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    axes = figure.subplots(1, 3)
+    figure, axes = make_axes(3, (13, 4.2))
     unlimited = [row for row in means if row.case.limit_gaussians is None]
     for model, height in dict.fromkeys((row.case.model, row.case.height) for row in unlimited):
-        line = [row.result for row in unlimited if (row.case.model, row.case.height) == (model, height)]
-        seconds = [result.predict_s + result.refine_s for result in line]
+        line = [row for row in unlimited if (row.case.model, row.case.height) == (model, height)]
+        seconds = [row.get("predict_s") + row.get("refine_s") for row in line]
         label = model if model == CROSS_FADE else f"{model}, {height}x{2 * height}"
-        axes[0].plot(seconds, [result.ws_psnr_db for result in line], "o-", label=label)
-        axes[1].plot(seconds, [result.lpips for result in line], "o-", label=label)
+        axes[0].plot(seconds, [row.get("ws_psnr_db") for row in line], "o-", label=label)
+        axes[1].plot(seconds, [row.get("lpips") for row in line], "o-", label=label)
     largest = max((row.case.limit_s for row in means if row.case.limit_gaussians), default=0.0)
     budgets = [row for row in means if row.case.limit_s == largest and row.case.model == "default"]
     height = max((row.case.height for row in budgets), default=0)
-    budgets = sorted((row for row in budgets if row.case.height == height), key=lambda row: row.result.num_gaussians)
-    axes[2].plot([row.result.num_gaussians for row in budgets], [row.result.ws_psnr_db for row in budgets], "o-")
-    axes[0].set(xlabel="seconds of prediction and refinement", ylabel="WS-PSNR between the inputs, dB")
-    axes[1].set(xlabel="seconds of prediction and refinement", ylabel=f"LPIPS ({lpips})" if lpips else "LPIPS")
-    axes[2].set(
-        xlabel=f"Gaussians, default + {largest:g} s at height {height}", ylabel="WS-PSNR between the inputs, dB"
-    )
+    points = sorted((row.get("num_gaussians"), row.get("ws_psnr_db")) for row in budgets if row.case.height == height)
+    axes[2].plot([count for count, _ in points], [psnr for _, psnr in points], "o-")
+    between, seconds_label = "WS-PSNR between the inputs, dB", "seconds of prediction and refinement"
+    axes[0].set(xlabel=seconds_label, ylabel=between)
+    axes[1].set(xlabel=seconds_label, ylabel=f"LPIPS ({header['lpips']})" if header["lpips"] else "LPIPS")
+    axes[2].set(xlabel=f"Gaussians, default + {largest:g} s at height {height}", ylabel=between)
     axes[2].set_xlim(left=0)
-    axes[2].xaxis.set_major_formatter(EngFormatter())
+    axes[2].xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
     axes[0].legend(fontsize=8)
-    axes[0].set_title(title, loc="left", fontsize=9)
-    for ax in axes:
-        ax.grid(alpha=0.25)
+    axes[0].set_title(header["machine"]["cpu"], loc="left", fontsize=9)
     return figure
+
+
+REFINE = Benchmark(
+    "refine",
+    (
+        Column("model", "model"),
+        Column("height", "height", "{:d}"),
+        Column("refinement", lambda row: f"{row.case.limit_s:g} s" if row.case.limit_s else "none"),
+        Column("limit", "limit_gaussians", "{:,}"),
+        Column("Gaussians", "num_gaussians", "{:,.0f}"),
+        Column("predict s", "predict_s", "{:.1f}"),
+        Column("refine s", "refine_s", "{:.1f}"),
+        Column("steps", "steps", "{:.0f}"),
+        Column("WS-PSNR dB", "ws_psnr_db", "{:.2f}"),
+        Column("LPIPS", "lpips", "{:.3f}"),
+        Column("at inputs dB", "inputs_db", "{:.2f}"),
+    ),
+    lambda row: row.scene,
+    {"": plot_refine},
+    width=150,
+)

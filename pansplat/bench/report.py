@@ -1,39 +1,38 @@
-"""Rows of a benchmark and their report: a live table, a JSON file, tables in Markdown, plots."""
+"""Rows of all benchmarks and their report: tables, a JSON file, a page in Markdown, plots."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 from pansplat.atomic import replacing
 from pansplat.console import make_table_console
+from pansplat.errors import InputError
+from pansplat.evaluation.report import write_json
+from pansplat.strict_json import read_json
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from rich.table import Table
 
-Case = TypeVar("Case")
-Result = TypeVar("Result")
-AnyRow = TypeVar("AnyRow", bound="Row[Any, Any]")
-Status = Literal["measured", "not tried", "over the limit", "died"]
-
-_LIVE_ROWS = 14  # of the running table
+_SETTINGS_TO_CHANGE = ("limit_gib",)  # an interrupted run may continue with another value
 
 
 @dataclass
-class Row(Generic[Case, Result]):
-    """One benchmark case and its result.
+class Row:
+    """One case of a benchmark and its measured values.
 
     Attributes:
         suite: the question that the case answers.
-        scene: name of the rendered or predicted scene.
-        case: the configuration.
-        result: the measured values; None in a field means not measured.
+        scene: name of what is rendered or predicted.
+        case: the configuration, a frozen dataclass.
+        result: measured values by name; the name ends in the unit. What was not measured has no entry.
         status: whether the case was measured, or why not.
         is_reference: whether other rows are compared with this one.
         note: additional information.
@@ -41,17 +40,32 @@ class Row(Generic[Case, Result]):
 
     suite: str
     scene: str
-    case: Case
-    result: Result
-    status: Status = "measured"
+    case: Any
+    result: dict[str, Any] = field(default_factory=dict)
+    status: Literal["measured", "over the limit", "died"] = "measured"
     is_reference: bool = False
     note: str = ""
 
+    def get(self, name: str) -> Any:
+        """The value of this name in the case or the result; None if it was not measured."""
+        return getattr(self.case, name) if hasattr(self.case, name) else self.result.get(name)
+
     def as_json(self) -> dict[str, object]:
-        """All fields in one flat dictionary; numbers with six digits, null instead of infinite ones."""
+        """All values in one flat dictionary; numbers with six digits, null instead of infinite ones."""
         values = {name: getattr(self, name) for name in ("suite", "scene", "status", "is_reference", "note")}
-        values |= dataclasses.asdict(self.case) | dataclasses.asdict(self.result)  # type: ignore[call-overload]
-        return {name: _rounded(value) for name, value in values.items()}
+        return _rounded(values | dataclasses.asdict(self.case) | self.result)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any], case_type: type) -> Row:
+        """The row of a dictionary that `as_json` made.
+
+        Raises:
+            KeyError: a field is missing.
+        """
+        rest = dict(values)
+        row = {name: rest.pop(name) for name in ("suite", "scene", "status", "is_reference", "note")}
+        case = case_type(**{item.name: rest.pop(item.name) for item in dataclasses.fields(case_type)})
+        return cls(**row, case=case, result=rest)
 
 
 def _rounded(value: Any) -> Any:
@@ -62,50 +76,35 @@ def _rounded(value: Any) -> Any:
     return value
 
 
-def read_row(values: Mapping[str, Any], case: type[Case], result: type[Result]) -> Row[Case, Result]:
-    """The row of a dictionary that `Row.as_json` made.
-
-    Raises:
-        KeyError: a field is missing.
-    """
-
-    def read(kind: type) -> Any:
-        return kind(**{field.name: values[field.name] for field in dataclasses.fields(kind)})
-
-    return Row(
-        *(values["suite"], values["scene"], read(case), read(result)),
-        *(values["status"], values["is_reference"], values["note"]),
-    )
-
-
 @dataclass(frozen=True)
-class Column(Generic[AnyRow]):
+class Column:
     """A column of a table.
 
     Attributes:
-        cell: text of a row's cell; empty if the value was not measured.
+        value: name of a value of the row's case or result, or a function of the row.
+        form: format of a number. Columns of the format "{}" hold texts and are aligned on the left.
     """
 
     title: str
-    cell: Callable[[AnyRow], str]
-    justify: Literal["left", "right"] = "right"
+    value: str | Callable[[Row], Any]
+    form: str = "{}"
+
+    @property
+    def justify(self) -> Literal["left", "right"]:
+        """Alignment of the cells."""
+        return "left" if self.form == "{}" else "right"
+
+    def cell(self, row: Row) -> str:
+        """The text of a row's cell: empty if the value was not measured, "exact" for an infinite PSNR."""
+        value = row.get(self.value) if isinstance(self.value, str) else self.value(row)
+        if value is None or isinstance(value, str):
+            return value or ""
+        return "exact" if value == math.inf else self.form.format(value)
 
 
-def result_column(title: str, form: str, name: str) -> Column[Any]:
-    """The column of a field of the result."""
-    return Column(title, lambda row: format_number(getattr(row.result, name), form))
-
-
-def error_column(title: str, form: str, name: str) -> Column[Any]:
-    """The column of an error against the reference row."""
-    return Column(
-        title, lambda row: "reference" if row.is_reference else format_number(getattr(row.result, name), form)
-    )
-
-
-def format_number(value: float | None, form: str) -> str:
-    """The text of a cell: empty for None, "exact" for an infinite PSNR."""
-    return "" if value is None else "exact" if value == math.inf else form.format(value)
+def error_or_reference(name: str) -> Callable[[Row], Any]:
+    """A column's value: an error, or "reference" in the row that the others are compared with."""
+    return lambda row: "reference" if row.is_reference else row.get(name)
 
 
 def format_threads(count: int) -> str:
@@ -113,153 +112,165 @@ def format_threads(count: int) -> str:
     return "one thread" if count == 1 else f"{count} threads"
 
 
-def make_terminal_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow], title: str) -> Table:
-    """A table for the terminal; only cells of columns without a title may wrap."""
-    from rich.table import Table
+def make_axes(count: int, size: tuple[float, float], **options: Any) -> tuple[Figure, list[Axes]]:
+    """A figure of this size in inches with plots side by side."""
+    from matplotlib.figure import Figure
 
-    table = Table(title=title, title_justify="left", pad_edge=False)
-    for column in columns:
-        table.add_column(column.title, justify=column.justify, no_wrap=bool(column.title))
-    for row in rows:
-        table.add_row(*(column.cell(row) for column in columns))
-    return table
-
-
-def format_markdown_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow]) -> str:
-    """A table in Markdown, without a line break after the last row."""
-    rule = "|" + "|".join("---:" if column.justify == "right" else "---" for column in columns) + "|"
-    cells = [[column.title for column in columns], *([column.cell(row) for column in columns] for row in rows)]
-    lines = ["| " + " | ".join(texts) + " |" for texts in cells]
-    return "\n".join((lines[0], rule, *lines[1:]))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = list(figure.subplots(1, count, squeeze=False, **options)[0])
+    for each in axes:
+        each.grid(alpha=0.25)
+    return figure, axes
 
 
-def write_rows(path: Path, header: Mapping[str, object], rows: Iterable[Row[Any, Any]]) -> None:
-    """Write {**header, "rows": [...]} as JSON; the file is complete at any moment.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    text = json.dumps({**header, "rows": [row.as_json() for row in rows]}, indent=1, allow_nan=False)
-    with replacing(path) as partial:
-        partial.write_text(text + "\n")
+Header = Mapping[str, Any]
+Plot = Callable[[Sequence[Row], Header], "Figure | None"]
 
 
-@dataclass
-class Report(Generic[AnyRow]):
-    """The rows of one run: shown while they are measured, printed and written at the end.
-
-    As a context manager it prints and writes the measured rows even if the run was interrupted.
+@dataclass(frozen=True)
+class Benchmark:
+    """What the reports of one benchmark have in common.
 
     Attributes:
-        columns: of the tables.
+        name: of its files: NAME.json, NAME.md and NAME.png.
+        columns: of its tables.
         section: title of the table that a row belongs to.
-        machine: from `describe_machine`; written to the JSON file.
-        header: more values of the JSON file.
-        facts: entries of `machine` to print.
+        plots: functions that plot the rows, by what follows NAME in their file's name; they get the rows and the header
+            of the JSON file, and return None if there is nothing to plot.
         findings: sentences about all rows, for the terminal and the page.
-        json_file: written after every step.
-        page: Markdown, written at the end.
-        plots: functions that plot the rows, by file; they return None if there is nothing to plot.
-        print_steps: print each step if there is no terminal.
         width: characters of a printed line if there is no terminal.
-        rows: measured so far.
     """
 
-    columns: Sequence[Column[AnyRow]]
-    section: Callable[[AnyRow], str]
-    machine: Mapping[str, Any]
-    _: KW_ONLY
-    header: Mapping[str, object] = field(default_factory=dict)
-    facts: Sequence[str] = ()
-    findings: Callable[[Sequence[AnyRow]], list[str]] = lambda rows: []
-    json_file: Path | None = None
-    page: Path | None = None
-    plots: Mapping[Path, Callable[[Sequence[AnyRow]], Figure | None]] = field(default_factory=dict)
-    print_steps: bool = False
-    width: int = 150
-    rows: list[AnyRow] = field(default_factory=list)
-    _live: Any = None
+    name: str
+    columns: Sequence[Column]
+    section: Callable[[Row], str]
+    plots: Mapping[str, Plot]
+    findings: Callable[[Sequence[Row]], list[str]] = lambda rows: []
+    width: int = 190
 
-    def __enter__(self) -> Report[AnyRow]:
-        from rich.console import Console
-        from rich.live import Live
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """One table for each section, in the order of the rows; only cells of columns without a title may wrap."""
+        from rich.table import Table
 
-        self._live = Live(console=Console(stderr=True), refresh_per_second=4, transient=True)
-        self._live.start()
-        return self
+        tables = []
+        for title, part in self._sections(rows).items():
+            tables.append(Table(title=title, title_justify="left", pad_edge=False))
+            for column in self.columns:
+                tables[-1].add_column(column.title, justify=column.justify, no_wrap=bool(column.title))
+            for row in part:
+                tables[-1].add_row(*(column.cell(row) for column in self.columns))
+        return tables
 
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
-        self._live = None
-        self._print()
-        for file in self._write():
-            print(file)
-
-    def add(self, row: AnyRow) -> None:
-        """Add a measured row, write the JSON file and show the last rows."""
-        self.rows.append(row)
-        self.update()
-
-    def update(self, step: str = "") -> None:
-        """Write the JSON file and show the last rows and the step that follows."""
-        if self.json_file is not None and self.rows:
-            write_rows(self.json_file, {"machine": self.machine, **self.header}, self.rows)
-        if self._live is None:
-            return
-        if self._live.console.is_terminal:
-            from rich.console import Group
-            from rich.text import Text
-
-            self._live.update(Group(*self.tables(self.rows[-_LIVE_ROWS:]), Text(step, style="cyan")))
-        elif step and self.print_steps:
-            self._live.console.print(step, highlight=False, soft_wrap=True)
-
-    def tables(self, rows: Sequence[AnyRow]) -> list[Table]:
-        """One table for each section, in the order of the rows."""
-        return [make_terminal_table(self.columns, part, title) for title, part in self._sections(rows).items()]
-
-    def markdown(self) -> str:
+    def markdown(self, rows: Sequence[Row]) -> str:
         """The findings and all tables as the text of a page."""
-        parts = ["\n".join(f"* {sentence}" for sentence in self.findings(self.rows))]
-        for title, part in self._sections(self.rows).items():
-            parts.append(f"### {title[:1].upper()}{title[1:]}\n\n{format_markdown_table(self.columns, part)}")
+        rule = "|" + "|".join("---:" if column.justify == "right" else "---" for column in self.columns) + "|"
+        titles = "| " + " | ".join(column.title for column in self.columns) + " |"
+        parts = ["\n".join(f"* {sentence}" for sentence in self.findings(rows))]
+        for title, part in self._sections(rows).items():
+            lines = ["| " + " | ".join(column.cell(row) for column in self.columns) + " |" for row in part]
+            parts.append("\n".join((f"### {title[:1].upper()}{title[1:]}\n", titles, rule, *lines)))
         return "\n\n".join(part for part in parts if part) + "\n"
 
-    def _sections(self, rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
-        sections: dict[str, list[AnyRow]] = {}
+    def _sections(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
+        sections: dict[str, list[Row]] = {}
         for row in rows:
             sections.setdefault(self.section(row), []).append(row)
         return sections
 
-    def _print(self) -> None:
-        print_facts({name: self.machine[name] for name in self.facts})
-        console = make_table_console(self.width)
-        for table in self.tables(self.rows):
+
+class Report:
+    """The rows of one run: saved after each measurement, printed and written at the end.
+
+    As a context manager it prints and writes the measured rows even if the run was interrupted.
+
+    Attributes:
+        header: values of the JSON file beside the rows, with the `machine` of `describe_machine`.
+        json_file: written after every row.
+        rows: measured so far.
+    """
+
+    def __init__(
+        self, benchmark: Benchmark, header: Header, *, json_file: Path | None = None, out: Path | None = None
+    ) -> None:
+        """Begin a run.
+
+        Args:
+            json_file: by default NAME.json in `out`, if that is given.
+            out: folder for the page and the plots.
+        """
+        self.header, self.rows = header, list[Row]()
+        self.json_file = json_file or (None if out is None else out / f"{benchmark.name}.json")
+        self._benchmark, self._out = benchmark, out
+
+    def resume(self, case_type: type) -> None:
+        """Read the rows of an earlier run from the JSON file, if there is one.
+
+        Raises:
+            InputError: it is not a file of such rows, or its `setting` differs from that of the header.
+        """
+        if self.json_file is None or not self.json_file.is_file():
+            return
+        command = f"`pansplat bench {self._benchmark.name}`"
+        try:
+            content = read_json(self.json_file)
+            rows = [Row.from_json(values, case_type) for values in content["rows"]]
+            before, now = content.get("setting", {}), self.header.get("setting", {})
+            changed = [
+                f"{name} was {before.get(name)}, now {now[name]}"
+                for name in now
+                if name not in _SETTINGS_TO_CHANGE and before.get(name) != now[name]
+            ]
+        except (KeyError, TypeError, AttributeError, InputError) as error:
+            raise InputError(f"{self.json_file}: needed rows of {command}, got {error!r}; delete it.") from error
+        if changed:
+            raise InputError(
+                f"{self.json_file}: has another setting ({'; '.join(changed)}); give another --out, or delete the file."
+            )
+        self.rows += rows
+
+    def __enter__(self) -> Report:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        machine = self.header["machine"]
+        print(f"{machine['cpu']}, GPU: {machine.get('gpu') or 'none'}, {format_threads(machine['threads'])}")
+        console = make_table_console(self._benchmark.width)
+        for table in self._benchmark.tables(self.rows):
             console.print(table)
-        for sentence in self.findings(self.rows):
+        for sentence in self._benchmark.findings(self.rows):
             print(sentence)
+        for file in self._write():
+            print(file)
+
+    def step(self, text: str) -> None:
+        """Show what is measured next."""
+        print(text, file=sys.stderr, flush=True)
+
+    def add(self, row: Row) -> None:
+        """Add a measured row and write the JSON file."""
+        self.rows.append(row)
+        self.save()
+
+    def save(self) -> None:
+        """Write the JSON file after a change of the rows."""
+        if self.json_file is not None and self.rows:
+            write_json({**_rounded(dict(self.header)), "rows": [row.as_json() for row in self.rows]}, self.json_file)
 
     def _write(self) -> list[Path]:
-        """Write the files and return those that were written."""
+        """Write the page and the plots and return all written files."""
         if not self.rows:
             return []
         written = [] if self.json_file is None else [self.json_file]
-        if self.page is not None:
-            with replacing(self.page) as partial:
-                partial.write_text(self.markdown())
-            written.append(self.page)
-        for path, plot in self.plots.items():
-            figure = plot(self.rows)
+        if self._out is None:
+            return written
+        page = self._out / f"{self._benchmark.name}.md"
+        with replacing(page) as partial:
+            partial.write_text(self._benchmark.markdown(self.rows))
+        written.append(page)
+        for ending, plot in self._benchmark.plots.items():
+            figure, path = plot(self.rows, self.header), self._out / f"{self._benchmark.name}{ending}.png"
             if figure is not None:
                 with replacing(path) as partial:
                     figure.savefig(partial, dpi=110)
                 written.append(path)
         return written
-
-
-def print_facts(facts: Mapping[str, object]) -> None:
-    """Print entries of `describe_machine`, one a line."""
-    for name, value in facts.items():
-        if isinstance(value, dict):
-            value = ", ".join(f"{key}: {item}" for key, item in value.items())
-        print(f"{name:<15} {'none' if value is None else value}")

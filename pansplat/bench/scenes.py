@@ -88,52 +88,24 @@ def _make_discs(
     level: int,
     view: int,
 ) -> Gaussians:
-    """A disc where each ray from a camera meets the room."""
+    """A disc where each ray from a camera meets the room; it looks round along the ray."""
     distance, axis, body = _trace_room(rays, position)
     points = position + distance[:, None] * rays
     normals = torch.nn.functional.one_hot(axis, 3).double()
     facing = (rays * normals).sum(dim=1)
-    size = sample_disc_sizes(len(rays), generator)
-    harmonics = _make_harmonics(points, 6 * body + 2 * axis + (facing > 0), degree, generator)
-    return make_flat_discs(rays, points, normals, size, distance * pixel_angle, harmonics, level, view)
-
-
-def sample_disc_sizes(count: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:
-    """Random standard deviations, in pixels of the level, and opacities."""
     low, high = torch.tensor((_FOOTPRINT, _OPACITY), dtype=torch.float64).T
-    return low + (high - low) * torch.rand(2, count, generator=generator, dtype=torch.float64).T
-
-
-def make_flat_discs(
-    rays: Float[Tensor, "n 3"],
-    points: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    sizes: Float[Tensor, "n 2"],
-    pixel: Float[Tensor, "n"],
-    harmonics: Float[Tensor, "n k 3"],
-    level: int,
-    view: int,
-) -> Gaussians:
-    """Discs on surfaces that look round along their rays; on slanted surfaces they are stretched up to four times.
-
-    Args:
-        rays: unit directions from the camera to the points.
-        normals: of the surfaces, of unit length.
-        sizes: from `sample_disc_sizes`.
-        pixel: width of a pixel of the level at the points, metres.
-    """
-    facing = (rays * normals).sum(dim=1, keepdim=True)
+    size, opacity = (low + (high - low) * torch.rand(2, len(rays), generator=generator, dtype=torch.float64).T).T
     across = torch.linalg.cross(normals, rays + 1e-9 * rays.roll(1, dims=1))
     across = torch.nn.functional.normalize(across, dim=1)
     axes = torch.stack((torch.linalg.cross(across, normals), across, normals), dim=2)
-    width = sizes[:, 0] * pixel
-    stretch = (1 / facing[:, 0].abs()).clamp_max(_MAX_STRETCH)
+    width = size * distance * pixel_angle
+    stretch = (1 / facing.abs()).clamp_max(_MAX_STRETCH)
     return Gaussians(
         means=points.float(),
         scales=torch.stack((width * stretch, width, width * _THICKNESS), dim=1).float(),
         quats=quats_from_rotations(axes).float(),
-        opacities=sizes[:, 1].float(),
-        harmonics=harmonics.float(),
+        opacities=opacity.float(),
+        harmonics=_make_harmonics(points, 6 * body + 2 * axis + (facing > 0), degree, generator),
         levels=torch.full((len(rays),), level, dtype=torch.uint8),
         views=torch.full((len(rays),), view, dtype=torch.uint8),
     )

@@ -2,6 +2,10 @@
 
 A case is a renderer (OpenGL's two tiers, the processor), a view and a mode. The scenes are synthetic rooms. The viewer
 runs as a command because no module may import it.
+
+Values of a row: `frame_ms` is the median time of a frame, `spread_ms` half the range between the quartiles, `best_ms`
+the fastest frame, to which other load adds least; `stages` are median milliseconds; `psnr_db` and `max_error` are
+against the float64 image of the same mode; `device` is OpenGL's name of the device, or numba.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,10 +27,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.bench.fidelity import measure_fidelity
-from pansplat.bench.harness import quartile_range
-from pansplat.bench.raster_cases import BenchScene, make_room_scene
-from pansplat.bench.report import Column, Report, Row, format_number, read_row, result_column
+from pansplat.bench.harness import compare_images, quartile_range
+from pansplat.bench.raster import BenchScene, make_room_scene
+from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
 from pansplat.bench.scenes import make_room_cameras
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
@@ -41,8 +44,7 @@ View = Literal["perspective", "coarse", "look-around", "panorama"]
 Mode = Literal["joint", "deferred"]
 
 FOV_DEGREES = 75.0
-_TIERS = ("cpu", "gl33", "gl43")
-_GL_TIERS = ("gl33", "gl43")
+RENDERERS = ("cpu", "gl33", "gl43")
 _PANORAMA_SIZE = (1024, 512)  # pixels
 _FACE_SIZE = 326
 _MAX_REFERENCE = 1_000_000  # Gaussians; float64 takes a minute beyond
@@ -76,34 +78,7 @@ class ViewerCase:
         return {**values, "vertical_fov_degrees": FOV_DEGREES, "cached": self.view == "look-around"}
 
 
-@dataclass
-class ViewerResult:
-    """Times and errors of a frame.
-
-    Attributes:
-        frame_ms: median time of a frame.
-        spread_ms: half the range between the quartiles.
-        best_ms: time of the fastest frame, to which other load on the machine adds least.
-        num_gaussians: of the scene.
-        psnr_db, max_error: against the float64 image; None if there is none.
-        stages: median milliseconds of each stage.
-        device: OpenGL's name of the device, or numba.
-    """
-
-    frame_ms: float
-    spread_ms: float
-    best_ms: float
-    num_gaussians: int
-    psnr_db: float | None = None
-    max_error: float | None = None
-    stages: dict[str, float] = field(default_factory=dict)
-    device: str = ""
-
-
-ViewerRow = Row[ViewerCase, ViewerResult]
-
-
-def list_viewer_cases(size: tuple[int, int], renderers: Sequence[str] = _TIERS) -> list[ViewerCase]:
+def list_viewer_cases(size: tuple[int, int], renderers: Sequence[str] = RENDERERS) -> list[ViewerCase]:
     """The cases of one scene.
 
     Args:
@@ -126,20 +101,6 @@ def list_viewer_cases(size: tuple[int, int], renderers: Sequence[str] = _TIERS) 
     ]
 
 
-def read_viewer_rows(path: Path | None) -> list[ViewerRow]:
-    """The rows of an earlier run; none if there is no file.
-
-    Raises:
-        InputError: the file is not one of rows.
-    """
-    if path is None or not path.is_file():
-        return []
-    try:
-        return [read_row(values, ViewerCase, ViewerResult) for values in json.loads(path.read_text())["rows"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: needed rows of `pansplat bench viewer`, got {error!r}; delete it.") from error
-
-
 class ViewerBench:
     """Measures cases on rooms.
 
@@ -149,7 +110,7 @@ class ViewerBench:
         threads: of numba and of software OpenGL.
     """
 
-    def __init__(self, report: Report[ViewerRow], *, repeats: int, threads: int) -> None:
+    def __init__(self, report: Report, *, repeats: int, threads: int) -> None:
         self._report, self._repeats, self._threads = report, repeats, threads
 
     def run(self, height: int, cases: Sequence[ViewerCase]) -> None:
@@ -166,13 +127,13 @@ class ViewerBench:
         if not cases:
             return
         gaussians = room.load()
-        self._report.update(f"{room.name}: {len(gaussians):,} Gaussians, float64 images")
+        self._report.step(f"{room.name}: {len(gaussians):,} Gaussians, float64 images")
         references = _rasterize_references(room, gaussians, cases)
         with tempfile.TemporaryDirectory() as name:
             save_ply(Scene(gaussians, make_room_cameras(), near=0.1, far=100.0), Path(name, "scene.ply"))
             for tier in dict.fromkeys(case.renderer for case in cases):
                 of_tier = [case for case in cases if case.renderer == tier]
-                self._report.update(f"{room.name}: {tier}")
+                self._report.step(f"{room.name}: {tier}")
                 self._run_tier(Path(name), room, len(gaussians), of_tier, references)
 
     def _run_tier(
@@ -197,16 +158,18 @@ class ViewerBench:
         for line in read_viewer_output(folder / "job.json", self._threads):
             case = cases[line["settings"]]
             times = line["frame_ms"]
-            result = ViewerResult(
-                *(statistics.median(times), quartile_range(times) / 2, min(times), count),
-                stages=line["stages"],
-                device=line["renderer"],
-            )
+            result = {
+                "frame_ms": statistics.median(times),
+                "spread_ms": quartile_range(times) / 2,
+                "best_ms": min(times),
+                "num_gaussians": count,
+                "stages": line["stages"],
+                "device": line["renderer"],
+            }
             reference = references.get(_image_key(case))
             if reference is not None:
                 image = torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1)
-                error = measure_fidelity(image, reference, panorama=case.view == "panorama")
-                result.psnr_db, result.max_error = error.psnr_db, error.max_error
+                result |= compare_images(image, reference)
             self._report.add(Row("viewer", room.name, case, result))
 
 
@@ -265,34 +228,16 @@ def _rasterize_references(
     return images
 
 
-def _format_stages(row: ViewerRow) -> str:
-    return ", ".join(f"{name} {value:.1f}" for name, value in row.result.stages.items() if value >= 0.05)
-
-
-VIEWER_COLUMNS: tuple[Column[ViewerRow], ...] = (
-    Column("renderer", lambda row: row.case.renderer, "left"),
-    Column("view", lambda row: row.case.view, "left"),
-    Column("mode", lambda row: row.case.mode, "left"),
-    Column("pixels", lambda row: f"{row.case.width}x{row.case.height}"),
-    Column("frame ms", lambda row: f"{row.result.frame_ms:,.1f} ±{row.result.spread_ms:.1f}"),
-    result_column("fastest", "{:,.1f}", "best_ms"),
-    Column("fps", lambda row: f"{1000 / row.result.frame_ms:,.1f}"),
-    result_column("PSNR dB", "{:.1f}", "psnr_db"),
-    Column("max error", lambda row: format_number(row.result.max_error, "{:.1e}")),
-    Column("stages, ms", _format_stages, "left"),
-)
-
-
-def find_viewer_facts(rows: Sequence[ViewerRow]) -> list[str]:
+def find_viewer_facts(rows: Sequence[Row]) -> list[str]:
     """Sentences that compare the fastest frames of renderers and modes."""
     sentences = []
     for scene in dict.fromkeys(row.scene for row in rows):
         frames = {
-            (row.case.renderer, row.case.view, row.case.mode): row.result.best_ms for row in rows if row.scene == scene
+            (row.case.renderer, row.case.view, row.case.mode): row.get("best_ms") for row in rows if row.scene == scene
         }
-        count = next(row.result.num_gaussians for row in rows if row.scene == scene)
+        count = next(row.get("num_gaussians") for row in rows if row.scene == scene)
         cpu, parts = frames.get(("cpu", "perspective", "joint")), []
-        gl = [frames[key] for tier in _GL_TIERS if (key := (tier, "perspective", "joint")) in frames]
+        gl = [frames[key] for tier in RENDERERS[1:] if (key := (tier, "perspective", "joint")) in frames]
         if cpu and gl:
             parts.append(f"cpu draws a frame in {cpu:.0f} ms, OpenGL in {min(gl):.0f} ms")
         deferred = frames.get(("cpu", "perspective", "deferred"))
@@ -306,54 +251,49 @@ def find_viewer_facts(rows: Sequence[ViewerRow]) -> list[str]:
     return sentences
 
 
-def make_viewer_report(
-    machine: Mapping[str, Any], *, json: Path | None = None, out: Path | None = None
-) -> Report[ViewerRow]:
-    """The report of a run.
-
-    Args:
-        machine: from `describe_machine`.
-        json: file of the rows.
-        out: folder for viewer.md and viewer.png.
-    """
-    return Report(
-        VIEWER_COLUMNS,
-        lambda row: f"{row.result.num_gaussians:,} Gaussians ({row.scene})",
-        machine,
-        facts=("cpu", "threads"),
-        findings=find_viewer_facts,
-        json_file=json,
-        page=None if out is None else out / "viewer.md",
-        plots={} if out is None else {out / "viewer.png": lambda rows: plot_viewer(rows, str(machine["cpu"]))},
-        print_steps=True,
-        width=190,
-    )
-
-
-def plot_viewer(rows: Sequence[ViewerRow], title: str) -> Figure:
+def plot_viewer(rows: Sequence[Row], header: Header) -> Figure:
     """Plot the time of a frame over the number of Gaussians, for each view, renderer and mode."""
-    from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter
 
     views = list(dict.fromkeys(row.case.view for row in rows))
-    figure = Figure(figsize=(3.6 * len(views), 4.2), layout="constrained")
-    axes = figure.subplots(1, len(views), sharey=True, squeeze=False)[0]
+    figure, axes = make_axes(len(views), (3.6 * len(views), 4.2), sharey=True)
     for ax, view in zip(axes, views, strict=True):
         of_view = [row for row in rows if row.case.view == view]
         for renderer, mode in dict.fromkeys((row.case.renderer, row.case.mode) for row in of_view):
-            line = [row.result for row in of_view if (row.case.renderer, row.case.mode) == (renderer, mode)]
-            line.sort(key=lambda result: result.num_gaussians)
-            style = "o-" if mode == "joint" else "s--"
-            color = f"C{_TIERS.index(renderer)}"
-            x, y = [result.num_gaussians for result in line], [result.frame_ms for result in line]
-            ax.loglog(x, y, style, color=color, label=f"{renderer}, {mode}")
+            line = [row for row in of_view if (row.case.renderer, row.case.mode) == (renderer, mode)]
+            points = sorted((row.get("num_gaussians"), row.get("frame_ms")) for row in line)
+            style, color = "o-" if mode == "joint" else "s--", f"C{RENDERERS.index(renderer)}"
+            ax.loglog(*zip(*points, strict=True), style, color=color, label=f"{renderer}, {mode}")
         for rate in _RATES:
             ax.axhline(1000 / rate, color="grey", linewidth=0.8)
             ax.annotate(f"{rate} fps", (1, 1000 / rate), xycoords=("axes fraction", "data"), ha="right", va="bottom")
         ax.set(title=f"{view}, {of_view[0].case.width}x{of_view[0].case.height}", xlabel="Gaussians")
         ax.xaxis.set_minor_formatter(NullFormatter())  # they would overlap
-        ax.grid(alpha=0.25, which="both")
         ax.legend(fontsize=7)
     axes[0].set_ylabel("frame, ms")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=9)
+    figure.suptitle(header["machine"]["cpu"], x=0.01, ha="left", fontsize=9)
     return figure
+
+
+def _format_stages(row: Row) -> str:
+    return ", ".join(f"{name} {value:.1f}" for name, value in row.get("stages").items() if value >= 0.05)
+
+
+VIEWER = Benchmark(
+    "viewer",
+    (
+        Column("renderer", "renderer"),
+        Column("view", "view"),
+        Column("mode", "mode"),
+        Column("pixels", lambda row: f"{row.case.width}x{row.case.height}", "{:s}"),
+        Column("frame ms", lambda row: f"{row.get('frame_ms'):,.1f} ±{row.get('spread_ms'):.1f}", "{:s}"),
+        Column("fastest", "best_ms", "{:,.1f}"),
+        Column("fps", lambda row: 1000 / row.get("frame_ms"), "{:,.1f}"),
+        Column("PSNR dB", "psnr_db", "{:.1f}"),
+        Column("max error", "max_error", "{:.1e}"),
+        Column("stages, ms", _format_stages),
+    ),
+    lambda row: f"{row.get('num_gaussians'):,} Gaussians ({row.scene})",
+    {"": plot_viewer},
+    find_viewer_facts,
+)

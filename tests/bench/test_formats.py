@@ -1,12 +1,15 @@
 """The benchmark of file formats: errors by field and of images."""
 
-import dataclasses
-import math
+import json
+from pathlib import Path
 
 import pytest
 import torch
 
-from pansplat.bench.formats import make_format_table, measure_formats, set_degree
+from pansplat import pipeline
+from pansplat.bench import formats
+from pansplat.bench.report import Report
+from pansplat.cli import run
 from pansplat.errors import InputWarning
 from pansplat.files import SCENE_SUFFIXES
 from pansplat.gaussians.scene import Gaussians, Scene
@@ -27,25 +30,31 @@ def scene() -> Scene:
     return Scene(gaussians, torch.eye(4, dtype=torch.float64).repeat(2, 1, 1), near=0.1, far=10.0, height=16)
 
 
-@pytest.mark.slow
-def test_lossy_formats_are_smaller_and_lossless_ones_exact(scene: Scene) -> None:
-    rows = {row.suffix: row for row in measure_formats(scene, 16)}
+def test_lossy_formats_are_smaller_and_lossless_ones_exact(scene: Scene, tmp_path: Path) -> None:
+    file, out = tmp_path / "scene.ply", tmp_path / "out"
+    pipeline.save(scene, file)
+    assert run(["bench", "formats", str(file), "--height", "16", "--out", str(out), "--threads", "1"]) == 0
+    rows = {row["suffix"]: row for row in json.loads((out / "formats.json").read_text())["rows"]}
     assert set(rows) == set(SCENE_SUFFIXES)
     for suffix in (".ply", ".glb"):
-        assert rows[suffix].position_mm < 1e-3 and rows[suffix].psnr_db > 90
+        assert rows[suffix]["position_mm"] < 1e-3 and (rows[suffix]["psnr_db"] or 999) > 90
     for suffix in (".spz", ".splat", ".sog", ".compressed.ply"):
-        assert 30 < rows[suffix].psnr_db < 90 and math.isnan(rows[suffix].harmonics)
-    assert rows[".splat"].bytes == 32 * 50
-    assert 0.01 < rows[".spz"].position_mm < 0.25
-    assert make_format_table(list(rows.values()), "x").row_count == 6
+        assert 30 < rows[suffix]["psnr_db"] < 90 and "harmonics" not in rows[suffix]
+    assert rows[".splat"]["bytes"] == 32 * 50
+    assert 0.01 < rows[".spz"]["position_mm"] < 0.25
+    assert len((out / "formats.md").read_text().splitlines()) == 4 + len(rows)
+    assert "### Scene.ply: 50 Gaussians" in (out / "formats.md").read_text() and (out / "formats.png").is_file()
 
 
-def test_a_higher_degree_adds_random_harmonics(scene: Scene) -> None:
-    richer = set_degree(scene, 2)
+def test_a_higher_degree_adds_random_harmonics(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    richer = formats.set_degree(scene, 2)
     assert richer.gaussians.degree == 2
     assert torch.equal(richer.gaussians.harmonics[:, 0], scene.gaussians.harmonics[:, 0])
     assert 0.03 < float(richer.gaussians.harmonics[:, 1:].std()) < 0.07
-    assert set_degree(richer, 0).gaussians.degree == 0
+    assert formats.set_degree(richer, 0).gaussians.degree == 0
+    monkeypatch.setattr(formats, "_FORMATS", (".ply", ".compressed.ply", ".splat"))
+    report = Report(formats.FORMATS, {})
     with pytest.warns(InputWarning, match="up to degree 0"):
-        rows = {row.suffix: row for row in measure_formats(dataclasses.replace(richer), 16)}
-    assert 0 < rows[".compressed.ply"].harmonics < 0.01
+        formats.measure_formats(richer, 16, report)
+    ply, compressed, splat = (row.get("harmonics") for row in report.rows)
+    assert 0 < compressed < 0.01 and ply < 1e-6 and splat is None

@@ -1,5 +1,6 @@
-"""Memory and time of calls, and errors of child processes."""
+"""Memory, time and errors of calls, and errors of child processes."""
 
+import math
 import sys
 
 import numpy as np
@@ -10,9 +11,11 @@ from pansplat.bench.harness import (
     CaseFailedError,
     OverLimitError,
     _make_error,
+    compare_images,
     describe_machine,
     measure_peak_memory,
     quartile_range,
+    relative_deviation,
     time_call,
 )
 
@@ -39,16 +42,36 @@ def test_time_call_returns_the_result_of_the_call():
     assert result == 7 and timing.wall > 0 and timing.cpu > 0
 
 
-def test_the_machine_is_described():
-    machine = describe_machine(2)
-    assert set(machine) >= {"cpu", "cores", "system", "python", "gpu"}
-    assert machine["threads"] == 2 and machine["versions"]["torch"] == torch.__version__
-
-
 def test_outliers_hardly_change_the_quartile_range():
     assert quartile_range([5.0]) == 0
     assert quartile_range([1.0, 4.0]) == 3
     assert quartile_range([0.0, 1.0, 2.0, 3.0, 1000.0]) == 2
+
+
+def test_one_wrong_pixel_sets_the_largest_error_and_the_psnr():
+    reference = torch.rand(3, 8, 16, generator=torch.Generator().manual_seed(0))
+    wrong = reference.clone()
+    wrong[1, 5, 2] += 0.25
+    assert compare_images(reference, reference) == {"psnr_db": math.inf, "max_error": 0}
+    expected = -10 * math.log10(0.25**2 / reference.numel())
+    assert compare_images(wrong, reference) == pytest.approx({"psnr_db": expected, "max_error": 0.25}, rel=1e-5)
+    with pytest.raises(ValueError, match="reference's shape"):
+        compare_images(wrong[:, :-1], reference)
+
+
+def test_deviation_of_tensors_is_relative_to_the_reference():
+    reference = {"a": torch.tensor([3.0, 0.0]), "b": torch.tensor([4.0])}
+    result = {"a": torch.tensor([3.0, 0.3]), "b": torch.tensor([4.0])}
+    assert relative_deviation(result, reference, together=True) == pytest.approx(0.06)
+    assert relative_deviation(result, reference, together=False) == pytest.approx(0.1)
+    with pytest.raises(ValueError, match="must hold"):
+        relative_deviation({"a": result["a"]}, reference, together=True)
+
+
+def test_the_machine_is_described():
+    machine = describe_machine()
+    assert machine["cpu"] and machine["threads"] == torch.get_num_threads()
+    assert machine["versions"]["torch"] == torch.__version__
 
 
 @pytest.mark.parametrize(

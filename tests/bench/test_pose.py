@@ -1,5 +1,6 @@
 """Rows of estimated poses against known ones."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,9 @@ import pytest
 import torch
 
 from pansplat.bench import pose as bench
+from pansplat.bench.report import Row
+from pansplat.cli import run
+from pansplat.data.folders import load_pairs
 from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.poses.estimate import PoseEstimate
@@ -39,18 +43,26 @@ def test_errors_do_not_depend_on_the_world(monkeypatch: pytest.MonkeyPatch, turn
     panoramas = _panoramas()
     monkeypatch.setattr(bench, "estimate_poses", lambda images, camera_height: _estimate(panoramas, turn))
     row = bench.measure_poses("room", panoramas, 1.5, "tour")
-    assert row.result.outcome == outcome
-    assert row.result.scale_percent == pytest.approx(100)
-    assert row.result.position_cm == pytest.approx(0, abs=1e-6)
-    assert row.result.rotation_degrees == pytest.approx(np.degrees(turn), abs=1e-6)
-    assert "1 " + outcome in bench.summarise([row])
+    assert row.get("outcome") == outcome
+    assert row.get("scale_percent") == pytest.approx(100)
+    assert row.get("position_cm") == pytest.approx(0, abs=1e-6)
+    assert row.get("rotation_degrees") == pytest.approx(np.degrees(turn), abs=1e-6)
+    (summary,) = bench.summarise([Row("pair", "room", row.case, row.result), row])
+    assert f"1 {outcome}" in summary and ("rotation median 0.000" in summary) == (outcome == "solved")
 
 
-def test_a_refused_estimate_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_a_row_for_each_pair_and_tour(monkeypatch, tmp_path: Path, write_pair) -> None:
     def refuse(images, camera_height):
         raise InputError("no poses were found: too dark.")
 
     monkeypatch.setattr(bench, "estimate_poses", refuse)
-    row = bench.measure_poses("room", _panoramas()[:2], 1.5)
-    assert row.result.outcome == "flagged" and "too dark" in row.note
-    assert bench.plot_poses([row]).axes
+    room, out = write_pair(tmp_path / "room"), tmp_path / "out"
+    assert run(["bench", "pose", str(room), "--tours", "--out", str(out), "--threads", "1"]) == 0
+    pair, tour = json.loads((out / "pose.json").read_text())["rows"]
+    assert (pair["suite"], tour["suite"], tour["scene"]) == ("pair", "tour", "room")
+    assert pair["outcome"] == "flagged" and "too dark" in pair["note"] and pair["count"] == 2
+    assert "0 solved, 1 flagged, 0 wrong" in (out / "pose.md").read_text() and (out / "pose.png").is_file()
+    known = {view.image: view for view in load_pairs(room)[0].context}
+    turned = _estimate(list(known.values()), 0.1)
+    monkeypatch.setattr(bench, "estimate_poses", lambda images, camera_height: turned)
+    assert run(["bench", "pose", str(room), "--threads", "1"]) == 1  # a wrong pose passed the check

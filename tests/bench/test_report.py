@@ -1,16 +1,17 @@
 """Rows, their JSON file, and the tables of a report."""
 
-import io
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
-from rich.console import Console
 
-from pansplat.bench.report import Column, Report, Row, format_number, read_row, write_rows
+from pansplat.bench.report import Benchmark, Column, Report, Row
 from pansplat.errors import InputError
+
+HEADER = {"machine": {"cpu": "some", "gpu": None, "threads": 2}}
 
 
 @dataclass(frozen=True)
@@ -18,88 +19,84 @@ class Case:
     height: int
 
 
-@dataclass
-class Result:
-    seconds: float | None = None
-    stages: dict[str, float] = field(default_factory=dict)
-
-
-COLUMNS = (
-    Column("height", lambda row: str(row.case.height)),
-    Column("seconds", lambda row: format_number(row.result.seconds, "{:.1f}")),
-    Column("", lambda row: row.note, "left"),
+SPEED = Benchmark(
+    "speed",
+    (Column("height", "height", "{:d}"), Column("seconds", "seconds", "{:.1f}"), Column("", lambda row: row.note)),
+    lambda row: f"{row.suite}: {row.case.height}",
+    {"": lambda rows, header: Figure(), "_empty": lambda rows, header: None},
+    lambda rows: [f"{len(rows)} rows."],
 )
 
 
 def row(height: int = 16, **values) -> Row:
-    return Row("speed", "room", Case(height), Result(**values))
+    return Row("speed", "room", Case(height), values)
 
 
-def report(**options) -> Report:
-    return Report(COLUMNS, lambda row: f"{row.suite}: {row.case.height}", {"cpu": "some", "gpu": None}, **options)
+def resume(file: Path, **setting) -> list[Row]:
+    report = Report(SPEED, HEADER | {"setting": setting}, json_file=file)
+    report.resume(Case)
+    return report.rows
 
 
 def test_rows_are_read_as_they_were_written(tmp_path):
-    rows = [row(seconds=2.0, stages={"sort": 0.5}), row(32)]
-    rows[1].status, rows[1].note, rows[0].is_reference = "died", "ended by SIGKILL", True
-    write_rows(tmp_path / "rows.json", {"machine": {"cpu": "some"}}, rows)
-    content = json.loads((tmp_path / "rows.json").read_text())
-    assert set(content) == {"machine", "rows"} and content["machine"] == {"cpu": "some"}
-    assert [read_row(values, Case, Result) for values in content["rows"]] == rows
+    report = Report(SPEED, HEADER | {"setting": {"style": "plain", "limit_gib": 1.0}}, out=tmp_path)
+    report.add(Row("speed", "room", Case(16), {"seconds": 2.0, "stages": {"sort": 0.5}}, is_reference=True))
+    report.add(Row("speed", "room", Case(32), status="died", note="ended by SIGKILL"))
+    file = tmp_path / "speed.json"
+    assert json.loads(file.read_text())["machine"] == HEADER["machine"]
+    assert resume(file, style="plain", limit_gib=2.0) == report.rows
+    assert resume(tmp_path / "none.json", style="plain") == []
+    with pytest.raises(InputError, match=r"style was plain, now rich.*give another --out"):
+        resume(file, style="rich")
+    for text in ("{}", "no json", '{"rows": [{"suite": "speed"}]}'):
+        file.write_text(text)
+        with pytest.raises(InputError, match=r"needed rows of `pansplat bench speed`.*delete it"):
+            resume(file, style="plain")
 
 
 def test_numbers_have_six_digits_and_infinite_ones_are_null(tmp_path):
-    write_rows(tmp_path / "rows.json", {}, [row(seconds=1 / 3, stages={"a": math.nan}), row(seconds=math.inf)])
-    first, second = json.loads((tmp_path / "rows.json").read_text())["rows"]
-    assert first["seconds"] == 0.333333 and first["stages"] == {"a": None} and second["seconds"] is None
+    report = Report(SPEED, HEADER, json_file=tmp_path / "rows.json")
+    report.add(row(seconds=1 / 3, stages={"a": math.nan}, psnr_db=math.inf))
+    (found,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert found["seconds"] == 0.333333 and found["stages"] == {"a": None} and found["psnr_db"] is None
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
-    file = tmp_path / "rows.json"
-    write_rows(file, {}, [row()])
-    before = file.read_text()
+    report = Report(SPEED, HEADER, json_file=tmp_path / "rows.json")
+    report.add(row())
+    before = report.json_file.read_text()
     with pytest.raises(TypeError):
-        write_rows(file, {"cpu": object()}, [row(), row()])
-    assert file.read_text() == before
-    assert list(tmp_path.iterdir()) == [file]
+        report.add(row(seconds=object()))
+    assert report.json_file.read_text() == before and list(tmp_path.iterdir()) == [report.json_file]
     with pytest.raises(InputError, match="create it first"):
-        write_rows(tmp_path / "no" / "rows.json", {}, [row()])
+        Report(SPEED, HEADER, json_file=tmp_path / "no" / "rows.json").add(row())
 
 
-def test_each_section_has_a_table():
-    found = report().tables([row(16), row(32), row(16, seconds=2.0)])
-    assert [(table.title, table.row_count) for table in found] == [("speed: 16", 2), ("speed: 32", 1)]
-    console = Console(width=200, record=True, file=io.StringIO())
-    console.print(*found)
-    assert "2.0" in console.export_text()
-
-
-def test_markdown_holds_the_findings_and_the_tables():
-    page = report(findings=lambda rows: [f"{len(rows)} rows."])
-    page.rows += [row(16, seconds=2.0), row(16)]
-    assert page.markdown().splitlines() == [
+def test_a_page_holds_the_findings_and_a_table_for_each_section():
+    rows = [row(16), row(32), row(16, seconds=2.0)]
+    assert [(table.title, table.row_count) for table in SPEED.tables(rows)] == [("speed: 16", 2), ("speed: 32", 1)]
+    assert SPEED.markdown([row(16, seconds=math.inf), row(16)]).splitlines() == [
         *("* 2 rows.", "", "### Speed: 16", ""),
-        *("| height | seconds |  |", "|---:|---:|---|", "| 16 | 2.0 |  |", "| 16 |  |  |"),
+        *("| height | seconds |  |", "|---:|---:|---|", "| 16 | exact |  |", "| 16 |  |  |"),
     ]
-    assert report().markdown() == "\n"
+    assert replace(SPEED, findings=lambda rows: []).markdown([]) == "\n"
 
 
 def test_an_interrupted_run_is_printed_and_written(tmp_path, capsys):
-    files = {"json_file": tmp_path / "rows.json", "page": tmp_path / "page.md"}
-    plots = {tmp_path / "a.png": lambda rows: Figure(), tmp_path / "b.png": lambda rows: None}
-    with pytest.raises(KeyboardInterrupt), report(**files, plots=plots, facts=("cpu", "gpu")) as page:
-        page.update("the first row")
-        page.add(row(16, seconds=2.0))
+    with pytest.raises(KeyboardInterrupt), Report(SPEED, HEADER, out=tmp_path) as report:
+        report.step("the first row")
+        report.add(row(16, seconds=2.0))
         raise KeyboardInterrupt
-    assert len(json.loads(files["json_file"].read_text())["rows"]) == 1
-    assert "### Speed: 16" in files["page"].read_text()
-    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG") and not (tmp_path / "b.png").exists()
-    printed = capsys.readouterr().out
-    assert "cpu             some" in printed and "gpu             none" in printed and "speed: 16" in printed
-    assert printed.split()[-3:] == [str(tmp_path / name) for name in ("rows.json", "page.md", "a.png")]
+    assert len(json.loads((tmp_path / "speed.json").read_text())["rows"]) == 1
+    assert "### Speed: 16" in (tmp_path / "speed.md").read_text()
+    assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+    printed, steps = capsys.readouterr()
+    assert "some, GPU: none, 2 threads" in printed and "speed: 16" in printed and "1 rows." in printed
+    assert printed.split()[-3:] == [str(tmp_path / name) for name in ("speed.json", "speed.md", "speed.png")]
+    assert steps == "the first row\n"
 
 
 def test_a_run_without_rows_writes_nothing(tmp_path):
-    with report(json_file=tmp_path / "rows.json", page=tmp_path / "page.md") as page:
-        page.update("nothing")
+    with Report(SPEED, HEADER, out=tmp_path) as report:
+        report.save()
     assert not list(tmp_path.iterdir())
