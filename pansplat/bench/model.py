@@ -213,7 +213,7 @@ def _timed_stages(network: PanSplat, stages: dict[str, float]) -> Iterator[None]
 def plot_model(rows: Sequence[Row], header: Header) -> Figure:
     """Plot each row's seconds by stage and its memory as bars."""
     figure, (left, right) = make_axes(2, (11, 1.5 + 0.4 * len(rows)), sharey=True, width_ratios=(2, 1))
-    names = [_describe_case(row.case) for row in rows]
+    names = [str(row.case) for row in rows]
     starts = [0.0] * len(rows)
     for stage, color in zip(STAGES, _STAGE_COLORS, strict=True):
         widths = [row.get("stages_s").get(stage, 0.0) for row in rows]
@@ -226,13 +226,6 @@ def plot_model(rows: Sequence[Row], header: Header) -> Figure:
     right.barh(names, [row.get("peak_gib") or 0.0 for row in rows], color="#888888")
     right.set(xlabel="largest resident memory, GiB")
     return figure
-
-
-def _describe_case(case: ModelCase) -> str:
-    parts = [case.compat, case.precision]
-    parts += ["attention bfloat16"] * (case.attention == "bfloat16")
-    parts += [f"{case.tiles}x{case.tiles} tiles"] * (case.tiles > 1)
-    return ", ".join([*parts, format_threads(case.threads)])
 
 
 def _stage_column(stage: str) -> Column:

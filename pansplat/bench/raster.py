@@ -436,7 +436,7 @@ def plot_choices(rows: Sequence[Row], header: Header) -> Figure | None:
     axes.scatter([], [], facecolors="#cccccc", edgecolors="#444444", label="dark edge: float64")
     axes.set(xscale="log", xlabel="forward, milliseconds", ylabel=f"PSNR, dB (at most {_MAX_PSNR:g})")
     axes.set_title(f"{shown[0].scene}: {_describe_size(shown[0])}; {header['machine']['cpu']}", loc="left", fontsize=9)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="center")
     return figure
 
 

@@ -17,25 +17,23 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
+from pansplat import pipeline
 from pansplat.bench.harness import compare_images, quartile_range
-from pansplat.bench.raster import BenchScene, make_room_scene
+from pansplat.bench.raster import make_room_scene
 from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
 from pansplat.bench.scenes import make_room_cameras
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
-from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.pose import blend_weights
-from pansplat.rendering import Rendering, blend, rasterize
+from pansplat.gaussians.scene import Scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,6 +67,11 @@ class ViewerCase:
     mode: Mode
     width: int
     height: int
+
+    @property
+    def image_key(self) -> tuple[object, ...]:
+        """The values that the exact image depends on."""
+        return self.view == "panorama", self.mode, self.width, self.height
 
     def settings(self) -> dict[str, object]:
         """The values of the viewer's `DrawSettings`, and the size."""
@@ -126,28 +129,29 @@ class ViewerBench:
         cases = [case for case in cases if case not in measured]
         if not cases:
             return
-        gaussians = room.load()
-        self._report.step(f"{room.name}: {len(gaussians):,} Gaussians, float64 images")
-        references = _rasterize_references(room, gaussians, cases)
-        with tempfile.TemporaryDirectory() as name:
-            save_ply(Scene(gaussians, make_room_cameras(), near=0.1, far=100.0), Path(name, "scene.ply"))
-            for tier in dict.fromkeys(case.renderer for case in cases):
-                of_tier = [case for case in cases if case.renderer == tier]
-                self._report.step(f"{room.name}: {tier}")
-                self._run_tier(Path(name), room, len(gaussians), of_tier, references)
+        scene = Scene(room.load(), make_room_cameras(), near=0.1, far=100.0)
+        self._report.step(f"{room.name}: {len(scene.gaussians):,} Gaussians, float64 images")
+        images = _render_exact(scene, room.pose, cases) if len(scene.gaussians) <= _MAX_REFERENCE else {}
+        with tempfile.TemporaryDirectory() as folder:
+            save_ply(scene, Path(folder, "scene.ply"))
+            for renderer in dict.fromkeys(case.renderer for case in cases):
+                self._report.step(f"{room.name}: {renderer}")
+                chosen = [case for case in cases if case.renderer == renderer]
+                for case, result in self._measure(Path(folder), room.pose, chosen):
+                    result["num_gaussians"] = len(scene.gaussians)
+                    if case.image_key in images:
+                        result |= compare_images(result["image"], images[case.image_key])
+                    del result["image"]
+                    self._report.add(Row("viewer", room.name, case, result))
 
-    def _run_tier(
-        self,
-        folder: Path,
-        room: BenchScene,
-        count: int,
-        cases: list[ViewerCase],
-        references: Mapping[tuple[object, ...], Tensor],
-    ) -> None:
+    def _measure(
+        self, folder: Path, pose: Tensor, cases: Sequence[ViewerCase]
+    ) -> Iterator[tuple[ViewerCase, dict[str, Any]]]:
+        """Run the viewer for cases of one renderer; yield the values of each case, with its `image`."""
         repeats = self._repeats if cases[0].renderer == "cpu" else max(self._repeats // 3, 1)
         job = {
             "scene": str(folder / "scene.ply"),
-            "pose": room.pose.tolist(),
+            "pose": pose.tolist(),
             "size": [cases[0].width, cases[0].height],
             "repeats": repeats,
             "folder": str(folder),
@@ -156,21 +160,18 @@ class ViewerBench:
         }
         (folder / "job.json").write_text(json.dumps(job))
         for line in read_viewer_output(folder / "job.json", self._threads):
-            case = cases[line["settings"]]
             times = line["frame_ms"]
-            result = {
-                "frame_ms": statistics.median(times),
-                "spread_ms": quartile_range(times) / 2,
-                "best_ms": min(times),
-                "num_gaussians": count,
-                "stages": line["stages"],
-                "device": line["renderer"],
-            }
-            reference = references.get(_image_key(case))
-            if reference is not None:
-                image = torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1)
-                result |= compare_images(image, reference)
-            self._report.add(Row("viewer", room.name, case, result))
+            yield (
+                cases[line["settings"]],
+                {
+                    "frame_ms": statistics.median(times),
+                    "spread_ms": quartile_range(times) / 2,
+                    "best_ms": min(times),
+                    "stages": line["stages"],
+                    "device": line["renderer"],
+                    "image": torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1),
+                },
+            )
 
 
 def read_viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
@@ -193,58 +194,37 @@ def read_viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
             raise InputError(f"the viewer rendered nothing: {messages[-1] if messages else 'no message'}")
 
 
-def _image_key(case: ViewerCase) -> tuple[object, ...]:
-    """The values that the exact image of a case depends on."""
-    return case.view == "panorama", case.mode, case.width, case.height
+@torch.no_grad()
+def _render_exact(scene: Scene, pose: Tensor, cases: Sequence[ViewerCase]) -> dict[tuple[object, ...], Tensor]:
+    """The float64 images of the cases, by their `image_key`."""
+    double = replace(scene, gaussians=scene.gaussians.to(dtype=torch.float64))
+    return {
+        key: pipeline.render(
+            double,
+            pose,
+            blend=case.mode,
+            size=(case.height, case.width),
+            layout="equirect" if case.view == "panorama" else "pinhole",
+            vertical_fov_degrees=FOV_DEGREES,
+            backend="torch",
+        ).color
+        for key, case in {case.image_key: case for case in cases}.items()
+    }
 
 
-def _rasterize_references(
-    room: BenchScene, gaussians: Gaussians, cases: Sequence[ViewerCase]
-) -> dict[tuple[object, ...], Float[Tensor, "3 height width"]]:
-    """The float64 images of the cases, by `_image_key`; none for a large scene."""
-    if len(gaussians) > _MAX_REFERENCE:
-        return {}
-    double = gaussians.to(dtype=torch.float64)
-    images = {}
-    for case in {_image_key(case): case for case in cases}.values():
-
-        def draw(part: Gaussians, case: ViewerCase = case) -> Rendering:
-            return rasterize(
-                part,
-                room.pose,
-                size=(case.height, case.width),
-                layout="equirect" if case.view == "panorama" else "pinhole",
-                vertical_fov_degrees=FOV_DEGREES,
-                backend="torch",
-            )
-
-        with torch.no_grad():
-            if case.mode == "joint":
-                images[_image_key(case)] = draw(double).color
-                continue
-            weights = blend_weights(room.pose[:3, 3], make_room_cameras()[:, :3, 3])
-            views = [draw(double.select(double.views == view)) for view in range(len(weights))]
-            images[_image_key(case)] = blend(views, weights).color
-    return images
-
-
-def find_viewer_facts(rows: Sequence[Row]) -> list[str]:
+def list_findings(rows: Sequence[Row]) -> list[str]:
     """Sentences that compare the fastest frames of renderers and modes."""
     sentences = []
-    for scene in dict.fromkeys(row.scene for row in rows):
-        frames = {
-            (row.case.renderer, row.case.view, row.case.mode): row.get("best_ms") for row in rows if row.scene == scene
-        }
-        count = next(row.get("num_gaussians") for row in rows if row.scene == scene)
-        cpu, parts = frames.get(("cpu", "perspective", "joint")), []
-        gl = [frames[key] for tier in RENDERERS[1:] if (key := (tier, "perspective", "joint")) in frames]
+    for count in dict.fromkeys(row.get("num_gaussians") for row in rows):
+        of_scene = [row for row in rows if row.get("num_gaussians") == count]
+        best = {(row.case.renderer, row.case.view, row.case.mode): row.get("best_ms") for row in of_scene}
+        cpu, parts = best.get(("cpu", "perspective", "joint")), []
+        gl = [best[key] for name in ("gl33", "gl43") if (key := (name, "perspective", "joint")) in best]
         if cpu and gl:
             parts.append(f"cpu draws a frame in {cpu:.0f} ms, OpenGL in {min(gl):.0f} ms")
-        deferred = frames.get(("cpu", "perspective", "deferred"))
-        if cpu and deferred:
+        if cpu and (deferred := best.get(("cpu", "perspective", "deferred"))):
             parts.append(f"deferred blending takes {deferred / cpu:.2f} times as long as joint")
-        turning = frames.get(("cpu", "look-around", "deferred"))
-        if turning:
+        if turning := best.get(("cpu", "look-around", "deferred")):
             parts.append(f"look-around has {1000 / turning:.0f} frames per second")
         if parts:
             sentences.append(f"{count:,} Gaussians: {'; '.join(parts)}.")
@@ -295,5 +275,5 @@ VIEWER = Benchmark(
     ),
     lambda row: f"{row.get('num_gaussians'):,} Gaussians ({row.scene})",
     {"": plot_viewer},
-    find_viewer_facts,
+    list_findings,
 )
