@@ -135,6 +135,6 @@ FORMATS = Benchmark(
         Column("read s", "read_s", "{:.2f}"),
     ),
     lambda row: row.scene,
-    {"": plot_formats},
+    plot_formats,
     width=140,
 )

@@ -30,8 +30,6 @@ from torch import Tensor
 from pansplat.console import describes_out_of_memory
 
 T = TypeVar("T")
-Numbers = Mapping[str, object]
-Tensors = Mapping[str, Tensor]
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _PACKAGES = ("pansplat", "torch", "numpy", "numba")
@@ -239,7 +237,7 @@ def _make_error(status: int, log: str) -> CaseFailedError:
     return CaseFailedError(message[:160])
 
 
-def serve_job(measure: Callable[[dict[str, Any]], tuple[Numbers, Tensors]]) -> None:
+def serve_job(measure: Callable[[dict[str, Any]], tuple[Mapping[str, object], Mapping[str, Tensor]]]) -> None:
     """Main function of a child process: measure its job and write the result for `run_child`."""
     folder = Path(sys.argv[1])
     job = json.loads((folder / "job.json").read_text())

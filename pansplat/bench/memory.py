@@ -334,7 +334,7 @@ MEMORY = Benchmark(
         Column("", lambda row: "" if row.status == "measured" else f"{row.status}: {row.note}"),
     ),
     lambda row: "one prediction or training step of each row",
-    {"": plot_memory},
+    plot_memory,
     width=150,
 )
 

@@ -249,7 +249,7 @@ MODEL = Benchmark(
         Column("PSNR dB", "psnr_db", "{:.1f}"),
     ),
     lambda row: f"{row.scene}, {row.get('height')}x{2 * row.get('height')}, {row.get('num_gaussians'):,} Gaussians",
-    {"": plot_model},
+    plot_model,
 )
 
 

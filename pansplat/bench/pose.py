@@ -156,7 +156,7 @@ POSE = Benchmark(
         Column("s", "seconds", "{:.1f}"),
     ),
     lambda row: row.suite,
-    {"": plot_poses},
+    plot_poses,
     summarise,
     width=150,
 )

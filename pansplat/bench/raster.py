@@ -51,17 +51,9 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 _MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
 _MAX_TORCH_GAUSSIANS = 4_000_000  # the torch reference renders them in minutes
 _MAX_CHOICE_HEIGHT = 512  # pixels: every choice needs a float64 reference of its own
-_MARKERS = {
-    ("numba", "equirect"): "o",
-    ("numba", "cubemap"): "s",
-    ("torch", "equirect"): "*",
-    ("torch", "cubemap"): "X",
-    ("triton", "equirect"): "^",
-    ("triton", "cubemap"): "D",
-}
-_KERNEL_COLORS = {"ray": "#1764ab", "ewa": "#c8501e"}
+_MARKERS = {"numba": "o", "torch": "s", "triton": "D"}
 _HEADLINE = ("headline", "equirect", "float32")  # suite, layout and precision
-_MAX_PSNR = 160.0  # dB; smaller errors are plotted at this value
+_MAX_PSNR = 160.0  # dB, of a plotted point
 
 
 @dataclass(frozen=True)
@@ -418,24 +410,20 @@ def _describe_size(row: Row) -> str:
 def plot_choices(rows: Sequence[Row], header: Header) -> Figure | None:
     """Plot PSNR over time; None if there is nothing to plot."""
     shown = [row for row in rows if row.suite == "choices" and row.case.layout != "pinhole"]
-    shown = [row for row in shown if row.get("forward_ms") and row.get("psnr_db") is not None]
+    shown = [row for row in shown if row.case.precision == "float32" and row.get("psnr_db") is not None]
     if not shown:
         return None
     figure, (axes,) = make_axes(1, (10, 6))
-    for row in shown:
-        case, color = row.case, _KERNEL_COLORS[row.case.kernel]
-        fill = color if case.filter == "angular" else "none"
-        edge = color if case.precision == "float32" else "#444444"
-        point = row.get("forward_ms"), min(_MAX_PSNR, row.get("psnr_db"))
-        axes.scatter(*point, s=55, marker=_MARKERS[case.backend, case.layout], facecolors=fill, edgecolors=edge)
-    for backend, layout in dict.fromkeys((row.case.backend, row.case.layout) for row in shown):
-        axes.scatter([], [], marker=_MARKERS[backend, layout], color="#888888", label=f"{backend}, {layout}")
-    for kernel, color in _KERNEL_COLORS.items():
-        axes.plot([], [], linewidth=4, color=color, label=f"kernel {kernel}")
-    axes.scatter([], [], facecolors="none", edgecolors="#888888", label="hollow: filter 3dgs")
-    axes.scatter([], [], facecolors="#cccccc", edgecolors="#444444", label="dark edge: float64")
+    for backend, layout in dict.fromkeys((row.case.backend, row.case.layout_name) for row in shown):
+        group = [row for row in shown if (row.case.backend, row.case.layout_name) == (backend, layout)]
+        x, y = [row.get("forward_ms") for row in group], [min(_MAX_PSNR, row.get("psnr_db")) for row in group]
+        axes.plot(x, y, _MARKERS[backend], label=f"{backend}, {layout}")
+        for row, *point in zip(group, x, y, strict=True):
+            choice, above = f"{row.case.kernel} {row.case.order} {row.case.filter}", len(axes.texts) % 2  # in turns
+            axes.annotate(choice, point, xytext=(6, 5 if above else -11), textcoords="offset points", fontsize=7)
     axes.set(xscale="log", xlabel="forward, milliseconds", ylabel=f"PSNR, dB (at most {_MAX_PSNR:g})")
     axes.set_title(f"{shown[0].scene}: {_describe_size(shown[0])}; {header['machine']['cpu']}", loc="left", fontsize=9)
+    axes.margins(x=0.15)
     axes.legend(fontsize=8, loc="center")
     return figure
 
@@ -464,7 +452,7 @@ RASTER = Benchmark(
         Column("max error", "max_error", "{:.1e}"),
     ),
     lambda row: f"{row.suite}: {row.scene}",
-    {"": plot_choices},
+    plot_choices,
     list_findings,
     width=210,
 )

@@ -190,6 +190,6 @@ REFINE = Benchmark(
         Column("at inputs dB", "inputs_db", "{:.2f}"),
     ),
     lambda row: row.scene,
-    {"": plot_refine},
+    plot_refine,
     width=150,
 )

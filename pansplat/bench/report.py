@@ -1,4 +1,4 @@
-"""Rows of all benchmarks and their report: tables, a JSON file, a page in Markdown, plots."""
+"""Rows of all benchmarks and their report: tables, a JSON file, a page in Markdown, a plot."""
 
 from __future__ import annotations
 
@@ -135,8 +135,7 @@ class Benchmark:
         name: of its files: NAME.json, NAME.md and NAME.png.
         columns: of its tables.
         section: title of the table that a row belongs to.
-        plots: functions that plot the rows, by what follows NAME in their file's name; they get the rows and the header
-            of the JSON file, and return None if there is nothing to plot.
+        plot: a function that plots the rows, given also the header of the JSON file; None if there is nothing to plot.
         findings: sentences about all rows, for the terminal and the page.
         width: characters of a printed line if there is no terminal.
     """
@@ -144,7 +143,7 @@ class Benchmark:
     name: str
     columns: Sequence[Column]
     section: Callable[[Row], str]
-    plots: Mapping[str, Plot]
+    plot: Plot
     findings: Callable[[Sequence[Row]], list[str]] = lambda rows: []
     width: int = 190
 
@@ -196,7 +195,7 @@ class Report:
 
         Args:
             json_file: by default NAME.json in `out`, if that is given.
-            out: folder for the page and the plots.
+            out: folder for the page and the plot.
         """
         self.header, self.rows = header, list[Row]()
         self.json_file = json_file or (None if out is None else out / f"{benchmark.name}.json")
@@ -257,20 +256,18 @@ class Report:
             write_json({**_rounded(dict(self.header)), "rows": [row.as_json() for row in self.rows]}, self.json_file)
 
     def _write(self) -> list[Path]:
-        """Write the page and the plots and return all written files."""
+        """Write the page and the plot and return all written files."""
         if not self.rows:
             return []
         written = [] if self.json_file is None else [self.json_file]
         if self._out is None:
             return written
-        page = self._out / f"{self._benchmark.name}.md"
+        page, picture = (self._out / f"{self._benchmark.name}{suffix}" for suffix in (".md", ".png"))
         with replacing(page) as partial:
             partial.write_text(self._benchmark.markdown(self.rows))
-        written.append(page)
-        for ending, plot in self._benchmark.plots.items():
-            figure, path = plot(self.rows, self.header), self._out / f"{self._benchmark.name}{ending}.png"
-            if figure is not None:
-                with replacing(path) as partial:
-                    figure.savefig(partial, dpi=110)
-                written.append(path)
-        return written
+        figure = self._benchmark.plot(self.rows, self.header)
+        if figure is None:
+            return [*written, page]
+        with replacing(picture) as partial:
+            figure.savefig(partial, dpi=110)
+        return [*written, page, picture]

@@ -274,6 +274,6 @@ VIEWER = Benchmark(
         Column("stages, ms", _format_stages),
     ),
     lambda row: f"{row.get('num_gaussians'):,} Gaussians ({row.scene})",
-    {"": plot_viewer},
+    plot_viewer,
     list_findings,
 )

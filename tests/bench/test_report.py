@@ -23,7 +23,7 @@ SPEED = Benchmark(
     "speed",
     (Column("height", "height", "{:d}"), Column("seconds", "seconds", "{:.1f}"), Column("", lambda row: row.note)),
     lambda row: f"{row.suite}: {row.case.height}",
-    {"": lambda rows, header: Figure(), "_empty": lambda rows, header: None},
+    lambda rows, header: Figure(),
     lambda rows: [f"{len(rows)} rows."],
 )
 
@@ -96,7 +96,10 @@ def test_an_interrupted_run_is_printed_and_written(tmp_path, capsys):
     assert steps == "the first row\n"
 
 
-def test_a_run_without_rows_writes_nothing(tmp_path):
+def test_a_run_without_rows_writes_nothing_and_one_without_a_plot_no_picture(tmp_path):
     with Report(SPEED, HEADER, out=tmp_path) as report:
         report.save()
     assert not list(tmp_path.iterdir())
+    with Report(replace(SPEED, plot=lambda rows, header: None), HEADER, out=tmp_path) as report:
+        report.add(row())
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["speed.json", "speed.md"]
