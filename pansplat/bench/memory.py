@@ -144,22 +144,24 @@ class MemoryBench:
     Attributes:
         weights: file of the network's weights.
         report: its rows may hold those of earlier runs.
+        retry: measure failed rows of earlier runs again.
     """
 
     setting: MemorySetting
     weights: Path
     report: Report
+    retry: bool = False
 
     def run(self, cases: Sequence[MemoryCase]) -> None:
         """Measure the cases. The report's rows have the order of `list_memory_cases`.
 
         Cases of one height and kind are compared with the first that succeeds, so they are measured in one run: they
-        are skipped only if all of them were measured before.
+        are skipped only if all of them have rows.
         """
-        measured = {row.case for row in self.report.rows if row.status == "measured"}
+        done = {row.case for row in self.report.rows if row.status == "measured" or not self.retry}
         for _, group in itertools.groupby(cases, key=lambda case: (case.height, case.kind)):
             comparable = list(group)
-            if measured.issuperset(comparable):
+            if done.issuperset(comparable):
                 continue
             self.report.rows[:] = [row for row in self.report.rows if row.case not in comparable]
             reference: dict[str, Tensor] = {}
@@ -187,14 +189,10 @@ class MemoryBench:
 
 
 def measure_case(case: MemoryCase, setting: MemorySetting, weights: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Measure a case in a child process.
-
-    Returns:
-        The result; gradients by name, or means, opacities and image of a prediction.
+    """The values of a case from a child process, and gradients by name, or means, opacities and image of a prediction.
 
     Raises:
-        OverLimitError: it exceeded the limit or the available memory.
-        CaseFailedError: it failed otherwise.
+        CaseFailedError: it failed; OverLimitError if it exceeded the limit or the available memory.
     """
     job = {"case": dataclasses.asdict(case), "setting": dataclasses.asdict(setting), "weights": str(weights)}
     return run_child("pansplat.bench.memory", job, threads=setting.threads, limit_gib=setting.limit_gib)

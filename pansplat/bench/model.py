@@ -120,14 +120,11 @@ def compare_predictions(prediction: Mapping[str, Tensor], reference: Mapping[str
 def measure_case(
     case: ModelCase, weights: Path, views: Path, *, near: float, far: float
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Measure a case in a child process.
+    """The values of a case from a child process; `depth` of the finest sphere sweep and `image` at the middle pose.
 
     Args:
         weights: file of the network's weights.
         views: safetensors file with `images` (view 3 height width) and `cam2world` (view 4 4).
-
-    Returns:
-        The values without errors; the `depth` of the finest sphere sweep and the `image` at the middle pose.
 
     Raises:
         InputError: the child failed; with its last message.

@@ -201,19 +201,19 @@ class Report:
         self.json_file = json_file or (None if out is None else out / f"{benchmark.name}.json")
         self._benchmark, self._out = benchmark, out
 
-    def resume(self, case_type: type) -> None:
-        """Read the rows of an earlier run from the JSON file, if there is one.
+    def resume(self, case_type: type) -> bool:
+        """Read the rows of an earlier run from the JSON file, if there is one; False if its limits were other ones.
 
         Raises:
             InputError: it is not a file of such rows, or its `setting` differs from that of the header.
         """
         if self.json_file is None or not self.json_file.is_file():
-            return
+            return True
         command = f"`pansplat bench {self._benchmark.name}`"
         try:
             content = read_json(self.json_file)
             rows = [Row.from_json(values, case_type) for values in content["rows"]]
-            before, now = content.get("setting", {}), self.header.get("setting", {})
+            before, now = content.get("setting", {}), _rounded(self.header.get("setting", {}))
             changed = [
                 f"{name} was {before.get(name)}, now {now[name]}"
                 for name in now
@@ -226,6 +226,7 @@ class Report:
                 f"{self.json_file}: has another setting ({'; '.join(changed)}); give another --out, or delete the file."
             )
         self.rows += rows
+        return before == now
 
     def __enter__(self) -> Report:
         return self

@@ -168,7 +168,8 @@ class BenchMemory(_Options):
     quick: bool = False
     """Without one-step and 4 tiles."""
     limit_gb: Positive = 8.0
-    """Largest memory of a row, 10^9 bytes. Rows that exceed it are ended."""
+    """Largest memory of a row, 10^9 bytes. Rows that exceed it are ended, and measured again if another
+    limit is given."""
     style: Literal["panorama", "cubemap", "original"] = "cubemap"
     """How images are rendered; as training's --memory.style."""
     perceptual: Literal["structure", "lpips-vgg", "lpips-alex", "lpips-squeeze"] = "structure"
@@ -184,11 +185,11 @@ class BenchMemory(_Options):
         setting = MemorySetting(self.preset, self.style, self.perceptual, self._set_threads(), limit_gib)
         cases = list_memory_cases(self.heights, quick=self.quick)
         report = self._open_report(MEMORY, setting=asdict(setting))
-        report.resume(MemoryCase)
+        retry = not report.resume(MemoryCase)
         with tempfile.TemporaryDirectory() as folder, report:
             weights = Path(folder, "random.safetensors")
             save_random_weights(weights, network_config(setting.network))
-            MemoryBench(setting, weights, report).run(cases)
+            MemoryBench(setting, weights, report, retry).run(cases)
         return 0
 
 

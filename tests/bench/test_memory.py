@@ -95,7 +95,7 @@ def test_rows_of_other_settings_are_refused(measured, tmp_path, capsys):
     assert "style was cubemap, now panorama" in capsys.readouterr().err
 
 
-def test_failed_rows_have_a_status_and_are_measured_again(measured, tmp_path, capsys):
+def test_failed_rows_have_a_status_and_are_measured_again_with_another_limit(measured, tmp_path, capsys):
     errors = {"plain": OverLimitError("ended at 2 GiB"), "one-step": CaseFailedError("ended by SIGSEGV")}
     measured.error_of = lambda case: errors.get(case.work)
     assert run([*ARGUMENTS, "--out", str(tmp_path)]) == 0
@@ -108,7 +108,10 @@ def test_failed_rows_have_a_status_and_are_measured_again(measured, tmp_path, ca
     assert ("two-step", 1) in references_in(tmp_path)  # the first that succeeded
     measured.cases.clear()
     measured.error_of = lambda case: None
-    assert run([*ARGUMENTS[:4], "--heights", "64", "--threads", "1", "--out", str(tmp_path)]) == 0
+    assert run([*ARGUMENTS, "--out", str(tmp_path)]) == 0
+    assert not measured.cases
+    small = [*ARGUMENTS[:4], "--heights", "64", "--threads", "1", "--limit-gb", "9", "--out", str(tmp_path)]
+    assert run(small) == 0
     assert measured.cases == [case for case in list_memory_cases([64], quick=False) if case.kind == "training"]
     assert [row["status"] for row in rows_in(tmp_path) if row["height"] == 64] == ["measured"] * 10
     assert len(rows_in(tmp_path)) == 20

@@ -34,7 +34,7 @@ def row(height: int = 16, **values) -> Row:
 
 def resume(file: Path, **setting) -> list[Row]:
     report = Report(SPEED, HEADER | {"setting": setting}, json_file=file)
-    report.resume(Case)
+    assert report.resume(Case) == (setting == {"style": "plain", "limit_gib": 1.0} or not report.rows)
     return report.rows
 
 
@@ -44,7 +44,8 @@ def test_rows_are_read_as_they_were_written(tmp_path):
     report.add(Row("speed", "room", Case(32), status="died", note="ended by SIGKILL"))
     file = tmp_path / "speed.json"
     assert json.loads(file.read_text())["machine"] == HEADER["machine"]
-    assert resume(file, style="plain", limit_gib=2.0) == report.rows
+    for limit in (1.0, 2.0):
+        assert resume(file, style="plain", limit_gib=limit) == report.rows
     assert resume(tmp_path / "none.json", style="plain") == []
     with pytest.raises(InputError, match=r"style was plain, now rich.*give another --out"):
         resume(file, style="rich")
