@@ -302,7 +302,7 @@ def plot_memory(rows: Sequence[Row], header: Header) -> Figure | None:
         for _, text, height, gigabytes in (point for point in PAPER_POINTS if point[0] == kind):
             point = (height, gigabytes * 1e9 / 2**30)
             axes.plot(*point, "*", **_PAPER_STYLE)
-            axes.annotate(f"{text} ", point, ha="right", va="center", fontsize=8, color=_PAPER_STYLE["color"])
+            axes.annotate(f"{text}    ", point, ha="right", va="center", fontsize=8, color=_PAPER_STYLE["color"])
         axes.plot([], [], "*", **_PAPER_STYLE, label="the paper: its network, a GPU")
         axes.set_xscale("log", base=2)
         axes.set_yscale("log", base=2)
