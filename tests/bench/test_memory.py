@@ -134,7 +134,7 @@ def weights(tmp_path_factory) -> Path:
 @pytest.mark.slow
 def test_a_child_measures_gradients_and_memory(weights):
     """The tiled case runs in a child process; the plain one in this process, which gives the expected gradients."""
-    plain, tiled = MemoryCase("plain", 1, 64), MemoryCase("two-step", 4, 64)
+    plain, tiled = MemoryCase("plain", 1, 64), MemoryCase("two-step", 2, 64)
     job = {"case": dataclasses.asdict(plain), "setting": dataclasses.asdict(SETTING), "weights": str(weights)}
     expected, plain_gradients = bench_memory._measure_job(job)
     result, tiled_gradients = measure_case(tiled, SETTING, weights)
