@@ -134,7 +134,7 @@ def plot_poses(rows: Sequence[Row], header: Header) -> Figure:
         for name in ("rotation", "direction") if chosen else ():
             values = [row.get(f"{name}_degrees") for row in chosen]
             axes[0].semilogy([row.case.baseline_m for row in chosen], values, marker, label=f"{name}, {outcome}")
-            axes[1].plot(np.sort(values), np.linspace(0, 1, len(values)), label=f"{name}, {outcome}")
+            axes[1].plot(np.sort(values), np.linspace(0, 1, len(values)), ".-", label=f"{name}, {outcome}")
             axes[0].legend(fontsize=8)
     axes[0].set(xlabel="distance of the cameras, m", ylabel="error, degrees")
     axes[1].set(xlabel="error, degrees", ylabel="fraction of the pairs", xlim=(0, 2))
