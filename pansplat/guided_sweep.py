@@ -50,7 +50,7 @@ class GuidedSweep(Sweep):
     """
 
     def __init__(self, network: DepthRefinement, weights_hash: str, name: str = "default") -> None:
-        config = SweepConfig(search=SearchConfig(room_layout=None, finest_height=_SEARCH_HEIGHT))
+        config = SweepConfig(search=SearchConfig(finest_height=_SEARCH_HEIGHT))
         super().__init__(config, NetworkPrior(network, weights_hash + _hash_sources()))
         self.name, self.network = name, network
 

@@ -1,7 +1,7 @@
 """A predictor without weights: a hierarchical sphere sweep.
 
 In the order of the pipeline: `predictor` (the call), `search` (three levels), `planes` (the scene's axes and planes),
-`room_layout` (floor boundary and walls), `matching` (matching cost and its aggregation), `surface` (consistency between
+`prior` (depth that a model expects), `matching` (matching cost and its aggregation), `surface` (consistency between
 views, upsampling), `lift` (Gaussians).
 """
 

@@ -171,10 +171,6 @@ class ScenePlanes:
         here, there = (self.axes[axis] @ pose[:3, 3] for pose in (cam2world, other))
         return np.stack([sign * (here - there) + 1 / inverse <= 0 for sign in (-1, 1)])
 
-    def camera_height(self, cam2world: np.ndarray) -> float:
-        """Height of a camera over the detected floor, metres; infinite without one."""
-        return self.floor_ceiling[0] - float(self.axes[_DOWN_AXIS] @ (cam2world[:3, 3] - self.origin))
-
     def vertical_bounds(self, cam2world: np.ndarray) -> tuple[float, float]:
         """Extent of the scene below and above (negative) a camera, metres; infinite where unknown."""
         horizontal = self.histogram[_DOWN_AXIS]

@@ -1,10 +1,10 @@
 """The hierarchical sphere sweep: from posed panoramas to one surface per view.
 
-The scene's planes and the room layout of each view are detected first. Three levels of matching follow at 1/4, 1/2 and
-1/1 of the height, as in the paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searches the
-whole depth range with spheres and with planes across the scene's axes. It runs twice: the second pass uses the surfaces
-of the first for occlusion, consistency between views, and the support of planes. Each finer level searches a narrow
-range around the coarser surface.
+The scene's planes are detected first. Three levels of matching follow at 1/4, 1/2 and 1/1 of the height, as in the
+paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres
+and with planes across the scene's axes. It runs twice: the second pass uses the surfaces of the first for occlusion,
+consistency between views, and the support of planes. Each finer level searches a narrow range around the coarser
+surface.
 """
 
 from __future__ import annotations
@@ -37,20 +37,9 @@ from pansplat.sweep.planes import (
     make_empty_planes,
 )
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
-from pansplat.sweep.room_layout import (
-    FloorBoundary,
-    RoomLayoutConfig,
-    Walls,
-    apply_floor_costs,
-    apply_wall_bonus,
-    detect_floor_boundaries,
-    discount_contradicted,
-    fit_walls,
-)
 from pansplat.sweep.surface import Surface, consistency_mask, guided_upsample, resize_mask, resize_sphere
 
-_DETECTION_HEIGHT = 128  # pixels; planes and room layouts are detected at this size
-_FLOOR_THICKNESS = 2.5  # in bins of the planes' offsets
+_DETECTION_HEIGHT = 128  # pixels; planes are detected at this size
 
 
 @dataclass(frozen=True)
@@ -74,8 +63,6 @@ class SearchConfig:
     """Penalty of spheres relative to supported planes."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
-    room_layout: RoomLayoutConfig | None = field(default_factory=RoomLayoutConfig)
-    """None for no room layout."""
     prior: PriorConfig = field(default_factory=PriorConfig)
 
 
@@ -141,26 +128,16 @@ def search_surfaces(
     priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
         priors = estimator.estimate_by_matching(detection.views, (low, high), config.matching)
-    report("finding floor, ceiling and walls", 0.05)
+    report("finding planes", 0.05)
     planes = detect_planes(
         detection.views, detection.rays, posed.cam2world, planes, depths, MIN_FLOOR * posed.near, config.matching
     )
-    boundaries = None
-    if config.room_layout is not None:
-        boundaries = detect_floor_boundaries(detection.views, detection.rays, posed.cam2world, planes, config.matching)
-    layouts = boundaries and [
-        (boundary, fit_walls(boundary, planes.camera_height(pose), posed.far))
-        for boundary, pose in zip(boundaries, posed.cam2world, strict=True)
-    ]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         if estimator is not None and surfaces is not None:
             priors = estimator.estimate_from_surfaces(surfaces)
         level = _SearchLevel(posed, heights[0], planes, depths.limits, config, surfaces)
-        surfaces = [
-            level.search_full_range(view, candidates, layouts and layouts[view], priors[view])
-            for view in range(len(posed.images))
-        ]
+        surfaces = [level.search_full_range(view, candidates, own) for view, own in enumerate(priors)]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
@@ -207,13 +184,7 @@ class _SearchLevel:
             for n, (image, mask, rays) in enumerate(zip(posed.images, masks, self.rays, strict=True))
         ]
 
-    def search_full_range(
-        self,
-        view: int,
-        inverse: np.ndarray,
-        layout: tuple[FloorBoundary, Walls] | None,
-        priors: Sequence[DepthPrior],
-    ) -> Surface:
+    def search_full_range(self, view: int, inverse: np.ndarray, priors: Sequence[DepthPrior]) -> Surface:
         """The best hypotheses: spheres of inverse depths (set 0) and planes across the axes (sets 1 to 3)."""
         low, step, count = inverse[0], inverse[1] - inverse[0], len(inverse)
         shape = (self.height, 2 * self.height)
@@ -232,25 +203,9 @@ class _SearchLevel:
         ]
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
         cost = self._mean_cost(view, lambda other: self._mark_separating_planes(view, other, sets, inverse))
-        if layout is not None:
-            camera_height = self.planes.camera_height(self.posed.cam2world[view])
-            is_floor = np.abs(1 / inverse - camera_height) < _FLOOR_THICKNESS * self.planes.bin
-            apply_floor_costs(cost, layout[0], sets, is_floor, self.rays[view], self.config.room_layout)
-            if self.surfaces is not None:
-                self._apply_walls(view, *layout, sets, cost)
         if priors:
             apply_prior_cost(cost, [prior.resize(self.height) for prior in priors], sets, self.config.prior)
         return self._select_hypotheses(view, sets, cost, slot_map.astype(np.float32), count)
-
-    def _apply_walls(
-        self, view: int, boundary: FloorBoundary, walls: Walls, sets: list[HypothesisSet], cost: np.ndarray
-    ) -> None:
-        """Lower the cost of those of the view's walls that its surface does not contradict."""
-        known = self.views[view].inverse_depth
-        assert known is not None
-        walls = discount_contradicted(walls, boundary, self.rays[view], known, self.consistent[view])
-        _, ceiling = self.planes.vertical_bounds(self.posed.cam2world[view])
-        apply_wall_bonus(cost, walls, boundary, sets, self.rays[view], ceiling, self.config.room_layout.wall_bonus)
 
     def _mark_separating_planes(
         self, view: int, other: int, sets: list[HypothesisSet], inverse: np.ndarray

@@ -1,6 +1,5 @@
 """Textured rooms with known depth; each is searched once for all tests."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -8,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from pansplat.sweep.matching import MatchingConfig, View
-from pansplat.sweep.planes import axis_components, make_empty_planes
-from pansplat.sweep.room_layout import FloorBoundary, detect_floor_boundaries
+from pansplat.sweep.matching import View
+from pansplat.sweep.planes import axis_components
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
 from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
 
@@ -215,41 +213,3 @@ def _views_of(posed: PosedImages, images: np.ndarray, masks: np.ndarray) -> tupl
 def views_of() -> Callable[..., tuple[list[View], list[np.ndarray]]]:
     """Makes views of images and masks at the poses of posed images, and their rays along the room's axes."""
     return _views_of
-
-
-def _find_boundaries(posed, images, floor: float) -> tuple[list[FloorBoundary] | None, list[np.ndarray]]:
-    views, rays = _views_of(posed, images, posed.masks)
-    planes = make_empty_planes(posed.cam2world, _AXES, posed.near, posed.far)
-    planes = dataclasses.replace(planes, floor_ceiling=(floor - planes.origin[1], -math.inf))
-    return detect_floor_boundaries(views, rays, posed.cam2world, planes, MatchingConfig()), rays
-
-
-@pytest.fixture(scope="session")
-def find_boundaries():
-    """Finds the floor boundaries of images at the poses of posed images, and the rays, for a floor at an offset."""
-    return _find_boundaries
-
-
-@pytest.fixture(scope="session")
-def paint_floor(empty_room) -> Callable[..., np.ndarray]:
-    """Paints the room's floor brown and its walls white, but points where `wall(points)` is true in another brown."""
-
-    def paint(wall: Callable[[np.ndarray], np.ndarray] = lambda points: np.zeros(points.shape[:2], bool)) -> np.ndarray:
-        images, posed = [], empty_room.posed
-        for pose, depth, image in zip(posed.cam2world, empty_room.depths, posed.images, strict=True):
-            points = (ray_grid(len(image)) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
-            on_floor = np.abs(points[..., 1] - empty_room.room.high[1]) < 1e-3
-            color = np.where(on_floor[..., None], (0.45, 0.3, 0.15), (0.85, 0.85, 0.85))
-            color = np.where(wall(points)[..., None], (0.345, 0.23, 0.115), color)
-            images.append(color * (0.8 + 0.4 * image.mean(axis=2, keepdims=True)))
-        return np.stack(images).clip(0, 1).astype(np.float32)
-
-    return paint
-
-
-@pytest.fixture(scope="session")
-def brown_floor(empty_room, paint_floor):
-    """Floor boundaries of the room with a brown floor and white walls, and the rays."""
-    boundaries, rays = _find_boundaries(empty_room.posed, paint_floor(), empty_room.room.high[1])
-    assert boundaries is not None
-    return boundaries, rays

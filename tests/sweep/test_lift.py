@@ -79,7 +79,8 @@ def test_the_input_is_rendered_at_its_own_pose(small_furnished_room, gaussians, 
     assert psnr(rendering.color, image) > 22.5
 
 
-def test_the_room_is_rendered_between_the_inputs(small_furnished_room, gaussians):
+def test_the_room_is_rendered_between_the_inputs(small_furnished_room):
+    gaussians = lift(small_furnished_room.posed, small_furnished_room.make_exact_surfaces(), LiftConfig())
     pose = _middle(small_furnished_room)
     truth, depth = small_furnished_room.room.cast(pose, 64)
     rendering = _render(gaussians, small_furnished_room, pose)

@@ -168,14 +168,6 @@ def test_planes_between_two_cameras_are_separating():
     assert not nothing.separating(0, here, there, 1 / distance).any()
 
 
-def test_each_camera_has_its_own_height_over_the_floor():
-    poses = np.stack((np.eye(4), np.eye(4)))
-    poses[1, 1, 3] = 0.4  # y points down
-    floor = dataclasses.replace(make_empty_planes(poses, _AXES, 0.5, 8.0), floor_ceiling=(1.0, -np.inf))
-    assert floor.camera_height(poses[0]) == pytest.approx(1.2)
-    assert floor.camera_height(poses[1]) == pytest.approx(0.8)
-
-
 @pytest.fixture(scope="module")
 def detect(views_of):
     """The planes that the views of posed images vote for."""

@@ -178,7 +178,7 @@ def test_coincident_cameras_have_the_first_estimate_at_a_usual_height(make_room,
     pose = room.pose((-0.4, 0.0, -0.2))
     observed = observe(room, [pose, pose], 64)
     model = TrueDepth(room, [pose, pose])
-    surfaces = search_surfaces(observed.posed, SearchConfig(room_layout=None), lambda what, fraction: None, model)
+    surfaces = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, model)
     expected = observed.depths[0] * 1.5 / _CAMERA_HEIGHT
     for surface in surfaces:
         assert np.median(np.abs(surface.inverse_depth * expected - 1)) < 0.02
@@ -189,8 +189,6 @@ def test_prior_decides_where_photographs_are_blank(make_room, observe, two_poses
     poses = two_poses(room)
     observed = observe(room, poses, 64)
     upright = [pose.copy() for pose in poses]
-    surfaces = search_surfaces(
-        observed.posed, SearchConfig(room_layout=None), lambda what, fraction: None, TrueHeights(room, upright)
-    )
+    surfaces = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, TrueHeights(room, upright))
     for surface, depth in zip(surfaces, observed.depths, strict=True):
         assert np.median(np.abs(surface.inverse_depth * depth - 1)) < 0.05

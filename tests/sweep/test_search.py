@@ -89,7 +89,6 @@ def test_translating_the_world_changes_no_surface(empty_room):
 
 
 def test_rotating_the_world_changes_no_surface(empty_room, turn):
-    """Up to the floor boundary, which is uncertain here: the floor looks like the walls."""
     motion = np.eye(4)
     motion[:3, :3] = turn("y", 71) @ turn("x", 35) @ turn("z", -21)
     inverse = _search(empty_room.posed, cam2world=motion @ empty_room.posed.cam2world)
