@@ -12,7 +12,7 @@ by generalized model optimization, ACCV 2004; P. Torr, A. Zisserman, MLESAC, CVI
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,7 +50,7 @@ _POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # of right ma
 _POLISH_WEIGHT = 4.0  # of these shares, in matches
 _CALIBRATION = 1.5, 80.0  # factor of formal standard deviations: least one; that times the number of places
 _LEVEL = [2, 0, 1]  # order of the axes in a levelled camera: x, y down, z
-_MAX_MATCHES = 2500
+_MIN_MATCHES, _MAX_MATCHES = 8, 2500
 _TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
 _SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
 _QUICK, _RESCORED = 500, 3000  # best matches that rank all hypotheses; hypotheses that all matches rank
@@ -58,13 +58,14 @@ _KEPT, _KEPT_PARALLEL = 20, 10  # hypotheses that are optimised: of all kinds, a
 _PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit vectors
 _MIN_PARALLAX = 5.0  # in the noise's standard deviation
 _MAX_UNCERTAINTY = math.radians(4)
+_FACTORS, _PARALLEL_FACTORS = (2, 1), (4, 2, 1)  # of the noise, in the optimisation of a hypothesis
 _EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
 
 
 @dataclass(frozen=True)
-class _Evidence:
-    """The least evidence of a pose that passes the check."""
+class _Support:
+    """How many places, which score and which margin of it support a pose; or the least that passes the check."""
 
     places: float
     score: float
@@ -74,7 +75,7 @@ class _Evidence:
 # By the number of confirmations that do not depend on the matches: the walls of both panoramas are parallel, and both
 # agree on a floor. Measured on pairs of a home, of which most have nothing in common: of the wrong poses with at least
 # 10 places and a score of 36, none is confirmed by both; repeated doors and windows give them up to 26 places.
-_NEEDED = _Evidence(32, 80, 20), _Evidence(24, 100, 10), _Evidence(10, 36, 4)
+_NEEDED = _Support(32, 80, 20), _Support(24, 100, 10), _Support(10, 36, 4)
 _FLOOR_SCORE = 6.0  # gain of a pose that the floor confirms
 _ALTERNATIVES = 5  # best hypotheses that are compared by the floor
 
@@ -111,61 +112,66 @@ def _density(angle: Array, noise: float | Array) -> Array:
     return math.sqrt(2 / math.pi) * ((1 - _WIDE_SHARE) * narrow + _WIDE_SHARE * wide)
 
 
-def _likelihood_ratio(angle: Array, noise: float) -> Array:
-    """Likelihood ratio of an epipolar angle for a right match against chance (uniform on the sphere)."""
-    return np.where(angle < _MAX_ANGLE * _WIDE * noise, _density(angle, noise), 0.0)
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """All that is known of a relative pose before it is sought.
 
-
-def evaluate(
-    a: Float[Array, "match 3"],
-    b: Float[Array, "match 3"],
-    prior: Float[Array, "match"],
-    rotation: Float[Array, "3 3"],
-    translation: Float[Array, "3"],
-    noise: float,
-    axes: RotationPrior = NO_PRIOR,
-) -> Hypothesis:
-    """The evidence for a relative pose. Matches whose rays meet behind a camera are counted as wrong.
-
-    A right match by chance also has its point in front of both cameras in about half of all cases, so that a point in
-    front has twice the likelihood ratio.
+    Attributes:
+        a, b: bearings of the matches in the first and in the second panorama, the most distinctive match first.
+        prior: probability of each match to be right.
+        noise: standard deviation of a right match's epipolar angle, radians.
+        axes: gravity and walls of both panoramas.
     """
-    angle = np.abs(epipolar_angles(a, b, rotation, translation))
-    ratio = np.where(_are_behind(a, b, rotation, translation, noise), 0.0, 2 * _likelihood_ratio(angle, noise))
-    total = 1 - prior + prior * ratio
-    score = float(np.log(total).sum()) + axes.score(rotation)
-    return Hypothesis(rotation, translation, score, prior * ratio / total)
+
+    a: Float[Array, "match 3"]
+    b: Float[Array, "match 3"]
+    prior: Float[Array, "match"]
+    noise: float
+    axes: RotationPrior
+
+    def strongest(self, count: int) -> _Evidence:
+        """The evidence of the first `count` matches."""
+        return replace(self, a=self.a[:count], b=self.b[:count], prior=self.prior[:count])
+
+    def with_noise(self, factor: float) -> _Evidence:
+        """The evidence with another noise, in units of this one."""
+        return replace(self, noise=factor * self.noise)
+
+    def evaluate(self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Hypothesis:
+        """The evidence for a relative pose. Matches whose rays meet behind a camera are counted as wrong.
+
+        A right match by chance also has its point in front of both cameras in about half of all cases, so that a point
+        in front has twice the likelihood ratio against chance (uniform on the sphere).
+        """
+        angle = np.abs(epipolar_angles(self.a, self.b, rotation, translation))
+        likelihood = np.where(angle < _MAX_ANGLE * _WIDE * self.noise, _density(angle, self.noise), 0.0)
+        behind = _are_behind(self.a, self.b, rotation, translation, self.noise)
+        ratio = np.where(behind, 0.0, 2 * likelihood)
+        total = 1 - self.prior + self.prior * ratio
+        score = float(np.log(total).sum()) + self.axes.score(rotation)
+        return Hypothesis(rotation, translation, score, self.prior * ratio / total)
+
+    def refine(self, start: Hypothesis, steps: int) -> Hypothesis:
+        """The pose of the smallest weighted epipolar angles near a hypothesis, by Gauss-Newton with a robust loss."""
+        rotation, translation, best = start.rotation, start.translation, start
+        for _ in range(steps):
+            normal, gradient = _normal_equations(self.a, self.b, best.probability, rotation, translation, self.noise)
+            rotation, translation, step = _gauss_newton(normal, gradient, rotation, translation, self.axes)
+            if not np.abs(step).max() < 0.5:
+                break
+            found = self.evaluate(rotation, translation)
+            improved = found.score > best.score + 1e-3
+            if found.score > best.score:
+                best = found
+            if not improved:
+                break
+        return best
 
 
 def _are_behind(a: Array, b: Array, rotation: Array, translation: Array, noise: float | Array) -> Bool[Array, "match"]:
     """Whether the rays of each match meet behind a camera; parallel rays do not."""
     depths = two_view_depths(a, b, rotation, translation)
     return (depths < 0).any(axis=1) & (angle_between(a @ rotation.T, b) > 3 * noise)
-
-
-def refine_pose(
-    a: Float[Array, "match 3"],
-    b: Float[Array, "match 3"],
-    prior: Float[Array, "match"],
-    start: Hypothesis,
-    noise: float,
-    axes: RotationPrior = NO_PRIOR,
-    steps: int = 6,
-) -> Hypothesis:
-    """The pose of the smallest weighted epipolar angles near a hypothesis, by Gauss-Newton with a robust loss."""
-    rotation, translation, best = start.rotation, start.translation, start
-    for _ in range(steps):
-        normal, gradient = _normal_equations(a, b, best.probability, rotation, translation, noise)
-        rotation, translation, step = _gauss_newton(normal, gradient, rotation, translation, axes)
-        if not np.abs(step).max() < 0.5:
-            break
-        found = evaluate(a, b, prior, rotation, translation, noise, axes)
-        improved = found.score > best.score + 1e-3
-        if found.score > best.score:
-            best = found
-        if not improved:
-            break
-    return best
 
 
 def _gauss_newton(
@@ -294,71 +300,81 @@ def _calibrate(deviations: tuple[float, float], places: float) -> tuple[float, f
     return factor * deviations[0], factor * deviations[1]
 
 
-def search_hypotheses(
-    a: Float[Array, "match 3"],
-    b: Float[Array, "match 3"],
-    prior: Float[Array, "match"],
-    noise: float,
-    rng: np.random.Generator,
-    axes: RotationPrior = NO_PRIOR,
-) -> list[Hypothesis]:
-    """Distinct optimised hypotheses, best first. Matches are sorted, the most distinctive first."""
-    count = min(len(a), _MAX_MATCHES)
-    a, b, prior = a[:count], b[:count], prior[:count]
-    if count < 8:
+def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> list[Hypothesis]:
+    """Distinct optimised hypotheses, best first."""
+    if len(evidence.a) < _MIN_MATCHES:
         return []
-    level = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
-    free, parallel = [], []
-    for top in sorted({min(top, count) for top in _TOP_SETS}):
+    free, parallel = _sample_essentials(evidence, rng)
+    found = [_optimise(essential, evidence, _FACTORS) for essential in _choose_best(free, evidence, _KEPT)]
+    if len(parallel):
+        # A rotation by the walls is inexact: its hypotheses are compared among themselves, with a larger tolerance.
+        chosen = _choose_best(parallel, evidence.with_noise(2), _KEPT_PARALLEL)
+        found += [_optimise(essential, evidence, _PARALLEL_FACTORS) for essential in chosen]
+    return _merge_same(found, evidence.axes)
+
+
+def _sample_essentials(
+    evidence: _Evidence, rng: np.random.Generator
+) -> tuple[Float[Array, "n 3 3"], Float[Array, "m 3 3"]]:
+    """Essential matrices of random samples: of any pose or of levelled cameras, and of cameras with parallel walls."""
+    a, b, axes = evidence.a, evidence.b, evidence.axes
+    levels = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
+    wall_rotations = relative_rotations(axes.first, axes.second) if axes.has_walls else []
+    free, parallel = [], [np.empty((0, 3, 3))]
+    for top in sorted({min(top, len(a)) for top in _TOP_SETS}):
         chosen = _draw(rng, top, _SAMPLES[5], 5)
         free.append(essential_from_five(a[chosen], b[chosen])[0])
         for size, solver in ((3, upright_from_three), (2, upright_from_two)):
             chosen = _draw(rng, top, _SAMPLES[size], size)
-            rotations, translations = solver(a[chosen] @ level[0].T, b[chosen] @ level[1].T)
-            free.append(level[1].T @ skew(translations) @ rotations @ level[0])
-        for rotation in relative_rotations(axes.first, axes.second) if axes.has_walls else ():
+            rotations, translations = solver(a[chosen] @ levels[0].T, b[chosen] @ levels[1].T)
+            free.append(levels[1].T @ skew(translations) @ rotations @ levels[0])
+        for rotation in wall_rotations:
             chosen = _draw(rng, top, _SAMPLES[2], 2)
             normals = np.cross(a[chosen] @ rotation.T, b[chosen])
             translations = np.cross(normals[:, 0], normals[:, 1])
             translations /= np.maximum(np.linalg.norm(translations, axis=1, keepdims=True), 1e-12)
             parallel.append(skew(translations) @ rotation)
-    starts = []
-    # A rotation by the walls is inexact: its hypotheses are compared among themselves, with a larger tolerance.
-    for essentials, factors, kept in ((free, (2, 1), _KEPT), (parallel, (4, 2, 1), _KEPT_PARALLEL)):
-        if essentials:
-            essential = np.concatenate(essentials)
-            tolerance = factors[0] * noise / 2
-            quick = _score_essentials(essential, a[:_QUICK], b[:_QUICK], prior[:_QUICK], tolerance)
-            essential = essential[np.argsort(-quick)[:_RESCORED]]
-            picked = _pick_distinct(essential, _score_essentials(essential, a, b, prior, tolerance), kept)
-            starts += [(essential[index], factors) for index in picked]
-    found: list[Hypothesis] = []
-    for essential, factors in starts:
-        options = [
-            evaluate(a, b, prior, rotation, translation, factors[0] * noise, axes)
-            for rotation, translation in decompose_essential(essential)
-        ]
-        best = max(options, key=lambda option: option.score)
-        for factor in factors:
-            best = evaluate(a, b, prior, best.rotation, best.translation, factor * noise, axes)
-            best = refine_pose(a, b, prior, best, factor * noise, axes, 4 if factor > 1 else 6)
-        found.append(best)
-    found.sort(key=lambda h: -h.score)
+    return np.concatenate(free), np.concatenate(parallel)
+
+
+def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: int) -> Float[Array, "kept 3 3"]:
+    """At most `count` different essential matrices with the highest scores, best first."""
+    quick = _score_essentials(essential, evidence.strongest(_QUICK))
+    essential = essential[np.argsort(-quick)[:_RESCORED]]
+    return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
+
+
+def _optimise(essential: Float[Array, "3 3"], evidence: _Evidence, factors: Sequence[float]) -> Hypothesis:
+    """The best pose of an essential matrix, refined with decreasing factors of the noise."""
+    start = evidence.with_noise(factors[0])
+    options = [start.evaluate(rotation, translation) for rotation, translation in decompose_essential(essential)]
+    best = max(options, key=lambda option: option.score)
+    for factor in factors:
+        relaxed = evidence.with_noise(factor)
+        best = relaxed.refine(relaxed.evaluate(best.rotation, best.translation), steps=4 if factor > 1 else 6)
+    return best
+
+
+def _merge_same(found: Sequence[Hypothesis], axes: RotationPrior) -> list[Hypothesis]:
+    """One hypothesis of each group of equal ones, best first.
+
+    It is the one of the highest score, or one of nearly this score that makes the walls parallel.
+    """
     distinct: list[Hypothesis] = []
-    for hypothesis in found:
-        near = next((n for n, other in enumerate(distinct) if are_same(hypothesis, other)), None)
-        if near is None:
+    for hypothesis in sorted(found, key=lambda h: -h.score):
+        same = next((n for n, other in enumerate(distinct) if _are_same(hypothesis, other)), None)
+        if same is None:
             distinct.append(hypothesis)
         elif (
-            hypothesis.score > _EQUAL_SCORE * distinct[near].score
+            hypothesis.score > _EQUAL_SCORE * distinct[same].score
             and axes.confirms(hypothesis.rotation)
-            and not axes.confirms(distinct[near].rotation)
+            and not axes.confirms(distinct[same].rotation)
         ):
-            distinct[near] = hypothesis
+            distinct[same] = hypothesis
     return sorted(distinct, key=lambda h: -h.score)
 
 
-def are_same(first: Hypothesis, second: Hypothesis) -> bool:
+def _are_same(first: Hypothesis, second: Hypothesis) -> bool:
     """Whether two hypotheses hardly differ."""
     turned = rotation_angle(first.rotation @ second.rotation.T)
     return bool(turned < _SAME_ROTATION and angle_between(first.translation, second.translation) < _SAME_DIRECTION)
@@ -370,38 +386,37 @@ def _draw(rng: np.random.Generator, top: int, samples: int, size: int) -> Int[Ar
     return chosen + np.arange(size)
 
 
-def _score_essentials(
-    essential: Float[Array, "h 3 3"], a: Array, b: Array, prior: Array, noise: float
-) -> Float[Array, "h"]:
+def _score_essentials(essential: Float[Array, "n 3 3"], evidence: _Evidence) -> Float[Array, "n"]:
     """Scores of essential matrices without the signs of the depths, by matrix products.
 
     Squared Sampson denominators are |E a|^2 + |E' b|^2, up to the square of the residual.
     """
+    a, b, noise = evidence.a, evidence.b, evidence.noise
     i, j = np.triu_indices(3)
     twice = np.where(i == j, 1.0, 2.0)
     products = (b[:, :, None] * a[:, None, :]).reshape(-1, 9).T.astype(np.float32)
     squares_a, squares_b = (np.ascontiguousarray((x[:, i] * x[:, j] * twice).T.astype(np.float32)) for x in (a, b))
     limit = np.float32((_MAX_ANGLE * _WIDE * noise) ** 2)
     scores = np.empty(len(essential))
-    weight = prior / (1 - prior)
-    constant = float(np.log(1 - prior).sum())
+    odds = evidence.prior / (1 - evidence.prior)
     narrow, wide = np.float32(-0.5 / noise**2), np.float32(-0.5 / (_WIDE * noise) ** 2)
-    height = math.sqrt(2 / math.pi) / noise
-    first, second = np.float32(height * (1 - _WIDE_SHARE)), np.float32(height * _WIDE_SHARE / _WIDE)
+    peak = math.sqrt(2 / math.pi) / noise
+    narrow_peak, wide_peak = np.float32(peak * (1 - _WIDE_SHARE)), np.float32(peak * _WIDE_SHARE / _WIDE)
     for start in range(0, len(essential), 2048):
         part = essential[start : start + 2048]
-        e = part.reshape(-1, 9).astype(np.float32) @ products
+        residual = part.reshape(-1, 9).astype(np.float32) @ products
         left = np.einsum("hki,hkj->hij", part, part)[:, i, j].astype(np.float32) @ squares_a
         right = np.einsum("hik,hjk->hij", part, part)[:, i, j].astype(np.float32) @ squares_b
-        squared = e * e / np.maximum(left + right, np.float32(1e-12))
-        h, m = np.nonzero(squared < limit)
-        value = squared[h, m]
-        likelihood = first * np.exp(narrow * value) + second * np.exp(wide * value)
-        scores[start : start + len(part)] = np.bincount(h, np.log1p(weight[m] * likelihood), len(part))
-    return scores + constant
+        squared = residual * residual / np.maximum(left + right, np.float32(1e-12))
+        hypothesis, match = np.nonzero(squared < limit)
+        angle = squared[hypothesis, match]
+        likelihood = narrow_peak * np.exp(narrow * angle) + wide_peak * np.exp(wide * angle)
+        gain = np.log1p(odds[match] * likelihood)
+        scores[start : start + len(part)] = np.bincount(hypothesis, gain, len(part))
+    return scores + float(np.log(1 - evidence.prior).sum())
 
 
-def _pick_distinct(essential: Float[Array, "h 3 3"], scores: Float[Array, "h"], kept: int) -> list[int]:
+def _pick_distinct(essential: Float[Array, "n 3 3"], scores: Float[Array, "n"], kept: int) -> list[int]:
     """Indices of the best hypotheses whose essential matrices differ."""
     picked: list[int] = []
     norm = np.linalg.norm(essential, axis=(1, 2))
@@ -465,70 +480,72 @@ def estimate_relative_pose(
         seed: of the random samples.
     """
     count = min(len(matches), _MAX_MATCHES)
-    a = first.bearings[matches.indices[:count, 0]]
-    b = second.bearings[matches.indices[:count, 1]]
-    prior, noise = match_priors(matches.ratio[:count]), noise_of(first, second)
-    found = search_hypotheses(a, b, prior, noise, np.random.default_rng(seed), axes)
+    indices = matches.indices[:count]
+    a, b = first.bearings[indices[:, 0]], second.bearings[indices[:, 1]]
+    evidence = _Evidence(a, b, match_priors(matches.ratio[:count]), noise_of(first, second), axes)
+    found = _search_hypotheses(evidence, np.random.default_rng(seed))
     if not found:
-        empty = np.empty((0, 2), np.int64)
         no_match = f"only {count} features match"
-        return RelativePose(np.eye(3), np.array((0.0, 0, 1)), empty, 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, no_match)
-
-    def measure(ranked: list[Hypothesis]) -> _Evidence:
-        """The evidence for the first hypothesis."""
-        best = ranked[0]
-        places = min(_count_places(x, best.probability) for x in (a, b))
-        return _Evidence(places, best.score, best.score - ranked[1].score if len(ranked) > 1 else best.score)
-
-    evidence, confirmations = measure(found), int(axes.confirms(found[0].rotation))
-    if _find_problem(evidence, confirmations) is not None and found[0].score >= _NEEDED[2].score:
-        found = found[:_ALTERNATIVES]
-        on_floor = [agree_on_floor(h) for h in found]
-        found = [replace(h, score=h.score + _FLOOR_SCORE * floor) for h, floor in zip(found, on_floor, strict=True)]
-        order = sorted(range(len(found)), key=lambda n: -found[n].score)
-        found = [found[n] for n in order]
-        evidence, confirmations = measure(found), int(axes.confirms(found[0].rotation)) + on_floor[order[0]]
-    best = found[0]
+        return RelativePose(
+            np.eye(3), np.array((0.0, 0, 1)), indices[:0], 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, no_match
+        )
+    best, support, confirmations = _choose_confirmed(found, evidence, agree_on_floor)
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
-    polished = np.flatnonzero(right)[:_MAX_POLISHED]
-    rotation, translation, uncertainty = polish_pose(
-        a[polished], b[polished], best.rotation, best.translation, noise, axes
+    used = np.flatnonzero(right)[:_MAX_POLISHED]
+    rotation, translation, deviations = polish_pose(
+        a[used], b[used], best.rotation, best.translation, evidence.noise, axes
     )
-    uncertainty = _calibrate(uncertainty, evidence.places)
-    problem = _find_problem(evidence, confirmations)
-    if spread < _MIN_PARALLAX * noise and right.sum() >= _NEEDED[2].places:
+    uncertainty = _calibrate(deviations, support.places)
+    problem = _find_problem(support, confirmations)
+    if spread < _MIN_PARALLAX * evidence.noise and right.sum() >= _NEEDED[2].places:
         problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
     elif problem is None and uncertainty[1] > _MAX_UNCERTAINTY:
         problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
     return RelativePose(
-        rotation,
-        translation,
-        matches.indices[:count][right],
-        best.score,
-        evidence.margin,
-        evidence.places,
-        spread,
-        uncertainty,
-        problem,
+        rotation, translation, indices[right], best.score, support.margin, support.places, spread, uncertainty, problem
     )
 
 
-def _find_problem(evidence: _Evidence, confirmations: int) -> str | None:
-    """Why the evidence for a pose does not suffice; None if it does."""
+def _choose_confirmed(
+    found: list[Hypothesis], evidence: _Evidence, agree_on_floor: Callable[[Hypothesis], bool]
+) -> tuple[Hypothesis, _Support, int]:
+    """The best hypothesis, its support, and how many of walls and floor confirm it.
+
+    The floor is compared only if matches and walls do not suffice; it can change the order of the hypotheses.
+    """
+
+    def measure(ranked: list[Hypothesis]) -> _Support:
+        best = ranked[0]
+        places = min(_count_places(x, best.probability) for x in (evidence.a, evidence.b))
+        return _Support(places, best.score, best.score - ranked[1].score if len(ranked) > 1 else best.score)
+
+    support, confirmations = measure(found), int(evidence.axes.confirms(found[0].rotation))
+    if _find_problem(support, confirmations) is None or found[0].score < _NEEDED[2].score:
+        return found[0], support, confirmations
+    found = found[:_ALTERNATIVES]
+    on_floor = [agree_on_floor(h) for h in found]
+    found = [replace(h, score=h.score + _FLOOR_SCORE * floor) for h, floor in zip(found, on_floor, strict=True)]
+    order = sorted(range(len(found)), key=lambda n: -found[n].score)
+    found = [found[n] for n in order]
+    return found[0], measure(found), int(evidence.axes.confirms(found[0].rotation)) + on_floor[order[0]]
+
+
+def _find_problem(support: _Support, confirmations: int) -> str | None:
+    """Why the support of a pose does not suffice; None if it does."""
     needed = min(
         _NEEDED[: confirmations + 1],
-        key=lambda n: (evidence.places < n.places) + (evidence.score < n.score) + (evidence.margin < n.margin),
+        key=lambda n: (support.places < n.places) + (support.score < n.score) + (support.margin < n.margin),
     )
     unconfirmed = ("", ", as only walls or floor confirm the pose", ", as neither walls nor floor confirm the pose")
-    if evidence.places < needed.places:
-        reason = f"{evidence.places:.0f} places match, {needed.places:.0f} are needed"
-    elif evidence.score < needed.score:
-        reason = f"the matches have a score of {evidence.score:.0f}, {needed.score:.0f} is needed"
-    elif evidence.margin < needed.margin:
+    if support.places < needed.places:
+        reason = f"{support.places:.0f} places match, {needed.places:.0f} are needed"
+    elif support.score < needed.score:
+        reason = f"the matches have a score of {support.score:.0f}, {needed.score:.0f} is needed"
+    elif support.margin < needed.margin:
         return (
-            f"another pose fits as well (difference of the scores {evidence.margin:.1f}, {needed.margin:.0f} is needed"
+            f"another pose fits as well (difference of the scores {support.margin:.1f}, {needed.margin:.0f} is needed"
             f"{unconfirmed[2 - confirmations]})"
         )
     else:
@@ -563,7 +580,8 @@ def polish_relative_pose(
                 return relation
     rotation, translation, uncertainty = polish_pose(a, b, rotation, translation, noise, axes, weigh)
     # A tour has a robust loss, and needs as many points as possible that several panoramas see.
-    agreeing = evaluate(*every, match_priors(matches.ratio), rotation, translation, noise_of(first, second), axes)
+    evidence = _Evidence(*every, match_priors(matches.ratio), noise_of(first, second), axes)
+    agreeing = evidence.evaluate(rotation, translation)
     return replace(
         relation,
         rotation=rotation,
