@@ -40,7 +40,6 @@ class Tour:
     Attributes:
         placed: indices of the panoramas that have a pose.
         poses: cam2world of the placed panoramas, in that order.
-        points: of the scene.
         depths: distances of the points from the cameras that observe them.
         angles: residuals of these observations, radians.
         rejected: pairs that contradict the others.
@@ -49,7 +48,6 @@ class Tour:
 
     placed: tuple[int, ...]
     poses: Float[Array, "placed 4 4"]
-    points: Float[Array, "point 3"]
     depths: Float[Array, "observation"]
     angles: Float[Array, "observation"]
     rejected: tuple[Pair, ...]
@@ -78,12 +76,12 @@ def build_tour(
     count = len(features)
     if not reliable:
         return Tour(
-            (), np.empty((0, 4, 4)), np.empty((0, 3)), np.empty(0), np.empty(0), rejected,
+            (), np.empty((0, 4, 4)), np.empty(0), np.empty(0), rejected,
             {view: _describe_failure(view, relations, rejected) for view in range(count)},
         )  # fmt: skip
-    observations = _make_tracks(features, reliable)
-    problem, placed = _grow(observations, reliable, downs, noise, floor_height)
-    problem = _add_distances(problem, placed, reliable, floor_height)
+    growing = _GrowingTour(_make_tracks(features, reliable), reliable, downs, noise, floor_height)
+    growing.grow()
+    problem, placed = growing.with_distances(), growing.placed
     for _ in range(_ROUNDS if len(placed) > 2 else 1):
         if len(placed) > 2:
             problem = adjust(problem, noise)
@@ -91,11 +89,9 @@ def build_tour(
     poses = np.tile(np.eye(4), (len(placed), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = problem.rotations, problem.centres
     order = np.argsort(placed)
-    finite = np.abs(problem.points[:, 3]) > 1e-6
     return Tour(
         tuple(int(placed[i]) for i in order),
         poses[order],
-        problem.points[finite, :3] / problem.points[finite, 3:],
         point_depths(problem),
         residual_angles(problem),
         rejected,
@@ -154,7 +150,6 @@ class _Observations:
     view: Int[Array, "observation"]
     track: Int[Array, "observation"]
     bearing: Float[Array, "observation 3"]
-    track_of: dict[tuple[int, int], int]
 
 
 def _make_tracks(features: Sequence[Features], relations: Mapping[Pair, RelativePose]) -> _Observations:
@@ -176,199 +171,169 @@ def _make_tracks(features: Sequence[Features], relations: Mapping[Pair, Relative
     kept = ~ambiguous[track]
     nodes, view, track = nodes[kept], view[kept], track[kept]
     bearings = np.concatenate([f.bearings for f in features])[nodes]
-    track_of = {(int(v), int(n - starts[v])): int(t) for v, n, t in zip(view, nodes, track, strict=True)}
-    return _Observations(view, track, bearings, track_of)
+    return _Observations(view, track, bearings)
 
 
-def _grow(
-    observations: _Observations,
-    relations: Mapping[Pair, RelativePose],
-    downs: Array,
-    noise: float,
-    floor_height: FloorHeight,
-) -> tuple[Problem, list[int]]:
-    """Place panoramas one after another; returns the problem of the placed ones in the order of placing."""
-    start = max(relations, key=lambda p: relations[p].score * min(1.0, relations[p].parallax / math.radians(5)))
-    first = relations[start]
-    placed = list(start)
-    rotations = [np.eye(3), first.rotation.T]
-    centres = [np.zeros(3), -first.rotation.T @ first.translation]
-    failed: set[int] = set()
-    tried: set[int] = set()  # to be placed by the floor
-    problem = _make_problem(observations, placed, rotations, centres, downs)
-    while True:
-        candidates = {}
-        for (i, j), relation in relations.items():
-            for inside, outside in ((i, j), (j, i)):
-                if inside in placed and outside not in placed and outside not in failed:
-                    candidates[outside] = candidates.get(outside, 0.0) + relation.score
-        if candidates:
-            view = max(candidates, key=lambda v: candidates[v])
-            pose = _place(view, placed, problem, observations, relations)
-        else:  # no points determine the distance of any further panorama
-            left = failed - tried
-            if not left:
-                return problem, placed
-            view = min(left)
-            tried.add(view)
-            pose = _place_by_floor(view, placed, problem, relations, floor_height)
-        if pose is None:
-            failed.add(view)
-            continue
-        failed.clear()
-        placed.append(view)
-        rotations, centres = [*problem.rotations, pose[0]], [*problem.centres, pose[1]]
-        problem = _make_problem(observations, placed, rotations, centres, downs)
-        problem = adjust(problem, noise, steps=6)
+class _GrowingTour:
+    """Panoramas that are placed one after another; the first one is the world.
 
-
-def _make_problem(
-    observations: _Observations,
-    placed: Sequence[int],
-    rotations: Sequence[Array],
-    centres: Sequence[Array],
-    downs: Array,
-) -> Problem:
-    """Triangulate the tracks that two or more placed panoramas see."""
-    position = np.full(len(downs), -1)
-    position[list(placed)] = np.arange(len(placed))
-    kept = position[observations.view] >= 0
-    counts = np.bincount(observations.track[kept], minlength=int(observations.track.max(initial=0)) + 1)
-    kept &= counts[observations.track] >= 2
-    tracks, point = np.unique(observations.track[kept], return_inverse=True)
-    camera, bearing = position[observations.view[kept]], observations.bearing[kept]
-    rotation, centre = np.stack(rotations), np.stack(centres)
-    points = triangulate(rotation, centre, camera, point.reshape(-1), bearing, len(tracks))
-    axes = downs[list(placed)]
-    world = np.einsum("nij,nj->ni", rotation, axes)
-    known = np.isfinite(world).all(axis=1)
-    down = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
-    return Problem(rotation, centre, points, camera, point.reshape(-1), bearing, axes, down / np.linalg.norm(down))
-
-
-def _place(
-    view: int,
-    placed: Sequence[int],
-    problem: Problem,
-    observations: _Observations,
-    relations: Mapping[Pair, RelativePose],
-) -> tuple[Float[Array, "3 3"], Float[Array, "3"]] | None:
-    """The pose of a new panorama by the relation to a placed one that most known points support."""
-    known = _known_points(placed, problem, observations)
-    own = observations.view == view
-    tracks = observations.track[own]
-    shared = np.isin(tracks, list(known))
-    bearings = observations.bearing[own][shared]
-    points = np.array([known[t] for t in tracks[shared]]).reshape(-1, 3)
-    best, most = None, float(_MIN_SHARED) - 0.5
-    for position, other in enumerate(placed):
-        relation = relations.get((other, view)) or relations.get((view, other))
-        if relation is None:
-            continue
-        world, direction = _turn_to(problem.rotations[position], relation, (other, view) in relations)
-        scales = _scales(points, bearings, problem.centres[position], world, direction)
-        for scale in np.unique(np.quantile(scales, np.linspace(0.1, 0.9, 17))) if len(scales) else ():
-            centre = problem.centres[position] + scale * direction
-            toward = points - centre
-            cosine = np.einsum("ij,nj,ni->n", world, bearings, toward) / np.maximum(
-                np.linalg.norm(toward, axis=1), 1e-12
-            )
-            support = float(np.exp(-0.5 * (np.arccos(np.clip(cosine, -1, 1)) / math.radians(1.0)) ** 2).sum())
-            if support > most:
-                best, most = (world, centre), support
-    return best
-
-
-def _turn_to(placed: Array, relation: RelativePose, is_first: bool) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
-    """Rotation of the other camera of a relation, and the direction to it from the placed one, in the world.
-
-    Args:
-        placed: rotation of the placed camera.
-        is_first: whether the placed camera is the first one of the relation.
+    Attributes:
+        placed: panoramas in the order of placing; cameras of the problem.
+        problem: their poses, and the points that two or more of them see.
+        tracks: of the problem's points.
     """
-    rotation, translation = relation.rotation, relation.translation
-    if not is_first:
-        rotation, translation = rotation.T, -rotation.T @ translation
-    world = placed @ rotation.T
-    return world, -world @ translation
 
+    def __init__(
+        self,
+        observations: _Observations,
+        relations: Mapping[Pair, RelativePose],
+        downs: Float[Array, "view 3"],
+        noise: float,
+        floor_height: FloorHeight,
+    ) -> None:
+        self._observations, self._relations, self._downs = observations, relations, downs
+        self._noise, self._floor_height = noise, floor_height
+        start = max(relations, key=lambda p: relations[p].score * min(1.0, relations[p].parallax / math.radians(5)))
+        first = relations[start]
+        self.placed = list(start)
+        self._triangulate([np.eye(3), first.rotation.T], [np.zeros(3), -first.rotation.T @ first.translation])
 
-def _place_by_floor(
-    view: int,
-    placed: Sequence[int],
-    problem: Problem,
-    relations: Mapping[Pair, RelativePose],
-    floor_height: FloorHeight,
-) -> tuple[Float[Array, "3 3"], Float[Array, "3"]] | None:
-    """The pose of a new panorama by its best relation to a placed one, and a distance by the height over the floor.
+    def grow(self) -> None:
+        """Place all panoramas that can be placed."""
+        failed: set[int] = set()
+        tried: set[int] = set()  # to be placed by the floor
+        while True:
+            candidates: dict[int, float] = {}
+            for (i, j), relation in self._relations.items():
+                for inside, outside in ((i, j), (j, i)):
+                    if inside in self.placed and outside not in self.placed and outside not in failed:
+                        candidates[outside] = candidates.get(outside, 0.0) + relation.score
+            if candidates:
+                view = max(candidates, key=lambda v: candidates[v])
+                pose = self._place_by_points(view)
+            else:  # no points determine the distance of any further panorama
+                left = failed - tried
+                if not left:
+                    return
+                view = min(left)
+                tried.add(view)
+                pose = self._place_by_floor(view)
+            if pose is None:
+                failed.add(view)
+                continue
+            failed.clear()
+            self.placed.append(view)
+            self._triangulate([*self.problem.rotations, pose[0]], [*self.problem.centres, pose[1]])
+            self.problem = adjust(self.problem, self._noise, steps=6)
 
-    The cameras of a tour have one height: it is the unit in which floors give the distances of pairs.
-    """
-    own = [pair for pair in relations if view in pair and (set(pair) - {view}) <= set(placed)]
-    if not own:
-        return None
-    pair = max(own, key=lambda p: relations[p].score)
-    relative = floor_height(pair)
-    if relative is None:
-        return None
-    height = _measure_height(placed, problem, relations, floor_height)
-    if height is None:
-        return None
-    other = placed.index(pair[0] if pair[1] == view else pair[1])
-    world, direction = _turn_to(problem.rotations[other], relations[pair], pair[1] == view)
-    return world, problem.centres[other] + height / relative * direction
+    def with_distances(self) -> Problem:
+        """The problem with distances by the floor for panoramas that few points connect to two others.
 
+        Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
+        """
+        problem, placed = self.problem, self.placed
+        counts = np.bincount(problem.point)
+        joint = np.bincount(problem.camera[counts[problem.point] > 2], minlength=len(placed))
+        weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
+        pairs = [pair for pair in self._relations if weak & set(pair) and set(pair) <= set(placed)]
+        height = self._measure_height() if pairs and len(placed) > 2 else None
+        if height is None:
+            return problem
+        relative = {pair: self._floor_height(pair) for pair in pairs}
+        known = {pair: height / value for pair, value in relative.items() if value is not None}
+        numbers = np.array([[placed.index(view) for view in pair] for pair in known]).reshape(-1, 2)
+        return replace(problem, pairs=numbers, distances=np.array(list(known.values())))
 
-def _measure_height(
-    placed: Sequence[int], problem: Problem, relations: Mapping[Pair, RelativePose], floor_height: FloorHeight
-) -> float | None:
-    """Height of the cameras over the floor in the tour's unit, by the best pairs; None without a floor."""
-    heights: list[float] = []
-    for i, j in sorted(relations, key=lambda p: -relations[p].score):
-        if i in placed and j in placed and len(heights) < _FLOOR_PAIRS:
-            height = floor_height((i, j))
-            if height is not None:
-                ends = problem.centres[placed.index(i)], problem.centres[placed.index(j)]
-                heights.append(height * float(np.linalg.norm(ends[0] - ends[1])))
-    return float(np.median(heights)) if heights else None
+    def _triangulate(self, rotations: Sequence[Array], centres: Sequence[Array]) -> None:
+        """Make the problem of the placed panoramas at these poses."""
+        observations = self._observations
+        position = np.full(len(self._downs), -1)
+        position[self.placed] = np.arange(len(self.placed))
+        kept = position[observations.view] >= 0
+        counts = np.bincount(observations.track[kept], minlength=int(observations.track.max(initial=0)) + 1)
+        kept &= counts[observations.track] >= 2
+        self.tracks, point = np.unique(observations.track[kept], return_inverse=True)
+        point, camera, bearing = point.reshape(-1), position[observations.view[kept]], observations.bearing[kept]
+        rotation, centre = np.stack(rotations), np.stack(centres)
+        points = triangulate(rotation, centre, camera, point, bearing, len(self.tracks))
+        axes = self._downs[self.placed]
+        world = np.einsum("nij,nj->ni", rotation, axes)
+        known = np.isfinite(world).all(axis=1)
+        down = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
+        self.problem = Problem(rotation, centre, points, camera, point, bearing, axes, down / np.linalg.norm(down))
 
+    def _place_by_points(self, view: int) -> tuple[Float[Array, "3 3"], Float[Array, "3"]] | None:
+        """The pose of a new panorama by the relation to a placed one that most known points support."""
+        known = self._known_points()
+        own = self._observations.view == view
+        tracks = self._observations.track[own]
+        shared = np.isin(tracks, list(known))
+        bearings = self._observations.bearing[own][shared]
+        points = np.array([known[t] for t in tracks[shared]]).reshape(-1, 3)
+        best, most = None, float(_MIN_SHARED) - 0.5
+        for other, origin in zip(self.placed, self.problem.centres, strict=True):
+            if (other, view) not in self._relations and (view, other) not in self._relations:
+                continue
+            world, direction = self._turn_from(other, view)
+            scales = _scales(points, bearings, origin, world, direction)
+            for scale in np.unique(np.quantile(scales, np.linspace(0.1, 0.9, 17))) if len(scales) else ():
+                centre = origin + scale * direction
+                toward = points - centre
+                distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
+                cosine = np.einsum("ij,nj,ni->n", world, bearings, toward) / distance
+                support = float(np.exp(-0.5 * (np.arccos(np.clip(cosine, -1, 1)) / math.radians(1.0)) ** 2).sum())
+                if support > most:
+                    best, most = (world, centre), support
+        return best
 
-def _add_distances(
-    problem: Problem, placed: Sequence[int], relations: Mapping[Pair, RelativePose], floor_height: FloorHeight
-) -> Problem:
-    """The problem with distances by the floor for panoramas that few points connect to two others.
+    def _known_points(self) -> dict[int, Float[Array, "3"]]:
+        """World positions of the tracks that the placed panoramas see with enough parallax."""
+        points, w = self.problem.points[:, :3], self.problem.points[:, 3:]
+        centres = self.problem.centres
+        baseline = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+        nearest = np.full(len(points), np.inf)
+        np.minimum.at(nearest, self.problem.point, point_depths(self.problem))
+        usable = (nearest * _MIN_PARALLAX < baseline) & (np.abs(w[:, 0]) > 1e-9)
+        return {int(t): points[n] / w[n] for n, t in enumerate(self.tracks) if usable[n]}
 
-    Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
-    """
-    counts = np.bincount(problem.point)
-    joint = np.bincount(problem.camera[counts[problem.point] > 2], minlength=len(placed))
-    weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
-    pairs = [pair for pair in relations if weak & set(pair) and set(pair) <= set(placed)]
-    height = _measure_height(placed, problem, relations, floor_height) if pairs and len(placed) > 2 else None
-    if height is None:
-        return problem
-    relative = {pair: floor_height(pair) for pair in pairs}
-    known = {pair: height / value for pair, value in relative.items() if value is not None}
-    numbers = np.array([[placed.index(view) for view in pair] for pair in known]).reshape(-1, 2)
-    return replace(problem, pairs=numbers, distances=np.array(list(known.values())))
+    def _turn_from(self, other: int, view: int) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+        """World rotation of a panorama by its relation to a placed one, and the direction from that one to it."""
+        if (other, view) in self._relations:
+            relation = self._relations[other, view]
+            rotation, translation = relation.rotation, relation.translation
+        else:
+            relation = self._relations[view, other]
+            rotation, translation = relation.rotation.T, -relation.rotation.T @ relation.translation
+        world = self.problem.rotations[self.placed.index(other)] @ rotation.T
+        return world, -world @ translation
 
+    def _place_by_floor(self, view: int) -> tuple[Float[Array, "3 3"], Float[Array, "3"]] | None:
+        """The pose of a new panorama by its best relation to a placed one, and a distance by the height over the floor.
 
-def _known_points(placed: Sequence[int], problem: Problem, observations: _Observations) -> dict[int, Float[Array, "3"]]:
-    """World positions of the tracks that the placed panoramas see with enough parallax."""
-    position = np.full(int(observations.view.max()) + 1, -1)
-    inside = [view for view in placed if view < len(position)]
-    position[inside] = [list(placed).index(view) for view in inside]
-    kept = position[observations.view] >= 0
-    counts = np.bincount(observations.track[kept], minlength=int(observations.track.max()) + 1)
-    kept &= counts[observations.track] >= 2
-    tracks = np.unique(observations.track[kept])
-    points, w = problem.points[:, :3], problem.points[:, 3:]
-    depth = point_depths(problem)
-    baseline = np.linalg.norm(problem.centres - problem.centres.mean(axis=0), axis=1).max()
-    nearest = np.full(len(points), np.inf)
-    np.minimum.at(nearest, problem.point, depth)
-    usable = (nearest * _MIN_PARALLAX < baseline) & (np.abs(w[:, 0]) > 1e-9)
-    return {int(t): points[n] / w[n] for n, t in enumerate(tracks) if usable[n]}
+        The cameras of a tour have one height: it is the unit in which floors give the distances of pairs.
+        """
+        own = [pair for pair in self._relations if view in pair and (set(pair) - {view}) <= set(self.placed)]
+        if not own:
+            return None
+        pair = max(own, key=lambda p: self._relations[p].score)
+        relative = self._floor_height(pair)
+        height = None if relative is None else self._measure_height()
+        if relative is None or height is None:
+            return None
+        other = pair[0] if pair[1] == view else pair[1]
+        world, direction = self._turn_from(other, view)
+        return world, self.problem.centres[self.placed.index(other)] + height / relative * direction
+
+    def _measure_height(self) -> float | None:
+        """Height of the cameras over the floor in the tour's unit, by the best pairs; None without a floor."""
+        heights: list[float] = []
+        for i, j in sorted(self._relations, key=lambda p: -self._relations[p].score):
+            if i in self.placed and j in self.placed and len(heights) < _FLOOR_PAIRS:
+                height = self._floor_height((i, j))
+                if height is not None:
+                    first, second = (self.problem.centres[self.placed.index(view)] for view in (i, j))
+                    heights.append(height * float(np.linalg.norm(first - second)))
+        return float(np.median(heights)) if heights else None
 
 
 def _scales(points: Array, bearings: Array, origin: Array, rotation: Array, direction: Array) -> Float[Array, "n"]:
