@@ -27,12 +27,12 @@ _FIRST_TOLERANCE = math.radians(3)
 _SEARCH_TOLERANCE = math.radians(1.5)
 _LARGEST_TILT = math.radians(20)  # of the camera
 _MIN_SUPPORT, _MIN_CONTRAST = 12, 2.5  # segments of an axis, also relative to the number by chance
-_PARALLEL = 0.9  # cosine between axes that do not give a third one
+_LARGEST_COSINE = 0.9  # between two axes that give a third one
 _LONG = math.radians(10)  # segments whose scatter measures the noise of the axes: pixels hardly matter
 _LEAST_NOISE, _LARGEST_NOISE = math.radians(0.03), math.radians(0.26)  # of the normals of long segments
 _TILT_NOISE, _YAW_NOISE = 0.8, 1.35  # of the relative rotation about horizontal axes and gravity, in this noise
 _LARGEST_RESIDUAL = 7.0  # of a rotation that the axes are taken to determine, in the noise's unit
-_PARALLEL = math.radians(1.8)  # difference of parallel axes
+_LARGEST_DIFFERENCE = math.radians(1.8)  # of axes that count as parallel
 _COMPASS_NOISE, _COMPASS_SHARE = math.radians(20), 0.6  # of headings; their prior probability to be right
 _AGREEMENT = 0.9, 0.06  # prior probability of axes of one building, and of upright cameras in different ones
 
@@ -141,7 +141,7 @@ def with_hints(axes: SceneAxes, down: Float[Array, "3"] | None, heading: float |
     """The axes with gravity and compass by the metadata, where the picture does not determine gravity itself."""
     if axes.has_down or down is None:
         return replace(axes, heading=heading)
-    level = axes.axes[2] if abs(down @ axes.axes[2]) < _PARALLEL else axes.axes[0]
+    level = axes.axes[2] if abs(down @ axes.axes[2]) < _LARGEST_COSINE else axes.axes[0]
     wall = np.cross(down, level)
     wall /= np.linalg.norm(wall)
     return SceneAxes(np.stack((down, wall, np.cross(down, wall))), True, False, heading=heading)
@@ -209,7 +209,7 @@ class RotationPrior:
         if not self.has_walls:
             return False
         options = relative_rotations(self.first, self.second)
-        return min(float(rotation_angle(option.T @ rotation)) for option in options) < _PARALLEL
+        return min(float(rotation_angle(option.T @ rotation)) for option in options) < _LARGEST_DIFFERENCE
 
     def score(self, rotation: Float[Array, "3 3"]) -> float:
         """Logarithm of the rotation's probability density under the prior, over that of a random rotation."""
