@@ -16,8 +16,9 @@ Source: Hirschmueller, doi:10.1109/TPAMI.2007.1166, generalised from fronto-para
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from typing import NamedTuple
 
 import cv2
@@ -28,7 +29,6 @@ from pansplat.geometry.equirect import row_weights
 from pansplat.sweep.surface import pad_sphere, ray_grid
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
-_OPPOSED = (np.float32(0.2), np.float32(-0.5))  # cosines between rays at which the penalty starts and is full
 _BLOCK = 8  # hypotheses that a thread processes together
 
 
@@ -67,16 +67,11 @@ class MatchingConfig:
     distance_penalty: float = 0.5
     """Penalty for an infinite ratio: half the view shrinks to a few pixels, which match everything."""
     opposed_penalty: float = 0.5
-    """For a sphere where the rays to a point meet at 120 degrees or more, falling to zero at 78: the cameras would see
-    opposite sides of the surface."""
-
-
-_WEIGHTS = (
-    "correlation_weight", "color_weight", "color_truncation", "variance_epsilon", "free_space_penalty",
-    "consistency_bonus", "occluded_cost", "tolerance", "outside_penalty",
-    "textureless_weight", "textureless_cost", "texture_variance", "distance_ratio", "distance_penalty",
-    "opposed_penalty", "back_facing_cost",
-)  # fmt: skip  # the order in which the kernel unpacks them
+    """For a sphere where the rays to a point are opposed: the cameras would see opposite sides of the surface."""
+    opposed_from: float = 0.2
+    """Cosine between the rays (78 degrees) at which this penalty starts."""
+    opposed_to: float = -0.5
+    """Cosine (120 degrees) at which it is full."""
 
 
 @nb.njit(fastmath=True, inline="always")
@@ -96,7 +91,7 @@ def _fast_atan2(y, x):
     return -r if y < 0 else r
 
 
-@nb.njit(fastmath=True, nogil=True, cache=True)
+@nb.njit(fastmath=True, nogil=True, cache=True, error_model="numpy")
 def _project_row(rays, rotation, translation, inverse, height, width, u, v, scale, cosine):
     """For one row: padded pixel coordinates in the other view, ratio of inverse depths, cosine between the two rays."""
     for j in range(rays.shape[0]):
@@ -167,100 +162,183 @@ def _pad_in_place(padded, m):
                 padded[i, j] = padded[source, m + (j - m + shift) % width]
 
 
-@nb.njit(parallel=True, fastmath=True, cache=True)
-def _compute_set_cost(
-    image, gray, mean, variance, other, rays, rotation, translation, base, step, limits, penalty, back_facing, sphere,
-    side, down, floor_ceiling, valid, other_valid, other_inverse, has_surface, weights, m,
-    cost, offset, count,
-):  # fmt: skip
-    height, width = image.shape[:2]
-    low, high = limits
-    correlation_weight, color_weight, color_truncation, epsilon, free_space_penalty = weights[:5]
-    consistency_bonus, occluded_cost, tolerance, outside_penalty = weights[5:9]
-    textureless_weight, textureless_cost, texture_variance, distance_ratio, distance_penalty = weights[9:14]
-    opposed_penalty, back_facing_cost = weights[14:]
-    opposed_from, opposed_to = _OPPOSED
-    if not sphere:
-        opposed_penalty = np.float32(0)
-    neutral = np.float32(0.5) * (correlation_weight + color_weight)
-    impossible = np.float32(2) * (correlation_weight + color_weight)
+# Arguments of the kernels; numba compiles a named tuple's fields as separate variables.
+_Weights = namedtuple("_Weights", [field.name for field in fields(MatchingConfig) if field.name != "window"])
+
+
+class _Matched(NamedTuple):
+    """The view that is matched: its image, rays and masks, and the grey values of its windows.
+
+    `gray` (h + 2m, w + 2m) is padded by half a window; `mean` and `variance` (h, w) are those of the windows.
+    """
+
+    image: np.ndarray
+    valid: np.ndarray
+    down: np.ndarray
+    rays: np.ndarray
+    gray: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+
+
+class _Other(NamedTuple):
+    """The view that is warped. Its image is padded by one pixel; without a surface the inverse depth has no meaning."""
+
+    image: np.ndarray
+    valid: np.ndarray
+    inverse_depth: np.ndarray
+    has_surface: bool
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+class _Set(NamedTuple):
+    """The maps of a `HypothesisSet`."""
+
+    base: np.ndarray
+    step: np.ndarray
+    penalty: np.ndarray
+    side: np.ndarray
+    back_facing: np.ndarray
+
+
+class _Bounds(NamedTuple):
+    """Limits of inverse depth, and the extent of the scene below and above (negative) the camera."""
+
+    low: np.float32
+    high: np.float32
+    floor: np.float32
+    ceiling: np.float32
+
+
+class _Warped(NamedTuple):
+    """The other view, warped by one hypothesis.
+
+    `gray` is padded; `color_cost` is in [0, 1]; `ratio` is the inverse depth over that of the other view's surface;
+    `penalty` grows with unequal distances and opposed rays.
+    """
+
+    gray: np.ndarray
+    color_cost: np.ndarray
+    state: np.ndarray
+    ratio: np.ndarray
+    penalty: np.ndarray
+
+
+_MATCHED, _OUT_OF_RANGE, _MASKED = 0, 1, 2  # states of a warped pixel
+
+
+@nb.njit(fastmath=True, forceinline=True, error_model="numpy")
+def _warp(k, view, other, hypotheses, bounds, weights, row, warped):
+    """Warp the other view by hypothesis `k`; `row` (5, w) is scratch."""
+    height, width = view.mean.shape
+    image, rays, base, step = view.image, view.rays, hypotheses.base, hypotheses.step
+    there, valid, inverse_there = other.image, other.valid, other.inverse_depth
+    gray, color_cost, state, ratio, penalty = warped
+    m = (gray.shape[0] - height) // 2
+    inverse, u, v, scale, cosine = row[0], row[1], row[2], row[3], row[4]
+    for i in range(height):
+        for j in range(width):
+            inverse[j] = base[i, j] + np.float32(k) * step[i, j]
+        _project_row(rays[i], other.rotation, other.translation, inverse, height, width, u, v, scale, cosine)
+        for j in range(width):
+            iu = min(max(int(u[j]), 0), width)
+            iv = min(max(int(v[j]), 0), height)
+            fu, fv = u[j] - iu, v[j] - iv
+            w00, w01 = (1 - fu) * (1 - fv), fu * (1 - fv)
+            w10, w11 = (1 - fu) * fv, fu * fv
+            r = w00 * there[iv, iu, 0] + w01 * there[iv, iu + 1, 0]
+            r += w10 * there[iv + 1, iu, 0] + w11 * there[iv + 1, iu + 1, 0]
+            g = w00 * there[iv, iu, 1] + w01 * there[iv, iu + 1, 1]
+            g += w10 * there[iv + 1, iu, 1] + w11 * there[iv + 1, iu + 1, 1]
+            b = w00 * there[iv, iu, 2] + w01 * there[iv, iu + 1, 2]
+            b += w10 * there[iv + 1, iu, 2] + w11 * there[iv + 1, iu + 1, 2]
+            gray[i + m, j + m] = np.float32(0.299) * r + np.float32(0.587) * g + np.float32(0.114) * b
+            difference = abs(image[i, j, 0] - r) + abs(image[i, j, 1] - g) + abs(image[i, j, 2] - b)
+            truncation = weights.color_truncation
+            color_cost[i, j] = min(difference * np.float32(1 / 3), truncation) / truncation
+            row_there = min(max(int(v[j] - np.float32(0.5)), 0), height - 1)
+            column_there = int(u[j] - np.float32(0.5)) % width
+            in_range = bounds.low <= inverse[j] <= bounds.high
+            state[i, j] = (_MATCHED if valid[row_there, column_there] else _MASKED) if in_range else _OUT_OF_RANGE
+            if other.has_surface:
+                ratio[i, j] = inverse[j] * scale[j] / inverse_there[row_there, column_there]
+            excess = max(1 - weights.distance_ratio * min(scale[j], 1 / scale[j]), np.float32(0))
+            opposed = (weights.opposed_from - cosine[j]) / (weights.opposed_from - weights.opposed_to)
+            penalty[i, j] = weights.distance_penalty * excess
+            penalty[i, j] += weights.opposed_penalty * min(max(opposed, np.float32(0)), np.float32(1))
+
+
+@nb.njit(fastmath=True, forceinline=True, error_model="numpy")
+def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m, result, slot):
+    """Write the cost of hypothesis `k` to `result[..., slot]`; `sums` are those of `_window_sums`."""
+    height, width = view.mean.shape
+    own_mean, own_variance, valid, down = view.mean, view.variance, view.valid, view.down
+    base, step, set_penalty, side, back_facing = hypotheses
+    _, color_cost, state, ratio, penalty = warped
+    sum_b, sum_bb, sum_ab = sums
     area = np.float32(1.0 / ((2 * m + 1) * (2 * m + 1)))
+    epsilon = weights.variance_epsilon
+    neutral = np.float32(0.5) * (weights.correlation_weight + weights.color_weight)
+    impossible = np.float32(2) * (weights.correlation_weight + weights.color_weight)
+    for i in range(height):
+        for j in range(width):
+            mean = sum_b[i, j] * area
+            variance = max(sum_bb[i, j] * area - mean * mean, np.float32(0))
+            covariance = sum_ab[i, j] * area - own_mean[i, j] * mean
+            score = (covariance + epsilon) / math.sqrt((own_variance[i, j] + epsilon) * (variance + epsilon))
+            cost = weights.correlation_weight * min(1 - score, np.float32(1))
+            cost += weights.color_weight * color_cost[i, j]
+            textured = own_variance[i, j] / (own_variance[i, j] + weights.texture_variance)
+            textured = weights.textureless_weight + (1 - weights.textureless_weight) * textured
+            cost = textured * cost + (1 - textured) * weights.textureless_cost
+            extra = set_penalty[side[i, j], k] + penalty[i, j]
+            if other.has_surface:
+                if ratio[i, j] > 1 + weights.tolerance:
+                    extra += weights.free_space_penalty
+                elif ratio[i, j] > 1 - weights.tolerance:
+                    extra -= weights.consistency_bonus
+                else:
+                    cost = weights.occluded_cost
+            if back_facing[side[i, j], k]:
+                cost = weights.back_facing_cost
+            if state[i, j] == _MASKED or not valid[i, j]:
+                cost = neutral
+            below = down[i, j] / max(base[i, j] + np.float32(k) * step[i, j], bounds.low)
+            if below > bounds.floor or below < bounds.ceiling:
+                extra += weights.outside_penalty
+            result[i, j, slot] = impossible if state[i, j] == _OUT_OF_RANGE else cost + extra
+
+
+@nb.njit(fastmath=True, nogil=True, cache=True)
+def _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, offset):
+    """Write the costs of the hypotheses from `first` to `last` to `cost` (h, w, labels); the set starts at `offset`."""
+    height, width = view.mean.shape
+    m = (view.gray.shape[0] - height) // 2
+    maps, row = np.empty((6, height, width), np.float32), np.empty((5, width), np.float32)
+    gray, state = np.empty((height + 2 * m, width + 2 * m), np.float32), np.empty((height, width), np.uint8)
+    warped, sums = _Warped(gray, maps[0], state, maps[1], maps[2]), (maps[3], maps[4], maps[5])
+    column = np.empty((3, width + 2 * m), np.float32)
+    result = np.empty((height, width, _BLOCK), np.float32)
+    for k in range(first, last):
+        _warp(k, view, other, hypotheses, bounds, weights, row, warped)
+        _pad_in_place(warped.gray, m)
+        _window_sums(view.gray, warped.gray, m, column[0], column[1], column[2], sums[0], sums[1], sums[2])
+        _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m, result, k - first)
+    for i in range(height):
+        for j in range(width):
+            for k in range(first, last):
+                cost[i, j, offset + k] = result[i, j, k - first]
+
+
+@nb.njit(parallel=True, fastmath=True, cache=True)
+def _compute_set_cost(view, other, hypotheses, bounds, weights, cost, offset):
+    """Write the costs of a set's hypotheses to `cost` (h, w, labels), from label `offset`."""
+    count = hypotheses.penalty.shape[1]
     for block in nb.prange((count + _BLOCK - 1) // _BLOCK):
-        warped = np.empty((height + 2 * m, width + 2 * m), np.float32)
-        difference = np.empty((height, width), np.float32)
-        state = np.empty((height, width), np.uint8)  # 0 matched, 1 out of range, 2 masked in the other view
-        ratio = np.empty((height, width), np.float32)
-        geometry = np.empty((height, width), np.float32)
-        sum_b, sum_bb = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-        sum_ab = np.empty((height, width), np.float32)
-        column = np.empty((3, width + 2 * m), np.float32)
-        u, v, scale = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-        inverse, cosine = np.empty(width, np.float32), np.empty(width, np.float32)
-        result = np.empty((height, width, _BLOCK), np.float32)
         first = block * _BLOCK
         last = min(first + _BLOCK, count)
-        for k in range(first, last):
-            for i in range(height):
-                for j in range(width):
-                    inverse[j] = base[i, j] + np.float32(k) * step[i, j]
-                _project_row(rays[i], rotation, translation, inverse, height, width, u, v, scale, cosine)
-                for j in range(width):
-                    iu = min(max(int(u[j]), 0), width)
-                    iv = min(max(int(v[j]), 0), height)
-                    fu, fv = u[j] - iu, v[j] - iv
-                    w00, w01 = (1 - fu) * (1 - fv), fu * (1 - fv)
-                    w10, w11 = (1 - fu) * fv, fu * fv
-                    r = w00 * other[iv, iu, 0] + w01 * other[iv, iu + 1, 0]
-                    r += w10 * other[iv + 1, iu, 0] + w11 * other[iv + 1, iu + 1, 0]
-                    g = w00 * other[iv, iu, 1] + w01 * other[iv, iu + 1, 1]
-                    g += w10 * other[iv + 1, iu, 1] + w11 * other[iv + 1, iu + 1, 1]
-                    b = w00 * other[iv, iu, 2] + w01 * other[iv, iu + 1, 2]
-                    b += w10 * other[iv + 1, iu, 2] + w11 * other[iv + 1, iu + 1, 2]
-                    warped[i + m, j + m] = np.float32(0.299) * r + np.float32(0.587) * g + np.float32(0.114) * b
-                    d = abs(image[i, j, 0] - r) + abs(image[i, j, 1] - g) + abs(image[i, j, 2] - b)
-                    difference[i, j] = min(d * np.float32(1 / 3), color_truncation) / color_truncation
-                    qi = min(max(int(v[j] - np.float32(0.5)), 0), height - 1)
-                    qj = int(u[j] - np.float32(0.5)) % width
-                    state[i, j] = 1 if inverse[j] < low or inverse[j] > high else (0 if other_valid[qi, qj] else 2)
-                    if has_surface:
-                        ratio[i, j] = inverse[j] * scale[j] / other_inverse[qi, qj]
-                    geometry[i, j] = distance_penalty * max(
-                        1 - distance_ratio * min(scale[j], 1 / scale[j]), np.float32(0)
-                    )
-                    opposed = (opposed_from - cosine[j]) / (opposed_from - opposed_to)
-                    geometry[i, j] += opposed_penalty * min(max(opposed, np.float32(0)), np.float32(1))
-            _pad_in_place(warped, m)
-            _window_sums(gray, warped, m, column[0], column[1], column[2], sum_b, sum_bb, sum_ab)
-            for i in range(height):
-                for j in range(width):
-                    mean_b = sum_b[i, j] * area
-                    var_b = max(sum_bb[i, j] * area - mean_b * mean_b, np.float32(0))
-                    covariance = sum_ab[i, j] * area - mean[i, j] * mean_b
-                    score = (covariance + epsilon) / math.sqrt((variance[i, j] + epsilon) * (var_b + epsilon))
-                    c = correlation_weight * min(1 - score, np.float32(1)) + color_weight * difference[i, j]
-                    textured = variance[i, j] / (variance[i, j] + texture_variance)
-                    textured = textureless_weight + (1 - textureless_weight) * textured
-                    c = textured * c + (1 - textured) * textureless_cost
-                    extra = penalty[side[i, j], k] + geometry[i, j]
-                    if has_surface:
-                        if ratio[i, j] > 1 + tolerance:
-                            extra += free_space_penalty
-                        elif ratio[i, j] > 1 - tolerance:
-                            extra -= consistency_bonus
-                        else:
-                            c = occluded_cost
-                    if back_facing[side[i, j], k]:
-                        c = back_facing_cost
-                    if state[i, j] == 2 or not valid[i, j]:
-                        c = neutral
-                    below = down[i, j] / max(base[i, j] + np.float32(k) * step[i, j], low)
-                    if below > floor_ceiling[0] or below < floor_ceiling[1]:
-                        extra += outside_penalty
-                    result[i, j, k - first] = impossible if state[i, j] == 1 else c + extra
-        for i in range(height):
-            for j in range(width):
-                for k in range(first, last):
-                    cost[i, j, offset + k] = result[i, j, k - first]
+        _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, offset)
 
 
 class DepthRange(NamedTuple):
@@ -351,23 +429,25 @@ def compute_matching_cost(
     mean = np.ascontiguousarray(cv2.boxFilter(gray, -1, window)[inside])
     variance = np.ascontiguousarray(cv2.boxFilter(gray * gray, -1, window)[inside])
     variance = np.maximum(variance - mean * mean, 0)
+    matched = _Matched(view.image, view.valid, view.down, ray_grid(height), gray, mean, variance)
     has_surface = other.inverse_depth is not None
-    other_inverse = other.inverse_depth if has_surface else np.ones((height, width), np.float32)
-    weights = tuple(np.float32(getattr(config, name)) for name in _WEIGHTS)
+    warped = _Other(
+        pad_sphere(other.image, 1),
+        other.valid,
+        other.inverse_depth if has_surface else np.ones((height, width), np.float32),
+        has_surface,
+        np.ascontiguousarray(pose[:3, :3], np.float32),
+        np.ascontiguousarray(pose[:3, 3], np.float32),
+    )
+    bounds = _Bounds(*np.float32((*limits, *floor_ceiling)))
+    weights = _Weights(*(np.float32(getattr(config, name)) for name in _Weights._fields))
     count = sets[0].penalty.shape[1]
     cost = np.empty((height, width, len(sets) * count), np.float32)
-    other_image, rays = pad_sphere(other.image, 1), ray_grid(height)
-    rotation = np.ascontiguousarray(pose[:3, :3], np.float32)
-    translation = np.ascontiguousarray(pose[:3, 3], np.float32)
-    for n, hypotheses in enumerate(sets):
-        back_facing = np.zeros((2, count), bool) if hypotheses.back_facing is None else hypotheses.back_facing
-        _compute_set_cost(
-            view.image, gray, mean, variance, other_image, rays, rotation, translation, hypotheses.base,
-            hypotheses.step, (np.float32(limits[0]), np.float32(limits[1])), hypotheses.penalty, back_facing,
-            hypotheses.sphere, hypotheses.side, view.down,
-            (np.float32(floor_ceiling[0]), np.float32(floor_ceiling[1])), view.valid, other.valid, other_inverse,
-            has_surface, weights, m, cost, n * count, count,
-        )  # fmt: skip
+    for n, own in enumerate(sets):
+        back_facing = np.zeros((2, count), bool) if own.back_facing is None else own.back_facing
+        hypotheses = _Set(own.base, own.step, own.penalty, own.side, back_facing)
+        own_weights = weights if own.sphere else weights._replace(opposed_penalty=np.float32(0))
+        _compute_set_cost(matched, warped, hypotheses, bounds, own_weights, cost, n * count)
     return cost
 
 
@@ -385,99 +465,117 @@ class AggregationConfig:
     """Sum of absolute colour differences that divides the jump penalty by e."""
 
 
+class _Penalties(NamedTuple):
+    """The values of an `AggregationConfig`."""
+
+    step: np.float32
+    crease: np.float32
+    jump: np.float32
+    edge_scale: np.float32
+
+
 @nb.njit(fastmath=True, inline="always")
-def _advance_path(previous, cost, out, step_penalty, crease_penalty, jump_penalty, sets, count, slots, slot_map, a, b):
-    """One step of a path: `out` = cost + lowest path cost so far, less its minimum, so that it stays bounded."""
+def _advance_path(previous, cost, slot_map, step, crease, jump, in_slot, near_slot, current):
+    """One step of a path: `current` = cost + lowest path cost so far, less its minimum, so that it stays bounded.
+
+    Args:
+        previous, current: (labels) path costs of the pixel before and of this pixel.
+        cost: (labels) matching costs.
+        slot_map: (sets, 2) see `aggregate_costs`.
+        step, crease, jump: penalties.
+        in_slot, near_slot: (slots) scratch: the lowest path cost, with a crease, in a depth slot; in it or next to it.
+    """
+    sets, slots = len(slot_map), len(in_slot)
+    count = len(cost) // sets
     lowest = previous[0]
-    for n in range(1, sets * count):
-        lowest = min(lowest, previous[n])
-    cap = lowest + jump_penalty
-    for s in range(slots):
-        a[s] = cap
-    for f in range(sets):
-        slope, start = slot_map[f, 0], slot_map[f, 1]
+    for label in range(1, len(cost)):
+        lowest = min(lowest, previous[label])
+    after_jump = lowest + jump
+    for slot in range(slots):
+        in_slot[slot] = after_jump
+    for n in range(sets):
+        slope, start, first = slot_map[n, 0], slot_map[n, 1], n * count
         for k in range(count):
-            s = int(slope * k + start)
-            if 0 <= s < slots:
-                a[s] = min(a[s], previous[f * count + k] + crease_penalty)
-    b[0] = min(a[0], a[1])
-    b[slots - 1] = min(a[slots - 1], a[slots - 2])
-    for s in range(1, slots - 1):
-        b[s] = min(min(a[s - 1], a[s]), a[s + 1])
-    for f in range(sets):
-        slope, start = slot_map[f, 0], slot_map[f, 1]
-        n0 = f * count
+            slot = int(slope * k + start)
+            if 0 <= slot < slots:
+                in_slot[slot] = min(in_slot[slot], previous[first + k] + crease)
+    near_slot[0] = min(in_slot[0], in_slot[1])
+    near_slot[slots - 1] = min(in_slot[slots - 1], in_slot[slots - 2])
+    for slot in range(1, slots - 1):
+        near_slot[slot] = min(min(in_slot[slot - 1], in_slot[slot]), in_slot[slot + 1])
+    for n in range(sets):
+        slope, start, first = slot_map[n, 0], slot_map[n, 1], n * count
         for k in range(count):
-            best = min(previous[n0 + k], cap)
+            best = min(previous[first + k], after_jump)
             if k > 0:
-                best = min(best, previous[n0 + k - 1] + step_penalty)
+                best = min(best, previous[first + k - 1] + step)
             if k < count - 1:
-                best = min(best, previous[n0 + k + 1] + step_penalty)
-            s = int(slope * k + start)
-            if 0 <= s < slots:
-                best = min(best, b[s])
-            out[n0 + k] = cost[n0 + k] + best - lowest
+                best = min(best, previous[first + k + 1] + step)
+            slot = int(slope * k + start)
+            if 0 <= slot < slots:
+                best = min(best, near_slot[slot])
+            current[first + k] = cost[first + k] + best - lowest
 
 
 @nb.njit(fastmath=True, inline="always")
-def _jump_penalty(guide, i, j, ip, jp, penalty, floor, scale):
-    d = abs(guide[i, j, 0] - guide[ip, jp, 0]) + abs(guide[i, j, 1] - guide[ip, jp, 1])
-    d += abs(guide[i, j, 2] - guide[ip, jp, 2])
-    return max(penalty * math.exp(-d / scale), floor)
+def _jump_penalty(pixel, before, penalties):
+    """Penalty of a jump between two neighbouring pixels of the guide, lower at an edge."""
+    difference = abs(pixel[0] - before[0]) + abs(pixel[1] - before[1])
+    difference += abs(pixel[2] - before[2])
+    floor = penalties.crease * np.float32(1.2)
+    return max(penalties.jump * math.exp(-difference / penalties.edge_scale), floor)
 
 
 @nb.njit(fastmath=True, nogil=True, cache=True)
-def _aggregate_rows(cost, total, guide, slot_map, sets, count, slots, penalties, stretch, dx):
+def _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx):
     """Add the costs of horizontal paths; each starts a full turn early, so that it is closed."""
     height, width, labels = cost.shape
-    step_penalty, crease_penalty, jump_penalty, scale = penalties
     previous, current = np.empty(labels, np.float32), np.empty(labels, np.float32)
-    a, b = np.empty(slots, np.float32), np.empty(slots, np.float32)
+    in_slot, near_slot = np.empty(slots, np.float32), np.empty(slots, np.float32)
     for i in range(height):
         t = stretch[i]  # neighbours near a pole are closer, so penalties are higher
         previous[:] = cost[i, 0]
         for n in range(1, 2 * width):
-            j, jp = (dx * n) % width, (dx * (n - 1)) % width
-            jump = _jump_penalty(guide, i, j, i, jp, jump_penalty, crease_penalty * np.float32(1.2), scale)
+            j, j_before = (dx * n) % width, (dx * (n - 1)) % width
+            jump = _jump_penalty(guide[i, j], guide[i, j_before], penalties)
             _advance_path(
-                previous, cost[i, j], current, step_penalty * t, crease_penalty * t, jump * t,
-                sets, count, slots, slot_map[i, j], a, b,
+                previous, cost[i, j], slot_map[i, j], penalties.step * t, penalties.crease * t, jump * t,
+                in_slot, near_slot, current,
             )  # fmt: skip
             if n >= width:
-                for k in range(labels):
-                    total[i, j, k] += current[k]
+                for label in range(labels):
+                    total[i, j, label] += current[label]
             previous, current = current, previous
 
 
 @nb.njit(fastmath=True, nogil=True, cache=True)
-def _aggregate_columns(cost, total, guide, slot_map, sets, count, slots, penalties, dy, dx, run_up):
+def _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, run_up):
     """Add the costs of vertical or diagonal paths; each starts `run_up` rows early, beyond the pole."""
     height, width, labels = cost.shape
-    step_penalty, crease_penalty, jump_penalty, scale = penalties
     length = np.float32(1.0 if dx == 0 else 1 / math.sqrt(2))
     previous, current = np.empty((width, labels), np.float32), np.empty((width, labels), np.float32)
-    a, b = np.empty(slots, np.float32), np.empty(slots, np.float32)
-    row_before, shift_before = 0, 0
+    in_slot, near_slot = np.empty(slots, np.float32), np.empty(slots, np.float32)
+    i_before, shift_before = 0, 0
     for n in range(-run_up, height):
-        row, shift = (n, 0) if n >= 0 else (-1 - n, width // 2)
+        i, shift = (n, 0) if n >= 0 else (-1 - n, width // 2)
         if dy < 0:
-            row = height - 1 - row
-        for j in range(width):
-            js = (j + shift) % width
+            i = height - 1 - i
+        for path in range(width):
+            j = (path + shift) % width
             if n == -run_up:
-                current[j] = cost[row, js]
+                current[path] = cost[i, j]
                 continue
-            jp = (j - dx) % width
-            floor = crease_penalty * np.float32(1.2)
-            jump = _jump_penalty(guide, row, js, row_before, (jp + shift_before) % width, jump_penalty, floor, scale)
+            path_before = (path - dx) % width
+            jump = _jump_penalty(guide[i, j], guide[i_before, (path_before + shift_before) % width], penalties)
             _advance_path(
-                previous[jp], cost[row, js], current[j], step_penalty * length, crease_penalty * length, jump * length,
-                sets, count, slots, slot_map[row, js], a, b,
+                previous[path_before], cost[i, j], slot_map[i, j],
+                penalties.step * length, penalties.crease * length, jump * length,
+                in_slot, near_slot, current[path],
             )  # fmt: skip
             if n >= 0:
-                for k in range(labels):
-                    total[row, js, k] += current[j, k]
-        row_before, shift_before = row, shift
+                for label in range(labels):
+                    total[i, j, label] += current[path, label]
+        i_before, shift_before = i, shift
         previous, current = current, previous
 
 
@@ -493,21 +591,17 @@ def aggregate_costs(
             differ by at most one have the same depth at this pixel.
         slots: number of depth slots.
     """
-    height, _, labels = cost.shape
-    sets = slot_map.shape[2]
+    height = len(cost)
     stretch = np.minimum(1 / row_weights(height).numpy(), 8).astype(np.float32)
-    penalties = tuple(
-        np.float32(v) for v in (config.step_penalty, config.crease_penalty, config.jump_penalty, config.edge_scale)
-    )
+    penalties = _Penalties(*np.float32(astuple(config)))
 
     def run(directions: tuple[tuple[int, int], ...]) -> np.ndarray:
         total = np.zeros_like(cost)
         for dy, dx in directions:
-            shape = (sets, labels // sets, slots, penalties)
             if dy == 0:
-                _aggregate_rows(cost, total, guide, slot_map, *shape, stretch, dx)
+                _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx)
             else:
-                _aggregate_columns(cost, total, guide, slot_map, *shape, dy, dx, height // 4)
+                _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, height // 4)
         return total
 
     # Fixed groups, summed in a fixed order: the result does not depend on the number of threads.

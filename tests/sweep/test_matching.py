@@ -14,6 +14,7 @@ from pansplat.sweep.matching import (
     View,
     _aggregate_columns,
     _fast_atan2,
+    _Penalties,
     aggregate_costs,
     compute_matching_cost,
     select_labels,
@@ -288,8 +289,8 @@ def test_a_path_continues_over_the_pole_half_a_turn_away(dy):
     cost[known, :4] = 1
     cost[known, :4, 5] = 0
     total = np.zeros_like(cost)
-    penalties = tuple(np.float32(price) for price in (0.08, 0.15, 0.8, 0.1))
-    _aggregate_columns(cost, total, _gray(height), _slots(height), 1, count, count, penalties, dy, 0, height // 4)
+    penalties = _Penalties(*np.float32((0.08, 0.15, 0.8, 0.1)))
+    _aggregate_columns(cost, total, _gray(height), _slots(height), count, penalties, dy, 0, height // 4)
     first = total[0 if dy > 0 else -1]
     evident = np.sort(first, axis=1)[:, 1] > first[:, 5] + 0.05
     assert np.flatnonzero(evident).tolist() == [0, 1, 2, 3, 32, 33, 34, 35]
