@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -90,8 +90,8 @@ def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gau
         ]
     views = range(len(surfaces))
     consistent = [consistency_mask(surfaces, posed.cam2world, view) for view in views]
-    surfaces = [_remove_inconsistent(posed, surfaces, consistent, view, config) for view in views]
     scene = _PosedSurfaces(posed, surfaces, consistent, config)
+    scene = replace(scene, surfaces=[_remove_inconsistent(scene, view) for view in views])
     fine = [_choose_fine_pixels(image, heights, config) for image in photographs]
     parts = []
     for level in range(NUM_LEVELS):
@@ -103,19 +103,6 @@ def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gau
                 ]
             parts.append(_lift_level(scene, view, level, fine[view][-1]))
     return Gaussians.cat(parts)
-
-
-def _remove_inconsistent(
-    posed: PosedImages, surfaces: list[Surface], consistent: list[np.ndarray], view: int, config: LiftConfig
-) -> Surface:
-    """The surface, with the points in other views' consistent free space moved back to the background layer."""
-    surface = surfaces[view]
-    points = world_points(surface, posed.cam2world[view]).reshape(-1, 3)
-    _, kept = _estimate_opacity(points, posed, surfaces, consistent, view, config)
-    far = _background_inverse_depth(surface.inverse_depth, posed.masks[view], 2, config)
-    behind = np.minimum(surface.inverse_depth, resize_sphere(far, surface.height))
-    kept = kept.reshape(behind.shape)
-    return Surface(np.where(kept, surface.inverse_depth, behind), surface.orientation)
 
 
 def _background_inverse_depth(inverse: np.ndarray, mask: np.ndarray, level: int, config: LiftConfig) -> np.ndarray:
@@ -136,6 +123,16 @@ class _PosedSurfaces:
     surfaces: list[Surface]
     consistent: list[np.ndarray]
     config: LiftConfig
+
+
+def _remove_inconsistent(scene: _PosedSurfaces, view: int) -> Surface:
+    """The surface, with the points in other views' consistent free space moved back to the background layer."""
+    surface, config = scene.surfaces[view], scene.config
+    points = world_points(surface, scene.posed.cam2world[view]).reshape(-1, 3)
+    _, kept = _estimate_opacity(points, scene, view)
+    far = _background_inverse_depth(surface.inverse_depth, scene.posed.masks[view], 2, config)
+    behind = np.minimum(surface.inverse_depth, resize_sphere(far, surface.height))
+    return Surface(np.where(kept.reshape(behind.shape), surface.inverse_depth, behind), surface.orientation)
 
 
 def _lattice_heights(height: int, surface_height: int) -> list[int]:
@@ -209,7 +206,7 @@ def _lift_lattice(
     row, column = nearest_pixel(rays, len(inverse))
     inverse_depth = np.maximum(inverse[row, column].astype(np.float64), 1e-6)
     points = (rays / inverse_depth[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    opacity, kept = _estimate_opacity(points, scene.posed, scene.surfaces, scene.consistent, view, config)
+    opacity, kept = _estimate_opacity(points, scene, view)
     spacing = math.sqrt(4 * math.pi / count)
     rays, inverse_depth, points, opacity = rays[kept], inverse_depth[kept], points[kept], opacity[kept]
     sloped = inverse if level else scene.surfaces[view].inverse_depth
@@ -285,24 +282,18 @@ def _background_layer(
     return color_map.astype(np.float32), (far / config.background_depth[level - 2]).astype(np.float32)
 
 
-def _estimate_opacity(
-    points: np.ndarray,
-    posed: PosedImages,
-    surfaces: list[Surface],
-    consistent: list[np.ndarray],
-    view: int,
-    config: LiftConfig,
-) -> tuple[np.ndarray, np.ndarray]:
+def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> tuple[np.ndarray, np.ndarray]:
     """Opacity (n) by consistency with the other views, and a mask of the points to keep."""
+    config, posed = scene.config, scene.posed
     opacity = np.full(len(points), config.single_view_opacity)
     kept = np.ones(len(points), bool)
-    for other, surface in enumerate(surfaces):
+    for other, surface in enumerate(scene.surfaces):
         if other == view:
             continue
         visibility = classify_visibility(points, surface, posed.cam2world[other], config.discontinuity)
         local = (points - posed.cam2world[other, :3, 3]) @ posed.cam2world[other, :3, :3]
         row, column = nearest_pixel(local, surface.height)
-        certain = consistent[other][row, column] & posed.masks[other][row, column]
+        certain = scene.consistent[other][row, column] & posed.masks[other][row, column]
         opacity[visibility == CONSISTENT] = config.consistent_opacity
         in_free_space = visibility == FREE_SPACE
         opacity[in_free_space & ~certain] = config.uncertain_opacity
