@@ -147,15 +147,6 @@ def with_hints(axes: SceneAxes, down: Float[Array, "3"] | None, heading: float |
     return SceneAxes(np.stack((down, wall, np.cross(down, wall))), True, False, heading=heading)
 
 
-def relative_rotations(first: SceneAxes, second: SceneAxes) -> list[Float[Array, "3 3"]]:
-    """The four rotations from the first camera to the second one that make their axes agree."""
-    turned = []
-    for cosine, sine in ((1, 0), (0, 1), (-1, 0), (0, -1)):
-        quarter = np.array(((1.0, 0, 0), (0, cosine, -sine), (0, sine, cosine)))
-        turned.append(second.axes.T @ quarter @ first.axes)
-    return turned
-
-
 @dataclass(frozen=True, eq=False)
 class RotationPrior:
     """What the axes of two panoramas state about their relative rotation, before any match.
@@ -182,6 +173,20 @@ class RotationPrior:
         both = math.hypot(self.first.noise, self.second.noise)
         return _TILT_NOISE * both, _YAW_NOISE * both
 
+    def wall_rotations(self) -> list[Float[Array, "3 3"]]:
+        """The four rotations from the first camera to the second one that make the walls parallel; none without."""
+        rotations = []
+        for cosine, sine in ((1, 0), (0, 1), (-1, 0), (0, -1)) if self.has_walls else ():
+            quarter = np.array(((1.0, 0, 0), (0, cosine, -sine), (0, sine, cosine)))
+            rotations.append(self.second.axes.T @ quarter @ self.first.axes)
+        return rotations
+
+    def _turn_from_walls(self, rotation: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+        """The smallest rotation from one with parallel walls to this one, for known walls."""
+        return min(
+            (walls.T @ rotation for walls in self.wall_rotations()), key=lambda turn: float(rotation_angle(turn))
+        )
+
     def residual(self, rotation: Float[Array, "3 3"]) -> tuple[Float[Array, "n"], Float[Array, "n 3"]] | None:
         """Tilt (3) and, with walls, yaw (1) against the axes in units of their noise, and the derivative by rotation.
 
@@ -196,9 +201,7 @@ class RotationPrior:
         if np.linalg.norm(tilt) > _LARGEST_RESIDUAL or down @ turned < 0:
             return None
         if self.has_walls:
-            options = [option.T @ rotation for option in relative_rotations(self.first, self.second)]
-            nearest = min(options, key=lambda option: float(rotation_angle(option)))
-            yaw = float(self.first.axes[0] @ rotation_log(nearest)) / yaw_noise
+            yaw = float(self.first.axes[0] @ rotation_log(self._turn_from_walls(rotation))) / yaw_noise
             if abs(yaw) < _LARGEST_RESIDUAL:
                 tilt = np.append(tilt, yaw)
                 derivative = np.concatenate((derivative, turned[None] / yaw_noise))
@@ -206,10 +209,7 @@ class RotationPrior:
 
     def confirms(self, rotation: Float[Array, "3 3"]) -> bool:
         """Whether both panoramas determine the walls, and the rotation makes them parallel."""
-        if not self.has_walls:
-            return False
-        options = relative_rotations(self.first, self.second)
-        return min(float(rotation_angle(option.T @ rotation)) for option in options) < _LARGEST_DIFFERENCE
+        return self.has_walls and bool(rotation_angle(self._turn_from_walls(rotation)) < _LARGEST_DIFFERENCE)
 
     def score(self, rotation: Float[Array, "3 3"]) -> float:
         """Logarithm of the rotation's probability density under the prior, over that of a random rotation."""
@@ -221,7 +221,7 @@ class RotationPrior:
         upright = 2 / sigma**2 * math.exp(-0.5 * (tilt / sigma) ** 2)
         walls, share, others = 0.0, *_AGREEMENT
         if self.has_walls:
-            nearest = min(rotation_angle(option.T @ rotation) for option in relative_rotations(self.first, self.second))
+            nearest = rotation_angle(self._turn_from_walls(rotation))
             sigma = 1.5 * self.noise[1]
             walls = 2 * math.pi**2 / ((2 * math.pi) ** 1.5 * sigma**3) * math.exp(-0.5 * (nearest / sigma) ** 2)
         else:

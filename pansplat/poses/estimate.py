@@ -21,14 +21,7 @@ from pansplat.data.pairs import FAR, NEAR, find_mask
 from pansplat.errors import InputError
 from pansplat.files import require_file
 from pansplat.poses.axes import RotationPrior, SceneAxes, find_axes, with_hints
-from pansplat.poses.features import (
-    DIAGONAL,
-    FACE_ROTATIONS,
-    Features,
-    Matches,
-    detect_features,
-    match_features,
-)
+from pansplat.poses.features import DIAGONAL, FACE_ROTATIONS, Features, Matches, detect_features, match_features
 from pansplat.poses.hints import Hints, read_hints
 from pansplat.poses.tour import Pair, build_tour
 from pansplat.poses.two_view import (

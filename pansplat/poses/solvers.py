@@ -13,6 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+Bearings = Float[Array, "n 3"]
+Rotation = Float[Array, "3 3"]
+Vector = Float[Array, "3"]
+
 _ROOT_SAMPLES = 72  # angles at which a trigonometric polynomial is evaluated to find its sign changes
 _MIN_SINE = 1e-12
 
@@ -63,17 +67,9 @@ def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 def rotation_angle(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:
     """Angle of rotations, radians; exact for small ones."""
-    sine = 0.5 * np.linalg.norm(
-        np.stack(
-            (
-                rotation[..., 2, 1] - rotation[..., 1, 2],
-                rotation[..., 0, 2] - rotation[..., 2, 0],
-                rotation[..., 1, 0] - rotation[..., 0, 1],
-            ),
-            axis=-1,
-        ),
-        axis=-1,
-    )
+    twice = rotation - np.swapaxes(rotation, -1, -2)  # the axis times twice the sine, as a cross product
+    axis = np.stack((twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]), axis=-1)
+    sine = 0.5 * np.linalg.norm(axis, axis=-1)
     return np.arctan2(sine, 0.5 * (np.trace(rotation, axis1=-2, axis2=-1) - 1))
 
 
@@ -96,11 +92,7 @@ def essential_from_five(
     triple = np.einsum("spqik,srkj->spqrij", product, basis)
     trace = np.einsum("spqii->spq", product)
     cubic = triple - 0.5 * trace[..., None, None, None] * basis[:, None, None]
-    determinant = np.einsum(
-        "spi,sqri->spqr",
-        basis[:, :, 0],
-        np.cross(basis[:, :, None, 1], basis[:, None, :, 2]),
-    )
+    determinant = np.einsum("spi,sqri->spqr", basis[:, :, 0], np.cross(basis[:, :, None, 1], basis[:, None, :, 2]))
     constraints = np.concatenate((cubic.reshape(-1, 64, 9), determinant.reshape(-1, 64, 1)), axis=2)
     matrix = np.einsum("snc,nm->scm", constraints, _CUBIC)
     with np.errstate(all="ignore"):
@@ -221,9 +213,7 @@ def decompose_essential(essential: Float[Array, "3 3"]) -> list[tuple[Float[Arra
     return [(u @ m @ vt, sign * u[:, 2]) for m in (w, w.T) for sign in (1.0, -1.0)]
 
 
-def epipolar_angles(
-    a: Float[Array, "n 3"], b: Float[Array, "n 3"], rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
-) -> Float[Array, "n"]:
+def epipolar_angles(a: Bearings, b: Bearings, rotation: Rotation, translation: Vector) -> Float[Array, "n"]:
     """The signed angle, radians, by which both bearings of a pair must turn in total to meet (first order).
 
     Its square is the Sampson error on the sphere.
@@ -236,9 +226,7 @@ def epipolar_angles(
     return e / np.sqrt(np.maximum((by_b**2).sum(axis=1) + (by_g**2).sum(axis=1), _MIN_SINE))
 
 
-def two_view_depths(
-    a: Float[Array, "n 3"], b: Float[Array, "n 3"], rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
-) -> Float[Array, "n 2"]:
+def two_view_depths(a: Bearings, b: Bearings, rotation: Rotation, translation: Vector) -> Float[Array, "n 2"]:
     """Distances of the points from both cameras, in units of |t|; negative if the rays meet behind a camera.
 
     Rays are parallel at an infinite distance; the distances are then large numbers of either sign.

@@ -19,9 +19,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from pansplat.poses.axes import NO_PRIOR, RotationPrior, relative_rotations
+from pansplat.poses.axes import NO_PRIOR, RotationPrior
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.solvers import (
+    Bearings,
+    Rotation,
+    Vector,
     angle_between,
     decompose_essential,
     epipolar_angles,
@@ -89,8 +92,8 @@ class Hypothesis:
         probability: of each match to be right.
     """
 
-    rotation: Float[Array, "3 3"]
-    translation: Float[Array, "3"]
+    rotation: Rotation
+    translation: Vector
     score: float
     probability: Float[Array, "match"]
 
@@ -137,7 +140,7 @@ class _Evidence:
         """The evidence with another noise, in units of this one."""
         return replace(self, noise=factor * self.noise)
 
-    def evaluate(self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Hypothesis:
+    def evaluate(self, rotation: Rotation, translation: Vector) -> Hypothesis:
         """The evidence for a relative pose. Matches whose rays meet behind a camera are counted as wrong.
 
         A right match by chance also has its point in front of both cameras in about half of all cases, so that a point
@@ -168,15 +171,21 @@ class _Evidence:
         return best
 
 
-def _are_behind(a: Array, b: Array, rotation: Array, translation: Array, noise: float | Array) -> Bool[Array, "match"]:
+def _are_behind(
+    a: Bearings, b: Bearings, rotation: Rotation, translation: Vector, noise: float | Array
+) -> Bool[Array, "match"]:
     """Whether the rays of each match meet behind a camera; parallel rays do not."""
     depths = two_view_depths(a, b, rotation, translation)
     return (depths < 0).any(axis=1) & (angle_between(a @ rotation.T, b) > 3 * noise)
 
 
 def _gauss_newton(
-    hessian: Float[Array, "5 5"], gradient: Float[Array, "5"], rotation: Array, translation: Array, axes: RotationPrior
-) -> tuple[Float[Array, "3 3"], Float[Array, "3"], Float[Array, "5"]]:
+    hessian: Float[Array, "5 5"],
+    gradient: Float[Array, "5"],
+    rotation: Rotation,
+    translation: Vector,
+    axes: RotationPrior,
+) -> tuple[Rotation, Vector, Float[Array, "5"]]:
     """The pose after one step, and the step; it is NaN if the matches do not determine the pose.
 
     The prior of the axes is added to the Hessian and the gradient.
@@ -217,16 +226,14 @@ class _Linearised:
     by_second: Float[Array, "n 3"]
 
 
-def _linearise(a: Array, b: Array, rotation: Array, translation: Array) -> _Linearised:
+def _linearise(a: Bearings, b: Bearings, rotation: Rotation, translation: Vector) -> _Linearised:
     g = a @ rotation.T
-    n = np.cross(translation, g)
-    e = (n * b).sum(axis=1)
-    bt = np.cross(b, translation)
-    scale = np.sqrt(
-        np.maximum(((n - e[:, None] * b) ** 2).sum(axis=1) + ((bt - e[:, None] * g) ** 2).sum(axis=1), 1e-12)
-    )[:, None]
-    by_pose = np.concatenate((np.cross(g, bt), np.cross(g, b) @ _tangent_basis(translation)), axis=1)
-    return _Linearised(e / scale[:, 0], by_pose / scale, bt @ rotation / scale, n / scale)
+    by_b, by_g = np.cross(translation, g), np.cross(b, translation)
+    e = (by_b * b).sum(axis=1, keepdims=True)
+    squared = ((by_b - e * b) ** 2).sum(axis=1) + ((by_g - e * g) ** 2).sum(axis=1)
+    scale = np.sqrt(np.maximum(squared, 1e-12))[:, None]
+    by_pose = np.concatenate((np.cross(g, by_g), np.cross(g, b) @ _tangent_basis(translation)), axis=1)
+    return _Linearised((e / scale)[:, 0], by_pose / scale, by_g @ rotation / scale, by_b / scale)
 
 
 def _normal_equations(
@@ -245,15 +252,15 @@ def _normal_equations(
 
 
 def polish_pose(
-    a: Float[Array, "match 3"],
-    b: Float[Array, "match 3"],
-    rotation: Float[Array, "3 3"],
-    translation: Float[Array, "3"],
+    a: Bearings,
+    b: Bearings,
+    rotation: Rotation,
+    translation: Vector,
     noise: float | Float[Array, "match"],
     axes: RotationPrior = NO_PRIOR,
     weigh: Callable[[Array, Array], Array] | None = None,
     steps: int = 10,
-) -> tuple[Float[Array, "3 3"], Float[Array, "3"], tuple[float, float]]:
+) -> tuple[Rotation, Vector, tuple[float, float]]:
     """The pose by generalised least squares over right matches, and the standard deviations of rotation and direction.
 
     Stitching distorts a panorama smoothly: matches on one object share an error, which their number does not reduce.
@@ -306,8 +313,7 @@ def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> list[Hy
         return []
     free, parallel = _sample_essentials(evidence, rng)
     found = [_optimise(essential, evidence, _FACTORS) for essential in _choose_best(free, evidence, _KEPT)]
-    if len(parallel):
-        # A rotation by the walls is inexact: its hypotheses are compared among themselves, with a larger tolerance.
+    if len(parallel):  # inexact: compared among themselves, with a larger tolerance
         chosen = _choose_best(parallel, evidence.with_noise(2), _KEPT_PARALLEL)
         found += [_optimise(essential, evidence, _PARALLEL_FACTORS) for essential in chosen]
     return _merge_same(found, evidence.axes)
@@ -319,7 +325,6 @@ def _sample_essentials(
     """Essential matrices of random samples: of any pose or of levelled cameras, and of cameras with parallel walls."""
     a, b, axes = evidence.a, evidence.b, evidence.axes
     levels = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
-    wall_rotations = relative_rotations(axes.first, axes.second) if axes.has_walls else []
     free, parallel = [], [np.empty((0, 3, 3))]
     for top in sorted({min(top, len(a)) for top in _TOP_SETS}):
         chosen = _draw(rng, top, _SAMPLES[5], 5)
@@ -328,7 +333,7 @@ def _sample_essentials(
             chosen = _draw(rng, top, _SAMPLES[size], size)
             rotations, translations = solver(a[chosen] @ levels[0].T, b[chosen] @ levels[1].T)
             free.append(levels[1].T @ skew(translations) @ rotations @ levels[0])
-        for rotation in wall_rotations:
+        for rotation in axes.wall_rotations():
             chosen = _draw(rng, top, _SAMPLES[2], 2)
             normals = np.cross(a[chosen] @ rotation.T, b[chosen])
             translations = np.cross(normals[:, 0], normals[:, 1])
@@ -445,8 +450,8 @@ class RelativePose:
         problem: why the pose must not be used; None if it passes the check.
     """
 
-    rotation: Float[Array, "3 3"]
-    translation: Float[Array, "3"]
+    rotation: Rotation
+    translation: Vector
     indices: Int[Array, "match 2"]
     score: float
     margin: float
