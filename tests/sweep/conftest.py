@@ -1,5 +1,6 @@
-"""Textured rooms with known depth; each is searched once for all tests."""
+"""Textured rooms with known depth; each is searched at most once for all tests."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -7,8 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from pansplat.sweep.matching import View
-from pansplat.sweep.planes import axis_components
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
 from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
 
@@ -70,6 +69,17 @@ class Room:
         pose[:3, :3] /= scale
         return pose
 
+    def two_poses(self) -> list[np.ndarray]:
+        """Two cameras 0.86 m apart, the second turned by 20 degrees."""
+        return [self.pose((-0.4, 0.0, -0.2)), self.pose((0.4, 0.05, 0.1), _turn("y", 20))]
+
+    def observe(self, height: int, poses: Sequence[np.ndarray] | None = None) -> "Observed":
+        """The panoramas at the poses, by default `two_poses`."""
+        poses = self.two_poses() if poses is None else poses
+        images, depths = zip(*(self.cast(pose, height) for pose in poses), strict=True)
+        masks = np.ones((len(poses), height, 2 * height), bool)
+        return Observed(self, PosedImages(np.stack(images), np.stack(poses), masks, 0.5, 8.0), np.stack(depths))
+
     def wall_distances(self, points: np.ndarray) -> np.ndarray:
         """Distances (..., 6) of points in room axes from the planes of the walls, the ceiling and the floor."""
         return np.concatenate((np.abs(points - self.low), np.abs(points - self.high)), axis=-1)
@@ -102,13 +112,17 @@ def _turn(axis: str, degrees: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Observed:
-    """A room's panoramas, their true depth, and the sweep's surfaces."""
+    """A room's panoramas and their true depth."""
 
     room: Room
     posed: PosedImages
     depths: np.ndarray
     """True radial depth (v, h, 2h)."""
-    surfaces: list[Surface] = field(default_factory=list)
+
+    @functools.cached_property
+    def surfaces(self) -> list[Surface]:
+        """The sweep's surfaces."""
+        return search_surfaces(self.posed, SearchConfig(), lambda what, fraction: None)
 
     @property
     def inverse_depths(self) -> np.ndarray:
@@ -120,19 +134,7 @@ class Observed:
         return [Surface((1 / d).astype(np.float32), np.zeros(d.shape, np.uint8)) for d in self.depths]
 
 
-def _observe(room: Room, poses: Sequence[np.ndarray], height: int, *, search: bool = False) -> Observed:
-    images, depths = zip(*(room.cast(pose, height) for pose in poses), strict=True)
-    masks = np.ones((len(poses), height, 2 * height), bool)
-    posed = PosedImages(np.stack(images), np.stack(poses), masks, near=0.5, far=8.0)
-    surfaces = search_surfaces(posed, SearchConfig(), lambda what, fraction: None) if search else []
-    return Observed(room, posed, np.stack(depths), surfaces)
-
-
 _FURNISHED = Room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7)))
-
-
-def _two_poses(room: Room) -> list[np.ndarray]:
-    return [room.pose((-0.4, 0.0, -0.2)), room.pose((0.4, 0.05, 0.1), _turn("y", 20))]
 
 
 @pytest.fixture(scope="session")
@@ -147,18 +149,6 @@ def turn() -> Callable[[str, float], np.ndarray]:
     return _turn
 
 
-@pytest.fixture(scope="session")
-def two_poses() -> Callable[[Room], list[np.ndarray]]:
-    """Two cameras in a room, 0.86 m apart, the second turned by 20 degrees."""
-    return _two_poses
-
-
-@pytest.fixture(scope="session")
-def observe() -> Callable[..., Observed]:
-    """Renders a room's panoramas at poses and a height; `search=True` adds the sweep's surfaces."""
-    return _observe
-
-
 @pytest.fixture(params=(0, 1), ids=("view 0", "view 1"))
 def view(request: pytest.FixtureRequest) -> int:
     """Each of two views."""
@@ -167,49 +157,30 @@ def view(request: pytest.FixtureRequest) -> int:
 
 @pytest.fixture(scope="session")
 def empty_room() -> Observed:
-    """Two views of the textured room, 96 pixels high, searched."""
-    room = Room()
-    return _observe(room, _two_poses(room), 96, search=True)
+    """Two views of the textured room, 96 pixels high."""
+    return Room().observe(96)
+
+
+@pytest.fixture(scope="session")
+def small_room() -> Observed:
+    """Two views of the textured room, 64 pixels high."""
+    return Room().observe(64)
 
 
 @pytest.fixture(scope="session")
 def furnished_room() -> Observed:
-    """Two views of the room with a box on the floor, which occludes a part of the room in each view, searched."""
-    return _observe(_FURNISHED, _two_poses(_FURNISHED), 96, search=True)
+    """Two views of the room with a box on the floor, which occludes a part of the room in each view."""
+    return _FURNISHED.observe(96)
 
 
 @pytest.fixture(scope="session")
 def small_furnished_room() -> Observed:
-    """The room with the box, 64 pixels high, searched."""
-    return _observe(_FURNISHED, _two_poses(_FURNISHED), 64, search=True)
+    """The room with the box, 64 pixels high."""
+    return _FURNISHED.observe(64)
 
 
 @pytest.fixture(scope="session")
 def three_views() -> Observed:
-    """Three views of the room with the box, 64 pixels high, searched."""
-    poses = [*_two_poses(_FURNISHED), _FURNISHED.pose((0.1, -0.1, -0.7), _turn("y", -60))]
-    return _observe(_FURNISHED, poses, 64, search=True)
-
-
-_AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))
-
-
-@pytest.fixture(scope="session")
-def room_axes() -> np.ndarray:
-    """Down and the room's two wall normals."""
-    return _AXES
-
-
-def _views_of(posed: PosedImages, images: np.ndarray, masks: np.ndarray) -> tuple[list[View], list[np.ndarray]]:
-    rays = [axis_components(_AXES, pose[:3, :3], images.shape[1]) for pose in posed.cam2world]
-    views = [
-        View(np.ascontiguousarray(image, np.float32), mask, np.ascontiguousarray(ray[0], np.float32))
-        for image, mask, ray in zip(images, masks, rays, strict=True)
-    ]
-    return views, rays
-
-
-@pytest.fixture(scope="session")
-def views_of() -> Callable[..., tuple[list[View], list[np.ndarray]]]:
-    """Makes views of images and masks at the poses of posed images, and their rays along the room's axes."""
-    return _views_of
+    """Three views of the room with the box, 64 pixels high."""
+    third = _FURNISHED.pose((0.1, -0.1, -0.7), _turn("y", -60))
+    return _FURNISHED.observe(64, [*_FURNISHED.two_poses(), third])

@@ -173,10 +173,10 @@ def test_resized_prior_keeps_its_values():
     np.testing.assert_allclose(resize_sphere(prior.scale, 4), 0.2, rtol=1e-6)
 
 
-def test_coincident_cameras_have_the_first_estimate_at_a_usual_height(make_room, observe):
+def test_coincident_cameras_have_the_first_estimate_at_a_usual_height(make_room):
     room = make_room()
     pose = room.pose((-0.4, 0.0, -0.2))
-    observed = observe(room, [pose, pose], 64)
+    observed = room.observe(64, [pose, pose])
     model = TrueDepth(room, [pose, pose])
     surfaces = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, model)
     expected = observed.depths[0] * 1.5 / _CAMERA_HEIGHT
@@ -184,11 +184,11 @@ def test_coincident_cameras_have_the_first_estimate_at_a_usual_height(make_room,
         assert np.median(np.abs(surface.inverse_depth * expected - 1)) < 0.02
 
 
-def test_prior_decides_where_photographs_are_blank(make_room, observe, two_poses):
+def test_prior_decides_where_photographs_are_blank(make_room):
     room = make_room("blank")
-    poses = two_poses(room)
-    observed = observe(room, poses, 64)
-    upright = [pose.copy() for pose in poses]
-    surfaces = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, TrueHeights(room, upright))
+    observed = room.observe(64)
+    surfaces = search_surfaces(
+        observed.posed, SearchConfig(), lambda what, fraction: None, TrueHeights(room, room.two_poses())
+    )
     for surface, depth in zip(surfaces, observed.depths, strict=True):
         assert np.median(np.abs(surface.inverse_depth * depth - 1)) < 0.05

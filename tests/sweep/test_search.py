@@ -46,9 +46,8 @@ def test_a_box_is_in_front_of_the_walls(furnished_room, empty_room, view):
     assert (error[~box] < 0.10).mean() > 0.95
 
 
-def test_finer_panoramas_give_finer_surfaces(empty_room, two_poses, observe):
-    coarse = observe(empty_room.room, two_poses(empty_room.room), 64, search=True)
-    assert np.median(_error(empty_room, 0)) < 0.8 * np.median(_error(coarse, 0))
+def test_finer_panoramas_give_finer_surfaces(empty_room, small_room):
+    assert np.median(_error(empty_room, 0)) < 0.8 * np.median(_error(small_room, 0))
 
 
 def test_surfaces_stay_within_the_depth_range(small_furnished_room):
@@ -57,16 +56,17 @@ def test_surfaces_stay_within_the_depth_range(small_furnished_room):
     assert inverse.min() >= np.float32(1 / far) and inverse.max() <= np.float32(1 / near)
 
 
-@pytest.mark.parametrize("far_margin", (1.0, 10.0), ids=("far is the limit", "far is exceeded"))
-def test_walls_beyond_far_are_found(empty_room, far_margin):
-    posed = dataclasses.replace(empty_room.posed, far=1.8)
-    config = SearchConfig(far_margin=far_margin)
+def test_walls_beyond_far_are_found(empty_room):
     beyond = empty_room.depths > 2.0
-    found = np.stack([s.inverse_depth for s in search_surfaces(posed, config, lambda what, fraction: None)])
-    error = np.abs(1 / (found * empty_room.depths) - 1)
     assert beyond.mean() > 0.3
-    assert (np.median(error[beyond]) < 0.03) == (far_margin > 1)
-    assert np.median(error[~beyond]) < 0.03
+    medians = []
+    for far_margin in (1.0, 10.0):
+        posed, config = dataclasses.replace(empty_room.posed, far=1.8), SearchConfig(far_margin=far_margin)
+        found = np.stack([s.inverse_depth for s in search_surfaces(posed, config, lambda what, fraction: None)])
+        error = np.abs(1 / (found * empty_room.depths) - 1)
+        medians.append(np.median(error[beyond]))
+        assert np.median(error[~beyond]) < 0.03
+    assert medians[0] > 0.03 > medians[1]
 
 
 @pytest.mark.slow
@@ -81,27 +81,11 @@ def test_rolling_the_panoramas_rolls_the_surfaces(empty_room, turn):
     assert (change < 0.02).mean() > 0.97
 
 
-def test_translating_the_world_changes_no_surface(empty_room):
-    moved = empty_room.posed.cam2world.copy()
-    moved[:, :3, 3] += (31.0, -2.0, 7.5)
-    change = np.abs(_search(empty_room.posed, cam2world=moved) / empty_room.inverse_depths - 1)
-    assert ((change < 1e-3).mean(axis=(1, 2)) > 0.99).all()
-
-
-def test_rotating_the_world_changes_no_surface(empty_room, turn):
+def test_rotating_the_world_changes_no_surface(small_room, turn):
     motion = np.eye(4)
     motion[:3, :3] = turn("y", 71) @ turn("x", 35) @ turn("z", -21)
-    inverse = _search(empty_room.posed, cam2world=motion @ empty_room.posed.cam2world)
-    assert ((np.abs(inverse / empty_room.inverse_depths - 1) < 0.01).mean(axis=(1, 2)) > 0.95).all()
-
-
-@pytest.mark.slow
-def test_swapping_the_views_swaps_the_surfaces(empty_room):
-    posed = empty_room.posed
-    swapped = _search(posed, images=posed.images[::-1], cam2world=posed.cam2world[::-1])
-    change = np.abs(swapped[::-1] / empty_room.inverse_depths - 1)
-    assert np.median(change) < 4e-3
-    assert (change < 0.05).mean() > 0.95
+    inverse = _search(small_room.posed, cam2world=motion @ small_room.posed.cam2world)
+    assert ((np.abs(inverse / small_room.inverse_depths - 1) < 0.01).mean(axis=(1, 2)) > 0.95).all()
 
 
 @pytest.mark.slow
@@ -120,23 +104,19 @@ def test_more_views_are_no_worse_than_two(small_furnished_room, three_views):
     assert three > two - 0.01
 
 
-def test_coincident_cameras_give_the_middle_of_the_range(empty_room):
-    inverse = _search(empty_room.posed, cam2world=np.stack([empty_room.posed.cam2world[0]] * 2))
+def test_coincident_cameras_give_the_middle_of_the_range(small_room):
+    inverse = _search(small_room.posed, cam2world=np.stack([small_room.posed.cam2world[0]] * 2))
     assert np.allclose(inverse, 0.5 * (1 / 0.5 + 1 / 8.0))
 
 
 @pytest.mark.slow
-def test_masked_pixels_are_not_matched(empty_room):
+def test_masked_pixels_are_not_matched(small_room):
     """A tripod moves with the camera. Without the mask its match pulls the surface away from the truth."""
-    rows = slice(-14, None)
-    images = empty_room.posed.images.copy()
+    rows, posed = slice(-10, None), small_room.posed
+    images, masks = posed.images.copy(), posed.masks.copy()
     images[:, rows] = np.arange(images.shape[2])[:, None] // 4 % 2
-    masks = empty_room.posed.masks.copy()
     masks[:, rows] = False
-    truth = empty_room.depths[:, rows]
-    errors = [
-        np.abs(1 / (_search(empty_room.posed, images=images, masks=m)[:, rows] * truth) - 1)
-        for m in (masks, empty_room.posed.masks)
-    ]
+    truth = small_room.depths[:, rows]
+    errors = [np.abs(1 / (_search(posed, images=images, masks=m)[:, rows] * truth) - 1) for m in (masks, posed.masks)]
     assert (errors[0] < 0.10).mean() > 0.9
-    assert (errors[1] < 0.10).mean() < 0.8  # 0.70 measured; the detected floor explains the rest
+    assert (errors[1] < 0.10).mean() < 0.8  # the detected floor explains the rest
