@@ -110,7 +110,8 @@ def render_room() -> Callable[..., Array]:
 
 @pytest.fixture(scope="module")
 def few_samples() -> Iterator[None]:
-    """A third of the random samples: rooms are easy, and their tests are about whole folders."""
+    """Fewer random samples, and matches of the polish: rooms are easy, and their tests are about whole folders."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pansplat.poses.two_view._TOP_SETS", (80, 2500))
+        patch.setattr("pansplat.poses.two_view._MAX_POLISHED", 250)
         yield

@@ -30,9 +30,7 @@ def _disturb(problem: Problem) -> Problem:
     rotations = rotation_exp(0.02 * rng.normal(size=(len(problem.centres), 3))) @ problem.rotations
     centres = problem.centres + 0.05 * rng.normal(size=problem.centres.shape)
     points = triangulate(rotations, centres, problem.camera, problem.point, problem.bearings, len(problem.points))
-    return Problem(
-        rotations, centres, points, problem.camera, problem.point, problem.bearings, problem.axes, problem.down
-    )
+    return replace(problem, rotations=rotations, centres=centres, points=points)
 
 
 def _relative_errors(found: Problem, truth: Problem) -> tuple[float, float]:
@@ -59,10 +57,7 @@ def test_adjustment_tolerates_wrong_observations() -> None:
     truth = _problem(3e-4)
     bearings = truth.bearings.copy()
     bearings[::9] = np.roll(bearings[::9], 1, axis=1)
-    wrong = Problem(
-        truth.rotations, truth.centres, truth.points, truth.camera, truth.point, bearings, truth.axes, truth.down
-    )
-    found = adjust(_disturb(wrong), noise=1e-3)
+    found = adjust(_disturb(replace(truth, bearings=bearings)), noise=1e-3)
     assert max(_relative_errors(found, truth)) < math.radians(0.3)
 
 

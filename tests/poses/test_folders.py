@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import cv2
@@ -24,11 +25,14 @@ POSES = {
 
 @pytest.fixture(scope="module")
 def estimate(tmp_path_factory: pytest.TempPathFactory, render_room, few_samples: None) -> PoseEstimate:
-    """Of two good pictures, a mirrored one and one of another room; the distance of the good ones is given."""
+    """Of two good pictures and others that have no pose; the distance of the good ones is given."""
     folder = tmp_path_factory.mktemp("rooms")
     for name, pose in POSES.items():
         image = render_room(int(name == "other_room"), *pose)
         cv2.imwrite(str(folder / f"{name}.png"), image[:, ::-1] if name == "mirrored" else image)
+    cv2.imwrite(str(folder / "dark.png"), np.full((64, 128, 3), 3, np.uint8))
+    cv2.imwrite(str(folder / "narrow.png"), np.full((64, 96, 3), 90, np.uint8))
+    shutil.copy(folder / "a.png", folder / "z_copy.png")
     return estimate_poses(sorted(folder.glob("*.png")), baseline=("a.png", "b.png", 2.0))
 
 
@@ -48,7 +52,8 @@ def test_a_given_distance_sets_the_scale(estimate: PoseEstimate) -> None:
 
 def test_the_reason_names_the_picture(estimate: PoseEstimate) -> None:
     reasons = {path.stem: reason for path, reason in estimate.unplaced.items()}
-    assert sorted(reasons) == ["mirrored", "other_room"]
+    assert sorted(reasons) == ["dark", "mirrored", "narrow", "other_room", "z_copy"]
+    assert "too dark" in reasons["dark"] and "2:1" in reasons["narrow"] and "copy of a.png" in reasons["z_copy"]
     assert "mirrored left to right" in reasons["mirrored"]
     assert "too little in common" in reasons["other_room"] and ".png" in reasons["other_room"]
 

@@ -14,16 +14,27 @@ PIXEL = 2 * math.pi / 2048
 NOISE = 0.3 * PIXEL
 
 
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A third of the random samples, where the right pose must be found."""
+    monkeypatch.setattr("pansplat.poses.two_view._TOP_SETS", (80, 2500))
+
+
+def features(bearings, sizes: np.ndarray | float = 1.0) -> tuple[Features, Features]:
+    """Features of both views with these bearings and no descriptors."""
+    count = len(bearings.first)
+    rest = np.zeros((count, 128), np.float32), np.broadcast_to(sizes, count), PIXEL
+    return Features(bearings.first, *rest), Features(bearings.second, *rest)
+
+
 def estimate(bearings, seed: int = 0, axes: RotationPrior = NO_PRIOR, **options) -> RelativePose:
     """The pose of bearings whose outliers come last, with ratios that hardly reveal them."""
-    count = len(bearings.first)
     rng = np.random.default_rng(seed)
-    ratio = np.sort(rng.uniform(0.6, 0.85, count))
-    order = rng.permutation(count)  # outliers are spread over all ratios
-    empty = np.zeros((count, 128), np.float32)
-    first, second = (Features(x, empty, np.ones(count), PIXEL) for x in (bearings.first, bearings.second))
-    matches = Matches(np.stack((order, order), axis=1), ratio)
-    return estimate_relative_pose(first, second, matches, axes, seed=seed, **options)
+    ratio = np.sort(rng.uniform(0.6, 0.85, len(bearings.first)))
+    order = rng.permutation(len(ratio))  # outliers are spread over all ratios
+    return estimate_relative_pose(
+        *features(bearings), Matches(np.stack((order, order), axis=1), ratio), axes, seed=seed, **options
+    )
 
 
 def errors_degrees(found: RelativePose, bearings) -> tuple[float, float]:
@@ -31,23 +42,17 @@ def errors_degrees(found: RelativePose, bearings) -> tuple[float, float]:
     return math.degrees(turn), math.degrees(angle_between(found.translation, bearings.translation))
 
 
-@pytest.mark.parametrize("outliers", [0.0, 0.5, 0.7])
-def test_the_pose_is_found_among_outliers(scene, outliers) -> None:
+@pytest.mark.parametrize("outliers", [0.0, 0.7])
+def test_the_pose_is_found_among_outliers_within_the_stated_uncertainty(scene, outliers, quick) -> None:
     bearings = scene(1, 300, noise=NOISE, outliers=outliers)
     found = estimate(bearings)
     rotation, direction = errors_degrees(found, bearings)
     assert found.is_reliable, found.problem
-    assert rotation < 0.1 and direction < 0.2
+    assert rotation < min(0.1, 4 * math.degrees(found.uncertainty[0]))
+    assert direction < min(0.2, 4 * math.degrees(found.uncertainty[1]))
 
 
-def test_the_error_is_within_the_stated_uncertainty(scene) -> None:
-    bearings = scene(2, 250, noise=NOISE, outliers=0.3)
-    found = estimate(bearings)
-    rotation, direction = errors_degrees(found, bearings)
-    assert rotation < 4 * math.degrees(found.uncertainty[0]) and direction < 4 * math.degrees(found.uncertainty[1])
-
-
-def test_points_of_one_plane_determine_the_pose(scene) -> None:
+def test_points_of_one_plane_determine_the_pose(scene, quick) -> None:
     bearings = scene(3, 300, noise=NOISE, outliers=0.4, planar=True, translation=np.array((0.6, 0.0, -0.8)))
     found = estimate(bearings)
     rotation, direction = errors_degrees(found, bearings)
@@ -55,20 +60,20 @@ def test_points_of_one_plane_determine_the_pose(scene) -> None:
     assert rotation < 0.3 and direction < 0.6
 
 
-def test_a_translation_from_pole_to_pole_is_found(scene) -> None:
+def test_a_translation_from_pole_to_pole_is_found(scene, quick) -> None:
     bearings = scene(4, 300, noise=NOISE, outliers=0.5, translation=np.array((0.0, 1.0, 0.0)))
     rotation, direction = errors_degrees(estimate(bearings), bearings)
     assert rotation < 0.1 and direction < 0.2
 
 
-def test_a_pure_rotation_is_reported_as_one_place(scene) -> None:
+def test_a_pure_rotation_is_reported_as_one_place(scene, quick) -> None:
     bearings = scene(5, 300, noise=NOISE, outliers=0.5, translation=np.zeros(3), rotation=rotation_exp(np.ones(3)))
     found = estimate(bearings)
     assert not found.is_reliable and found.problem is not None and "one place" in found.problem
     assert math.degrees(rotation_angle(found.rotation @ bearings.rotation.T)) < 0.2
 
 
-def test_views_turned_by_half_a_turn_about_the_baseline_are_distinguished(scene) -> None:
+def test_views_turned_by_half_a_turn_about_the_baseline_are_distinguished(scene, quick) -> None:
     for turn in (0.0, math.pi):
         translation = np.array((1.0, 0.0, 0.0))
         bearings = scene(6, 250, noise=NOISE, rotation=rotation_exp(turn * translation), translation=translation)
@@ -101,7 +106,7 @@ def test_walls_and_floor_confirm_a_pose_of_few_matches(scene) -> None:
     assert reliable == [False, False, True]
 
 
-def test_the_floor_prefers_a_pose_among_equal_ones(scene) -> None:
+def test_the_floor_prefers_a_pose_among_equal_ones(scene, quick) -> None:
     both = [scene(seed, 60, noise=NOISE) for seed in (11, 12)]
     mixed = type(both[0])(
         *(np.concatenate([getattr(b, side) for b in both]) for side in ("first", "second")),
@@ -133,29 +138,22 @@ def test_many_matches_of_one_distorted_object_do_not_outweigh_the_others(scene) 
         assert angle_between(translation, bearings.translation) < 4 * deviations[1]
 
 
-def test_further_matches_polish_a_pose(scene) -> None:
+def test_further_matches_polish_a_pose(scene, quick) -> None:
     bearings = scene(9, 900, noise=2 * NOISE, outliers=0.5)
-    few = type(bearings)(*(x[:60] for x in (bearings.first, bearings.second)), bearings.rotation, bearings.translation)
-    found = estimate(few)
-    count = len(bearings.first)
-    empty = np.zeros((count, 128), np.float32)
-    first, second = (Features(x, empty, np.ones(count), PIXEL) for x in (bearings.first, bearings.second))
+    few = type(bearings)(bearings.first[:60], bearings.second[:60], bearings.rotation, bearings.translation)
+    found, count = estimate(few), len(bearings.first)
     every = Matches(np.tile(np.arange(count)[:, None], (1, 2)), np.full(count, 0.7))
-    polished = polish_relative_pose(found, first, second, every)
+    polished = polish_relative_pose(found, *features(bearings), every)
     assert len(polished.indices) > len(found.indices) and polished.uncertainty[0] < found.uncertainty[0]
     assert sum(errors_degrees(polished, bearings)) < sum(errors_degrees(found, bearings))
 
 
 def _polish(bearings, ratio: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
     """Errors of a polished pose that was 0.5 degrees off."""
-    count = len(bearings.first)
-    first, second = (
-        Features(x, np.zeros((count, 128), np.float32), sizes, PIXEL) for x in (bearings.first, bearings.second)
-    )
     start = rotation_exp(np.radians((0.3, -0.4, 0.0))) @ bearings.rotation
-    indices = np.tile(np.arange(count)[:, None], (1, 2))
+    indices = np.tile(np.arange(len(ratio))[:, None], (1, 2))
     relation = RelativePose(start, bearings.translation, indices[:8], 99.0, 99.0, 50.0, 0.5, (0.1, 0.1), None)
-    return errors_degrees(polish_relative_pose(relation, first, second, Matches(indices, ratio)), bearings)
+    return errors_degrees(polish_relative_pose(relation, *features(bearings, sizes), Matches(indices, ratio)), bearings)
 
 
 def _displaced(bearings, others, turns: np.ndarray):
