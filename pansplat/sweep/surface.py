@@ -44,11 +44,12 @@ def resize_sphere(image: np.ndarray, height: int) -> np.ndarray:
         return np.ascontiguousarray(image)
     if image.shape[0] > height:
         return cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_AREA)
-    factor = height // image.shape[0]
-    if height % image.shape[0] == 0:
-        large = cv2.resize(pad_sphere(image, 2), None, fx=factor, fy=factor, interpolation=cv2.INTER_LINEAR)
-        return np.ascontiguousarray(large[2 * factor : -2 * factor, 2 * factor : -2 * factor])
-    return cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_LINEAR)
+    # The smallest margin that has whole pixels at both sizes: values continue over the seam and the poles.
+    common = math.gcd(image.shape[0], height)
+    margin, scaled = image.shape[0] // common, height // common
+    size = 2 * (height + scaled), height + 2 * scaled
+    large = cv2.resize(pad_sphere(image, margin), size, interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(large[scaled:-scaled, scaled:-scaled])
 
 
 def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:

@@ -64,6 +64,21 @@ def test_surfaces_at_other_depths_are_inconsistent(empty_room):
     assert consistency_mask(surfaces, empty_room.posed.cam2world, 0).mean() < 0.1
 
 
+@pytest.mark.parametrize("height", (64, 48, 36, 24, 8))
+def test_resizing_wraps_around_and_continues_over_the_poles(height):
+    """32 rows to others; the panorama is turned by an eighth."""
+    image = np.random.default_rng(0).random((32, 64, 3)).astype(np.float32)
+    large = resize_sphere(image, height)
+    assert large.shape == (height, 2 * height, 3)
+    turned = resize_sphere(np.roll(image, 8, axis=1), height)
+    assert np.allclose(turned, np.roll(large, height // 4, axis=1), atol=1e-6)
+    row = 0.5 * 32 / height  # of the first pixel centre, in pixels of the image: between both sides of the pole
+    if height > 32:
+        opposite = np.roll(image[0], 32, axis=0)
+        pole = (0.5 + row) * image[0] + (0.5 - row) * opposite
+        assert np.allclose(large[0], resize_sphere(np.repeat(pole[None], 32, axis=0), height)[height // 2], atol=1e-6)
+
+
 def _smooth(height: int) -> np.ndarray:
     rays = ray_grid(height)
     return 0.5 + 0.07 * rays[..., 0] - 0.05 * rays[..., 1] + 0.04 * rays[..., 2] * rays[..., 0]
