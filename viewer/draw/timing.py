@@ -1,6 +1,6 @@
 """`python -m pansplat_viewer.draw.timing JOB.json` measures the renderer and writes its images.
 
-`pansplat bench raster` runs this command, because no other package may import the viewer. Needs no window. A job is
+`pansplat bench viewer` runs this command, because no other package may import the viewer. Needs no window. A job is
 
     {"scene": "scene.ply", "pose": 4x4 cam2world, "size": [width, height], "repeats": 5, "folder": "images",
      "tiers": ["gl33", "gl43", "cpu"], "settings": [{"preset": "exact", "layout": "equirect", ...}, ...]}
