@@ -4,6 +4,7 @@ Colours and radial order depend on the position of the camera and not on its rot
 a worker thread.
 """
 
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt
 
 from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.rendering.cpu.display import NO_LAYER, Selection, mark_in_view
 from pansplat.rendering.cpu.runtime import parallel_for_slices
 from pansplat.rendering.cpu.tiling import radix_argsort
 from pansplat_viewer.draw.displays import color_by_property
@@ -54,6 +56,11 @@ class Splats:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    @functools.cached_property
+    def balls(self) -> Float[np.ndarray, "5 n"]:
+        """Rows x, y, z, extent and reach."""
+        return np.stack((*self.means.T, self.extent, self.reach))
 
     @staticmethod
     def from_scene(
@@ -176,7 +183,6 @@ class SortedSplats:
 
     splats: Splats
     position: tuple[float, float, float]  # camera centre in the splats' moved frame
-    distances: Float[np.ndarray, "n"]  # of each mean from the camera, metres
     order: UInt[np.ndarray, "n"]  # indices by ascending distance, ties by index
     colors: Float[np.ndarray, "n 4"] | None
     milliseconds: float = 0.0  # time of sorting and colours
@@ -189,23 +195,12 @@ class SortedSplats:
         A splat is bounded by a ball of its reach, widened by the low-pass filter. The linearised response of preset
         `3dgs` is not `bounded` by it: then only splats behind the camera are culled.
         """
-        splats = self.splats
-        if not bounded:
-            normals, bound = camera.rotation[:, 2][None], np.float32(0)
-        else:
-            normals = camera.compute_side_normals()
-            moved = math.dist(camera.position, self.position)
-            deviation = np.float32(1.001 * math.sqrt(filter_variance))
-            bound = self.distances + np.float32(moved)
-            bound *= deviation * splats.reach + np.float32(1e-5)
-            bound += np.float32(1.001) * splats.extent
-        offsets = normals @ np.asarray(camera.position)
-        distances = normals.astype(np.float32) @ splats.means.T
-        seen = selected.copy()
-        for distance, offset in zip(distances, offsets, strict=True):
-            distance += bound
-            seen &= distance >= np.float32(offset)
-        return seen
+        normals = camera.compute_side_normals() if bounded else camera.rotation[:, 2][None]
+        selection = Selection(normals, math.sqrt(filter_variance) if bounded else 0.0)
+        labels = np.where(selected, np.int16(0), np.int16(NO_LAYER))
+        balls = self.splats.balls if bounded else self.splats.balls * np.array([[1], [1], [1], [0], [1]], np.float32)
+        _, marks, _ = mark_in_view(balls, np.asarray(camera.position), selection, labels)
+        return marks != NO_LAYER
 
     def sort_back_to_front(
         self, camera: Pinhole, seen: Bool[np.ndarray, "n"], *, by_depth: bool
@@ -224,8 +219,7 @@ def color_splats(splats: Splats, position: tuple[float, float, float]) -> Sorted
     """Evaluate the colours of the splats as seen from a camera position; the GPU sorts them."""
     start = time.perf_counter()
     colors = splats.evaluate_colors(position) if splats.base_colors is None else None
-    none = np.zeros(0, np.float32)
-    return SortedSplats(splats, position, none, none.astype(np.uint32), colors, 1e3 * (time.perf_counter() - start))
+    return SortedSplats(splats, position, np.zeros(0, np.uint32), colors, 1e3 * (time.perf_counter() - start))
 
 
 def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
@@ -238,7 +232,7 @@ def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedS
     order = radix_argsort(squared)
     colors = splats.evaluate_colors(position) if splats.base_colors is None else None
     milliseconds = 1e3 * (time.perf_counter() - start)
-    return SortedSplats(splats, position, np.sqrt(squared), order, colors, milliseconds)
+    return SortedSplats(splats, position, order, colors, milliseconds)
 
 
 class SplatSorter:
