@@ -29,7 +29,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pansplat.cache import _read_gaussians
+from pansplat.cache import _read_scene
 from pansplat.cli.render import read_poses
 from pansplat.data.folders import load_pairs
 from pansplat.data.images import read_depth, read_panorama, write_image
@@ -126,7 +126,7 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
     def read_cached(path: Path) -> None:
         body = path.read_bytes()[:-4]  # with a valid checksum, else nothing is parsed
         path.write_bytes(body + zlib.crc32(body).to_bytes(4, "little"))
-        _read_gaussians(path, 2)
+        _read_scene(path, 2)
 
     def read_pair(path: Path) -> None:
         del path

@@ -108,7 +108,7 @@ def _arm_assembly(code):
     return machine.emit_assembly(module)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("processor", [_HASWELL, _X86_64], ids=["haswell", "x86-64"])
 def test_code_for_other_processors_is_vectorised_and_gives_the_same_result(processor, make_case, tmp_path):
     case = make_case("equirect", (40, 80), 200)
