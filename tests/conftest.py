@@ -66,9 +66,10 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the tests of the markers `exhaustive` and `lint` unless -m names the marker."""
     if _selects(config, "exhaustive"):
-        folders = [Path(__file__).with_name(name) for name in _CHECKED]
+        tests = Path(__file__).parent
+        checked = {name for package in _CHECKED for name in (package, f"test_{package}.py")}
         for item in items:
-            if any(item.path.is_relative_to(folder) or item.path.stem == f"test_{folder.name}" for folder in folders):
+            if item.path.relative_to(tests).parts[0] in checked:
                 item.add_marker("exhaustive")
     hidden = [marker for marker in ("exhaustive", "lint") if not _selects(config, marker)]
     left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in hidden)]
