@@ -43,7 +43,7 @@ from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.viewer import Viewer
 from pansplat_viewer.window.preferences import Preferences
 
-pytestmark = [pytest.mark.gl, pytest.mark.xdist_group("viewer")]
+pytestmark = pytest.mark.gl
 
 SIZE = (560, 900)
 IMAGE = (slice(20, 560), slice(310, 560))  # rows and columns without panels

@@ -25,8 +25,6 @@ from pansplat.tours import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
-pytestmark = pytest.mark.xdist_group("chromium")  # one browser
-
 SIZE = (320, 240)
 LOADS = int(os.environ.get("PANSPLAT_PAGE_LOADS", "2"))  # docs/web.md has the result of 50
 OPTIONS = ("--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
