@@ -25,6 +25,23 @@ _COINCIDENT = 1e-3  # metres, in a world of metres
 _MATCHING_SECONDS = 2.0  # for two panoramas of 512 rows on two cores
 
 
+@dataclass(frozen=True)
+class Link:
+    """A way from one panorama towards another, as a tour states it: often on the door, 10 to 25 degrees off.
+
+    Attributes:
+        target: name of the other panorama.
+        yaw: to the right of the centre column, radians.
+        pitch: below the horizon, radians.
+        text: label of the hot spot; may be empty.
+    """
+
+    target: str
+    yaw: float
+    pitch: float = 0.0
+    text: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class Panorama:
     """One panorama file with its pose.
@@ -36,6 +53,10 @@ class Panorama:
         mask: image that is white where the panorama shows the scene; None to detect static content.
         depth: radial depth, 16-bit PNG in millimetres or EXR in metres; None when there is none.
         is_scan: whether the panorama is rendered from a scan, whose holes are exactly black.
+        part: panoramas of different parts have no common world. One without a known pose is a part of its own.
+        title: for people, if it differs from the name.
+        links: to other panoramas of the tour.
+        start: yaw and pitch, as of a link, of the view that a visitor sees first; None if there is none.
     """
 
     name: str
@@ -44,16 +65,25 @@ class Panorama:
     mask: Path | None = None
     depth: Path | None = None
     is_scan: bool = False
+    part: int = 0
+    title: str = ""
+    links: tuple[Link, ...] = ()
+    start: tuple[float, float] | None = None
+
+    @property
+    def label(self) -> str:
+        """The title, or the name if there is none."""
+        return self.title or self.name
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Context and target panoramas of one scene. Image files are read by `load_context` and `load_targets`.
+    """Context and target panoramas of one scene; a scene of a single view has one context panorama. Image files are read by `load_context` and `load_targets`.
 
     Attributes:
         name: unique among the pairs that were loaded together; valid as a file name.
         folder: folder of the files.
-        context: two or more panoramas, the input of a predictor.
+        context: one or more panoramas, the input of a predictor.
         targets: panoramas for comparison; may be empty.
         near, far: radial depth range to search, metres.
         siblings: all panoramas taken with the same camera; static content is detected in them.
@@ -85,7 +115,7 @@ class Pair:
         centres = torch.stack([panorama.cam2world[:3, 3] for panorama in self.context])
         if len(self.context) > MAX_CONTEXT:
             raise too_many_panoramas(self.name, len(self.context))
-        if float(torch.pdist(centres).min()) < _COINCIDENT / working_factor(self.near):
+        if len(centres) > 1 and float(torch.pdist(centres).min()) < _COINCIDENT / working_factor(self.near):
             warnings.warn(
                 f"{self.name}: cameras of the context views coincide (less than 1 mm apart); "
                 "depth cannot be estimated without a baseline, and only rotations of the camera will look right. "

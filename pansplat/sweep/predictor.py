@@ -38,7 +38,7 @@ class SweepConfig:
 class Sweep:
     """Hierarchical sphere sweep with a hand-crafted matching cost; see docs/sweep.md.
 
-    It takes two or more views and matches each against all others. A prior model adds knowledge of rooms where the
+    It takes one or more views and matches each against all others. A prior model adds knowledge of rooms where the
     panoramas have no evidence.
     """
 
@@ -71,7 +71,7 @@ class Sweep:
                 exact black (0, 0, 0), the holes of scans, are masked too.
 
         Raises:
-            InputError: wrong shapes, fewer than two views, non-finite values, or near >= far.
+            InputError: wrong shapes, no view, non-finite values, or near >= far.
         """
         if images.ndim == 5:
             item_masks = [None] * len(images) if masks is None else masks
@@ -120,9 +120,9 @@ class Sweep:
 
 def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Tensor | None) -> None:
     shape = tuple(images.shape)
-    if images.ndim != 4 or shape[0] < 2 or shape[1] != 3 or shape[3] != 2 * shape[2]:
+    if images.ndim != 4 or shape[0] < 1 or shape[1] != 3 or shape[3] != 2 * shape[2]:
         raise InputError(
-            f"`images` must be (view, 3, height, 2 * height) of at least two panoramas, got {shape}; "
+            f"`images` must be (view, 3, height, 2 * height) of at least one panorama, got {shape}; "
             "stack RGB equirectangular images of one size"
         )
     require_matching_inputs(images, cam2world, masks)
