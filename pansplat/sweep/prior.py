@@ -24,6 +24,7 @@ from pansplat.geometry.equirect import rotate_equirect
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
 from pansplat.sweep.surface import Surface, resize_sphere
+from pansplat.threads import limit_numba_threads
 
 _HEIGHT_CANDIDATES = 64
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
@@ -273,6 +274,7 @@ def apply_prior_cost(
     log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
     scale = np.stack([np.maximum(prior.scale, config.min_scale) for prior in priors]).astype(np.float32)
     penalty = np.where(np.arange(len(priors)) > 0, config.further_penalty, 0).astype(np.float32)
+    limit_numba_threads()
     for n, hypotheses in enumerate(sets):
         _add_cost(
             cost, log_depth, scale, penalty, hypotheses.base, hypotheses.step, n * count, count,

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from pansplat.geometry.equirect import pixel_directions, uv_from_directions
+from pansplat.threads import limit_numba_threads
 
 
 def ray_grid(height: int) -> np.ndarray:
@@ -123,6 +124,7 @@ def guided_upsample(
     """
     if needed is None:
         needed = np.ones(fine.shape[:2], bool)
+    limit_numba_threads()
     return Surface(*_upsample(surface.inverse_depth, surface.orientation, coarse, fine, needed))
 
 
