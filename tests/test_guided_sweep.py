@@ -136,14 +136,14 @@ def test_shipped_model_estimates_the_sample_within_a_fifth():
 @pytest.fixture(scope="module")
 def sample():
     (pair,) = load_pairs(Path(__file__).parents[1] / "assets" / "living_room")
-    return pair.load_context(128), pair.load_targets(128), load_model("default")
+    return pair.load_context(64), pair.load_targets(64), load_model("default")
 
 
 def _error_between(sample, **changes):
     """Error of the middle view, drawn from a prediction with other inputs, dB."""
     views, targets, model = sample
     views = dataclasses.replace(views, **changes)
-    middle = render(predict(views, model), targets.cam2world[0], size=(128, 256)).color
+    middle = render(predict(views, model), targets.cam2world[0], size=(64, 128)).color
     return ws_psnr(middle.clamp(0, 1), targets.images[0])
 
 
@@ -155,7 +155,7 @@ def test_errors_of_poses_and_depth_range_cost_little(sample):
         [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]], dtype=poses.dtype
     )
     poses[1, :3, 3] += torch.tensor([0.01, -0.01, 0.014], dtype=poses.dtype)  # 2 cm
-    assert _error_between(sample, cam2world=poses) > exact - 1.5
+    assert _error_between(sample, cam2world=poses) > exact - 0.5  # 1.46 for errors four times as large
     assert _error_between(sample, near=views.near / 2, far=2 * views.far) > exact - 0.5
 
 
@@ -164,5 +164,5 @@ def test_coincident_cameras_give_a_scene_that_is_better_than_a_sphere(sample, sp
     views, targets, _ = sample
     same = {name: getattr(views, name)[:1].repeat(2, *[1] * (getattr(views, name).ndim - 1)) for name in _OF_A_VIEW}
     sphere = predict(dataclasses.replace(views, **same), sphere_predictor())
-    drawn = render(sphere, targets.cam2world[0], size=(128, 256)).color.clamp(0, 1)
+    drawn = render(sphere, targets.cam2world[0], size=(64, 128)).color.clamp(0, 1)
     assert _error_between(sample, **same) > ws_psnr(drawn, targets.images[0]) + 2
