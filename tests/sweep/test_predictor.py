@@ -212,16 +212,16 @@ def _decibels(pair: Pair, height: int) -> tuple[float, float]:
 @pytest.mark.slow
 def test_the_middle_view_of_a_scanned_room_is_rendered(shared: Path):
     (pair,) = (pair for pair in pansplat.load_pairs(shared / "data/mp3d_sample") if pair.targets)
-    reached, faded = _decibels(pair, 256)
-    assert reached >= 24.0  # 24.6 measured
-    assert reached >= faded + 7.0
+    reached, faded = _decibels(pair, 128)
+    assert reached >= 26.0  # 26.7 measured
+    assert reached >= faded + 9.5
 
 
 @pytest.mark.shared
 @pytest.mark.slow
 def test_photographed_homes_are_rendered_better_than_by_a_cross_fade(shared: Path):
     pairs = [pair for pair in pansplat.load_pairs(shared / "data/zind") if pair.targets]
-    figures = torch.tensor([_decibels(pair, 128) for pair in pairs])
+    figures = torch.tensor([_decibels(pair, 64) for pair in pairs])
     assert len(pairs) == 3
     assert (figures[:, 0] > figures[:, 1]).all()
-    assert float((figures[:, 0] - figures[:, 1]).mean()) >= 3.0
+    assert float((figures[:, 0] - figures[:, 1]).mean()) >= 4.0  # 4.6 measured
