@@ -22,7 +22,7 @@ from torch import Tensor
 from pansplat.cache import CachedPrediction, CachedScene
 from pansplat.data import folders
 from pansplat.data.pairs import Pair
-from pansplat.data.views import Views
+from pansplat.data.views import CAMERA_HEIGHT, Views
 from pansplat.errors import InputError
 from pansplat.files import expand_home, find_scene_suffix
 from pansplat.gaussians.formats import load_scene, save_scene
@@ -209,7 +209,7 @@ def predict(
         compat, precision: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
-        refine_seconds: time limit of the refinement; 0 for none.
+        refine_seconds: time limit of the refinement; 0 for none. A single view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it.
         cache: whether to read and write the cache.
         progress: called with a description of the current work and the completed fraction.
@@ -227,7 +227,7 @@ def predict(
     views = pair if isinstance(pair, Views) else pair.load_context(height)
     cached_pair = pair if cache and isinstance(pair, Pair) else None
     report: Progress = progress or (lambda what, fraction: None)
-    if not refine_seconds:
+    if not refine_seconds or len(views.images) == 1:  # one photograph does not show what is wrong seen from elsewhere
         return _predict_views(cached_pair, views, predictor, height, report)
     refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
     cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
@@ -572,8 +572,11 @@ def _load_only_pair(path: str | Path) -> Pair:
 
 
 def _make_scene(content: CachedScene, views: Views, predictor: Predictor) -> Scene:
+    gaussians = content.gaussians
+    if len(views.images) == 1:  # predicted as of a camera at the usual height
+        gaussians = gaussians.scaled(views.camera_height / CAMERA_HEIGHT, views.cam2world[0, :3, 3])
     return Scene(
-        content.gaussians,
+        gaussians,
         views.cam2world.double(),
         near=views.near,
         far=views.far,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_height, read_mask, read_panorama
 from pansplat.data.masks import lift_black_surfaces, scene_mask_of_files
-from pansplat.data.views import Views
+from pansplat.data.views import CAMERA_HEIGHT, Views
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import require_depth_range, working_factor
 
@@ -78,7 +78,9 @@ class Panorama:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Context and target panoramas of one scene; a scene of a single view has one context panorama. Image files are read by `load_context` and `load_targets`.
+    """Context and target panoramas of one scene; a scene of a single view has one context panorama.
+
+    Image files are read by `load_context` and `load_targets`.
 
     Attributes:
         name: unique among the pairs that were loaded together; valid as a file name.
@@ -87,6 +89,7 @@ class Pair:
         targets: panoramas for comparison; may be empty.
         near, far: radial depth range to search, metres.
         siblings: all panoramas taken with the same camera; static content is detected in them.
+        camera_height: over the floor, metres; the scale of a single view.
     """
 
     name: str
@@ -96,6 +99,7 @@ class Pair:
     near: float
     far: float
     siblings: tuple[Path, ...] = field(default=(), repr=False)
+    camera_height: float = CAMERA_HEIGHT
 
     @property
     def image_height(self) -> int:
@@ -154,6 +158,7 @@ class Pair:
             near=self.near,
             far=self.far,
             names=tuple(p.name for p in panoramas),
+            camera_height=self.camera_height,
             depths=torch.stack(depths) if depths and len(depths) == len(panoramas) else None,
         )
 

@@ -53,6 +53,13 @@ def resize_sphere(image: np.ndarray, height: int) -> np.ndarray:
     return np.ascontiguousarray(large[scaled:-scaled, scaled:-scaled])
 
 
+def resize_nearest(values: np.ndarray, height: int) -> np.ndarray:
+    """A panorama (h, w) at another height: the nearest pixel when smaller, so that edges stay, bilinear when larger."""
+    if height >= len(values):
+        return resize_sphere(values, height)
+    return cv2.resize(values, (2 * height, height), interpolation=cv2.INTER_NEAREST_EXACT)
+
+
 def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:
     """A panorama (h, w) of bool at another height, by the nearest pixel."""
     return cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
