@@ -468,8 +468,8 @@ def render(
         scene: the Gaussians and their input cameras.
         cam2world: pose of the camera, OpenCV axes, metres.
         blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; in a scene of
-            a tour, those of the views at the nearest edge, and other views fill their holes. "joint" renders all
-            Gaussians together; a number renders the Gaussians of one view only.
+            a tour, those of the views at the nearest edge, and other views of its part fill their holes. "joint"
+            renders all Gaussians together, of a tour those of the part; a number renders those of one view only.
         size: (height, width), pixels; by default the scene's height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
         eye_distance: if given, omni-directional stereo (docs/rendering.md, section 9): the left eye's panorama above
@@ -511,24 +511,22 @@ def render(
         return rasterize_gaussians(scene.gaussians.select(scene.gaussians.views == blend), pose)
     if blend not in ("deferred", "joint"):
         raise InputError(f"`blend` must be deferred, joint or the number of a view, got {blend!r}")
+    tour = make_graph(scene) if scene.overlaps else None
+    edge = None if tour is None else tour.find_nearest_edge(pose[:3, 3].detach().numpy())[0]
+    shown = list(range(num_views))
+    if tour is not None and edge is not None:
+        shown = [view for view in shown if not tour.is_fade(view, edge[0])]
     if blend == "joint" or num_views < 2:
-        return rasterize_gaussians(scene.gaussians, pose)
-    weights = _choose_weights(scene, pose[:3, 3])
-    views = [scene.gaussians.select(scene.gaussians.views == view) for view in range(num_views)]
+        gaussians = scene.gaussians
+        if len(shown) < num_views:
+            gaussians = gaussians.select(torch.isin(gaussians.views, torch.tensor(shown).to(gaussians.views)))
+        return rasterize_gaussians(gaussians, pose)
+    group = shown if tour is None or edge is None else list(tour.choose_scene_views()[edge])
+    weights = torch.zeros(num_views, dtype=torch.float64)
+    weights[group] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].double())
+    views = [scene.gaussians.select(scene.gaussians.views == view) for view in shown]
     renderings = [rasterize_gaussians(view, pose) for view in views]
-    return blend_renderings(renderings, weights)
-
-
-def _choose_weights(scene: Scene, position: Float[Tensor, "3"]) -> Float[Tensor, "view"]:
-    """Weights of the views at a camera position; in a tour, 0 but for the views of the scene of the nearest edge."""
-    positions = scene.cam2world[:, :3, 3].double()
-    if not scene.overlaps:
-        return blend_weights(position, positions)
-    tour = make_graph(scene)
-    views = list(tour.choose_scene_views()[tour.find_nearest_edge(position.detach().numpy())[0]])
-    weights = torch.zeros(len(positions), dtype=torch.float64)
-    weights[views] = blend_weights(position, positions[views])
-    return weights
+    return blend_renderings(renderings, weights[shown])
 
 
 def _choose_rasterizer(

@@ -19,7 +19,13 @@ Gains = tuple[tuple[float, ...], ...]
 """Factors of R, G and B for each view's photograph."""
 
 Overlaps = tuple[tuple[int, int, float], ...]
-"""Edges of a tour graph: two views, the smaller one first, and their overlap."""
+"""Edges of a tour graph: two views, the smaller one first, and their overlap; a view twice if it has no other edge."""
+
+Links = tuple[tuple[int, int, float, float, str], ...]
+"""Links between panoramas: from view to view, yaw (to the right) and pitch (below the horizon) in radians, and text."""
+
+Starts = tuple[tuple[float, float] | None, ...]
+"""Yaw and pitch, as of a link, of the view of each panorama that a visitor sees first; None if there is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +141,8 @@ class Scene:
         gains: exposure and white balance of each view's photograph, as factors of R, G and B relative to the geometric
             mean of all; a refinement estimates them. The colours of a view's Gaussians are those of its photograph.
         overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.TourGraph`.
+        links: of a scene of a whole tour: the known directions from one panorama towards another one.
+        starts: of a scene of a whole tour: one for each view, or none.
     """
 
     gaussians: Gaussians
@@ -146,6 +154,8 @@ class Scene:
     height: int = 512
     gains: Gains = ()
     overlaps: Overlaps = ()
+    links: Links = ()
+    starts: Starts = ()
 
     def scaled(self, factor: float) -> Scene:
         """The scene in a world that is multiplied by a factor."""

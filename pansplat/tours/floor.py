@@ -214,7 +214,7 @@ def paint_floor_plan(
     centers = plan.to_pixels(tour.positions @ axes).round().astype(np.int32)
     if route is not None:
         line = plan.to_pixels(route.positions @ axes).round().astype(np.int32)
-        cv2.polylines(image, [line], False, (255, 204, 51), 2, cv2.LINE_AA)
+        cv2.polylines(image, np.split(line, route.jumps + 1), False, (255, 204, 51), 2, cv2.LINE_AA)
     else:
         for edge in tour.overlaps:
             cv2.polylines(image, [centers[list(edge)]], False, (170, 180, 190), 1, cv2.LINE_AA)
