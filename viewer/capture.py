@@ -223,15 +223,18 @@ class TourFrames:
         if slot is not None:
             if fade.scenes[slot] is not loaded.scene:
                 self._renderers[slot].upload(loaded.scene)
-            fade.show(slot, loaded.scene, now)
+            fade.show(slot, loaded.scene, now, scenes.part)
+        fade.move(pose, scenes.part)
         weight, color, depth = fade.compute_weight(now), 0.0, None
         for slot, part in ((1 - fade.front, 1 - weight), (fade.front, weight)):
             scene, renderer = fade.scenes[slot], self._renderers[slot]
             if scene is not None and (part > 0 or (with_depth and slot == fade.front)):
                 settings = replace(fit_settings(self._settings, scene), vertical_fov_degrees=vertical_fov_degrees)
+                view = fade.poses[slot]
+                assert view is not None
                 image, image_depth = render_image(
                     renderer,
-                    pose,
+                    view,
                     self._size,
                     settings,
                     self.image_format,

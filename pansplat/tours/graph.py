@@ -195,10 +195,13 @@ class TourGraph:
 
     def find_nearest_edge(self, position: Float[np.ndarray, "3"], part: int | None = None) -> tuple[Edge, float]:
         """The edge nearest to a position, of all or of one part, and the distance in metres."""
-        edges = (edge for edge in self.overlaps if part is None or self.parts[edge[0]] == part)
-        distances = {edge: self.measure_distance(edge, position) for edge in edges}
-        edge = min(distances, key=distances.__getitem__)
-        return edge, distances[edge]
+        edges = np.array([*self.overlaps])
+        if part is not None:
+            edges = edges[np.array(self.parts)[edges[:, 0]] == part]
+        distances = self._measure_distances(edges, position)
+        nearest = int(distances.argmin())
+        a, b = edges[nearest].tolist()
+        return (a, b), float(distances[nearest])
 
     def follow_edge(self, position: Float[np.ndarray, "3"], current: Edge) -> Edge:
         """The edge of a camera that moves: `current`, unless another edge is nearer by `EDGE_HYSTERESIS`.
@@ -213,10 +216,15 @@ class TourGraph:
 
     def measure_distance(self, edge: Edge, position: Float[np.ndarray, "3"]) -> float:
         """Distance of a position from the line between an edge's cameras, metres."""
-        a, b = self.positions[list(edge)]
+        return float(self._measure_distances(np.array([edge]), position)[0])
+
+    def _measure_distances(
+        self, edges: Int[np.ndarray, "edge 2"], position: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "edge"]:
+        a, b = self.positions[edges[:, 0]], self.positions[edges[:, 1]]
         along = b - a
-        fraction = float((position - a) @ along / max(float(along @ along), 1e-12))
-        return float(np.linalg.norm(position - (a + min(max(fraction, 0.0), 1.0) * along)))
+        fractions = ((position - a) * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), 1e-12)
+        return np.linalg.norm(position - (a + np.clip(fractions, 0, 1)[:, None] * along), axis=1)
 
     def find_walk(self, start: int, end: int) -> list[int]:
         """The nodes of the cheapest way along edges and fades, both ends included.
