@@ -286,13 +286,16 @@ class TourGraph:
 
         Args:
             start: its first node; None chooses the start of the shortest walk, of some starts for more than 100 nodes.
-                A tour of parts with links starts at its first node, as its author has chosen.
+                A tour of parts with links starts at its first node, as its author has chosen, and one without links in
+                its largest part.
         """
         costs, _ = self._shortest
-        count = len(self)
-        if start is None and self.links and max(self.parts) > 0:
-            start = 0
-        starts = range(0, count, math.ceil(count**2 / _MAX_STARTS)) if start is None else (start,)
+        starts = np.arange(len(self)) if start is None else np.array([start])
+        if start is None and max(self.parts) > 0:
+            starts = (
+                starts[:1] if self.links else np.flatnonzero(np.array(self.parts) == np.bincount(self.parts).argmax())
+            )
+        starts = starts[:: math.ceil(len(starts) * len(self) / _MAX_STARTS)].tolist()
         orders = [_improve_order(_order_by_distance(costs, first), costs) for first in starts]
         order = min(orders, key=lambda order: float(costs[order[:-1], order[1:]].sum()))
         first, *others = order.tolist()
