@@ -39,7 +39,7 @@ from pansplat.refinement import RefineConfig, Refinement, RefineReport, refineme
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
-from pansplat.tours import TourGraph, make_graph, merge_scenes
+from pansplat.tours import TourGraph, list_starts, make_graph, merge_scenes
 
 __all__ = [
     "estimate_poses",
@@ -225,18 +225,18 @@ def predict(
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
-    cached_pair = pair if cache and isinstance(pair, Pair) else None
     report: Progress = progress or (lambda what, fraction: None)
     if not refine_seconds:
-        return _predict_views(cached_pair, views, predictor, height, report)
+        return _predict_views(pair, views, predictor, height, cache, report)
     refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
-    cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
+    is_cached = cache and isinstance(pair, Pair)
+    cached = CachedPrediction(pair, views, predictor, height, refinement) if is_cached else None
     found = None if cached is None else cached.read()
-    final = None if found is None or found.is_starved else _make_scene(found, views, predictor)
+    final = None if found is None or found.is_starved else _make_scene(found, pair, views, predictor)
     if final is not None and on_predicted is None:
         report("read from the cache", 1.0)
         return final
-    scene = _predict_views(cached_pair, views, predictor, height, lambda what, done: report(what, 0.5 * done))
+    scene = _predict_views(pair, views, predictor, height, cache, lambda what, done: report(what, 0.5 * done))
     if on_predicted is not None:
         on_predicted(scene)
     if final is not None:
@@ -253,22 +253,24 @@ def predict(
     if found is not None and found.steps > done.steps:
         refined = found._replace(is_starved=False)  # it runs once more only
     cached.write(refined)
-    return _make_scene(refined, views, predictor)
+    return _make_scene(refined, pair, views, predictor)
 
 
-def _predict_views(pair: Pair | None, views: Views, predictor: Predictor, height: int, progress: Progress) -> Scene:
-    """Predict without refinement; with a pair the cache is read and written."""
-    cached = None if pair is None else CachedPrediction(pair, views, predictor, height)
+def _predict_views(
+    source: Pair | Views, views: Views, predictor: Predictor, height: int, cache: bool, progress: Progress
+) -> Scene:
+    """Predict without refinement; of a pair, the cache is read and written if `cache`."""
+    cached = CachedPrediction(source, views, predictor, height) if cache and isinstance(source, Pair) else None
     found = None if cached is None else cached.read()
     if found is not None:
         progress("read from the cache", 1.0)
-        return _make_scene(found, views, predictor)
+        return _make_scene(found, source, views, predictor)
     gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress)
     assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
     predicted = CachedScene(gaussians)
     if cached is not None:
         cached.write(predicted)
-    return _make_scene(predicted, views, predictor)
+    return _make_scene(predicted, source, views, predictor)
 
 
 def refine(
@@ -437,8 +439,8 @@ def predict_to_file(
         )
         pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
         if suffix == ".ply":
-            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), views, predictor), pruned, path)
-        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), views, predictor)
+            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), pair, views, predictor), pruned, path)
+        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), pair, views, predictor)
     else:
         scene = predict(pair, predictor, height=height, refine_seconds=refine_seconds, cache=cache, progress=progress)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
@@ -569,14 +571,16 @@ def _load_only_pair(path: str | Path) -> Pair:
     return pairs[0]
 
 
-def _make_scene(content: CachedScene, views: Views, predictor: Predictor) -> Scene:
+def _make_scene(content: CachedScene, source: Pair | Views, views: Views, predictor: Predictor) -> Scene:
+    panoramas = source.context if isinstance(source, Pair) else ()
     return Scene(
         content.gaussians,
         views.cam2world.double(),
         near=views.near,
         far=views.far,
-        names=views.names,
+        names=tuple(panorama.label for panorama in panoramas) or views.names,
         model=predictor.name,
         height=views.images.shape[-2],
         gains=content.gains,
+        starts=list_starts(panoramas),
     )
