@@ -39,7 +39,7 @@ from pansplat.refinement import RefineConfig, Refinement, RefineReport, refineme
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
-from pansplat.tours import TourGraph, make_graph, merge_scenes
+from pansplat.tours import TourGraph, list_starts, make_graph, merge_scenes
 
 __all__ = [
     "estimate_poses",
@@ -225,18 +225,18 @@ def predict(
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
-    cached_pair = pair if cache and isinstance(pair, Pair) else None
     report: Progress = progress or (lambda what, fraction: None)
     if not refine_seconds or len(views.images) == 1:  # one photograph does not show what is wrong seen from elsewhere
-        return _predict_views(cached_pair, views, predictor, height, report)
+        return _predict_views(pair, views, predictor, height, cache, report)
     refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
-    cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
+    is_cached = cache and isinstance(pair, Pair)
+    cached = CachedPrediction(pair, views, predictor, height, refinement) if is_cached else None
     found = None if cached is None else cached.read()
-    final = None if found is None or found.is_starved else _make_scene(found, views, predictor)
+    final = None if found is None or found.is_starved else _make_scene(found, pair, views, predictor)
     if final is not None and on_predicted is None:
         report("read from the cache", 1.0)
         return final
-    scene = _predict_views(cached_pair, views, predictor, height, lambda what, done: report(what, 0.5 * done))
+    scene = _predict_views(pair, views, predictor, height, cache, lambda what, done: report(what, 0.5 * done))
     if on_predicted is not None:
         on_predicted(scene)
     if final is not None:
@@ -253,22 +253,24 @@ def predict(
     if found is not None and found.steps > done.steps:
         refined = found._replace(is_starved=False)  # it runs once more only
     cached.write(refined)
-    return _make_scene(refined, views, predictor)
+    return _make_scene(refined, pair, views, predictor)
 
 
-def _predict_views(pair: Pair | None, views: Views, predictor: Predictor, height: int, progress: Progress) -> Scene:
-    """Predict without refinement; with a pair the cache is read and written."""
-    cached = None if pair is None else CachedPrediction(pair, views, predictor, height)
+def _predict_views(
+    source: Pair | Views, views: Views, predictor: Predictor, height: int, cache: bool, progress: Progress
+) -> Scene:
+    """Predict without refinement; of a pair, the cache is read and written if `cache`."""
+    cached = CachedPrediction(source, views, predictor, height) if cache and isinstance(source, Pair) else None
     found = None if cached is None else cached.read()
     if found is not None:
         progress("read from the cache", 1.0)
-        return _make_scene(found, views, predictor)
+        return _make_scene(found, source, views, predictor)
     gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress)
     assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
     predicted = CachedScene(gaussians)
     if cached is not None:
         cached.write(predicted)
-    return _make_scene(predicted, views, predictor)
+    return _make_scene(predicted, source, views, predictor)
 
 
 def refine(
@@ -437,8 +439,8 @@ def predict_to_file(
         )
         pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
         if suffix == ".ply":
-            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), views, predictor), pruned, path)
-        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), views, predictor)
+            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), pair, views, predictor), pruned, path)
+        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), pair, views, predictor)
     else:
         scene = predict(pair, predictor, height=height, refine_seconds=refine_seconds, cache=cache, progress=progress)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
@@ -468,8 +470,8 @@ def render(
         scene: the Gaussians and their input cameras.
         cam2world: pose of the camera, OpenCV axes, metres.
         blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; in a scene of
-            a tour, those of the views at the nearest edge, and other views fill their holes. "joint" renders all
-            Gaussians together; a number renders the Gaussians of one view only.
+            a tour, those of the views at the nearest edge, and other views of its part fill their holes. "joint"
+            renders all Gaussians together, of a tour those of the part; a number renders those of one view only.
         size: (height, width), pixels; by default the scene's height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
         eye_distance: if given, omni-directional stereo (docs/rendering.md, section 9): the left eye's panorama above
@@ -511,24 +513,22 @@ def render(
         return rasterize_gaussians(scene.gaussians.select(scene.gaussians.views == blend), pose)
     if blend not in ("deferred", "joint"):
         raise InputError(f"`blend` must be deferred, joint or the number of a view, got {blend!r}")
+    tour = make_graph(scene) if scene.overlaps else None
+    edge = None if tour is None else tour.find_nearest_edge(pose[:3, 3].detach().numpy())[0]
+    shown = list(range(num_views))
+    if tour is not None and edge is not None:
+        shown = [view for view in shown if not tour.is_fade(view, edge[0])]
     if blend == "joint" or num_views < 2:
-        return rasterize_gaussians(scene.gaussians, pose)
-    weights = _choose_weights(scene, pose[:3, 3])
-    views = [scene.gaussians.select(scene.gaussians.views == view) for view in range(num_views)]
+        gaussians = scene.gaussians
+        if len(shown) < num_views:
+            gaussians = gaussians.select(torch.isin(gaussians.views, torch.tensor(shown).to(gaussians.views)))
+        return rasterize_gaussians(gaussians, pose)
+    group = shown if tour is None or edge is None else list(tour.choose_scene_views()[edge])
+    weights = torch.zeros(num_views, dtype=torch.float64)
+    weights[group] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].double())
+    views = [scene.gaussians.select(scene.gaussians.views == view) for view in shown]
     renderings = [rasterize_gaussians(view, pose) for view in views]
-    return blend_renderings(renderings, weights)
-
-
-def _choose_weights(scene: Scene, position: Float[Tensor, "3"]) -> Float[Tensor, "view"]:
-    """Weights of the views at a camera position; in a tour, 0 but for the views of the scene of the nearest edge."""
-    positions = scene.cam2world[:, :3, 3].double()
-    if not scene.overlaps:
-        return blend_weights(position, positions)
-    tour = make_graph(scene)
-    views = list(tour.choose_scene_views()[tour.find_nearest_edge(position.detach().numpy())[0]])
-    weights = torch.zeros(len(positions), dtype=torch.float64)
-    weights[views] = blend_weights(position, positions[views])
-    return weights
+    return blend_renderings(renderings, weights[shown])
 
 
 def _choose_rasterizer(
@@ -571,8 +571,8 @@ def _load_only_pair(path: str | Path) -> Pair:
     return pairs[0]
 
 
-def _make_scene(content: CachedScene, views: Views, predictor: Predictor) -> Scene:
-    gaussians = content.gaussians
+def _make_scene(content: CachedScene, source: Pair | Views, views: Views, predictor: Predictor) -> Scene:
+    panoramas, gaussians = source.context if isinstance(source, Pair) else (), content.gaussians
     if len(views.images) == 1:  # predicted as of a camera at the usual height
         gaussians = gaussians.scaled(views.camera_height / CAMERA_HEIGHT, views.cam2world[0, :3, 3])
     return Scene(
@@ -580,8 +580,9 @@ def _make_scene(content: CachedScene, views: Views, predictor: Predictor) -> Sce
         views.cam2world.double(),
         near=views.near,
         far=views.far,
-        names=views.names,
+        names=tuple(panorama.label for panorama in panoramas) or views.names,
         model=predictor.name,
         height=views.images.shape[-2],
         gains=content.gains,
+        starts=list_starts(panoramas),
     )

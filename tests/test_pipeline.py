@@ -47,6 +47,14 @@ def test_a_predicted_scene_holds_its_cameras_and_predictor_name(scene: Scene) ->
     assert (scene.model, scene.height, scene.names) == ("sphere", HEIGHT, ("left", "right"))
 
 
+def test_a_scene_of_one_panorama_keeps_its_title_and_start_view(pair_folder: Path, sphere_predictor) -> None:
+    (pair,) = load_pairs(pair_folder)
+    single = replace(pair, context=(replace(pair.context[1], title="hall", start=(7.0, 0.1)),))
+    for cache in (True, True, False):
+        scene = predict(single, sphere_predictor(), height=HEIGHT, cache=cache)
+        assert scene.names == ("hall",) and scene.starts == ((pytest.approx(7 - 2 * np.pi), 0.1),)
+
+
 @pytest.mark.parametrize(
     ("photographs", "largest", "expected"), [(32, None, 64), (300, None, 300), (2048, None, 512), (2048, 1024, 1024)]
 )
@@ -130,6 +138,26 @@ def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_the
     others = render(select_views(cut, (2, 3)), pose, size=(32, 64))
     assert (drawn.alpha[hole] == others.alpha[hole]).all() and others.alpha[hole].min() > 0.9
     assert not torch.allclose(of_edge.color, render(replace(cut, overlaps=()), pose, size=(32, 64)).color, atol=0.05)
+
+
+@pytest.mark.parametrize("blending", ["deferred", "joint"])
+def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
+    tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor, blending: str
+) -> None:
+    pairs = load_pairs(write_tour(tmp_path / "house", 3))
+    alone = replace(pairs[1].context[1], part=1)
+    (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
+    whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
+    assert [edge[:2] for edge in whole.overlaps] == [(0, 1), (2, 2)]
+    options = {"size": (32, 64), "blend": blending}
+    for views in ((0, 1), (2,)):
+        pose = tour.cam2world[views[0]].clone()
+        pose[2, 3] += 0.3
+        gaussians = whole.gaussians
+        cut = replace(whole, gaussians=gaussians.select((gaussians.means - pose[:3, 3].float())[:, 1] < 0.5))
+        drawn = render(cut, pose, **options)
+        assert (drawn.alpha == 0).any(), "the other part fills no hole"
+        torch.testing.assert_close(drawn.color, render(select_views(cut, views), pose, **options).color)
 
 
 def test_joint_rendering_equals_one_rasterisation(scene: Scene) -> None:

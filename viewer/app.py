@@ -33,13 +33,13 @@ _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics
 
 @dataclass(frozen=True)
 class Options:
-    """Fly through the scene between two posed 360-degree panoramas.
+    """Fly through the scene of one or more 360-degree panoramas.
 
     Opens a window. Without a display, writes a film, stills and a panorama.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """A folder of panoramas (three or more are a tour), a folder of such folders, or a scene file."""
+    """A panorama, a folder of panoramas (a tour), a folder of such folders, or a scene file."""
     offscreen: Path | None = None
     """Open no window; write film, stills and panorama to this folder."""
     path_file: Annotated[Path | None, tyro.conf.arg(name="path")] = None

@@ -142,7 +142,10 @@ class SceneFrames:
 
     Attributes:
         image_format: of the frames.
+        tour: None.
     """
+
+    tour = None
 
     def __init__(
         self,
@@ -176,6 +179,7 @@ class TourFrames:
 
     Attributes:
         image_format: of the frames.
+        tour: the graph.
     """
 
     def __init__(
@@ -197,7 +201,7 @@ class TourFrames:
             settings: draw settings.
             image_format: a perspective image of one eye by default.
         """
-        self.image_format = image_format or ImageFormat()
+        self.image_format, self.tour = image_format or ImageFormat(), scenes.tour
         self._renderers, self._scenes, self._load, self._size = renderers, scenes, load, size
         self._settings = replace(settings, near=NEAR_OF_FAR * scenes.tour.far)
         self._fade = CrossFade()
@@ -223,15 +227,18 @@ class TourFrames:
         if slot is not None:
             if fade.scenes[slot] is not loaded.scene:
                 self._renderers[slot].upload(loaded.scene)
-            fade.show(slot, loaded.scene, now)
+            fade.show(slot, loaded.scene, now, scenes.part)
+        fade.move(pose, scenes.part)
         weight, color, depth = fade.compute_weight(now), 0.0, None
         for slot, part in ((1 - fade.front, 1 - weight), (fade.front, weight)):
             scene, renderer = fade.scenes[slot], self._renderers[slot]
             if scene is not None and (part > 0 or (with_depth and slot == fade.front)):
                 settings = replace(fit_settings(self._settings, scene), vertical_fov_degrees=vertical_fov_degrees)
+                view = fade.poses[slot]
+                assert view is not None
                 image, image_depth = render_image(
                     renderer,
-                    pose,
+                    view,
                     self._size,
                     settings,
                     self.image_format,
@@ -332,7 +339,7 @@ def write_path_film(
 
     def draw(frame: int, *, with_depth: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         progress("film", frame / num_frames)
-        camera = path.interpolate(frame / fps, level)
+        camera = path.interpolate(frame / fps, level, frames.tour)
         return frames.draw(camera.cam2world, camera.vertical_fov_degrees, frame / fps, with_depth=with_depth)
 
     projection, stereo = frames.image_format.projection, frames.image_format.stereo

@@ -211,7 +211,6 @@ class Viewer:
         self._take_film(now)
         self._watch.look(now)
         self._exchange_scene()
-        self._update_tour(now)
         self.gui.begin(seconds, new_frame)
         self._update_panel_data(size)
         was_playing = self.state.playing
@@ -220,6 +219,7 @@ class Viewer:
         key_commands = apply_input(self.state, read_input(min(seconds, _MAX_STEP_SECONDS)))
         self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
         advance_path(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
+        self._update_tour(now)
         if self._loaded is None:
             self._draw_preview(target, now)
         else:
@@ -320,12 +320,13 @@ class Viewer:
         self._shown = self.entries, self.panel_data.current, self.path
         self._resolution = self._create_resolution()
         self._fade.clear()
-        self._fade.show(0, loaded.scene, now)
         self._comparer.photographs.open(loaded.entry.panoramas)
         if loaded.entry.tour is None:
             enter_scene(self.state, loaded.scene, at=self._at)
         else:
             self._enter_tour(loaded)
+        part = 0 if loaded.entry.tour is None else loaded.entry.tour.parts[loaded.entry.views[0]]
+        self._fade.show(0, loaded.scene, now, part)
         self._last_camera = self.state.camera
         self.state.show_message(f"{loaded.entry.name}   (H shows the keys)", now)
 
@@ -349,6 +350,7 @@ class Viewer:
         route = state.route if state.playing else None
         tour.move(np.asarray(state.camera.position), route, state.flight)
         self._show_tour_scene(tour, now)
+        self._fade.move(state.camera.cam2world, tour.part)
         if self._is_other_requested():
             return
         request = tour.choose_request(tour.list_next(route, state.flight), self.loader.entry)
@@ -366,7 +368,7 @@ class Viewer:
             ready = self._incoming is None and self._preparer.is_ready(loaded.scene)
             if not ready or not self._upload(self._slots[slot], loaded.scene, loaded.entry):
                 return
-        self._fade.show(slot, loaded.scene, now)
+        self._fade.show(slot, loaded.scene, now, tour.part)
         adapt_settings(self.state, loaded.scene)
         self.state.points = []
 
@@ -395,6 +397,8 @@ class Viewer:
         before = state.flight
         advance_flight(state, seconds, limit)
         self._waiting = state.playing and state.flight == before and limit < 1
+        if self._waiting and tour is not None and state.route is not None and tour.is_blocked(state.route, limit):
+            self._waiting = state.playing = False
 
     def _visit(self, place: tuple[float, float], size: tuple[int, int]) -> bool:
         """Fly to the panorama whose hotspot is at a place of the window; returns whether there is one."""
@@ -414,6 +418,7 @@ class Viewer:
             count, done = len(self._incoming.scene.gaussians), self._preparer.progress
             data.loading = self._incoming.entry.name, f"preparing {count:,} Gaussians", done
         data.refinement = self.loader.refinement if self._refined is None else 1.0
+        data.notes = self.entries[data.current].notes if 0 <= data.current < len(self.entries) else ()
         data.changed, data.photographs, data.pinned = (
             self._watch.changed,
             comparer.photographs.names,
@@ -428,7 +433,8 @@ class Viewer:
         data.tour, data.film = self._tour, None if film is None else film[1]
         data.hotspots = []
         if self._tour is not None:
-            if get_eye_size(size, self.state.settings.stereo) == size:
+            has_arrived = self._fade.parts[self._fade.front] == self._tour.part
+            if has_arrived and get_eye_size(size, self.state.settings.stereo) == size:
                 data.hotspots = find_hotspots(self._tour, self.state.camera, size)
             data.background = None
             if not self._is_other_requested():
@@ -450,7 +456,11 @@ class Viewer:
         if source is not None:
             panoramas = entry.panoramas if entry.pair is None else entry.pair.context
             poses = torch.stack([panorama.cam2world for panorama in panoramas])
-            enter_scene(self.state, Scene(empty_gaussians(), poses, source.near, source.far), at=self._at)
+            scene = Scene(empty_gaussians(), poses, source.near, source.far)
+            if entry.tour is None:
+                enter_scene(self.state, scene, at=self._at)
+            else:
+                enter_tour(self.state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
             self._last_camera = self.state.camera
 
     def _draw_preview(self, target: moderngl.Framebuffer, now: float) -> None:
@@ -492,13 +502,17 @@ class Viewer:
 
     def _draw_image(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
         camera, plan = self.state.camera, self._plan_resolution(size, now)
-        weight, fading = self._fade.compute_weight(now), None
-        settings = self.state.draw_settings
-        milliseconds = self._render(self._slot, size, settings, plan)
+        weight, fading, pose = self._fade.compute_weight(now), None, camera.cam2world
+        settings, poses = self.state.draw_settings, [pose, pose]
+        if self._tour is not None:
+            poses = [pose if each is None else each for each in self._fade.poses]
+        front, back = self._slot, self._slots[self._fade.front - 1]
+        milliseconds = self._render(front, poses[self._fade.front], size, settings, plan)
         if weight < 1:
-            back = self._slots[1 - self._fade.front]  # its scene may have fewer views
-            assert back.scene is not None
-            milliseconds += self._render(back, size, fit_settings(settings, back.scene), plan)
+            assert back.scene is not None  # it may have fewer views
+            milliseconds += self._render(
+                back, poses[self._fade.front - 1], size, fit_settings(settings, back.scene), plan
+            )
             fading = back.image
         if milliseconds > 0:  # else the image is not new, or not finished
             self._resolution.record(plan, milliseconds)
@@ -511,16 +525,23 @@ class Viewer:
         self.panel_data.size = self.renderer.stats.size
 
         def draw_pinned(slot: SceneSlot, settings: DrawSettings) -> moderngl.Texture | None:
-            self._render(slot, size, settings, plan)
+            self._render(slot, pose, size, settings, plan)
             return slot.image
 
         mono = settings.stereo == "mono"
         right = self._comparer.get_right_side(self.state, draw_pinned) if mono else None
         self.presenter.draw(image, target, camera, right=right, fading=fading, weight=weight)
 
-    def _render(self, slot: SceneSlot, size: tuple[int, int], settings: DrawSettings, plan: ResolutionPlan) -> float:
+    def _render(
+        self,
+        slot: SceneSlot,
+        cam2world: Float[np.ndarray, "4 4"],
+        size: tuple[int, int],
+        settings: DrawSettings,
+        plan: ResolutionPlan,
+    ) -> float:
         """Draw the image of this plan; returns milliseconds, 0 if it is not new."""
-        cam2world, settings = self.state.camera.cam2world, replace(settings, cached=plan.cached)
+        settings = replace(settings, cached=plan.cached)
         # Both eyes need faces at new places during a turn: the coarsest ones, so that they are finished in time.
         scale = plan.scale if settings.stereo == "mono" or not plan.cached else self._resolution.coarsest
         if not (plan.cached and slot.renderer.has_faces(cam2world, size, settings)):

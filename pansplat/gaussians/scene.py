@@ -19,7 +19,13 @@ Gains = tuple[tuple[float, ...], ...]
 """Factors of R, G and B for each view's photograph."""
 
 Overlaps = tuple[tuple[int, int, float], ...]
-"""Edges of a tour graph: two views, the smaller one first, and their overlap."""
+"""Edges of a tour graph: two views, the smaller one first, and their overlap; a view twice if it has no other edge."""
+
+Links = tuple[tuple[int, int, float, float, str], ...]
+"""Links between panoramas: from view to view, yaw (to the right) and pitch (below the horizon) in radians, and text."""
+
+Starts = tuple[tuple[float, float] | None, ...]
+"""Yaw and pitch, as of a link, of the view of each panorama that a visitor sees first; None if there is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +144,8 @@ class Scene:
         gains: exposure and white balance of each view's photograph, as factors of R, G and B relative to the geometric
             mean of all; a refinement estimates them. The colours of a view's Gaussians are those of its photograph.
         overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.TourGraph`.
+        links: of a scene of a whole tour: the known directions from one panorama towards another one.
+        starts: of a scene of a whole tour: one for each view, or none.
     """
 
     gaussians: Gaussians
@@ -149,6 +157,8 @@ class Scene:
     height: int = 512
     gains: Gains = ()
     overlaps: Overlaps = ()
+    links: Links = ()
+    starts: Starts = ()
 
     def scaled(self, factor: float) -> Scene:
         """The scene in a world that is multiplied by a factor."""
@@ -163,6 +173,15 @@ class Scene:
         poses = self.cam2world.clone()
         poses[:, :3] = rotation.to(poses) @ poses[:, :3]
         return dataclasses.replace(self, gaussians=self.gaussians.rotated(rotation), cam2world=poses)
+
+    def moved(self, motion: Float[Tensor, "4 4"]) -> Scene:
+        """The scene after a rigid motion of the world."""
+        scene = self.rotated(motion[:3, :3])
+        poses = scene.cam2world.clone()
+        poses[:, :3, 3] += motion[:3, 3].to(poses)
+        gaussians = scene.gaussians
+        means = (gaussians.means.double() + motion[:3, 3].to(gaussians.means.device)).to(gaussians.means)
+        return dataclasses.replace(scene, gaussians=dataclasses.replace(gaussians, means=means), cam2world=poses)
 
     def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
         """The pose at a fraction from the first context camera (0) to the last (1); an InputError without cameras."""

@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, empty_gaussians, prune
+from pansplat.gaussians.scene import Gains, Gaussians, Links, Overlaps, Scene, Starts, empty_gaussians, prune
 from pansplat.geometry.world import MAX_POSITION, require_depth_range
 from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
 
@@ -30,6 +28,7 @@ _MAX_RUNS = 4096  # the Gaussians are sorted if the entry would list more runs, 
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.1, 100.0  # depth range, metres, for a file without one
 _MAX_HEIGHT, _MAX_CAMERAS, _MAX_LEVEL = 1 << 16, 1 << 12, 255
 _MAX_GAIN = 1e3
+_MAX_ANGLE = 4 * np.pi  # radians
 
 
 def format_entry(scene: Scene, runs: list[list[int]]) -> str:
@@ -44,13 +43,20 @@ def format_entry(scene: Scene, runs: list[list[int]]) -> str:
         "height": scene.height,
         "near": scene.near,
         "far": scene.far,
-        "names": [name.encode(errors="backslashreplace").decode() for name in scene.names],
+        "names": [_escape(name) for name in scene.names],
         "cam2world": scene.cam2world.double().cpu().tolist(),
         **({"gains": scene.gains} if scene.gains else {}),
         **({"overlaps": scene.overlaps} if scene.overlaps else {}),
+        **({"links": [[*link[:4], _escape(link[4])] for link in scene.links]} if scene.links else {}),
+        **({"starts": scene.starts} if any(scene.starts) else {}),
         "runs": runs,
     }
     return json.dumps(content, separators=(",", ":"))
+
+
+def _escape(text: str) -> str:
+    """The text, valid as Unicode."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
@@ -168,6 +174,8 @@ def _read_entry(content: Any) -> _Entry:
         Scene.height if height is None else int(height),
         _read_gains(list_field(content, "gains", "comment"), len(poses)),
         _read_overlaps(list_field(content, "overlaps", "comment"), len(poses)),
+        _read_links(list_field(content, "links", "comment"), len(poses)),
+        _read_starts(list_field(content, "starts", "comment"), len(poses)),
     )
     return scene, list_field(content, "runs", "comment")
 
@@ -185,22 +193,52 @@ def _read_gains(rows: list[Any], cameras: int) -> Gains:
 
 
 def _read_overlaps(rows: list[Any], cameras: int) -> Overlaps:
-    """Edges that connect all cameras, or nothing."""
+    """Edges of which each camera has one or more, or nothing."""
     edges: dict[tuple[int, int], float] = {}
     for row in rows:
         a, b, overlap = row if isinstance(row, list) and len(row) == 3 else (None, None, None)
-        is_edge = type(a) is int and type(b) is int and 0 <= a < b < cameras
+        is_edge = _is_camera(a, cameras) and _is_camera(b, cameras) and a <= b
         if not is_edge or type(overlap) not in (int, float) or not 0 <= overlap <= 1:
             raise InputError(
                 f"comment: needed two of the {cameras} cameras and a number from 0 to 1 in overlaps, got {row!r:.60}"
             )
         edges[a, b] = overlap
-    if edges:
-        ends = np.array(list(edges)).T
-        graph = coo_array((np.ones(len(edges)), ends), shape=(cameras, cameras))
-        if (parts := connected_components(graph, directed=False, return_labels=False)) > 1:
-            raise InputError(f"comment: needed overlaps that connect all {cameras} cameras, got {parts} parts")
+    if edges and (missing := set(range(cameras)) - {camera for edge in edges for camera in edge}):
+        raise InputError(f"comment: needed overlaps of all {cameras} cameras, got none of camera {min(missing)}")
     return tuple((a, b, overlap) for (a, b), overlap in edges.items())
+
+
+def _read_links(rows: list[Any], cameras: int) -> Links:
+    """Links between two cameras, or nothing."""
+    links: list[tuple[int, int, float, float, str]] = []
+    for row in rows:
+        a, b, *angles, text = row if isinstance(row, list) and len(row) == 5 else (None,) * 5
+        are_cameras = _is_camera(a, cameras) and _is_camera(b, cameras) and a != b
+        if not are_cameras or not _are_angles(angles) or not isinstance(text, str):
+            raise InputError(
+                f"comment: needed two of the {cameras} cameras, two angles and a text in links, got {row!r:.60}"
+            )
+        links.append((a, b, *map(float, angles), text))
+    return tuple(links)
+
+
+def _read_starts(rows: list[Any], cameras: int) -> Starts:
+    """Two angles or nothing for each camera, or nothing."""
+    for row in rows:
+        if row is not None and not (isinstance(row, list) and _are_angles(row)):
+            raise InputError(f"comment: needed two angles, or null, in starts, got {row!r:.60}")
+    if rows and len(rows) != cameras:
+        raise InputError(f"comment: needed one of each of the {cameras} cameras in starts, got {len(rows)}")
+    return tuple(None if row is None else tuple(map(float, row)) for row in rows)
+
+
+def _is_camera(value: Any, cameras: int) -> bool:
+    return type(value) is int and 0 <= value < cameras
+
+
+def _are_angles(values: list[Any]) -> bool:
+    """Whether the values are two angles within two turns, radians."""
+    return len(values) == 2 and all(type(value) in (int, float) and abs(value) <= _MAX_ANGLE for value in values)
 
 
 def _read_pose(rows: Any) -> np.ndarray:

@@ -14,6 +14,7 @@ from torch import Tensor
 from pansplat.geometry.pose import interpolate_poses
 
 _MIN_STEP = 1e-6  # metres; a shorter step has no direction
+_EXCURSION = 0.4  # metres, of a flight with a single camera
 
 
 def ease_in_out(fraction: float) -> float:
@@ -104,7 +105,8 @@ def fly_pose(
     """Pose at a fraction of a flight through all cameras.
 
     The camera starts and stops smoothly. It looks along the path and turns slowly to the left and then to the right, so
-    that parallax is visible; at both ends and in the middle it looks straight ahead.
+    that parallax is visible; at both ends and in the middle it looks straight ahead. With a single camera, it flies a
+    level circle through it and a place 0.4 m ahead.
 
     Args:
         cam2world: the cameras in the order of the flight; at least one.
@@ -119,6 +121,10 @@ def fly_pose(
     eased = ease_in_out(fraction)
     up = up_direction(cam2world)
     pose = _interpolate_path(path_poses(cam2world), eased)
+    if len(cam2world) == 1:
+        angle = 2 * math.pi * eased
+        pose = pose.clone()
+        pose[:3, 3] += 0.5 * _EXCURSION * ((1 - math.cos(angle)) * pose[:3, 2] - math.sin(angle) * pose[:3, 0])
     # The turn depends on the eased fraction, so that it also starts and stops smoothly.
     return turn_pose(pose, -math.radians(turn_degrees) * math.sin(2 * math.pi * eased), up)
 

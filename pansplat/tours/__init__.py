@@ -1,7 +1,8 @@
-"""Tours: many posed panoramas of one place as a graph, the scenes of its edges, routes along it, and its floor plan.
+"""Tours: many panoramas of one place as a graph, the scenes of its edges, routes along it, and its floor plan.
 
 An edge joins two panoramas that show the same surfaces. A camera flies along edges; the scene of an edge is predicted
-from its two panoramas and a third one that overlaps with both.
+from its two panoramas and a third one that overlaps with both. Panoramas without poses are parts of their own, with a
+self-edge and the scene of a single view. Between parts the image fades.
 """
 
 from pansplat.tours.floor import (
@@ -21,6 +22,7 @@ from pansplat.tours.graph import (
     TourGraph,
     Views,
     find_tours,
+    list_starts,
     make_graph,
     merge_scenes,
     select_views,
@@ -43,6 +45,7 @@ __all__ = [
     "find_floor_outline",
     "find_floor_outlines",
     "find_tours",
+    "list_starts",
     "make_graph",
     "merge_scenes",
     "paint_floor_plan",

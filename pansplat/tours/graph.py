@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,29 +14,36 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse.csgraph import shortest_path
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, shortest_path
 from torch import Tensor
 
-from pansplat.data.pairs import Pair, Panorama
-from pansplat.errors import InputError
-from pansplat.gaussians.scene import Gains, Gaussians, Scene
+from pansplat.data.pairs import Link, Pair, Panorama
+from pansplat.gaussians.scene import Gains, Gaussians, Scene, Starts
 from pansplat.geometry.path import level_pose, up_direction
+from pansplat.geometry.world import working_factor
+from pansplat.tours.layout import REACH, lay_out
 
 Edge = tuple[int, int]
-"""Indices of two panoramas, the smaller one first."""
+"""Indices of two panoramas, the smaller one first; a panorama without another one has a self-edge, twice its index."""
 
 Views = tuple[int, ...]
 """The panoramas of a scene, by their number in the tour."""
 
 EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
-_MIN_PANORAMAS = 3
+_MIN_PANORAMAS = 3  # of a tour of one part
 _MIN_BASELINE = 0.03  # of a scene of two views, as a fraction of far; depth is inaccurate below it
 _MAX_STARTS = 10_000  # of a walk, divided by the number of nodes
+_LINKED_FADE = 0.5  # cost of a fade along a link, as a fraction of far
+_UNLINKED_FADE = 2.5  # cost of another fade, as a factor, so that two fades along links cost less
 
 
 @dataclass(frozen=True, eq=False)
 class TourGraph:
-    """Posed panoramas of one place and the edges between them.
+    """Panoramas of one place and the edges between them.
+
+    Panoramas that edges connect are a part. Parts have no common world; `lay_out` places them side by side. From part
+    to part the image fades.
 
     Attributes:
         name: for lists and folders.
@@ -43,7 +51,10 @@ class TourGraph:
         panoramas: the nodes, in file order.
         near, far: depth range to search, metres.
         siblings: all panoramas taken with the same camera.
-        overlaps: of each edge: 1 if one panorama explains the other at each pixel, 0 for unrelated panoramas.
+        overlaps: of each edge: 1 if one panorama explains the other at each pixel, 0 for unrelated panoramas. That of a
+            self-edge is 1.
+        originals: the panoramas with poses in the worlds of their parts, which scenes are predicted from; none if these
+            are `panoramas`.
     """
 
     name: str
@@ -53,6 +64,7 @@ class TourGraph:
     far: float
     siblings: tuple[Path, ...] = field(default=(), repr=False)
     overlaps: dict[Edge, float] = field(default_factory=dict)
+    originals: tuple[Panorama, ...] = field(default=(), repr=False)
 
     def __len__(self) -> int:
         return len(self.panoramas)
@@ -72,16 +84,54 @@ class TourGraph:
         """Right, down and forward (columns, world axes) of a level camera at the first panorama."""
         return level_pose(self.cam2world[0], up_direction(self.cam2world))[:3, :3].numpy()
 
+    @cached_property
+    def parts(self) -> tuple[int, ...]:
+        """The part of each node; parts are numbered in the order of their first nodes."""
+        ends = np.array([*self.overlaps], int).reshape(-1, 2).T
+        graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(self), len(self)))
+        labels = connected_components(graph, directed=False)[1].tolist()
+        numbers = {label: number for number, label in enumerate(dict.fromkeys(labels))}
+        return tuple(numbers[label] for label in labels)
+
+    @cached_property
+    def links(self) -> dict[tuple[int, int], Link]:
+        """The links by the nodes at which they start and end; of several ones between two nodes, the first."""
+        number = {panorama.name: node for node, panorama in enumerate(self.panoramas)}
+        found: dict[tuple[int, int], Link] = {}
+        for node, panorama in enumerate(self.panoramas):
+            for link in panorama.links:
+                if number.get(link.target, node) != node:
+                    found.setdefault((node, number[link.target]), link)
+        return found
+
+    def find_direction(self, start: int, end: int) -> Float[np.ndarray, "3"] | None:
+        """The unit direction, in world axes, of the link from a node to another one; None if there is none."""
+        link = self.links.get((start, end))
+        return None if link is None else self._direct(start, link.yaw, link.pitch)
+
+    def find_start_view(self, node: int) -> Float[np.ndarray, "3"] | None:
+        """The unit direction, in world axes, of the view that a visitor of a node sees first; None if it has none."""
+        start = self.panoramas[node].start
+        return None if start is None else self._direct(node, *start)
+
+    def _direct(self, node: int, yaw: float, pitch: float) -> Float[np.ndarray, "3"]:
+        local = math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)
+        return self.cam2world[node, :3, :3].numpy() @ local
+
     def neighbours(self, node: int) -> list[int]:
-        """Nodes that share an edge with a node."""
-        return sorted({sum(edge) - node for edge in self.overlaps if node in edge})
+        """The other nodes that share an edge with a node."""
+        return sorted({sum(edge) - node for edge in self.overlaps if node in edge} - {node})
+
+    def find_edge(self, node: int) -> Edge:
+        """The edge of a node with the largest overlap."""
+        return max((edge for edge in self.overlaps if node in edge), key=self.overlaps.__getitem__)
 
     def list_reachable(self, edge: Edge) -> set[int]:
         """The nodes of an edge, and those that share an edge with one of them."""
         return {*edge, *(node for end in edge for node in self.neighbours(end))}
 
     def choose_scene_views(self) -> dict[Edge, Views]:
-        """The panoramas of the scene of each edge: two, or three that overlap with each other.
+        """The panoramas of the scene of each edge: two, or three that overlap with each other; one of a self-edge.
 
         Edges share scenes where they can, so that fewer scenes are predicted and exchanged.
         """
@@ -118,10 +168,13 @@ class TourGraph:
 
     def _weakest_overlap(self, nodes: Views) -> float:
         """The smallest overlap of the edges between the panoramas of a scene."""
-        return min(self.overlaps[edge] for edge in itertools.combinations(nodes, 2) if edge in self.overlaps)
+        edges = itertools.combinations_with_replacement(nodes, 2)
+        return min(self.overlaps[edge] for edge in edges if edge in self.overlaps)
 
     def _add_baseline(self, edge: Edge) -> Views:
         """The edge's panoramas, with the best neighbour of either if they are too close together for depth."""
+        if edge[0] == edge[1]:
+            return edge[:1]
         if self.length(edge) >= _MIN_BASELINE * self.far:
             return edge
         others = [
@@ -138,46 +191,86 @@ class TourGraph:
         return float(np.linalg.norm(a - b))
 
     def make_pair(self, views: Sequence[int]) -> Pair:
-        """The panoramas of a scene as the input of a prediction."""
-        context = tuple(self.panoramas[view] for view in views)
+        """The panoramas of a scene as the input of a prediction, in the world of their part.
+
+        It does not depend on the other parts, so that cached predictions stay valid when panoramas are added.
+        """
+        context = tuple((self.originals or self.panoramas)[view] for view in views)
         name = "-".join(panorama.name for panorama in context)
         return Pair(name, self.folder, context, (), self.near, self.far, self.siblings)
 
-    def find_nearest_edge(self, position: Float[np.ndarray, "3"]) -> tuple[Edge, float]:
-        """The edge nearest to a position, and the distance in metres."""
-        distances = {edge: self.measure_distance(edge, position) for edge in self.overlaps}
-        edge = min(distances, key=distances.__getitem__)
-        return edge, distances[edge]
+    def place(self, scene: Scene, views: Views) -> Scene:
+        """The scene of `make_pair` in the world of the tour."""
+        if not self.originals or self.panoramas[views[0]] is self.originals[views[0]]:
+            return scene
+        return scene.moved(self.cam2world[views[0]] @ self.originals[views[0]].cam2world.double().inverse())
+
+    def find_nearest_edge(self, position: Float[np.ndarray, "3"], part: int | None = None) -> tuple[Edge, float]:
+        """The edge nearest to a position, of all or of one part, and the distance in metres."""
+        edges = np.array([*self.overlaps])
+        if part is not None:
+            edges = edges[np.array(self.parts)[edges[:, 0]] == part]
+        distances = self._measure_distances(edges, position)
+        nearest = int(distances.argmin())
+        a, b = edges[nearest].tolist()
+        return (a, b), float(distances[nearest])
 
     def follow_edge(self, position: Float[np.ndarray, "3"], current: Edge) -> Edge:
-        """The edge of a camera that moves: `current`, unless another edge is nearer by `EDGE_HYSTERESIS`."""
+        """The edge of a camera that moves: `current`, unless another edge is nearer by `EDGE_HYSTERESIS`.
+
+        It is an edge of the part of `current`, unless the camera is within reach of another part after a jump.
+        """
         nearest, distance = self.find_nearest_edge(position)
+        part = self.parts[current[0]]
+        if self.parts[nearest[0]] != part and distance > REACH / working_factor(self.near):
+            nearest, distance = self.find_nearest_edge(position, part)
         return current if self.measure_distance(current, position) <= distance + EDGE_HYSTERESIS else nearest
 
     def measure_distance(self, edge: Edge, position: Float[np.ndarray, "3"]) -> float:
         """Distance of a position from the line between an edge's cameras, metres."""
-        a, b = self.positions[list(edge)]
+        return float(self._measure_distances(np.array([edge]), position)[0])
+
+    def _measure_distances(
+        self, edges: Int[np.ndarray, "edge 2"], position: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "edge"]:
+        a, b = self.positions[edges[:, 0]], self.positions[edges[:, 1]]
         along = b - a
-        fraction = float((position - a) @ along / max(float(along @ along), 1e-12))
-        return float(np.linalg.norm(position - (a + min(max(fraction, 0.0), 1.0) * along)))
+        fractions = ((position - a) * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), 1e-12)
+        return np.linalg.norm(position - (a + np.clip(fractions, 0, 1)[:, None] * along), axis=1)
 
     def find_walk(self, start: int, end: int) -> list[int]:
-        """The nodes of the cheapest way along edges, both ends included."""
+        """The nodes of the cheapest way along edges and fades, both ends included.
+
+        It stays in the part of both ends, if they are of one part.
+        """
         _, previous = self._shortest
         walk = [end]
         while walk[-1] != start:
             walk.append(int(previous[start, walk[-1]]))
         return walk[::-1]
 
-    def find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
-        """The nodes on the way from a position to a node: from that end of the nearest edge which makes it shorter."""
-        nearest, _ = self.find_nearest_edge(position)
+    def find_way(self, position: Float[np.ndarray, "3"], node: int, part: int | None = None) -> list[int]:
+        """The nodes on the way from a position to a node: from that end of the nearest edge which makes it better.
 
-        def measure(walk: list[int]) -> float:
-            places = [position, *self.positions[walk]]
-            return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+        The better way has fewer fades. Of those with as many, it is the shorter one.
+
+        Args:
+            position: of the camera.
+            node: the last one.
+            part: of the camera, if it is known.
+        """
+        nearest, _ = self.find_nearest_edge(position, part)
+
+        def measure(walk: list[int]) -> tuple[int, float]:
+            fades = [self.is_fade(a, b) for a, b in itertools.pairwise(walk)]
+            steps = np.linalg.norm(np.diff([position, *self.positions[walk]], axis=0), axis=1)
+            return sum(fades), float(steps[~np.array([False, *fades])].sum())
 
         return min((self.find_walk(end, node) for end in nearest), key=measure)
+
+    def is_fade(self, start: int, end: int) -> bool:
+        """Whether a step of a walk is a fade: its nodes are of different parts."""
+        return self.parts[start] != self.parts[end]
 
     def find_next_nodes(self) -> list[list[int]]:
         """The next node on the cheapest way from a node (row) to another one (column)."""
@@ -187,37 +280,48 @@ class TourGraph:
         ]
 
     def plan_walk(self, start: int | None = None) -> list[int]:
-        """Nodes of a short walk along edges that visits all nodes; some of them more than once.
+        """Nodes of a short walk along edges and fades that visits all nodes; some of them more than once.
 
         Nearest neighbours first, improved by exchanging parts of the order (2-opt).
 
         Args:
             start: its first node; None chooses the start of the shortest walk, of some starts for more than 100 nodes.
+                A tour of parts with links starts at its first node, as its author has chosen, and one without links in
+                its largest part.
         """
         costs, _ = self._shortest
-        count = len(self)
-        starts = range(0, count, math.ceil(count**2 / _MAX_STARTS)) if start is None else (start,)
+        starts = np.arange(len(self)) if start is None else np.array([start])
+        if start is None and max(self.parts) > 0:
+            starts = (
+                starts[:1] if self.links else np.flatnonzero(np.array(self.parts) == np.bincount(self.parts).argmax())
+            )
+        starts = starts[:: math.ceil(len(starts) * len(self) / _MAX_STARTS)].tolist()
         orders = [_improve_order(_order_by_distance(costs, first), costs) for first in starts]
         order = min(orders, key=lambda order: float(costs[order[:-1], order[1:]].sum()))
-        walk = [order[0]]
-        for node in order[1:]:
+        first, *others = order.tolist()
+        walk = [first]
+        for node in others:
             walk += self.find_walk(walk[-1], node)[1:]
         return walk
 
     @cached_property
     def _shortest(self) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
-        """Cost of the cheapest way between all nodes, and the node before its end.
-
-        Raises:
-            InputError: the edges do not connect all nodes.
-        """
+        """Cost of the cheapest way between all nodes, and the node before its end."""
         costs = np.full((len(self), len(self)), np.inf)
         for (a, b), overlap in self.overlaps.items():
             doubt = max(1 - overlap / 0.25, 0.0)  # with little overlap a way around looks better
             costs[a, b] = costs[b, a] = max(self.length((a, b)), 1e-3) * (1 + 3 * doubt)
         ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
-        if not np.isfinite(ways).all():
-            raise InputError(f"tour: needed edges that connect all {len(self)} panoramas, got separate parts")
+        is_near = np.isfinite(ways)
+        if not is_near.all():
+            # Two fades cost more than each way within a part, so that a way between nodes of a part stays in it.
+            longest = ways[is_near].max()
+            fade = 0.5 * longest + _LINKED_FADE * self.far
+            costs[~is_near] = _UNLINKED_FADE * fade + longest
+            for a, b in self.links:
+                if self.is_fade(a, b):
+                    costs[a, b] = costs[b, a] = fade
+            ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
         return ways, previous
 
 
@@ -252,36 +356,49 @@ def _improve_order(order: Int[np.ndarray, "node"], costs: Float[np.ndarray, "nod
 
 
 def find_tours(pairs: Sequence[Pair]) -> list[TourGraph]:
-    """Tours of three or more panoramas that the pairs connect; their edges are the pairs, without overlaps (0)."""
+    """Tours of the pairs of folders; their edges are the pairs, without overlaps (0).
+
+    All panoramas of a folder are one tour if they are of two or more parts; a panorama that is in no pair with another
+    one has a self-edge. Else three or more panoramas that pairs connect are a tour.
+    """
+    of_folder: dict[Path, list[Pair]] = {}
+    for pair in pairs:
+        of_folder.setdefault(pair.folder, []).append(pair)
+    parts = {folder: {view.part for pair in group for view in pair.context} for folder, group in of_folder.items()}
     components: list[list[Pair]] = []
     for pair in pairs:
+        if len(parts[pair.folder]) > 1:
+            continue
         images = {panorama.image for panorama in pair.context}
         joined = [part for part in components if any(images & _list_images(other) for other in part)]
         components = [part for part in components if part not in joined]
         components.append([*itertools.chain.from_iterable(joined), pair])
-    tours = []
-    for component in components:
-        first = component[0]
-        found = {panorama.image: panorama for pair in component for panorama in pair.context}
-        if len(found) < _MIN_PANORAMAS:
-            continue
-        rank = {image: index for index, image in enumerate(first.siblings)}
-        images = sorted(found, key=lambda image: rank.get(image, len(rank)))
-        number = {image: index for index, image in enumerate(images)}
-        edges = {
-            tuple(sorted((number[a.image], number[b.image])))
-            for pair in component
-            for a, b in itertools.combinations(pair.context, 2)
-        }
-        near, far = min(pair.near for pair in component), max(pair.far for pair in component)
-        name = f"{first.folder.resolve().name} tour"
-        panoramas = tuple(found[image] for image in images)
-        tours.append(
-            TourGraph(name, first.folder, panoramas, near, far, first.siblings, dict.fromkeys(sorted(edges), 0.0))
-        )
+    components = [part for part in components if len(set().union(*map(_list_images, part))) >= _MIN_PANORAMAS]
+    components += [group for folder, group in of_folder.items() if len(parts[folder]) > 1]
+    tours = [_make_tour(component) for component in components]
     if len(tours) > 1:
         tours = [dataclasses.replace(tour, name=f"{tour.name} {i}") for i, tour in enumerate(tours, start=1)]
     return tours
+
+
+def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
+    """The tour of all panoramas of some pairs."""
+    first = pairs[0]
+    found = {panorama.image: panorama for pair in pairs for panorama in pair.context}
+    rank = {image: index for index, image in enumerate(first.siblings)}
+    images = sorted(found, key=lambda image: rank.get(image, len(rank)))
+    number = {image: index for index, image in enumerate(images)}
+    edges = {
+        tuple(sorted((number[a.image], number[b.image])))
+        for pair in pairs
+        for a, b in itertools.combinations(pair.context, 2)
+    }
+    overlaps = dict.fromkeys(sorted(edges), 0.0)
+    overlaps |= {(node, node): 1.0 for node in sorted(set(range(len(images))) - {*itertools.chain(*edges)})}
+    near, far = min(pair.near for pair in pairs), max(pair.far for pair in pairs)
+    originals = tuple(found[image] for image in images)
+    name = f"{first.folder.resolve().name} tour"
+    return TourGraph(name, first.folder, lay_out(originals, near), near, far, first.siblings, overlaps, originals)
 
 
 def _list_images(pair: Pair) -> set[Path]:
@@ -293,20 +410,21 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
 
     Args:
         tour: the graph.
-        load: returns the scene of some panoramas; called once for each scene that is needed.
+        load: returns the scene of some panoramas (`make_pair`); called once for each scene that is needed.
     """
     parts: dict[int, Gaussians] = {}
     names: dict[int, str] = {}
     gains: dict[Views, Gains] = {}
     scene = None
     for views, provided in tour.choose_sources().items():
-        scene = load(views)
+        scene = tour.place(load(views), views)
         gains[views] = scene.gains
         for node in provided:
             view = views.index(node)
             part = scene.gaussians.select(scene.gaussians.views == view)
             parts[node] = dataclasses.replace(part, views=torch.full_like(part.views, node, dtype=torch.int64))
-            names[node] = scene.names[view] if view < len(scene.names) else tour.panoramas[node].name
+            panorama = tour.panoramas[node]
+            names[node] = panorama.title or (scene.names[view] if view < len(scene.names) else panorama.name)
     assert scene is not None
     return dataclasses.replace(
         scene,
@@ -315,21 +433,36 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
         near=tour.near,
         far=tour.far,
         names=tuple(names[node] for node in range(len(tour))),
-        gains=_join_gains(gains, len(tour)),
+        gains=_join_gains(gains, tour.parts),
         overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
+        links=tuple((a, b, *_wrap((link.yaw, link.pitch)), link.text) for (a, b), link in tour.links.items()),
+        starts=list_starts(tour.panoramas),
     )
 
 
-def _join_gains(gains: dict[Views, Gains], count: int) -> Gains:
+def list_starts(panoramas: Sequence[Panorama]) -> Starts:
+    """The start views of panoramas, as a scene keeps them; nothing if there is none."""
+    starts = tuple(None if panorama.start is None else _wrap(panorama.start) for panorama in panoramas)
+    return starts if any(starts) else ()
+
+
+def _wrap(angles: tuple[float, float]) -> tuple[float, float]:
+    """The angles within half a turn, radians."""
+    yaw, pitch = (math.remainder(angle, 2 * math.pi) for angle in angles)
+    return yaw, pitch
+
+
+def _join_gains(gains: dict[Views, Gains], parts: Sequence[int]) -> Gains:
     """Gains of all panoramas from those of scenes, each of which are relative to the mean of the scene's photographs.
 
     Panoramas that scenes have in common give the ratios of these means, by least squares. Scenes without gains count
-    with none; without any gains there are none.
+    with none; without any gains there are none. Those of a part are relative to the mean of the part.
 
     Args:
         gains: of each scene's views.
-        count: number of panoramas.
+        parts: of the panoramas.
     """
+    count = len(parts)
     known = [
         (node, scene, row)
         for scene, (views, rows) in enumerate(gains.items())
@@ -342,7 +475,10 @@ def _join_gains(gains: dict[Views, Gains], count: int) -> Gains:
     for equation, (node, scene, _) in zip(system, known, strict=True):
         equation[node], equation[count + scene] = 1, -1
     logs = np.linalg.lstsq(system, np.log([row for *_, row in known]), rcond=None)[0][:count]
-    return tuple(map(tuple, np.exp(logs - logs.mean(axis=0)).tolist()))
+    for part in set(parts):
+        members = np.array(parts) == part
+        logs[members] -= logs[members].mean(axis=0)
+    return tuple(map(tuple, np.exp(logs).tolist()))
 
 
 def select_views(scene: Scene, views: Views) -> Scene:
@@ -359,14 +495,24 @@ def select_views(scene: Scene, views: Views) -> Scene:
         names=tuple(scene.names[view] for view in chosen) if scene.names else (),
         gains=tuple(scene.gains[view] for view in chosen) if scene.gains else (),
         overlaps=(),
+        links=(),
+        starts=(),
     )
 
 
 def make_graph(scene: Scene) -> TourGraph:
-    """The graph of a scene's cameras, with the edges that `merge_scenes` has kept in the scene."""
-    names = [scene.names[k] if k < len(scene.names) else f"panorama {k + 1}" for k in range(len(scene.cam2world))]
+    """The graph of a scene's cameras, with the edges and links that `merge_scenes` has kept in the scene."""
+    count = len(scene.cam2world)
+    titles = [scene.names[k] if k < len(scene.names) else f"panorama {k + 1}" for k in range(count)]
+    counts = Counter(titles)
+    names = [title if counts[title] == 1 else f"{title} ({k + 1})" for k, title in enumerate(titles)]
+    links: list[list[Link]] = [[] for _ in range(count)]
+    for start, end, yaw, pitch, text in scene.links:
+        links[start].append(Link(names[end], yaw, pitch, text))
+    starts = scene.starts or (None,) * count
     panoramas = tuple(
-        Panorama(name, Path(name), pose) for name, pose in zip(names, scene.cam2world.double(), strict=True)
+        Panorama(names[k], Path(names[k]), pose, title=titles[k], links=tuple(links[k]), start=starts[k])
+        for k, pose in enumerate(scene.cam2world.double())
     )
     overlaps = {(a, b): overlap for a, b, overlap in scene.overlaps}
     return TourGraph("", Path(), panoramas, scene.near, scene.far, overlaps=overlaps)

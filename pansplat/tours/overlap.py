@@ -25,22 +25,25 @@ _MAX_NEIGHBOURS = 6  # nearest panoramas that are compared
 def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = None) -> TourGraph:
     """The tour with measured overlaps, and with edges between further panoramas that overlap.
 
-    Each panorama is compared with its nearest neighbours within 0.4 far. Given edges are kept whatever their overlap.
+    Each panorama is compared with its nearest neighbours within 0.4 far, of those with poses in the same world. Given
+    edges are kept whatever their overlap.
 
     Raises:
         InputError: an image cannot be read.
     """
     report = progress or (lambda what, done: None)
-    features = []
-    for index, panorama in enumerate(tour.panoramas):
-        report("comparing panoramas", 0.5 * index / len(tour))
-        features.append(_compute_features(read_panorama(panorama.image, _HEIGHT)[0]))
+    world = np.array([panorama.part for panorama in tour.panoramas])
     distances = np.linalg.norm(tour.positions[:, None] - tour.positions[None], axis=2)
-    compared = set(tour.overlaps)
+    distances[world[:, None] != world] = np.inf
+    compared = {(a, b) for a, b in tour.overlaps if a != b}
     for node in range(len(tour)):
         for other in distances[node].argsort(kind="stable")[1 : _MAX_NEIGHBOURS + 1].tolist():
             if other != node and distances[node, other] <= _MAX_BASELINE * tour.far:
                 compared.add((min(node, other), max(node, other)))
+    features = {}
+    for node in sorted({node for edge in compared for node in edge}):
+        report("comparing panoramas", 0.5 * node / len(tour))
+        features[node] = _compute_features(read_panorama(tour.panoramas[node].image, _HEIGHT)[0])
     overlaps = {}
     for index, (a, b) in enumerate(sorted(compared)):
         report("comparing panoramas", 0.5 + 0.5 * index / len(compared))
@@ -48,6 +51,8 @@ def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = Non
         overlap = _measure_overlap(features[a], features[b], poses, tour.near, tour.far)
         if overlap >= _MIN_OVERLAP or (a, b) in tour.overlaps:
             overlaps[a, b] = max(overlap, 0.0)
+    joined = {node for edge in overlaps for node in edge}
+    overlaps |= {(a, b): overlap for (a, b), overlap in tour.overlaps.items() if a == b and a not in joined}
     return dataclasses.replace(tour, overlaps=overlaps)
 
 

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,17 +20,24 @@ _TURN_BACK_DEGREES = 120.0  # of the way at a panorama, at which the camera turn
 _TURN_IN_PLACE_DEGREES = 60.0  # between the heading and the way, at which the camera stands still
 _SMOOTHING_SECONDS = 1.2
 _SAMPLES_PER_SECOND = 60
+_LINK_METRES = 0.7  # that the camera goes along a link, before the fade
+_LOOK_AROUND_DEGREES = 90.0  # that the camera turns in a part without a way, before the fade
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
     """A smooth flight through panoramas, in samples of equal duration.
 
+    Leg i is the step from `walk[i]` to `walk[i + 1]`. That of a fade begins with the jump to the other part, after
+    which the camera stands for a moment while the image fades.
+
     Attributes:
         positions: camera centres, metres.
         yaws, pitches: radians, relative to `level`; positive turns right and up.
-        legs: index of the edge in `edges` at each sample; -1 before the first panorama.
+        legs: leg of each sample; -1 before the first panorama.
         walk: the panoramas in the order of the flight.
+        edges: of each leg, whose scene is shown; of a fade, that of the part where it ends.
+        fades: the legs that are fades.
         level: axes of a level camera (columns right, down, forward).
         seconds: duration.
     """
@@ -39,13 +47,16 @@ class Route:
     pitches: Float[np.ndarray, "sample"]
     legs: Int[np.ndarray, "sample"]
     walk: tuple[int, ...]
+    edges: tuple[Edge, ...]
+    fades: tuple[int, ...]
     level: Float[np.ndarray, "3 3"]
     seconds: float
 
-    @property
-    def edges(self) -> list[Edge]:
-        """The edges in the order of the flight."""
-        return [(min(a, b), max(a, b)) for a, b in itertools.pairwise(self.walk)]
+    @cached_property
+    def jumps(self) -> Int[np.ndarray, "jump"]:
+        """The samples after which the camera jumps to another part."""
+        begins = (self.legs[1:] != self.legs[:-1]) & np.isin(self.legs[1:], self.fades)
+        return np.flatnonzero(begins)
 
     def leg(self, fraction: float) -> int:
         """Index of the edge that is flown at a fraction of the duration; -1 before the first panorama."""
@@ -54,6 +65,8 @@ class Route:
     def pose(self, fraction: float) -> Float[np.ndarray, "4 4"]:
         """The pose (cam2world) at a fraction of the duration, 0 to 1."""
         at = min(max(fraction, 0.0), 1.0) * (len(self.yaws) - 1)
+        if math.floor(at) in self.jumps:
+            at = round(at)
         steps = np.arange(len(self.yaws))
         yaw, pitch = (np.interp(at, steps, values) for values in (self.yaws, self.pitches))
         cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
@@ -70,7 +83,7 @@ class Route:
 
     def edges_after(self, fraction: float) -> list[Edge]:
         """The edges from a fraction of the duration on."""
-        return self.edges[max(self.leg(fraction), 0) :]
+        return list(self.edges[max(self.leg(fraction), 0) :])
 
 
 def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4 4"] | None = None) -> Route:
@@ -78,28 +91,110 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
 
     Where the way turns back, the camera turns in place. All is smoothed over time, so that corners are rounded.
 
+    Before a fade along a link the camera turns in the direction of the link, and goes 0.7 m. Before another one, at a
+    panorama alone, it turns by 90 degrees. After a fade, it looks away from the link back; without one, in the
+    direction of the panorama's start view; else its heading stays.
+
     Args:
         tour: the graph.
-        walk: nodes; consecutive ones share an edge.
-        start: pose from which the first node is approached; None starts at that node, in the direction of the second.
+        walk: nodes; consecutive ones share an edge, or are of different parts.
+        start: pose from which the first node is approached; None starts at that node, in the direction of its start
+            view, or of the second node.
     """
-    level, places = tour.level_axes, [tour.positions[node] for node in walk]
-    legs = list(range(len(walk) - 1))
+    steps = list(itertools.pairwise(walk))
+    fades = [leg for leg, step in enumerate(steps) if tour.is_fade(*step)]
+    edges = [(min(step), max(step)) for step in steps]
+    for leg in fades:
+        is_flown = leg + 1 < len(steps) and leg + 1 not in fades
+        edges[leg] = edges[leg + 1] if is_flown else tour.find_edge(walk[leg + 1])
+    level, yaw, pitch = tour.level_axes, None, 0.0
     if start is not None:
-        places, legs = [start[:3, 3], *places], [-1, *legs]
-    path = np.array(places) @ level  # right, down, forward
+        yaw, pitch = _find_angles(level.T @ start[:3, 2])
+    elif (view := tour.find_start_view(walk[0])) is not None:
+        yaw, pitch = _find_angles(level.T @ view)
+    sections = []
+    for first, last in itertools.pairwise([-1, *fades, len(steps)]):
+        nodes = walk[first + 1 : last + 1]
+        places, legs = [tour.positions[node] for node in nodes], list(range(first + 1, last))
+        link = _find_way_along_link(tour, *steps[last]) if last < len(steps) else None
+        if link is not None:
+            places.append(places[-1] + link)
+            legs.append(legs[-1] if legs else first)
+        if first < 0 and start is not None:
+            if last == 0:  # a fade begins where the camera is, or near the link
+                places = places[1:]
+            else:
+                legs = [-1, *legs]
+            places = [start[:3, 3], *places]
+        if first >= 0:
+            yaw, pitch = _find_arrival(tour, *steps[first]) or (yaw, 0.0)
+        is_left = last < len(steps) and (first >= 0 or start is None)
+        around = math.radians(_LOOK_AROUND_DEGREES) if is_left and len(places) == 1 else 0.0
+        sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch, around))
+        yaw = float(sections[-1][3][-1])
+    *positions, yaws, pitches, numbers = (np.concatenate(values) for values in zip(*sections, strict=True))
+    return Route(
+        np.stack(positions, axis=1) @ level.T,
+        yaws,
+        pitches,
+        numbers,
+        tuple(walk),
+        tuple(edges),
+        tuple(fades),
+        level,
+        (len(yaws) - 1) / _SAMPLES_PER_SECOND,
+    )
+
+
+def _find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
+    """Yaw and pitch of a unit direction (right, down, forward)."""
+    return math.atan2(direction[0], direction[2]), math.asin(min(max(-float(direction[1]), -1.0), 1.0))
+
+
+def _find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
+    """The level way, in world axes, along the link between two nodes; None without one, and if it is vertical."""
+    direction = tour.find_direction(start, end)
+    if direction is None:
+        return None
+    flat = direction - (direction @ tour.level_axes[:, 1]) * tour.level_axes[:, 1]
+    length = float(np.linalg.norm(flat))
+    return None if length < 0.1 else _LINK_METRES / length * flat
+
+
+def _find_arrival(tour: TourGraph, start: int, end: int) -> tuple[float, float] | None:
+    """Yaw and pitch of a camera after a fade; None to keep the heading."""
+    back, view = _find_way_along_link(tour, end, start), tour.find_start_view(end)
+    if back is not None:
+        return _find_angles(-tour.level_axes.T @ back / _LINK_METRES)
+    return None if view is None else _find_angles(tour.level_axes.T @ view)
+
+
+def _fly(
+    path: Float[np.ndarray, "place 3"],
+    legs: Sequence[int],
+    before: int,
+    yaw: float | None,
+    pitch: float,
+    around: float = 0.0,
+) -> tuple[np.ndarray, ...]:
+    """The flight through places of one part: right, down, forward, yaw, pitch and leg of each sample.
+
+    Args:
+        path: places (right, down, forward).
+        legs: of the steps between them.
+        before: the leg that leads to this part, during which the camera stands.
+        yaw: at the start, radians; None looks along the path.
+        pitch: at the start, radians.
+        around: turn to the right at the end, radians.
+    """
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     kept = lengths > 1e-6
-    lengths, legs = lengths[kept], np.array(legs, dtype=int)[kept]
+    lengths, numbers = lengths[kept], np.array(legs, dtype=int)[kept]
     path = path[np.concatenate(([True], kept))]
     if not len(lengths):
-        legs = np.array([-1])
+        numbers = np.array([before])
     ends = np.concatenate(([0.0], np.cumsum(lengths)))
     stops = [*ends[_find_turns_back(path)], ends[-1]]
-    yaw, pitch = None, 0.0
-    if start is not None:
-        forward = level.T @ start[:3, 2]
-        yaw, pitch = math.atan2(forward[0], forward[2]), math.asin(min(max(-float(forward[1]), -1.0), 1.0))
     place, step = 0.0, 1 / _SAMPLES_PER_SECOND
     places, yaws = [place], [yaw]
     while place < ends[-1]:
@@ -117,22 +212,20 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
         places.append(place)
         yaws.append(yaw)
     yaws[0] = yaws[1] if len(yaws) > 1 and yaws[0] is None else yaws[0] or 0.0
+    turns = np.arange(0, around, math.radians(_TURN_DEGREES) * step).tolist()
+    places += [place for _ in turns]
+    yaws += [yaws[-1] + turn for turn in turns]
     along = np.array(places)
     pitches = np.zeros(len(yaws))
     pitches[0] = pitch
     positions = [np.interp(along, ends, column) for column in path.T]
-    numbers = legs[np.clip(np.searchsorted(ends, along, side="right") - 1, 0, len(legs) - 1)]
+    numbers = numbers[np.clip(np.searchsorted(ends, along, side="right") - 1, 0, len(numbers) - 1)]
     half = round(_SMOOTHING_SECONDS / 2 * _SAMPLES_PER_SECOND)
     smooth = [_smooth(values, half) for values in (*positions, np.array(yaws), pitches)]
-    return Route(
-        np.stack(smooth[:3], axis=1) @ level.T,
-        smooth[3],
-        smooth[4],
-        np.pad(numbers, half, mode="edge"),
-        tuple(walk),
-        level,
-        (len(smooth[3]) - 1) / _SAMPLES_PER_SECOND,
-    )
+    numbers = np.pad(numbers, half, mode="edge")
+    if before >= 0:
+        numbers[:half] = before
+    return *smooth, numbers
 
 
 def _find_turns_back(path: Float[np.ndarray, "place 3"]) -> list[int]:

@@ -61,6 +61,7 @@ def test_a_saved_scene_is_loaded_unchanged(tmp_path: Path, degree: int, make_sce
     assert torch.equal(back.cam2world, scene.cam2world)  # bit-exact
     assert (back.near, back.far, back.height, back.model) == (0.45, 10.0, 256, "sweep")
     assert back.names == scene.names and back.gains == scene.gains and back.overlaps == scene.overlaps
+    assert (back.links, back.starts) == (scene.links, scene.starts)
 
 
 def test_the_file_has_the_3dgs_layout(tmp_path: Path, make_scene) -> None:

@@ -11,9 +11,13 @@ import torch
 
 import pansplat.tours as tours
 from pansplat.data.pairs import Pair, Panorama
-from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.tours import find_tours
+
+
+def make_gaussians(count: int) -> Gaussians:
+    zeros, sizes = torch.zeros(count, dtype=torch.int64), torch.ones(count, 3)
+    return Gaussians(sizes, sizes, torch.ones(count, 4), torch.ones(count), torch.zeros(count, 1, 3), zeros, zeros)
 
 
 def test_pairs_that_share_panoramas_are_one_tour(make_tour):
@@ -59,10 +63,80 @@ def test_the_scene_of_an_edge_holds_both_ends_and_shares_a_third(make_tour):
     assert make_tour(places, ((0, 1), (2, 3))).choose_scene_views()[2, 3] == (2, 3)
 
 
-def test_a_walk_over_separate_parts_is_refused(make_tour):
-    tour = make_tour(((0, 0), (0, 1), (2, 0), (3, 0)), ((0, 1), (2, 3)))
-    with pytest.raises(InputError, match="needed edges that connect all 4 panoramas"):
-        tour.plan_walk()
+def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
+    assert list(home.overlaps.items()) == [((0, 1), 0), ((1, 2), 0), ((4, 5), 0), ((3, 3), 1), ((6, 6), 1)]
+    assert home.parts == (0, 0, 0, 1, 2, 2, 3) and home.name == "home tour"
+    scenes = home.choose_scene_views()
+    assert scenes[3, 3] == (3,) and scenes[4, 5] == (4, 5) and set(home.choose_sources()) == set(scenes.values())
+    assert home.neighbours(3) == [] and home.list_reachable((3, 3)) == {3}
+    pairs = [home.make_pair((node,)) for node in (3, 6)]
+    (tour,) = find_tours(pairs)
+    assert set(tour.overlaps) == {(0, 0), (1, 1)}, "two photographs are a tour of two parts"
+    assert find_tours(pairs[:1]) == [] and find_tours([home.make_pair((0, 1))]) == []
+    elsewhere = dataclasses.replace(pairs[1], folder=Path("other"))
+    assert find_tours([pairs[0], elsewhere]) == [], "each folder has its own tour"
+
+
+def test_parts_are_level_and_far_apart(home):
+    distances = np.linalg.norm(home.positions[:, None] - home.positions[None], axis=2)
+    parts = np.array(home.parts)
+    assert distances[parts[:, None] != parts].min() >= 8
+    assert distances[4, 5] == pytest.approx(1) and np.allclose(home.positions[:3], [(0, 0, z) for z in range(3)])
+    axes = home.cam2world[:, :3, :3].numpy()
+    assert np.allclose(axes, np.eye(3)), "up is up, and the first panorama of each part looks ahead"
+    assert np.allclose(home.positions[:, 1], 0), "the cameras have one height"
+    pair = home.make_pair((4, 5))
+    (place, _), poses = pair.context, torch.stack([panorama.cam2world for panorama in pair.context])
+    assert np.allclose(place.cam2world[:3, 3], (5, 5, 0)), "scenes are predicted in the world of their part"
+    means = poses[:, :3, 3].float() + place.cam2world[:3, 2].float()  # 1 m ahead
+    gaussians = dataclasses.replace(make_gaussians(2), means=means)
+    scene = home.place(Scene(gaussians, poses, 1.0, 2.0), (4, 5))
+    assert np.allclose(scene.cam2world, home.cam2world[4:6]), "and placed in that of the tour"
+    assert np.allclose(scene.gaussians.means, home.positions[4:6] + np.array((0, 0, 1)), atol=1e-5)
+    for node, place in enumerate(home.positions):
+        moved = place + np.array((0.7, 0, 0.7))
+        edge, distance = home.find_nearest_edge(moved)
+        assert node in edge and distance < 1 and home.follow_edge(moved, edge) == edge
+
+
+def test_two_hundred_parts_stay_near_each_other(make_tour):
+    single = make_tour(((0, 0),), ()).panoramas[0]
+    panoramas = tuple(dataclasses.replace(single, image=Path(f"{k}.jpg"), part=k) for k in range(200))
+    (tour,) = find_tours([Pair("", Path(), (panorama,), (), 0.45, 10.0, ()) for panorama in panoramas])
+    assert np.ptp(tour.positions, axis=0).max() < 250 and len(tour.plan_walk()) == 200
+
+
+def test_an_edge_is_followed_within_its_part_until_the_camera_is_at_another_one(home):
+    places = home.positions
+    towards = places[3] - places[2]
+    between = places[3] - 0.55 * towards
+    assert home.find_nearest_edge(between)[0] == (1, 2) and home.follow_edge(between, (3, 3)) == (3, 3)
+    assert home.find_nearest_edge(between, part=0)[0] in ((0, 1), (1, 2))
+    assert home.follow_edge(places[6], (3, 3)) == (6, 6), "after a jump"
+
+
+def test_walks_fade_between_parts_preferably_along_links(home):
+    walk = home.plan_walk()
+    assert set(walk) == set(range(7)) and walk[:5] == [0, 1, 2, 3, 6], "from the first panorama on, along links"
+    flown = [(min(step), max(step)) for step in itertools.pairwise(walk) if not home.is_fade(*step)]
+    assert len(walk) - len(flown) == 4 and set(flown) <= set(home.overlaps), "three fades"
+    assert home.find_walk(0, 6) == [0, 1, 2, 3, 6] and home.find_walk(6, 0) == [6, 3, 2, 1, 0]
+    assert home.find_walk(0, 5) == [0, 5], "no link leads there"
+    assert home.find_walk(0, 2) == [0, 1, 2], "a fade is no short cut within a part"
+    assert home.find_way(home.positions[0] + (0, 0, 0.4), 3) == [1, 2, 3]
+    assert home.find_way(home.positions[3], 2, part=home.parts[4])[0] in (4, 5)
+    unlinked = dataclasses.replace(home, panoramas=tuple(dataclasses.replace(p, links=()) for p in home.panoramas))
+    assert set(unlinked.plan_walk()) == set(range(7)) and unlinked.plan_walk()[:3] in ([0, 1, 2], [2, 1, 0])
+    assert unlinked.find_walk(0, 6) == [0, 6]
+
+
+def test_a_link_is_a_direction_in_the_world(home):
+    assert set(home.links) == {(2, 3), (3, 2), (3, 6)}
+    assert np.allclose(home.find_direction(2, 3), (-math.cos(0.4), math.sin(0.4), 0)), "left and below the horizon"
+    assert home.find_direction(6, 3) is None and home.find_start_view(0) is None
+    panorama = dataclasses.replace(home.panoramas[4], start=(math.pi / 2, -0.1))
+    tour = dataclasses.replace(home, panoramas=(panorama,), overlaps={(0, 0): 1.0})
+    assert np.allclose(tour.find_start_view(0), (math.cos(0.1), -math.sin(0.1), 0))
 
 
 def test_panoramas_too_close_for_depth_get_a_third(make_tour):
@@ -82,8 +156,7 @@ def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_ove
         count = 10 * len(views)
         labels = torch.arange(count) % len(views)
         means = torch.tensor(views)[labels, None].float().expand(count, 3)
-        sizes, colors = torch.ones(count, 3), torch.zeros(count, 1, 3)
-        gaussians = Gaussians(means, sizes, torch.ones(count, 4), torch.ones(count), colors, labels, labels.byte())
+        gaussians = dataclasses.replace(make_gaussians(count), means=means, views=labels.byte())
         return Scene(gaussians, tour.cam2world[list(views)], 1.0, 2.0, tuple(f"{view}.jpg" for view in views))
 
     scene = tours.merge_scenes(tour, load)
@@ -113,13 +186,40 @@ def test_a_merged_scene_has_the_gains_of_all_photographs_relative_to_their_mean(
     assert tours.merge_scenes(tour, lambda views: load(views, refined=False)).gains == ()
 
 
-def test_next_nodes_lead_along_the_cheapest_walk(comb):
-    following = comb.find_next_nodes()
-    for start, end in itertools.product(range(6), repeat=2):
-        walk = [start]
-        while walk[-1] != end:
-            walk.append(following[walk[-1]][end])
-        assert walk == comb.find_walk(start, end)
+def test_a_merged_scene_of_parts_has_their_links_titles_and_gains(home):
+    title, start = "living <room>", (9.0, 0.1)
+    panoramas = list(home.panoramas)
+    panoramas[3] = dataclasses.replace(panoramas[3], title=title, start=start)
+    panoramas[6] = dataclasses.replace(panoramas[6], title=title)
+    tour = dataclasses.replace(home, panoramas=tuple(panoramas))
+
+    def load(views: tuple[int, ...]) -> Scene:
+        gains = ((2.0,) * 3, (0.5,) * 3)[: len(views)] if len(views) > 1 else ((1.0,) * 3,)
+        names = tuple(f"p{view}" for view in views)
+        return Scene(empty_gaussians(), tour.cam2world[list(views)], 1.0, 2.0, names, gains=gains)
+
+    scene = tours.merge_scenes(tour, load)
+    assert scene.names == ("p0", "p1", "p2", title, "p4", "p5", title)
+    gains = np.array(scene.gains)
+    assert np.allclose(gains[[3, 6]], 1) and np.allclose(gains[[4, 5]], [[2] * 3, [0.5] * 3])
+    assert scene.starts == (None,) * 3 + ((9.0 - 2 * math.pi, 0.1),) + (None,) * 3
+    again = tours.make_graph(scene)
+    assert again.overlaps == tour.overlaps and set(again.links) == set(tour.links) and again.parts == tour.parts
+    assert again.links[2, 3].text == "to the hall"
+    assert np.allclose(again.find_direction(2, 3), tour.find_direction(2, 3))
+    assert [panorama.label for panorama in again.panoramas] == list(scene.names)
+    part = tours.select_views(scene, (3,))
+    assert part.names == (title,) and part.links == part.starts == part.overlaps == ()
+
+
+def test_next_nodes_lead_along_the_cheapest_walk(comb, home):
+    for tour in (comb, home):
+        following = tour.find_next_nodes()
+        for start, end in itertools.product(range(len(tour)), repeat=2):
+            walk = [start]
+            while walk[-1] != end:
+                walk.append(following[walk[-1]][end])
+            assert walk == tour.find_walk(start, end)
 
 
 def test_an_edge_is_followed_until_another_one_is_clearly_nearer(comb):

@@ -1,9 +1,12 @@
 """Smooth flights through panoramas."""
 
+import dataclasses
 import itertools
+import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from pansplat.data.pairs import Panorama
@@ -53,3 +56,38 @@ def test_the_camera_looks_along_its_way_in_any_world(comb):
     pose = plan_route(tour, [0, 1, 2, 3]).pose(0.5)
     assert np.allclose(pose[:3, 2], turn @ torch.tensor((0.0, 0, 1), dtype=torch.float64), atol=1e-6)
     assert np.allclose(pose[:3, 1], (0, 0, -1))
+
+
+def test_a_route_goes_along_a_link_then_jumps_and_looks_away_from_the_link_back(home):
+    route = plan_route(home, [1, 2, 3, 6])
+    assert route.fades == (1, 2) and len(route.jumps) == 2
+    assert route.edges == ((1, 2), (3, 3), (6, 6))
+    before, after = route.jumps[0], route.jumps[0] + 1
+    assert np.allclose(route.positions[before], home.positions[2] + (-0.7, 0, 0)), "0.7 m to the left"
+    assert math.remainder(route.yaws[before] + math.pi / 2, 2 * math.pi) == pytest.approx(0, abs=0.02)
+    assert np.allclose(route.positions[after], home.positions[3]) and math.cos(route.yaws[after]) == pytest.approx(1)
+    assert route.legs[before] == 0 and set(route.legs[after : route.jumps[1] + 1]) == {1}
+    assert np.allclose(route.positions[route.jumps[1]], home.positions[3] + (0, 0, 0.7))
+    assert np.allclose(route.positions[-1], home.positions[6]) and math.cos(route.yaws[-1]) == pytest.approx(1)
+    steps = np.linalg.norm(np.diff(route.positions, axis=0), axis=1)
+    assert steps[np.delete(np.arange(len(steps)), route.jumps)].max() < 1.05 / 60, "only the jumps are fast"
+    count = 7 * len(route.yaws)
+    places = np.stack([route.pose(k / count)[:3, 3] for k in range(count + 1)])
+    assert np.linalg.norm(places[:, None] - home.positions[None], axis=2).min(axis=1).max() < 0.8, "never between parts"
+    seen = [route.edge(k / count) for k in range(count + 1)]
+    assert [edge for edge, _ in itertools.groupby(seen)] == [(1, 2), (3, 3), (6, 6)]
+
+
+def test_a_fade_without_a_link_begins_at_once_and_ends_in_the_start_view_or_the_heading(home):
+    start = home.cam2world[3].numpy().copy()
+    start[:3, 3] += 0.3
+    start[:3, :3] = ((0, 0, 1), (0, 1, 0), (-1, 0, 0))  # looks to the right
+    kept = plan_route(home, [3, 4, 5], start)
+    (jump,) = kept.jumps
+    assert np.allclose(kept.positions[: jump + 1], start[:3, 3]) and kept.legs[jump] == -1 and kept.edges[0] == (4, 5)
+    assert kept.yaws[jump + 1] == pytest.approx(math.pi / 2)
+    panoramas = list(home.panoramas)
+    panoramas[4] = dataclasses.replace(panoramas[4], start=(-0.5, 0.2))
+    tour = dataclasses.replace(home, panoramas=tuple(panoramas))
+    route = plan_route(tour, [3, 4], start)
+    assert route.yaws[-1] == pytest.approx(-0.5) and route.pitches[-1] == pytest.approx(-0.2)

@@ -5,13 +5,15 @@ loaded; `tour` requests its other scenes. A file that has the graph of a tour is
 of the scene in the file. Imports no torch before it loads.
 """
 
+import contextlib
 import re
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.files import is_scene_file
 from pansplat_viewer.scene.background import BackgroundWorker
 
@@ -38,6 +40,7 @@ class SceneEntry:
     tour: "TourGraph | None" = None  # the tour, or None
     views: tuple[int, ...] = ()  # of one scene of a tour: numbers of its panoramas in the tour
     merged: "Scene | None" = None  # of a tour from a file: the scene in it, of all panoramas
+    notes: tuple[str, ...] = ()  # what was not used or not placed at its path, and why
 
     @property
     def panoramas(self) -> "tuple[Panorama, ...]":
@@ -95,7 +98,7 @@ class LoadOptions:
 
 
 def find_entries(path: Path, options: LoadOptions, progress: Progress | None = None) -> list[SceneEntry]:
-    """Return all scenes at `path`: tours of three or more panoramas first, then pairs, then scene files.
+    """Return all scenes at `path`: tours first, then pairs and single views, then scene files.
 
     Args:
         path: a file or folder.
@@ -113,15 +116,37 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
     try:
         from pansplat.pipeline import load_pairs
 
-        pairs = load_pairs(path, convention=options.convention, near=options.near, far=options.far, progress=progress)
+        with _collect_notes() as notes:
+            pairs = load_pairs(
+                path, convention=options.convention, near=options.near, far=options.far, progress=progress
+            )
     except InputError:
         if not scenes:
             raise
-        pairs = []
+        pairs, notes = [], []
     from pansplat.tours import find_tours
 
-    tours = [SceneEntry(tour.name, tour=tour) for tour in find_tours(pairs)]
-    return tours + [SceneEntry(pair.name, pair=pair) for pair in pairs] + [SceneEntry(p.stem, file=p) for p in scenes]
+    entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in find_tours(pairs)]
+    entries += [SceneEntry(pair.name, pair=pair, notes=tuple(notes)) for pair in pairs]
+    return entries + [SceneEntry(p.stem, file=p) for p in scenes]
+
+
+@contextlib.contextmanager
+def _collect_notes() -> Iterator[list[str]]:
+    """The warnings about the input while pairs are looked for; they are also shown as before."""
+    notes: list[str] = []
+    show = warnings.showwarning
+
+    def note(message: Warning | str, *rest: Any) -> None:
+        if isinstance(message, InputWarning):
+            notes.append(str(message))
+        show(message, *rest)
+
+    warnings.showwarning = note
+    try:
+        yield notes
+    finally:
+        warnings.showwarning = show
 
 
 def load_entry(
@@ -179,12 +204,15 @@ def _load_tour_scene(
     assert tour is not None
     if not views:
         tour = tour if entry.merged is not None else connect(tour, progress)
-        first, second = tour.plan_walk()[:2]
-        views = tour.choose_scene_views()[min(first, second), max(first, second)]
+        first, *others = tour.plan_walk()
+        is_flown = others and not tour.is_fade(first, others[0])
+        edge = (min(first, others[0]), max(first, others[0])) if is_flown else tour.find_edge(first)
+        views = tour.choose_scene_views()[edge]
         entry = replace(entry, tour=tour, views=views)
     pair = entry.pair or tour.make_pair(views)
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
+        scene = scene if entry.merged is not None else tour.place(scene, views)
         return LoadedScene(entry, scene, is_final=is_final, outlines=find_floor_outlines(tour, scene, views))
 
     if entry.merged is not None:

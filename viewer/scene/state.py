@@ -1,5 +1,6 @@
 """The viewer's state: values that keys and panels change and that a frame reads. Needs neither window nor GL."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, up_direction
 from pansplat.tours import Route, TourGraph
-from pansplat_viewer.scene.camera import Camera, move_to_pose
+from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.scene.picking import PickedPoint
 from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Projection
@@ -51,6 +52,7 @@ class ViewerState:
     speed: float = 1.0  # of flying, metres per second
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     num_views: int = 0  # number of input cameras of the scene that is shown
+    tour: TourGraph | None = None  # that is shown; None for other scenes
     route: Route | None = None  # the flight through a tour; None if none is planned, and in other scenes
     target: int | None = None  # the panorama of a tour to fly to; None if there is none
     minimap: bool = True
@@ -86,10 +88,13 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
     adapt_settings(state, scene, keep_levels=False)
     state.settings = replace(state.settings, near=NEAR)
-    state.context, state.route, state.target = scene.cam2world.double().numpy(), None, None
+    state.context = scene.cam2world.double().numpy()
+    state.tour = state.route = state.target = None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
     level = create_level_camera(scene).level
     camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
+    if state.flight == 0 and scene.starts and scene.starts[0] is not None:
+        camera = _look_along(camera, scene.cam2world[0].numpy(), *scene.starts[0])
     state.camera = state.home = replace(camera, distance=_measure_distance(scene, 50))
     if before is not None:
         state.camera = replace(before, distance=state.home.distance)
@@ -97,12 +102,19 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     choose_display(state, state.settings.display)
 
 
+def _look_along(camera: Camera, cam2world: Float[np.ndarray, "4 4"], yaw: float, pitch: float) -> Camera:
+    """The camera, turned to a direction of a panorama: to the right of its centre, and below its horizon, radians."""
+    forward = cam2world[:3, :3] @ (math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch))
+    return focus_on_point(camera, np.asarray(camera.position) + forward)
+
+
 def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, *, at: float = 0.0) -> None:
     """Start in a tour, whose first scene is `scene`, at a fraction of a route through it; see `enter_scene`."""
     before = state.camera if _are_same(state.context, tour.cam2world.numpy()) else None
     enter_scene(state, scene)
     state.settings = replace(state.settings, near=NEAR_OF_FAR * tour.far)
-    state.context, state.route, state.flight = tour.cam2world.numpy(), route, min(max(at, 0.0), 1.0)
+    state.tour, state.context = tour, tour.cam2world.numpy()
+    state.route, state.flight = route, min(max(at, 0.0), 1.0)
     level = create_level_camera(scene, tour).level
     state.camera = state.home = move_to_pose(replace(state.camera, level=level), route.pose(state.flight))
     state.camera = before or state.camera
@@ -205,7 +217,7 @@ def show_path(state: ViewerState, seconds: float) -> None:
     """Move the camera to a time of the path."""
     state.playing, state.path_seconds = False, max(seconds, 0.0)
     if len(state.path):
-        state.camera = state.path.interpolate(state.path_seconds, state.camera)
+        state.camera = state.path.interpolate(state.path_seconds, state.camera, state.tour)
 
 
 def advance_path(state: ViewerState, seconds: float) -> None:

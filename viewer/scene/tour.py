@@ -23,6 +23,7 @@ DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
 _NEXT_SCENES = 3  # that are predicted before they are needed
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor
 _MIN_HOTSPOT_PIXELS = 14.0
+_LINK_METRES = (1.0, 3.0)  # distance of a link's hotspot on the floor
 
 
 class TourScenes:
@@ -50,6 +51,7 @@ class TourScenes:
         """
         self.tour, self._merged = tour, merged
         self.edge: Edge = next(iter(tour.overlaps))
+        self._is_placed = False  # whether the camera has been at the edge
         self.outlines: dict[int, FloorOutline] = {}
         self._views = tour.choose_scene_views()
         self._budget = memory * 2**30
@@ -60,6 +62,11 @@ class TourScenes:
     def views(self) -> Views:
         """The panoramas of the scene that the camera needs."""
         return self._views[self.edge]
+
+    @property
+    def part(self) -> int:
+        """The part of the tour that the camera is in."""
+        return self.tour.parts[self.edge[0]]
 
     @property
     def num_scenes(self) -> int:
@@ -103,19 +110,28 @@ class TourScenes:
     def move(self, position: Float[np.ndarray, "3"], route: Route | None = None, fraction: float = 0.0) -> None:
         """Choose the edge of a camera position, or of a fraction of a route that is being flown."""
         edge = None if route is None else route.edge(fraction)
-        self.edge = edge or self.tour.follow_edge(position, self.edge)
+        if edge is None:
+            tour, known = self.tour, self._is_placed
+            edge = tour.follow_edge(position, self.edge) if known else tour.find_nearest_edge(position)[0]
+        self.edge, self._is_placed = edge, True
 
     def list_next(self, route: Route | None, fraction: float) -> list[Views]:
         """The scenes to have in memory, the most urgent first: that of the camera, then those that are next.
 
-        These are the next ones of a route, or those around the nearest panorama.
+        These are the next ones of a route; or those around the nearest panorama, then those of other parts: first
+        where links lead to, then in the order of the panoramas.
         """
+        tour = self.tour
         if route is not None:
             edges = list(route.edges_after(fraction))
         else:
             a, b = self.edge
             edges = [edge for edge in self._views if {a, b} & set(edge)]
-            edges.sort(key=self.tour.length)
+            edges.sort(key=tour.length)
+            linked = [end for start, end in tour.links if start in self.edge]
+            following = (node % len(tour) for node in range(b + 1, b + len(tour)))
+            others = [node for node in (*linked, *following) if tour.is_fade(a, node)]
+            edges += [tour.find_edge(node) for node in others[: 2 * _NEXT_SCENES]]
         wanted = dict.fromkeys([self.views, *(self._views[edge] for edge in edges)])
         return list(wanted)[: 1 + _NEXT_SCENES]
 
@@ -144,24 +160,40 @@ class TourScenes:
             return 1.0
         return max((len(route.legs) - len(numbers) + int(missing[0]) - 1) / (len(route.legs) - 1), fraction)
 
+    def is_blocked(self, route: Route, fraction: float) -> bool:
+        """Whether a route cannot be flown on from a fraction, because the next scene could not be loaded."""
+        leg = int(route.legs[min(round(fraction * (len(route.legs) - 1)) + 1, len(route.legs) - 1)])
+        return leg >= 0 and self._views[route.edges[leg]] in self._failed
+
     def plan_route(self, camera: Float[np.ndarray, "4 4"], remaining: Sequence[int] = ()) -> Route:
         """A route from a pose through the remaining panoramas; without any, through all of them."""
+        position = camera[:3, 3]
         if remaining:
-            walk = [*self.tour.find_way(camera[:3, 3], remaining[0]), *remaining[1:]]
+            walk = [*self._find_way(position, remaining[0]), *remaining[1:]]
         else:
-            edge, _ = self.tour.find_nearest_edge(camera[:3, 3])
-            distances = np.linalg.norm(self.tour.positions[list(edge)] - camera[:3, 3], axis=1)
+            edge, _ = self.tour.find_nearest_edge(position, self._find_part(position))
+            distances = np.linalg.norm(self.tour.positions[list(edge)] - position, axis=1)
             walk = self.tour.plan_walk(edge[int(distances.argmin())])
         return plan_route(self.tour, walk, camera)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
         """A route from a pose to a panorama."""
-        return plan_route(self.tour, self.tour.find_way(camera[:3, 3], node), camera)
+        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera)
+
+    def _find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
+        return self.tour.find_way(position, node, self._find_part(position))
+
+    def _find_part(self, position: Float[np.ndarray, "3"]) -> int:
+        """The part of a position, which may be that after a jump."""
+        return self.tour.parts[self.tour.follow_edge(position, self.edge)[0]]
 
     @property
     def camera_height(self) -> float:
-        """Height of the cameras over the floor, metres."""
-        return choose_camera_height((outline.camera_height for outline in self.outlines.values()), self.tour.far)
+        """Height of the cameras over the floor, in the part of the camera if it is known there, metres."""
+        parts = self.tour.parts
+        here = [outline for node, outline in self.outlines.items() if parts[node] == self.part]
+        heights = (outline.camera_height for outline in here or self.outlines.values())
+        return choose_camera_height(heights, self.tour.far)
 
 
 def measure_bytes(scene: Scene) -> int:
@@ -173,15 +205,21 @@ def measure_bytes(scene: Scene) -> int:
 class CrossFade:
     """Two slots for scenes: one is shown, and the other one fades out for `FADE_SECONDS` after an exchange.
 
+    A scene of another part of a tour than that of the camera is drawn from the last pose in its part.
+
     Attributes:
         front: slot of the scene that is shown.
         scenes: of both slots.
+        parts: of the tour, of both scenes.
+        poses: from which the scenes are drawn; None before the first one.
     """
 
     def __init__(self) -> None:
         """Both slots are empty."""
         self.front = 0
         self.scenes: list[Scene | None] = [None, None]
+        self.poses: list[Float[np.ndarray, "4 4"] | None] = [None, None]
+        self.parts = [0, 0]
         self._start = -1e9
         self._fading = False
 
@@ -191,10 +229,17 @@ class CrossFade:
             return None
         return self.front if self.scenes[self.front] is None else 1 - self.front
 
-    def show(self, slot: int, scene: Scene, now: float) -> None:
+    def show(self, slot: int, scene: Scene, now: float, part: int = 0) -> None:
         """Show a scene that has been uploaded to a slot; at time `now` (seconds) the other one starts to fade out."""
         self._fading = self.scenes[slot] is not None or slot != self.front
         self.scenes[slot], self.front, self._start = scene, slot, now
+        self.poses[slot], self.parts[slot] = None, part
+
+    def move(self, pose: Float[np.ndarray, "4 4"], part: int = 0) -> None:
+        """Draw the scenes of a part from this pose."""
+        for slot in range(2):
+            if self.parts[slot] == part or self.poses[slot] is None:
+                self.poses[slot] = pose
 
     def compute_weight(self, now: float) -> float:
         """Weight of the scene that is shown, 0 to 1; that of the other one is the rest."""
@@ -204,29 +249,50 @@ class CrossFade:
 
     def clear(self) -> None:
         """Forget both scenes; the first slot is the front."""
-        self.front, self.scenes, self._fading = 0, [None, None], False
+        self.front, self.scenes, self.poses, self._fading = 0, [None, None], [None, None], False
 
 
 @dataclass(frozen=True)
 class Hotspot:
-    """The place of a panorama in the image, on the floor below its camera."""
+    """The place of a panorama in the image, on the floor below its camera, or on the floor where a link leads to it.
 
-    node: int  # number of the panorama
-    center: tuple[float, float]  # pixels, from the left and from the top
-    radius: float  # pixels, within which a click is meant
-    ring: tuple[tuple[float, float], ...]  # corners of the circle on the floor
+    Attributes:
+        node: number of the panorama.
+        label: its name, or the text of the link.
+        center: pixels, from the left and from the top.
+        radius: pixels, within which a click is meant.
+        ring: corners of the circle on the floor, pixels.
+        is_fade: whether the panorama is in another part, to which the image fades.
+    """
+
+    node: int
+    label: str
+    center: tuple[float, float]
+    radius: float
+    ring: tuple[tuple[float, float], ...]
+    is_fade: bool = False
 
 
 def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> list[Hotspot]:
-    """The panoramas that share an edge with those near the camera, and that are in the image; the nearest last."""
+    """The panoramas that can be reached next, and that are in the image; the nearest last.
+
+    They share an edge with those near the camera, or a link leads to them from there, to another part.
+    """
     tour, position = scenes.tour, np.asarray(camera.position)
     right, down, forward = np.asarray(camera.level).T
-    nodes = {*scenes.edge, *(node for end in scenes.edge for node in tour.neighbours(end))}
+    below = scenes.camera_height * down
+    feet = {
+        node: (tour.positions[node] + below, tour.panoramas[node].label)
+        for node in tour.list_reachable(scenes.edge)
+        if np.linalg.norm(tour.positions[node] - position) >= 3 * _HOTSPOT_RADIUS
+    }
+    for start in sorted(set(scenes.edge), key=lambda node: float(np.linalg.norm(tour.positions[node] - position))):
+        for (first, node), link in tour.links.items():
+            if first == start and tour.is_fade(first, node) and node not in feet:
+                way = _find_link_end(tour, first, node, scenes.camera_height, down)
+                feet[node] = (tour.positions[first] + way + below, link.text or tour.panoramas[node].label)
     found = []
-    for node in nodes:
-        foot = tour.positions[node] + scenes.camera_height * down
-        if np.linalg.norm(tour.positions[node] - position) < 3 * _HOTSPOT_RADIUS:
-            continue
+    for node, (foot, label) in feet.items():
         angles = np.arange(24) * (2 * np.pi / 24)
         circle = foot + _HOTSPOT_RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
         center = project_point(camera, tuple(foot), size)
@@ -234,8 +300,23 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
         if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):
             continue
         radius = max(np.ptp([corner[0] for corner in ring]) / 2, _MIN_HOTSPOT_PIXELS)
-        found.append((float(np.linalg.norm(foot - position)), Hotspot(node, center, float(radius), tuple(ring))))
+        is_fade = tour.is_fade(scenes.edge[0], node)
+        hotspot = Hotspot(node, label, center, float(radius), tuple(ring), is_fade)
+        found.append((float(np.linalg.norm(foot - position)), hotspot))
     return [hotspot for _, hotspot in sorted(found, key=lambda item: -item[0])]
+
+
+def _find_link_end(
+    tour: TourGraph, start: int, end: int, height: float, down: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """The level way from a camera to where a link meets the floor, 1 to 3 m away."""
+    direction = tour.find_direction(start, end)
+    assert direction is not None
+    fall = float(direction @ down)
+    flat = direction - fall * down
+    length = max(float(np.linalg.norm(flat)), 1e-6)
+    distance = height * length / fall if fall > 1e-6 else _LINK_METRES[1]
+    return min(max(distance, _LINK_METRES[0]), _LINK_METRES[1]) / length * flat
 
 
 def find_clicked(hotspots: Sequence[Hotspot], pixel: tuple[float, float]) -> int | None:

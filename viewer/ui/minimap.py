@@ -1,4 +1,7 @@
-"""The floor plan of a tour as a panel: floors, walls, panoramas, and the camera; a click flies to a panorama."""
+"""The floor plan of a tour as a panel: floors, walls, panoramas, and the camera; a click flies to a panorama.
+
+Panoramas without a known place are squares.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,35 @@ import moderngl
 import numpy as np
 from imgui_bundle import imgui
 
-from pansplat.tours import FloorPlan, draw_floor_plan
+from pansplat.tours import FloorPlan, TourGraph, draw_floor_plan
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.tour import TourScenes
+from pansplat_viewer.ui.overlays import FADE_COLOR
 
 SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1
 _CLICK_PIXELS = 12.0
 _VIEW_LENGTH = 1.0  # metres, of the camera's field of view
 
-# Colours of panoramas, of those whose scene is loaded, of edges and of the camera.
-_COLORS = ((0.75, 0.78, 0.82, 1.0), (0.35, 0.8, 1.0, 1.0), (0.6, 0.65, 0.7, 0.35), (1.0, 0.8, 0.2, 1.0))
+# Colours of panoramas, of those whose scene is loaded, of edges, of the camera, and of links to other parts.
+_COLORS = (
+    (0.75, 0.78, 0.82, 1.0),
+    (0.35, 0.8, 1.0, 1.0),
+    (0.6, 0.65, 0.7, 0.35),
+    (1.0, 0.8, 0.2, 1.0),
+    (*FADE_COLOR, 0.35),
+)
+
+
+def describe_panorama(tour: TourGraph, node: int) -> str:
+    """The label of a panorama, and whether its place is unknown."""
+    label = tour.panoramas[node].label
+    return f"{label} (not placed)" if (node, node) in tour.overlaps else label
+
+
+def describe_panoramas(tour: TourGraph) -> str:
+    """The number of panoramas with and without a known place."""
+    alone = sum(a == b for a, b in tour.overlaps)
+    return f"{len(tour) - alone} placed, {alone} not placed" if alone else f"{len(tour)} panoramas"
 
 
 class Minimap:
@@ -51,7 +73,7 @@ class Minimap:
         nearest = int(np.argmin(distances))
         if distances[nearest] > _CLICK_PIXELS * scale:
             return None
-        imgui.set_tooltip(scenes.tour.panoramas[nearest].name)
+        imgui.set_tooltip(describe_panorama(scenes.tour, nearest))
         return nearest if imgui.is_mouse_clicked(0) else None
 
     def release(self) -> None:
@@ -80,9 +102,15 @@ class Minimap:
         colors = [imgui.color_convert_float4_to_u32(color) for color in _COLORS]
         for a, b in tour.overlaps:
             canvas.add_line(self.nodes[a], self.nodes[b], colors[2], scale)
-        loaded = {node for views in scenes.loaded for node in views}
-        for node, pixel in enumerate(self.nodes):
-            canvas.add_circle_filled(pixel, 4.0 * scale, colors[node in loaded])
+        for a, b in tour.links:
+            if tour.is_fade(a, b):
+                canvas.add_line(self.nodes[a], self.nodes[b], colors[4], scale)
+        loaded, half = {node for views in scenes.loaded for node in views}, 3.5 * scale
+        for node, (x, y) in enumerate(self.nodes):
+            if (node, node) in tour.overlaps:
+                canvas.add_rect_filled((x - half, y - half), (x + half, y + half), colors[node in loaded])
+            else:
+                canvas.add_circle_filled((x, y), 4.0 * scale, colors[node in loaded])
         place, rotation = np.asarray(camera.position) @ axes, camera.rotation
         heading = rotation[:, 2] @ axes
         heading = heading / max(float(np.linalg.norm(heading)), 1e-6)

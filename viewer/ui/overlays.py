@@ -10,7 +10,7 @@ from pansplat_viewer.draw.color_maps import get_table
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.settings import SCALAR_MAPS, FrameStats
 from pansplat_viewer.scene.state import ViewerState
-from pansplat_viewer.scene.tour import Hotspot, TourScenes
+from pansplat_viewer.scene.tour import Hotspot
 from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.window.gui import PANEL_WIDTH
 
@@ -30,6 +30,7 @@ _LABEL = (
     | imgui.WindowFlags_.no_nav.value
 )
 _LEGEND_WIDTH = 180.0
+FADE_COLOR = (1.0, 0.75, 0.3)  # of panoramas of other parts of a tour
 UNITS = {"depth": " m", "count": ""}  # of displays whose range can be changed
 
 
@@ -84,19 +85,18 @@ def draw_points(state: ViewerState) -> None:
     _draw_label("##point", lines, alpha=0.6)
 
 
-def draw_hotspots(tour: TourScenes, hotspots: list[Hotspot]) -> None:
-    """Draw a ring on the floor below each panorama, with its name."""
+def draw_hotspots(hotspots: list[Hotspot]) -> None:
+    """Draw a ring on the floor for each panorama, with its label; amber if the image fades to it."""
     canvas = imgui.get_background_draw_list()
-    black, white = (imgui.color_convert_float4_to_u32((value, value, value, 0.8)) for value in (0.0, 1.0))
+    black, white, amber = (imgui.color_convert_float4_to_u32((*rgb, 0.8)) for rgb in ((0,) * 3, (1,) * 3, FADE_COLOR))
     for hotspot in hotspots:
         ring = [imgui.ImVec2(*corner) for corner in hotspot.ring]
-        for color, thickness in ((black, 4.0), (white, 2.0)):
+        for color, thickness in ((black, 4.0), (amber if hotspot.is_fade else white, 2.0)):
             canvas.add_polyline(ring, color, thickness=thickness, flags=imgui.ImDrawFlags_.closed.value)
             canvas.add_circle_filled(hotspot.center, 1.0 + thickness, color)
-        name = tour.tour.panoramas[hotspot.node].name
-        width = imgui.calc_text_size(name).x
+        width = imgui.calc_text_size(hotspot.label).x
         place = hotspot.center[0] - width / 2, hotspot.center[1] + hotspot.radius
-        _draw_outlined(canvas, place, white, name)
+        _draw_outlined(canvas, place, white, hotspot.label)
 
 
 def draw_message(message: str) -> None:

@@ -21,7 +21,7 @@ from pansplat_viewer.scene.state import (
     toggle_play,
 )
 from pansplat_viewer.scene.tour import Hotspot, TourScenes
-from pansplat_viewer.ui.minimap import SIZE, Minimap
+from pansplat_viewer.ui.minimap import SIZE, Minimap, describe_panorama, describe_panoramas
 from pansplat_viewer.ui.overlays import (
     FIXED,
     MARGIN,
@@ -49,6 +49,7 @@ _HANDLE = (
     | imgui.WindowFlags_.no_nav.value
 )
 _NUM_PANORAMAS = 9  # with buttons, as there are keys
+_OPENED_NOTES = 3  # at most, at first
 
 
 @dataclass
@@ -80,6 +81,7 @@ class PanelData:
     tour: TourScenes | None = None  # the scenes of the tour that is shown; None for other scenes
     hotspots: list[Hotspot] = field(default_factory=list)  # places of its panoramas in the image
     background: tuple[str, float] | None = None  # work of the loader on the tour, and the fraction done
+    notes: tuple[str, ...] = ()  # what was not used or not placed at the path of the scene, and why
 
 
 class Panels:
@@ -112,7 +114,7 @@ class Panels:
             draw_points(state)
         if state.overlay and data.tour is not None:
             if state.hotspots:
-                draw_hotspots(data.tour, data.hotspots)
+                draw_hotspots(data.hotspots)
             self._draw_tour(state, data, data.tour, commands)
         if state.help:
             state.help = _draw_help()
@@ -134,7 +136,7 @@ class Panels:
         first = (imgui.Cond_.always if commands.reset_layout else imgui.Cond_.first_use_ever).value
         imgui.set_next_window_dock_id(0, first)
         imgui.set_next_window_pos((size.x - MARGIN, 120 * scale), first, (1.0, 0.0))
-        imgui.set_next_window_size(((SIZE + 18) * scale, (SIZE + 110) * scale), first)
+        imgui.set_next_window_size(((SIZE + 18) * scale, (SIZE + 136) * scale), first)
         imgui.begin("Tour")
         place, width = imgui.get_window_pos(), imgui.get_window_width()
         if place.x + width > size.x:  # the window was larger when the layout was remembered
@@ -144,6 +146,15 @@ class Panels:
         state.hotspots = self._check("hotspots", state.hotspots)
         if state.minimap:
             commands.visit = self.minimap.draw(tour, state.camera)
+        imgui.set_next_item_width(-1)
+        if imgui.begin_combo("##visit", describe_panoramas(tour.tour)):
+            for node in range(len(tour.tour)):
+                if imgui.selectable(f"{node + 1}. {describe_panorama(tour.tour, node)}", False)[0]:
+                    commands.visit = node
+                self._record_rectangle(f"visit {node}")
+            imgui.end_combo()
+        else:
+            self._record_rectangle("visit")
         imgui.text_unformatted(f"{len(tour.loaded)} of {tour.num_scenes} scenes in memory")
         if data.background is not None:
             task, fraction = data.background
@@ -197,6 +208,8 @@ class Panels:
         if opened:
             imgui.push_item_width(-110 * scale)
             self._section("Scene", self._draw_scene, state, data, commands)
+            if data.notes:
+                self._section("Notes", _draw_notes, data.notes, opened=len(data.notes) <= _OPENED_NOTES)
             if data.stats.total:
                 self._section("Gaussians", self._draw_gaussians, state)
             self._section("Display", self._draw_display, state)
@@ -486,6 +499,13 @@ class Panels:
                 commands.reduce = data.reduced
             self._record_rectangle("Reduce")
         imgui.end()
+
+
+def _draw_notes(notes: tuple[str, ...]) -> None:
+    imgui.push_text_wrap_pos(0.0)
+    for note in notes:
+        imgui.text_unformatted(note)
+    imgui.pop_text_wrap_pos()
 
 
 def _draw_row_label(label: str) -> None:

@@ -41,8 +41,8 @@ class Photographs:
 
     @property
     def names(self) -> list[str]:
-        """Their names."""
-        return [panorama.name for panorama in self._panoramas]
+        """Their labels."""
+        return [panorama.label for panorama in self._panoramas]
 
     @property
     def is_reading(self) -> bool:

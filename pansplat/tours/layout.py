@@ -1,0 +1,65 @@
+"""Parts of a tour in one world: level, side by side, so far apart that the nearest edge is in the camera's part."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from pansplat.data.pairs import Panorama
+from pansplat.geometry.path import level_pose, up_direction
+from pansplat.geometry.world import working_factor
+
+REACH = 2.0  # metres, in which a camera moves around the panoramas of its part
+_GAP = 8.0  # metres, between what the cameras of two parts reach, so that few rooms meet in the floor plan
+_ASPECT = 1.5  # of the width of all rows to the square root of their area
+
+
+def lay_out(panoramas: Sequence[Panorama], near: float) -> tuple[Panorama, ...]:
+    """The panoramas with poses in one world.
+
+    The largest part stays where it is. The others are turned, so that their first panoramas look in the direction of
+    its first one, level, and stand in rows on its right and behind it, with their cameras at its height.
+
+    Args:
+        panoramas: of one or more parts (`Panorama.part`).
+        near: smallest depth; states the unit of the world.
+    """
+    members: dict[int, list[int]] = {}
+    for node, panorama in enumerate(panoramas):
+        members.setdefault(panorama.part, []).append(node)
+    order = sorted(members, key=lambda part: -len(members[part]))[:1]
+    order += [part for part in members if part not in order]
+    poses = [torch.stack([panoramas[node].cam2world for node in members[part]]).double() for part in order]
+    levels = [level_pose(group[0], up_direction(group))[:3, :3] for group in poses]
+    places = [(group[:, :3, 3] @ level).numpy() for group, level in zip(poses, levels, strict=True)]
+    margin = (2 * REACH + _GAP) / working_factor(near)
+    sizes = np.array([np.ptp(place, axis=0)[[0, 2]] + margin for place in places])  # right, forward
+    corners = _arrange_in_rows(sizes)
+    laid_out, world = list(panoramas), levels[0]
+    # Of each part the left front corner, and the mean height, move to those of the first part and its place in the row.
+    ends = np.array([(place[:, 0].min(), place[:, 1].mean(), place[:, 2].max()) for place in places])
+    for part, group, level, end, corner in zip(order, poses, levels, ends, corners, strict=True):
+        if part == order[0]:
+            continue
+        motion = torch.eye(4, dtype=torch.float64)
+        motion[:3, :3] = world @ level.T
+        motion[:3, 3] = world @ torch.from_numpy(ends[0] - end + (corner[0], 0, -corner[1]))
+        for node, pose in zip(members[part], motion @ group, strict=True):
+            laid_out[node] = dataclasses.replace(panoramas[node], cam2world=pose)
+    return tuple(laid_out)
+
+
+def _arrange_in_rows(sizes: np.ndarray) -> list[tuple[float, float]]:
+    """Corners (right, backward) of boxes of these sizes in rows; the first one is at the origin."""
+    width = max(_ASPECT * math.sqrt(float(sizes.prod(axis=1).sum())), float(sizes[:, 0].max()))
+    corners, right, back, depth = [], 0.0, 0.0, 0.0
+    for across, along in sizes.tolist():
+        if right > 0 and right + across > width:
+            right, back, depth = 0.0, back + depth, 0.0
+        corners.append((right, back))
+        right, depth = right + across, max(depth, along)
+    return corners
