@@ -9,12 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pansplat.console import exit_process
+from pansplat.data.generated.panes import close_panes
+from pansplat.data.views import Views
 from pansplat.geometry.equirect import resize_equirect, row_weights
 from pansplat.guided_sweep import default_weights, load_guided_sweep, load_sharpening, save_sharpening
 from pansplat.model.depth_network import DepthEstimate
@@ -66,7 +69,7 @@ class SharpeningTrainer(DepthTrainer):
     ) -> dict[str, Tensor]:
         """Loss terms of panoramas and the camera heights; without a generator the estimates have no noise."""
         images = to_channels_last(torch.cat([views.images for views, _ in samples]).to(self.device))
-        depth = torch.cat([v.depths / heights[:, None, None] for v, heights in samples if v.depths is not None])
+        depth = torch.cat([_make_target(views, heights) for views, heights in samples])
         with torch.no_grad():
             small = interpolate(images, (_NETWORK_HEIGHT, 2 * _NETWORK_HEIGHT), mode="area")
             estimate = self.depth_network(to_channels_last(small))
@@ -83,6 +86,13 @@ class SharpeningTrainer(DepthTrainer):
 
     def save_network(self, path: Path) -> None:
         save_sharpening(path, self.network, self.average.state)
+
+
+def _make_target(views: Views, camera_heights: Float[Tensor, "view"]) -> Float[Tensor, "view h w"]:
+    """Depth in camera heights, with panes closed; 0 where it is unknown."""
+    assert views.depths is not None
+    relative = (views.depths / camera_heights[:, None, None]).numpy()
+    return torch.from_numpy(np.stack([close_panes(depth, np.random.default_rng(0)) for depth in relative]))
 
 
 def sharpening_loss(
