@@ -151,6 +151,17 @@ def test_fully_masked_panoramas_give_no_gaussians(small):
     assert len(Sweep()(*small, 0.5, 8.0, masks=torch.zeros(2, 64, 128, dtype=torch.bool))) == 0
 
 
+@pytest.mark.parametrize("views", (1, 2))
+def test_only_a_single_view_is_filled_where_it_is_masked(small, views):
+    images, poses = small[0][:views], small[1][:views]
+    masks = torch.ones(views, *images.shape[-2:], dtype=torch.bool)
+    masks[:, -12:] = False  # 34 degrees around the nadir
+    gaussians = Sweep()(images, poses, 0.5, 8.0, masks=masks)
+    local = (gaussians.means.double() - poses[0, :3, 3]) @ poses[0, :3, :3]
+    below = (local[:, 1] > math.cos(math.radians(25)) * local.norm(dim=-1)) & (gaussians.views == 0)
+    assert set(gaussians.levels[below].tolist()) == ({2, 3} if views == 1 else set())
+
+
 def test_moving_the_world_moves_the_gaussians(small, predicted, turn):
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = torch.from_numpy(turn("y", 90.0).round())  # exact, so that only the position can differ
