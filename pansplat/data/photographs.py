@@ -35,12 +35,18 @@ def read_photograph(image: Path) -> Panorama:
 def list_photographs(folder: Path) -> list[Panorama]:
     """The panoramas among the pictures of a folder, sorted by name, with the links of links.json.
 
-    Warns about pictures that are no panoramas.
+    Pictures that pansplat rendered count only if there are no other panoramas. Warns about pictures that are left out.
 
     Raises:
         InputError: there are pictures, and none can be used.
     """
-    panoramas, problems = _read_pictures(list_panorama_files(folder), folder)
+    every = list_panorama_files(folder)
+    rendered = [image for image in every if _is_rendered(image)]
+    panoramas, problems = _read_pictures([image for image in every if image not in rendered], folder)
+    if panoramas:
+        problems += [f"{image}: it was rendered by pansplat." for image in rendered]
+    elif rendered:
+        panoramas, problems = _read_pictures(every, folder)
     if problems and not panoramas:
         raise InputError("; ".join(problem.rstrip(".") for problem in problems[:3]) + ".")
     _warn_left_out(problems)

@@ -42,6 +42,21 @@ def test_pictures_that_cannot_be_used_are_named_and_the_others_open(tmp_path: Pa
         list_photographs(tmp_path)
 
 
+def test_own_renderings_count_only_if_there_is_nothing_else(tmp_path: Path, write_panorama, write_scene) -> None:
+    for name in ("out.png", "out_2.jpg"):
+        write_panorama(tmp_path / name)
+    Image.new("RGB", (20, 20)).save(tmp_path / "logo.png")
+    with pytest.warns(UserWarning, match=r"logo\.png: needed a 2:1"):
+        assert [panorama.name for panorama in list_photographs(tmp_path)] == ["out", "out_2"]
+    (tmp_path / "logo.png").unlink()
+    write_scene(tmp_path / "photo.jpg")
+    with (
+        pytest.warns(UserWarning, match=r"left out: .*out\.png: it was rendered by pansplat"),
+        pytest.warns(UserWarning, match=r"out_2\.jpg: it was rendered"),
+    ):
+        assert [panorama.name for panorama in list_photographs(tmp_path)] == ["photo"]
+
+
 @pytest.fixture
 def rooms(tmp_path: Path, write_scene) -> Path:
     for name in ("p01", "p02"):
