@@ -76,26 +76,24 @@ def load_pairs(
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
-    The poses of a folder that holds panoramas only are estimated (docs/poses.md), with a warning, and cached.
+    The poses of a folder that holds panoramas only are estimated (docs/poses.md), with a warning, and cached. A
+    panorama without a pose is a pair of a single view; `Panorama.part` tells which panoramas have a common world.
 
     Args:
-        path: a pair folder, a folder of many panoramas, or a folder of such folders, in one of the formats of
-            docs/input.md. Also one of their files with poses.
+        path: a panorama, a pair folder, a folder of many panoramas, a web tour, or a folder of pair folders, in one of
+            the formats of docs/input.md. Also one of their files with poses, or the file that describes a tour.
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
         progress: called with a description of the estimate of poses and the completed fraction.
 
     Raises:
-        InputError: no known format was found, a file is missing or invalid, or no poses were found.
+        InputError: no known format was found, or a file is missing or invalid.
     """
-    folder = expand_home(path)
     try:
-        return folders.load_pairs(folder, convention=convention, near=near, far=far)
-    except folders.UnposedPanoramasError as unposed:
-        if not folder.is_dir():
-            raise
-        images = unposed.images
-    return estimate_pairs(folder, images, near=near, far=far, progress=progress)
+        return folders.load_pairs(path, convention=convention, near=near, far=far)
+    except folders.UnposedPanoramasError as error:
+        unposed = error
+    return estimate_pairs(unposed.folder, unposed.panoramas, near=near, far=far, progress=progress)
 
 
 def load_model(

@@ -230,4 +230,3 @@ def test_fine_lattices_draw_detail_that_a_coarse_one_loses(detailed):
         drawn = rasterize(gaussians.select(gaussians.views == 0), pose, size=(128, 256)).color
         errors.append(float((drawn - image).abs().mean()))
     assert errors[0] < 0.7 * errors[1]
-
