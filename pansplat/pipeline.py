@@ -72,6 +72,7 @@ def load_pairs(
     convention: str | None = None,
     near: float | None = None,
     far: float | None = None,
+    camera_height: float = CAMERA_HEIGHT,
     progress: Progress | None = None,
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
@@ -84,16 +85,26 @@ def load_pairs(
             the formats of docs/input.md. Also one of their files with poses, or the file that describes a tour.
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
+        camera_height: of the cameras over the floor, metres; the scale of estimated poses and of single views.
         progress: called with a description of the estimate of poses and the completed fraction.
 
     Raises:
         InputError: no known format was found, or a file is missing or invalid.
     """
+    if not 0 < camera_height < math.inf:
+        raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     try:
-        return folders.load_pairs(path, convention=convention, near=near, far=far)
+        pairs = folders.load_pairs(path, convention=convention, near=near, far=far)
     except folders.UnposedPanoramasError as error:
-        unposed = error
-    return estimate_pairs(unposed.folder, unposed.panoramas, near=near, far=far, progress=progress)
+        unposed = error.folder, error.panoramas
+    else:
+        return [_with_camera_height(pair, camera_height) for pair in pairs]
+    pairs = estimate_pairs(*unposed, near=near, far=far, camera_height=camera_height, progress=progress)
+    return [_with_camera_height(pair, camera_height) for pair in pairs]
+
+
+def _with_camera_height(pair: Pair, camera_height: float) -> Pair:
+    return replace(pair, context=tuple(replace(view, camera_height=camera_height) for view in pair.context))
 
 
 def load_model(

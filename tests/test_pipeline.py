@@ -71,6 +71,18 @@ def test_the_default_height_is_that_of_the_smallest_photograph_within_the_predic
         assert predict(pair_folder, predictor, cache=False).height == expected
 
 
+def test_a_single_view_has_the_scale_of_its_camera_height(tmp_path: Path, sphere_predictor, write_pair) -> None:
+    photograph = write_pair(tmp_path / "pair") / "left.png"
+    usual, tall = (
+        predict(load_pairs(photograph, camera_height=height)[0], sphere_predictor(), height=64) for height in (1.5, 3.0)
+    )
+    assert torch.equal(tall.gaussians.means, 2 * usual.gaussians.means)  # its camera is at the origin
+    assert torch.equal(tall.gaussians.scales, 2 * usual.gaussians.scales)
+    assert torch.equal(tall.cam2world, usual.cam2world)
+    with pytest.raises(InputError, match="camera_height"):
+        load_pairs(photograph, camera_height=0.0)
+
+
 def test_predict_refuses_a_folder_of_several_pairs(tmp_path: Path, sphere_predictor, write_pair) -> None:
     for index in range(2):
         write_pair(tmp_path / "pairs" / f"room{index}", seed=index)

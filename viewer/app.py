@@ -11,7 +11,7 @@ import tyro
 from pansplat.console import own_warnings, parse_arguments
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_file, require_output_folder
-from pansplat.options import EYE_DISTANCE, REAL, Depth, EyeDistance, Height, Range, Seconds, check_numbers
+from pansplat.options import EYE_DISTANCE, REAL, Depth, EyeDistance, Height, Positive, Range, Seconds, check_numbers
 from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
@@ -68,6 +68,8 @@ class Options:
     """Nearest depth of the search, metres, instead of the one in the files."""
     far: Depth | None = None
     """Farthest depth of the search, metres."""
+    camera_height: Positive = 1.5
+    """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
     mode: Mode = "deferred"
     """How the Gaussians of the input views are combined."""
     preset: Preset = "exact"
@@ -116,7 +118,7 @@ class Options:
     @property
     def load_options(self) -> LoadOptions:
         """Options of reading and prediction."""
-        names = ("model", "compat", "precision", "height", "convention", "near", "far")
+        names = ("model", "compat", "precision", "height", "convention", "near", "far", "camera_height")
         return LoadOptions(
             **{name: getattr(self, name) for name in names}, refine_seconds=self.refine, cache=not self.no_cache
         )

@@ -16,7 +16,7 @@ from tyro.conf import arg
 
 from pansplat.errors import InputError
 from pansplat.files import is_scene_file
-from pansplat.options import Depth, Height, Seconds
+from pansplat.options import Depth, Height, Positive, Seconds
 
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
@@ -42,6 +42,8 @@ class PairChoice:
     """Nearest depth to search, metres; by default the folder's."""
     far: Depth | None = None
     """Farthest depth to search, metres; by default the folder's."""
+    camera_height: Positive = 1.5
+    """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,9 @@ def load_choice(path: Path, choice: PairChoice) -> list[Pair]:
     """The pairs of a folder."""
     from pansplat import pipeline
 
-    return pipeline.load_pairs(path, convention=choice.convention, near=choice.near, far=choice.far)
+    return pipeline.load_pairs(
+        path, convention=choice.convention, near=choice.near, far=choice.far, camera_height=choice.camera_height
+    )
 
 
 def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:

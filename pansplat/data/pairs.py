@@ -58,6 +58,7 @@ class Panorama:
         title: for people, if it differs from the name.
         links: to other panoramas of the tour.
         start: yaw and pitch, as of a link, of the view that a visitor sees first; None if there is none.
+        camera_height: over the floor, metres; the scale of a scene of this panorama alone.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Panorama:
     title: str = ""
     links: tuple[Link, ...] = ()
     start: tuple[float, float] | None = None
+    camera_height: float = CAMERA_HEIGHT
 
     @property
     def label(self) -> str:
@@ -90,7 +92,6 @@ class Pair:
         targets: panoramas for comparison; may be empty.
         near, far: radial depth range to search, metres.
         siblings: all panoramas taken with the same camera; static content is detected in them.
-        camera_height: over the floor, metres; the scale of a single view.
     """
 
     name: str
@@ -100,7 +101,6 @@ class Pair:
     near: float
     far: float
     siblings: tuple[Path, ...] = field(default=(), repr=False)
-    camera_height: float = CAMERA_HEIGHT
 
     @property
     def image_height(self) -> int:
@@ -159,7 +159,7 @@ class Pair:
             near=self.near,
             far=self.far,
             names=tuple(p.name for p in panoramas),
-            camera_height=self.camera_height,
+            camera_height=panoramas[0].camera_height if panoramas else CAMERA_HEIGHT,
             depths=torch.stack(depths) if depths and len(depths) == len(panoramas) else None,
         )
 

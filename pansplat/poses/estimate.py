@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from pansplat.data.images import read_height, read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.pairs import FAR, NEAR, find_mask
+from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError
 from pansplat.files import require_file
 from pansplat.poses.axes import RotationPrior, SceneAxes, find_axes, with_hints
@@ -35,7 +36,6 @@ from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_floor, level_po
 from pansplat.predictor import Progress
 from pansplat.threads import one_thread, worker_threads
 
-CAMERA_HEIGHT = 1.5  # metres over the floor; tripods of tours stand at 1.3 to 1.6 m
 _HEIGHT = 1024  # pixels; larger panoramas are reduced
 _MIN_HEIGHT = 256
 _QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared thoroughly

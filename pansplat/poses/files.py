@@ -20,6 +20,7 @@ from pansplat.data.folders import make_names_unique
 from pansplat.data.images import read_thumbnail
 from pansplat.data.pairs import Collection, Pair, Panorama, single_view_pairs
 from pansplat.data.poses import rigid_matrix, to_cam2world
+from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
@@ -88,6 +89,7 @@ def estimate_pairs(
     *,
     near: float | None = None,
     far: float | None = None,
+    camera_height: float = CAMERA_HEIGHT,
     progress: Progress | None = None,
 ) -> list[Pair]:
     """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
@@ -99,17 +101,18 @@ def estimate_pairs(
         folder: of the tour.
         panoramas: two or more, of unique names.
         near, far: metres; they override the estimated range.
+        camera_height: of the cameras over the floor, metres.
         progress: called with a description of the current work and the completed fraction.
 
     Raises:
         InputError: a file is missing, or none can be read.
     """
     images = [panorama.image for panorama in panoramas]
-    name = f"poses-{_hash_files(images)}.json"
+    name = f"poses-{_hash_inputs(images, camera_height)}.json"
     folders = cache_folders(folder)
     source = next((cache / name for cache in folders if (cache / name).is_file()), None)
     if source is None:
-        content = _estimate(panoramas, progress)
+        content = _estimate(panoramas, camera_height, progress)
         source = write_cache_file(folders, name, json.dumps(content).encode())
         if source is None:
             raise InputError(
@@ -118,11 +121,11 @@ def estimate_pairs(
     return _make_pairs(folder, panoramas, read_json(source), source, near, far)
 
 
-def _estimate(panoramas: Sequence[Panorama], progress: Progress | None) -> dict[str, Any]:
+def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Progress | None) -> dict[str, Any]:
     """What is cached: parts of placed panoramas, and the reasons for the others, by name."""
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
-        estimate = estimate_poses(list(names), progress=progress)
+        estimate = estimate_poses(list(names), camera_height=camera_height, progress=progress)
     except NoPosesError as error:
         parts, summary, unplaced = [], "", error.reasons
     else:
@@ -184,8 +187,8 @@ def _in_brackets(title: str) -> str:
     return f" ({title})" if title else ""
 
 
-def _hash_files(images: Sequence[Path]) -> str:
-    digest = hashlib.blake2b(_FORMAT.encode(), digest_size=12)
+def _hash_inputs(images: Sequence[Path], camera_height: float) -> str:
+    digest = hashlib.blake2b(f"{_FORMAT} {camera_height:g}".encode(), digest_size=12)
     for image in images:
         state = image.stat()
         digest.update(os.fsencode(f"{image.name} {state.st_size} {state.st_mtime_ns};"))

@@ -74,7 +74,7 @@ def test_written_poses_are_read_back(estimate: PoseEstimate, photographs: Path, 
 def test_a_folder_without_poses_is_loaded_with_estimated_ones(
     photographs: Path, estimate: PoseEstimate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", lambda images, progress: estimate)
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", lambda images, **options: estimate)
     message = "has no poses; they were estimated: 2 of 2 panoramas"
     with pytest.warns(UserWarning, match=message):
         (pair,) = pansplat.load_pairs(photographs)

@@ -95,6 +95,7 @@ class LoadOptions:
     convention: str | None = None
     near: float | None = None
     far: float | None = None
+    camera_height: float = 1.5
 
 
 def find_entries(path: Path, options: LoadOptions, progress: Progress | None = None) -> list[SceneEntry]:
@@ -118,7 +119,12 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
 
         with _collect_notes() as notes:
             pairs = load_pairs(
-                path, convention=options.convention, near=options.near, far=options.far, progress=progress
+                path,
+                convention=options.convention,
+                near=options.near,
+                far=options.far,
+                camera_height=options.camera_height,
+                progress=progress,
             )
     except InputError:
         if not scenes:
