@@ -454,7 +454,11 @@ class Viewer:
         if source is not None:
             panoramas = entry.panoramas if entry.pair is None else entry.pair.context
             poses = torch.stack([panorama.cam2world for panorama in panoramas])
-            enter_scene(self.state, Scene(empty_gaussians(), poses, source.near, source.far), at=self._at)
+            scene = Scene(empty_gaussians(), poses, source.near, source.far)
+            if entry.tour is None:
+                enter_scene(self.state, scene, at=self._at)
+            else:
+                enter_tour(self.state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
             self._last_camera = self.state.camera
 
     def _draw_preview(self, target: moderngl.Framebuffer, now: float) -> None:

@@ -171,6 +171,15 @@ class Scene:
         poses[:, :3] = rotation.to(poses) @ poses[:, :3]
         return dataclasses.replace(self, gaussians=self.gaussians.rotated(rotation), cam2world=poses)
 
+    def moved(self, motion: Float[Tensor, "4 4"]) -> Scene:
+        """The scene after a rigid motion of the world."""
+        scene = self.rotated(motion[:3, :3])
+        poses = scene.cam2world.clone()
+        poses[:, :3, 3] += motion[:3, 3].to(poses)
+        gaussians = scene.gaussians
+        means = (gaussians.means.double() + motion[:3, 3].to(gaussians.means.device)).to(gaussians.means)
+        return dataclasses.replace(scene, gaussians=dataclasses.replace(gaussians, means=means), cam2world=poses)
+
     def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
         """The pose at a fraction from the first context camera (0) to the last (1); an InputError without cameras."""
         if not len(self.cam2world):

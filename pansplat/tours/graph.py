@@ -53,6 +53,8 @@ class TourGraph:
         siblings: all panoramas taken with the same camera.
         overlaps: of each edge: 1 if one panorama explains the other at each pixel, 0 for unrelated panoramas. That of a
             self-edge is 1.
+        originals: the panoramas with poses in the worlds of their parts, which scenes are predicted from; none if these
+            are `panoramas`.
     """
 
     name: str
@@ -62,6 +64,7 @@ class TourGraph:
     far: float
     siblings: tuple[Path, ...] = field(default=(), repr=False)
     overlaps: dict[Edge, float] = field(default_factory=dict)
+    originals: tuple[Panorama, ...] = field(default=(), repr=False)
 
     def __len__(self) -> int:
         return len(self.panoramas)
@@ -188,10 +191,19 @@ class TourGraph:
         return float(np.linalg.norm(a - b))
 
     def make_pair(self, views: Sequence[int]) -> Pair:
-        """The panoramas of a scene as the input of a prediction."""
-        context = tuple(self.panoramas[view] for view in views)
+        """The panoramas of a scene as the input of a prediction, in the world of their part.
+
+        It does not depend on the other parts, so that cached predictions stay valid when panoramas are added.
+        """
+        context = tuple((self.originals or self.panoramas)[view] for view in views)
         name = "-".join(panorama.name for panorama in context)
         return Pair(name, self.folder, context, (), self.near, self.far, self.siblings)
+
+    def place(self, scene: Scene, views: Views) -> Scene:
+        """The scene of `make_pair` in the world of the tour."""
+        if not self.originals or self.panoramas[views[0]] is self.originals[views[0]]:
+            return scene
+        return scene.moved(self.cam2world[views[0]] @ self.originals[views[0]].cam2world.double().inverse())
 
     def find_nearest_edge(self, position: Float[np.ndarray, "3"], part: int | None = None) -> tuple[Edge, float]:
         """The edge nearest to a position, of all or of one part, and the distance in metres."""
@@ -283,8 +295,9 @@ class TourGraph:
         starts = range(0, count, math.ceil(count**2 / _MAX_STARTS)) if start is None else (start,)
         orders = [_improve_order(_order_by_distance(costs, first), costs) for first in starts]
         order = min(orders, key=lambda order: float(costs[order[:-1], order[1:]].sum()))
-        walk = [order[0]]
-        for node in order[1:]:
+        first, *others = order.tolist()
+        walk = [first]
+        for node in others:
             walk += self.find_walk(walk[-1], node)[1:]
         return walk
 
@@ -380,9 +393,9 @@ def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
     overlaps = dict.fromkeys(sorted(edges), 0.0)
     overlaps |= {(node, node): 1.0 for node in sorted(set(range(len(images))) - {*itertools.chain(*edges)})}
     near, far = min(pair.near for pair in pairs), max(pair.far for pair in pairs)
-    panoramas = lay_out([found[image] for image in images], near)
+    originals = tuple(found[image] for image in images)
     name = f"{first.folder.resolve().name} tour"
-    return TourGraph(name, first.folder, panoramas, near, far, first.siblings, overlaps)
+    return TourGraph(name, first.folder, lay_out(originals, near), near, far, first.siblings, overlaps, originals)
 
 
 def _list_images(pair: Pair) -> set[Path]:
@@ -394,14 +407,14 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
 
     Args:
         tour: the graph.
-        load: returns the scene of some panoramas; called once for each scene that is needed.
+        load: returns the scene of some panoramas (`make_pair`); called once for each scene that is needed.
     """
     parts: dict[int, Gaussians] = {}
     names: dict[int, str] = {}
     gains: dict[Views, Gains] = {}
     scene = None
     for views, provided in tour.choose_sources().items():
-        scene = load(views)
+        scene = tour.place(load(views), views)
         gains[views] = scene.gains
         for node in provided:
             view = views.index(node)

@@ -14,7 +14,8 @@ from pansplat.geometry.path import level_pose, up_direction
 from pansplat.geometry.world import working_factor
 
 REACH = 2.0  # metres, in which a camera moves around the panoramas of its part
-_GAP = 4.0  # metres, between what the cameras of two parts reach
+_GAP = 8.0  # metres, between what the cameras of two parts reach, so that few rooms meet in the floor plan
+_ASPECT = 1.5  # of the width of all rows to the square root of their area
 
 
 def lay_out(panoramas: Sequence[Panorama], near: float) -> tuple[Panorama, ...]:
@@ -30,35 +31,35 @@ def lay_out(panoramas: Sequence[Panorama], near: float) -> tuple[Panorama, ...]:
     members: dict[int, list[int]] = {}
     for node, panorama in enumerate(panoramas):
         members.setdefault(panorama.part, []).append(node)
-    order = sorted(members.values(), key=lambda nodes: -len(nodes))
-    largest = order[0]
-    others = [nodes for nodes in members.values() if nodes is not largest]  # in file order
-    poses = {id(nodes): torch.stack([panoramas[node].cam2world for node in nodes]).double() for nodes in order}
-    axes = {key: level_pose(group[0], up_direction(group))[:3, :3] for key, group in poses.items()}
-    world, unit = axes[id(largest)], 1 / working_factor(near)
-    margin = (REACH + _GAP / 2) * unit
-    places = {key: (group[:, :3, 3] @ axes[key]).numpy() for key, group in poses.items()}  # right, down, forward
-    sizes = {key: np.ptp(place, axis=0)[[0, 2]] + 2 * margin for key, place in places.items()}
-    row = max(math.sqrt(sum(float(np.prod(size)) for size in sizes.values())), *(size[0] for size in sizes.values()))
-    height = places[id(largest)][:, 1].mean()
-    laid_out, corner, depth, origin = list(panoramas), np.zeros(2), 0.0, np.zeros(2)
-    for nodes in (largest, *others):
-        key = id(nodes)
-        if corner[0] > 0 and corner[0] + sizes[key][0] > 1.001 * row:
-            corner, depth = np.array((0.0, corner[1] + depth)), 0.0
-        low, high = places[key].min(axis=0), places[key].max(axis=0)
-        # The left end and the end in front; rows follow each other backwards.
-        shift = np.array((corner[0] - low[0], height - places[key][:, 1].mean(), -corner[1] - high[2]))
-        if nodes is largest:
-            origin = shift
-        corner[0] += sizes[key][0]
-        depth = max(depth, sizes[key][1])
-        turn, move = world @ axes[key].T, world @ torch.from_numpy(shift - origin)
-        if nodes is largest:
+    order = sorted(members, key=lambda part: -len(members[part]))[:1]
+    order += [part for part in members if part not in order]
+    poses = [torch.stack([panoramas[node].cam2world for node in members[part]]).double() for part in order]
+    levels = [level_pose(group[0], up_direction(group))[:3, :3] for group in poses]
+    places = [(group[:, :3, 3] @ level).numpy() for group, level in zip(poses, levels, strict=True)]
+    margin = (2 * REACH + _GAP) / working_factor(near)
+    sizes = np.array([np.ptp(place, axis=0)[[0, 2]] + margin for place in places])  # right, forward
+    corners = _arrange_in_rows(sizes)
+    laid_out, world = list(panoramas), levels[0]
+    # Of each part the left front corner, and the mean height, move to those of the first part and its place in the row.
+    ends = np.array([(place[:, 0].min(), place[:, 1].mean(), place[:, 2].max()) for place in places])
+    for part, group, level, end, corner in zip(order, poses, levels, ends, corners, strict=True):
+        if part == order[0]:
             continue
-        for node in nodes:
-            pose = panoramas[node].cam2world.double().clone()
-            pose[:3] = turn @ pose[:3]
-            pose[:3, 3] += move
+        motion = torch.eye(4, dtype=torch.float64)
+        motion[:3, :3] = world @ level.T
+        motion[:3, 3] = world @ torch.from_numpy(ends[0] - end + (corner[0], 0, -corner[1]))
+        for node, pose in zip(members[part], motion @ group, strict=True):
             laid_out[node] = dataclasses.replace(panoramas[node], cam2world=pose)
     return tuple(laid_out)
+
+
+def _arrange_in_rows(sizes: np.ndarray) -> list[tuple[float, float]]:
+    """Corners (right, backward) of boxes of these sizes in rows; the first one is at the origin."""
+    width = max(_ASPECT * math.sqrt(float(sizes.prod(axis=1).sum())), float(sizes[:, 0].max()))
+    corners, right, back, depth = [], 0.0, 0.0, 0.0
+    for across, along in sizes.tolist():
+        if right > 0 and right + across > width:
+            right, back, depth = 0.0, back + depth, 0.0
+        corners.append((right, back))
+        right, depth = right + across, max(depth, along)
+    return corners

@@ -21,6 +21,7 @@ _TURN_IN_PLACE_DEGREES = 60.0  # between the heading and the way, at which the c
 _SMOOTHING_SECONDS = 1.2
 _SAMPLES_PER_SECOND = 60
 _LINK_METRES = 0.7  # that the camera goes along a link, before the fade
+_LOOK_AROUND_DEGREES = 90.0  # that the camera turns in a part without a way, before the fade
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +91,15 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
 
     Where the way turns back, the camera turns in place. All is smoothed over time, so that corners are rounded.
 
-    Before a fade along a link the camera turns in the direction of the link, and goes 0.7 m. After it, it looks away
-    from the link back; without one, in the direction of the panorama's start view; else its heading stays.
+    Before a fade along a link the camera turns in the direction of the link, and goes 0.7 m. Before another one, at a
+    panorama alone, it turns by 90 degrees. After a fade, it looks away from the link back; without one, in the
+    direction of the panorama's start view; else its heading stays.
 
     Args:
         tour: the graph.
         walk: nodes; consecutive ones share an edge, or are of different parts.
-        start: pose from which the first node is approached; None starts at that node, in the direction of the second.
+        start: pose from which the first node is approached; None starts at that node, in the direction of its start
+            view, or of the second node.
     """
     steps = list(itertools.pairwise(walk))
     fades = [leg for leg, step in enumerate(steps) if tour.is_fade(*step)]
@@ -107,6 +110,8 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
     level, yaw, pitch = tour.level_axes, None, 0.0
     if start is not None:
         yaw, pitch = find_angles(level.T @ start[:3, 2])
+    elif (view := tour.find_start_view(walk[0])) is not None:
+        yaw, pitch = find_angles(level.T @ view)
     sections = []
     for first, last in itertools.pairwise([-1, *fades, len(steps)]):
         nodes = walk[first + 1 : last + 1]
@@ -123,7 +128,9 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
             places = [start[:3, 3], *places]
         if first >= 0:
             yaw, pitch = _find_arrival(tour, *steps[first]) or (yaw, 0.0)
-        sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch))
+        is_left = last < len(steps) and (first >= 0 or start is None)
+        around = math.radians(_LOOK_AROUND_DEGREES) if is_left and len(places) == 1 else 0.0
+        sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch, around))
         yaw = float(sections[-1][3][-1])
     *positions, yaws, pitches, numbers = (np.concatenate(values) for values in zip(*sections, strict=True))
     return Route(
@@ -163,7 +170,12 @@ def _find_arrival(tour: TourGraph, start: int, end: int) -> tuple[float, float] 
 
 
 def _fly(
-    path: Float[np.ndarray, "place 3"], legs: Sequence[int], before: int, yaw: float | None, pitch: float
+    path: Float[np.ndarray, "place 3"],
+    legs: Sequence[int],
+    before: int,
+    yaw: float | None,
+    pitch: float,
+    around: float = 0.0,
 ) -> tuple[np.ndarray, ...]:
     """The flight through places of one part: right, down, forward, yaw, pitch and leg of each sample.
 
@@ -173,6 +185,7 @@ def _fly(
         before: the leg that leads to this part, during which the camera stands.
         yaw: at the start, radians; None looks along the path.
         pitch: at the start, radians.
+        around: turn to the right at the end, radians.
     """
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     kept = lengths > 1e-6
@@ -199,6 +212,9 @@ def _fly(
         places.append(place)
         yaws.append(yaw)
     yaws[0] = yaws[1] if len(yaws) > 1 and yaws[0] is None else yaws[0] or 0.0
+    turns = np.arange(0, around, math.radians(_TURN_DEGREES) * step).tolist()
+    places += [place for _ in turns]
+    yaws += [yaws[-1] + turn for turn in turns]
     along = np.array(places)
     pitches = np.zeros(len(yaws))
     pitches[0] = pitch

@@ -134,6 +134,15 @@ def test_a_vertical_path_keeps_the_cameras_heading():
     assert torch.allclose(path_poses(cameras)[:, :3, :3], torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
 
 
+def test_a_flight_with_one_camera_is_a_circle_through_it():
+    path = fly_path(TWO[:1], [i / 100 for i in range(101)])[:, :3, 3]
+    ahead = path_poses(TWO[:1])[0, :3, 2]
+    assert torch.allclose(path[[0, -1]], TWO[:1, :3, 3].expand(2, 3))
+    center = TWO[0, :3, 3] + 0.2 * ahead
+    assert torch.allclose((path - center).norm(dim=-1), torch.tensor(0.2, dtype=torch.float64))
+    assert torch.allclose(path[50], center + 0.2 * ahead)
+
+
 def test_no_camera_is_refused():
     with pytest.raises(ValueError, match="at least one camera"):
         fly_pose(torch.zeros(0, 4, 4), 0.5)

@@ -15,6 +15,11 @@ from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.tours import find_tours
 
 
+def make_gaussians(count: int) -> Gaussians:
+    zeros, sizes = torch.zeros(count, dtype=torch.int64), torch.ones(count, 3)
+    return Gaussians(sizes, sizes, torch.ones(count, 4), torch.ones(count), torch.zeros(count, 1, 3), zeros, zeros)
+
+
 def test_pairs_that_share_panoramas_are_one_tour(make_tour):
     a, b, c, d, e = make_tour([(0, z) for z in range(5)], ()).panoramas
     siblings = tuple(p.image for p in (e, c, b, a, d))
@@ -80,6 +85,14 @@ def test_parts_are_level_and_far_apart(home):
     axes = home.cam2world[:, :3, :3].numpy()
     assert np.allclose(axes, np.eye(3)), "up is up, and the first panorama of each part looks ahead"
     assert np.allclose(home.positions[:, 1], 0), "the cameras have one height"
+    pair = home.make_pair((4, 5))
+    (place, _), poses = pair.context, torch.stack([panorama.cam2world for panorama in pair.context])
+    assert np.allclose(place.cam2world[:3, 3], (5, 5, 0)), "scenes are predicted in the world of their part"
+    means = poses[:, :3, 3].float() + place.cam2world[:3, 2].float()  # 1 m ahead
+    gaussians = dataclasses.replace(make_gaussians(2), means=means)
+    scene = home.place(Scene(gaussians, poses, 1.0, 2.0), (4, 5))
+    assert np.allclose(scene.cam2world, home.cam2world[4:6]), "and placed in that of the tour"
+    assert np.allclose(scene.gaussians.means, home.positions[4:6] + np.array((0, 0, 1)), atol=1e-5)
     for node, place in enumerate(home.positions):
         moved = place + np.array((0.7, 0, 0.7))
         edge, distance = home.find_nearest_edge(moved)
@@ -90,13 +103,14 @@ def test_two_hundred_parts_stay_near_each_other(make_tour):
     single = make_tour(((0, 0),), ()).panoramas[0]
     panoramas = tuple(dataclasses.replace(single, image=Path(f"{k}.jpg"), part=k) for k in range(200))
     (tour,) = find_tours([Pair("", Path(), (panorama,), (), 0.45, 10.0, ()) for panorama in panoramas])
-    assert np.ptp(tour.positions, axis=0).max() < 150 and len(tour.plan_walk()) == 200
+    assert np.ptp(tour.positions, axis=0).max() < 250 and len(tour.plan_walk()) == 200
 
 
 def test_an_edge_is_followed_within_its_part_until_the_camera_is_at_another_one(home):
     places = home.positions
-    between = 0.45 * places[3] + 0.55 * places[6]
-    assert home.find_nearest_edge(between)[0] == (6, 6) and home.follow_edge(between, (3, 3)) == (3, 3)
+    towards = places[3] - places[2]
+    between = places[3] - 0.55 * towards
+    assert home.find_nearest_edge(between)[0] == (1, 2) and home.follow_edge(between, (3, 3)) == (3, 3)
     assert home.find_nearest_edge(between, part=0)[0] in ((0, 1), (1, 2))
     assert home.follow_edge(places[6], (3, 3)) == (6, 6), "after a jump"
 
@@ -141,8 +155,7 @@ def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_ove
         count = 10 * len(views)
         labels = torch.arange(count) % len(views)
         means = torch.tensor(views)[labels, None].float().expand(count, 3)
-        sizes, colors = torch.ones(count, 3), torch.zeros(count, 1, 3)
-        gaussians = Gaussians(means, sizes, torch.ones(count, 4), torch.ones(count), colors, labels, labels.byte())
+        gaussians = dataclasses.replace(make_gaussians(count), means=means, views=labels.byte())
         return Scene(gaussians, tour.cam2world[list(views)], 1.0, 2.0, tuple(f"{view}.jpg" for view in views))
 
     scene = tours.merge_scenes(tour, load)

@@ -4,6 +4,7 @@ import functools
 import os
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 import torch
 
 from pansplat.data.images import write_image
-from pansplat.data.pairs import Panorama
+from pansplat.data.pairs import Link, Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
@@ -263,6 +264,17 @@ def house(tmp_path_factory, axis_photos) -> TourGraph:
         panoramas.append(Panorama(f"room{index}", folder / f"room{index}.png", pose))
     overlaps = {(0, 1): 0.4, (1, 2): 0.4, (2, 3): 0.4}
     return TourGraph("house tour", folder, tuple(panoramas), 0.45, 10.0, (), overlaps)
+
+
+@pytest.fixture(scope="session")
+def parted_house(house) -> TourGraph:
+    """The house, with its last panorama 20 m away in another part; a link leads to it, and one back."""
+    *placed, alone = house.panoramas
+    pose = alone.cam2world.clone()
+    pose[0, 3] = 20.0
+    placed[2] = replace(placed[2], links=(Link("room3", 0.1, 0.6, "to the hall"),))
+    alone = replace(alone, cam2world=pose, title="hall", links=(Link("room2", 1.2, 0.5),))
+    return replace(house, panoramas=(*placed, alone), overlaps={(0, 1): 0.4, (1, 2): 0.4, (3, 3): 1.0})
 
 
 @pytest.fixture(scope="session")

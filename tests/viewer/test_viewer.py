@@ -1132,6 +1132,44 @@ def test_a_file_of_a_tour_is_flown_along_its_edges(user, house_file, monkeypatch
     assert user.data.right_name is None, "there are no photographs"
 
 
+def test_a_click_on_a_link_fades_to_a_panorama_without_a_place_and_the_list_leads_back(user, parted_house, monkeypatch):
+    notes = ("room3.png: no pose was found; it is a part of its own",)
+    user.show(SceneEntry(parted_house.name, tour=parted_house, notes=notes))
+    user.settle()
+    assert user.data.notes == notes and "Notes" in user.panels.items
+    for slot in user.viewer._slots:
+        monkeypatch.setattr(slot.renderer, "pacing", SMALL)
+    user.state.target = 2
+    fly(user, 1.0)
+    user.state.camera = replace(user.state.camera, pitch_radians=-0.5, yaw_radians=-0.1)
+    user.draw_frames(2)
+    (spot,) = user.data.hotspots
+    assert (spot.node, spot.label, spot.is_fade) == (3, "to the hall", True)
+    left = user.viewer._slot.scene
+    user.click_at(*spot.center)
+    shown: list[np.ndarray] = []
+
+    def has_begun() -> bool:
+        shown.append(user.read_screen())
+        return user.viewer._tour.part == 1
+
+    user.draw_until(has_begun, "fade", 0.1)
+    assert np.abs(shown[-1] - shown[-2]).mean() < 5, "without a jump"
+    poses, front = user.viewer._fade.poses, user.viewer._fade.front
+    assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 0.71, "the scene before stays"
+    assert np.allclose(poses[front], user.state.camera.cam2world) and user.viewer._slots[1 - front].scene is left
+    fly(user)
+    assert find_node(user) == 3 and user.viewer._slot.scene is not left
+    assert changed_fraction(shown[-1], user.read_image()) > 0.5
+    user.click("visit")
+    user.click("visit 1")
+    fly(user, 0.5)
+    assert find_node(user) == 1
+    user.press(imgui.Key.r)
+    user.settle()
+    assert find_node(user) == 0 and user.state.camera == user.state.home
+
+
 def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(user, house, load_house, small_scene, monkeypatch):
     requested = []
 

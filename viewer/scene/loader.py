@@ -211,6 +211,7 @@ def _load_tour_scene(
     pair = entry.pair or tour.make_pair(views)
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
+        scene = scene if entry.merged is not None else tour.place(scene, views)
         return LoadedScene(entry, scene, is_final=is_final, outlines=find_floor_outlines(tour, scene, views))
 
     if entry.merged is not None:

@@ -2,13 +2,15 @@
 
 import threading
 import time
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.ply import save_ply
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 from pansplat_viewer.scene.tour import TourScenes
@@ -68,6 +70,28 @@ def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_fil
     assert other.entry.views == (2, 3) and other.entry.panoramas == ()
     assert other.scene.gaussians.views.unique().tolist() == [0, 1]
     assert np.allclose(other.scene.cam2world, house.cam2world[2:])
+
+
+def test_warnings_about_the_input_are_notes_of_its_entries(monkeypatch, house):
+    def load_pairs(path, **options):
+        warnings.warn("b.jpg: no pose was found", InputWarning, stacklevel=2)
+        return [house.make_pair((0, 1))]
+
+    monkeypatch.setattr("pansplat.pipeline.load_pairs", load_pairs)
+    with pytest.warns(InputWarning, match="no pose was found"):
+        (entry,) = find_entries(house.folder, LoadOptions())
+    assert entry.notes == ("b.jpg: no pose was found",)
+
+
+def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(monkeypatch, parted_house, load_house):
+    alone = parted_house.panoramas[3]
+    tour = replace(parted_house, panoramas=(alone, *parted_house.panoramas[:3]), originals=())
+    tour = replace(tour, overlaps={(0, 0): 1.0, (1, 2): 0.4, (2, 3): 0.4})
+    monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: tour)
+    scene = load_house(TourScenes(tour).make_entry((0,))).scene
+    monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, **options: scene)
+    loaded = load_entry(SceneEntry("house", tour=tour), LoadOptions(), ignore)
+    assert loaded.entry.views == (0,) and loaded.entry.tour is tour and loaded.scene is scene
 
 
 @pytest.mark.shared

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pansplat.data.pairs import Link
 from pansplat.tours import plan_route
 from pansplat_viewer import run
 from pansplat_viewer.capture import Film, TourFrames, write_tour
@@ -95,6 +96,55 @@ def test_a_fade_is_continuous_and_another_one_begins_after_its_end(small_scene):
     assert fade.compute_weight(times[-1]) == 1 and fade.choose_slot(first) == 0
 
 
+def test_a_scene_of_another_part_is_drawn_from_the_last_pose_in_its_part(small_scene):
+    fade, poses = CrossFade(), [np.full((4, 4), float(k)) for k in range(5)]
+    fade.show(0, small_scene, 0.0, part=1)
+    fade.move(poses[0], 1)
+    fade.move(poses[1], 1)
+    fade.move(poses[2], 2)
+    assert fade.poses[0] is poses[1], "the camera has jumped, and the next scene is not there yet"
+    fade.show(1, replace(small_scene), 1.0, part=2)
+    fade.move(poses[3], 2)
+    assert fade.poses == [poses[1], poses[3]] and fade.front == 1
+    fade.move(poses[4], 1)
+    assert fade.poses == [poses[4], poses[3]]
+
+
+def test_scenes_of_other_parts_are_loaded_next_those_of_links_first(parted_house, load_house):
+    scenes = TourScenes(parted_house)
+    assert scenes.list_next(None, 0.0) == [(0, 1), (1, 2), (3,)]
+    scenes.move(parted_house.positions[3])
+    assert scenes.views == (3,) and scenes.part == 1, "after a jump"
+    assert scenes.list_next(None, 0.0)[:2] == [(3,), (1, 2)]
+    route = scenes.plan_way(parted_house.cam2world[3].numpy(), 0)
+    assert route.walk == (3, 2, 1, 0) and route.fades == (0,)
+    scenes.add(load_house(scenes.make_entry((3,))))
+    limit = scenes.find_limit(route, 0.0)
+    assert route.edge(limit) is None and np.linalg.norm(route.pose(limit)[:3, 3] - parted_house.positions[3]) < 0.71
+    assert scenes.camera_height == 1.0
+    scenes.move(route.pose(1.0)[:3, 3], route, 1.0)
+    assert scenes.views == (0, 1)
+
+
+def test_the_hotspot_of_a_link_is_where_it_meets_the_floor(parted_house, load_house):
+    scenes = TourScenes(parted_house)
+    scenes.add(load_house(scenes.make_entry((1, 2))))
+    scenes.move(parted_house.positions[2])
+    camera = Camera(position=(0.0, 0.0, 1.6), vertical_fov_degrees=120.0)
+    (hotspot,) = find_hotspots(scenes, camera, (200, 200))
+    assert (hotspot.node, hotspot.label, hotspot.is_fade) == (3, "to the hall", True)
+    focal = 100 / np.tan(np.radians(60))
+    assert hotspot.center == pytest.approx((100 + focal * np.tan(0.1), 100 + focal * np.tan(0.6) / np.cos(0.1)))
+    scenes.move(parted_house.positions[3])
+    for pitch, distance in ((1.4, 1.0), (0.05, 3.0), (-0.2, 3.0)):
+        panoramas = list(parted_house.panoramas)
+        panoramas[3] = replace(panoramas[3], links=(Link("room2", 0.0, pitch),))
+        scenes.tour = replace(parted_house, panoramas=tuple(panoramas))
+        (hotspot,) = find_hotspots(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
+        assert hotspot.center == pytest.approx((100, 100 + focal / distance)), "1 to 3 m away"
+        assert hotspot.label == "room2"
+
+
 def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(scenes):
     camera = Camera(position=(0.0, 0.0, 0.0), vertical_fov_degrees=90.0)
     hotspots = find_hotspots(scenes, camera, (200, 200))
@@ -104,6 +154,28 @@ def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(scenes):
     assert find_clicked(hotspots, (x + 5, y)) == 2
     assert find_clicked(hotspots, (x, y - 60)) is None
     assert find_hotspots(scenes, replace(camera, yaw_radians=np.pi), (200, 200)) == []
+
+
+def test_the_film_of_a_fade_between_parts_mixes_both_last_views(parted_house, load_house):
+    scenes = TourScenes(parted_house)
+    renderers = [CpuRenderer(None), CpuRenderer(None)]
+    settings = DrawSettings(mode="deferred")
+    frames = TourFrames(renderers, scenes, lambda entry: load_house(entry), (64, 36), settings)
+    route = plan_route(parted_house, [2, 3])
+    (jump,) = route.jumps
+
+    def draw(sample: int, seconds: float) -> np.ndarray:
+        pose = route.pose(sample / (len(route.legs) - 1))
+        scenes.move(pose[:3, 3], route, sample / (len(route.legs) - 1))
+        return frames.draw_scene(pose, 75.0, seconds)[0]
+
+    before = draw(jump, 0.0)
+    assert np.abs(draw(jump + 1, 1.0) - before).max() < 1e-6, "the fade begins with the last view"
+    middle = draw(jump + 1, 1.0 + FADE_SECONDS / 2)
+    after = draw(jump + 1, 1.0 + FADE_SECONDS)
+    assert np.abs(after - before).mean() > 0.1 and np.abs(middle - (before + after) / 2).max() < 1e-6
+    for renderer in renderers:
+        renderer.release()
 
 
 def read_film(path) -> np.ndarray:
