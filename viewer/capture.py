@@ -142,7 +142,10 @@ class SceneFrames:
 
     Attributes:
         image_format: of the frames.
+        tour: None.
     """
+
+    tour = None
 
     def __init__(
         self,
@@ -176,6 +179,7 @@ class TourFrames:
 
     Attributes:
         image_format: of the frames.
+        tour: the graph.
     """
 
     def __init__(
@@ -197,7 +201,7 @@ class TourFrames:
             settings: draw settings.
             image_format: a perspective image of one eye by default.
         """
-        self.image_format = image_format or ImageFormat()
+        self.image_format, self.tour = image_format or ImageFormat(), scenes.tour
         self._renderers, self._scenes, self._load, self._size = renderers, scenes, load, size
         self._settings = replace(settings, near=NEAR_OF_FAR * scenes.tour.far)
         self._fade = CrossFade()
@@ -335,7 +339,7 @@ def write_path_film(
 
     def draw(frame: int, *, with_depth: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         progress("film", frame / num_frames)
-        camera = path.interpolate(frame / fps, level)
+        camera = path.interpolate(frame / fps, level, frames.tour)
         return frames.draw(camera.cam2world, camera.vertical_fov_degrees, frame / fps, with_depth=with_depth)
 
     projection, stereo = frames.image_format.projection, frames.image_format.stereo

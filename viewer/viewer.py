@@ -397,6 +397,8 @@ class Viewer:
         before = state.flight
         advance_flight(state, seconds, limit)
         self._waiting = state.playing and state.flight == before and limit < 1
+        if self._waiting and tour is not None and state.route is not None and tour.is_blocked(state.route, limit):
+            self._waiting = state.playing = False
 
     def _visit(self, place: tuple[float, float], size: tuple[int, int]) -> bool:
         """Fly to the panorama whose hotspot is at a place of the window; returns whether there is one."""

@@ -203,6 +203,8 @@ def paint_floor_plan(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The floor plan over dark grey with the names of the panoramas, the edges between them, and a route.
 
+    Panoramas without a known place are squares.
+
     Args:
         tour, outlines: see `draw_floor_plan`.
         route: drawn instead of the edges.
@@ -218,7 +220,10 @@ def paint_floor_plan(
     else:
         for edge in tour.overlaps:
             cv2.polylines(image, [centers[list(edge)]], False, (170, 180, 190), 1, cv2.LINE_AA)
-    for panorama, (x, y) in zip(tour.panoramas, centers.tolist(), strict=True):
-        cv2.circle(image, (x, y), 6, (90, 204, 255), -1, cv2.LINE_AA)
+    for node, (panorama, (x, y)) in enumerate(zip(tour.panoramas, centers.tolist(), strict=True)):
+        if (node, node) in tour.overlaps:
+            cv2.rectangle(image, (x - 5, y - 5), (x + 5, y + 5), (90, 204, 255), -1)
+        else:
+            cv2.circle(image, (x, y), 6, (90, 204, 255), -1, cv2.LINE_AA)
         cv2.putText(image, panorama.name, (x + 9, y + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return image

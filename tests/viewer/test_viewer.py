@@ -1141,7 +1141,7 @@ def test_a_click_on_a_link_fades_to_a_panorama_without_a_place_and_the_list_lead
         monkeypatch.setattr(slot.renderer, "pacing", SMALL)
     user.state.target = 2
     fly(user, 1.0)
-    user.state.camera = replace(user.state.camera, pitch_radians=-0.5, yaw_radians=-0.1)
+    user.state.camera = replace(user.state.camera, pitch_radians=-0.25, yaw_radians=-0.1)
     user.draw_frames(2)
     (spot,) = user.data.hotspots
     assert (spot.node, spot.label, spot.is_fade) == (3, "to the hall", True)
@@ -1214,6 +1214,9 @@ def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, 
     user.draw_frames(5)
     user.settle()
     assert failed == ["room1-room2"] and user.data.error is None
+    user.press(imgui.Key._3)
+    fly(user, 0.25)
+    assert find_node(user) == 1, "the flight ends before the scene that is missing"
 
 
 def test_a_scene_after_a_tour_does_not_fade_from_it(tour_user, pair):

@@ -24,6 +24,7 @@ from scipy.interpolate import PchipInterpolator
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
 from pansplat.strict_json import list_field, number_field, read_json, require_object
+from pansplat.tours import TourGraph
 from pansplat_viewer.scene.camera import MAX_FOV_DEGREES, MIN_FOV_DEGREES, Camera, move_to_pose
 
 MAX_SECONDS = 3600.0
@@ -54,7 +55,8 @@ class CameraPath:
     """Key frames in the order of time, and the smooth path through them.
 
     Position, heading, pitch and field of view are monotone cubics of time between the key frames (PCHIP), so that the
-    camera overshoots none of them.
+    camera overshoots none of them. Between key frames of two parts of a tour the camera stands still, and jumps at the
+    later one.
     """
 
     key_frames: tuple[KeyFrame, ...] = ()
@@ -71,14 +73,15 @@ class CameraPath:
         """Number of frames of a film: from time 0 to the last key frame, both included."""
         return math.floor(self.seconds * fps + 1e-6) + 1
 
-    def interpolate(self, seconds: float, level: Camera) -> Camera:
+    def interpolate(self, seconds: float, level: Camera, tour: TourGraph | None = None) -> Camera:
         """The camera at a time; before the first and after the last key frame it stands still.
 
         Args:
             seconds: time.
             level: a camera with the scene's level axes.
+            tour: that the path is in.
         """
-        frames = self.key_frames
+        frames = self.key_frames if tour is None else self._select_part(seconds, tour)
         times = np.array([frame.seconds for frame in frames])
         cameras = [_place(frame, level) for frame in frames]
         yaws = np.unwrap([camera.yaw_radians for camera in cameras])
@@ -91,6 +94,13 @@ class CameraPath:
         at = min(max(seconds, times[0]), times[-1])
         x, y, z, yaw, pitch, fov = (values[0] if len(frames) == 1 else PchipInterpolator(times, values)(at)).tolist()
         return replace(level, position=(x, y, z), yaw_radians=yaw, pitch_radians=pitch, vertical_fov_degrees=fov)
+
+    def _select_part(self, seconds: float, tour: TourGraph) -> tuple[KeyFrame, ...]:
+        """The key frames in a row of one part of a tour, among which is the last one at a time."""
+        parts = [tour.parts[tour.find_nearest_edge(np.array(frame.position))[0][0]] for frame in self.key_frames]
+        runs = [list(run) for _, run in itertools.groupby(range(len(parts)), key=parts.__getitem__)]
+        begun = [run for run in runs if self.key_frames[run[0]].seconds <= seconds] or runs[:1]
+        return tuple(self.key_frames[number] for number in begun[-1])
 
     def add(self, frame: KeyFrame) -> CameraPath:
         """The path with a further key frame; one at the same time is replaced."""

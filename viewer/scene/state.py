@@ -51,6 +51,7 @@ class ViewerState:
     speed: float = 1.0  # of flying, metres per second
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     num_views: int = 0  # number of input cameras of the scene that is shown
+    tour: TourGraph | None = None  # that is shown; None for other scenes
     route: Route | None = None  # the flight through a tour; None if none is planned, and in other scenes
     target: int | None = None  # the panorama of a tour to fly to; None if there is none
     minimap: bool = True
@@ -86,7 +87,8 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
     adapt_settings(state, scene, keep_levels=False)
     state.settings = replace(state.settings, near=NEAR)
-    state.context, state.route, state.target = scene.cam2world.double().numpy(), None, None
+    state.context = scene.cam2world.double().numpy()
+    state.tour = state.route = state.target = None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
     level = create_level_camera(scene).level
     camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
@@ -102,7 +104,8 @@ def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, 
     before = state.camera if _are_same(state.context, tour.cam2world.numpy()) else None
     enter_scene(state, scene)
     state.settings = replace(state.settings, near=NEAR_OF_FAR * tour.far)
-    state.context, state.route, state.flight = tour.cam2world.numpy(), route, min(max(at, 0.0), 1.0)
+    state.tour, state.context = tour, tour.cam2world.numpy()
+    state.route, state.flight = route, min(max(at, 0.0), 1.0)
     level = create_level_camera(scene, tour).level
     state.camera = state.home = move_to_pose(replace(state.camera, level=level), route.pose(state.flight))
     state.camera = before or state.camera
@@ -205,7 +208,7 @@ def show_path(state: ViewerState, seconds: float) -> None:
     """Move the camera to a time of the path."""
     state.playing, state.path_seconds = False, max(seconds, 0.0)
     if len(state.path):
-        state.camera = state.path.interpolate(state.path_seconds, state.camera)
+        state.camera = state.path.interpolate(state.path_seconds, state.camera, state.tour)
 
 
 def advance_path(state: ViewerState, seconds: float) -> None:

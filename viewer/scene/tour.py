@@ -5,7 +5,6 @@ Imports no OpenGL: the film and the window use the same objects.
 
 from __future__ import annotations
 
-import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -52,6 +51,7 @@ class TourScenes:
         """
         self.tour, self._merged = tour, merged
         self.edge: Edge = next(iter(tour.overlaps))
+        self._is_placed = False  # whether the camera has been at the edge
         self.outlines: dict[int, FloorOutline] = {}
         self._views = tour.choose_scene_views()
         self._budget = memory * 2**30
@@ -110,13 +110,16 @@ class TourScenes:
     def move(self, position: Float[np.ndarray, "3"], route: Route | None = None, fraction: float = 0.0) -> None:
         """Choose the edge of a camera position, or of a fraction of a route that is being flown."""
         edge = None if route is None else route.edge(fraction)
-        self.edge = edge or self.tour.follow_edge(position, self.edge)
+        if edge is None:
+            tour, known = self.tour, self._is_placed
+            edge = tour.follow_edge(position, self.edge) if known else tour.find_nearest_edge(position)[0]
+        self.edge, self._is_placed = edge, True
 
     def list_next(self, route: Route | None, fraction: float) -> list[Views]:
         """The scenes to have in memory, the most urgent first: that of the camera, then those that are next.
 
-        These are the next ones of a route; or those around the nearest panorama, then those that links lead to, and
-        those of other panoramas in their order.
+        These are the next ones of a route; or those around the nearest panorama, then those of other parts: first
+        where links lead to, then in the order of the panoramas.
         """
         tour = self.tour
         if route is not None:
@@ -126,8 +129,9 @@ class TourScenes:
             edges = [edge for edge in self._views if {a, b} & set(edge)]
             edges.sort(key=tour.length)
             linked = [end for start, end in tour.links if start in self.edge]
-            others = (node % len(tour) for node in range(b + 1, b + len(tour)))
-            edges += [tour.find_edge(node) for node in itertools.islice((*linked, *others), 2 * _NEXT_SCENES)]
+            following = (node % len(tour) for node in range(b + 1, b + len(tour)))
+            others = [node for node in (*linked, *following) if tour.is_fade(a, node)]
+            edges += [tour.find_edge(node) for node in others[: 2 * _NEXT_SCENES]]
         wanted = dict.fromkeys([self.views, *(self._views[edge] for edge in edges)])
         return list(wanted)[: 1 + _NEXT_SCENES]
 
@@ -155,6 +159,11 @@ class TourScenes:
         if not len(missing):
             return 1.0
         return max((len(route.legs) - len(numbers) + int(missing[0]) - 1) / (len(route.legs) - 1), fraction)
+
+    def is_blocked(self, route: Route, fraction: float) -> bool:
+        """Whether a route cannot be flown on from a fraction, because the next scene could not be loaded."""
+        leg = int(route.legs[min(round(fraction * (len(route.legs) - 1)) + 1, len(route.legs) - 1)])
+        return leg >= 0 and self._views[route.edges[leg]] in self._failed
 
     def plan_route(self, camera: Float[np.ndarray, "4 4"], remaining: Sequence[int] = ()) -> Route:
         """A route from a pose through the remaining panoramas; without any, through all of them."""

@@ -49,6 +49,7 @@ _HANDLE = (
     | imgui.WindowFlags_.no_nav.value
 )
 _NUM_PANORAMAS = 9  # with buttons, as there are keys
+_OPENED_NOTES = 3  # at most, at first
 
 
 @dataclass
@@ -208,7 +209,7 @@ class Panels:
             imgui.push_item_width(-110 * scale)
             self._section("Scene", self._draw_scene, state, data, commands)
             if data.notes:
-                self._section("Notes", _draw_notes, data.notes)
+                self._section("Notes", _draw_notes, data.notes, opened=len(data.notes) <= _OPENED_NOTES)
             if data.stats.total:
                 self._section("Gaussians", self._draw_gaussians, state)
             self._section("Display", self._draw_display, state)

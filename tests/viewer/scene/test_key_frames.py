@@ -135,3 +135,13 @@ def test_a_film_that_fails_leaves_no_file(frames, tmp_path):
     with pytest.raises(RuntimeError, match="stopped"):
         write_path_film(frames, replace(PATH), LEVEL, tmp_path / "film.mp4", 8.0, fail)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_path_stands_still_between_parts_and_jumps_at_the_later_key_frame(parted_house):
+    places = ((0.0, 0, 0), (0, 0, 1), (20, 0, 1.6), (20.5, 0, 1.6), (0, 0, 0.5))
+    path = CameraPath(tuple(KeyFrame(float(k), place, (0.0, 0, 1)) for k, place in enumerate(places)))
+    times = (-1.0, 0.5, 1.0, 1.9, 2.0, 2.5, 3.9, 4.0, 9.0)
+    shown = [path.interpolate(time, Camera(), parted_house).position for time in times]
+    expected = [places[0], (0, 0, 0.5), *[places[1]] * 2, places[2], (20.25, 0, 1.6), places[3], *[places[4]] * 2]
+    assert np.allclose(shown, expected)
+    assert path.interpolate(1.5, Camera()).position[0] > 1, "in other scenes it flies"

@@ -113,6 +113,9 @@ def test_a_scene_of_another_part_is_drawn_from_the_last_pose_in_its_part(small_s
 def test_scenes_of_other_parts_are_loaded_next_those_of_links_first(parted_house, load_house):
     scenes = TourScenes(parted_house)
     assert scenes.list_next(None, 0.0) == [(0, 1), (1, 2), (3,)]
+    scenes.move(parted_house.positions[3] - (0, 0, 3))
+    assert scenes.part == 1, "at first, the part of the nearest panorama"
+    scenes.move(parted_house.positions[0])
     scenes.move(parted_house.positions[3])
     assert scenes.views == (3,) and scenes.part == 1, "after a jump"
     assert scenes.list_next(None, 0.0)[:2] == [(3,), (1, 2)]
