@@ -334,41 +334,41 @@
 
   // The image of the last camera in the old part covers the new one until that is sorted, then it fades out.
   const still = byId("still");
-  let cover = null;
+  let frozen = null;
 
   function freeze() {
     if (!renderer || !sorted) return;
     drawAt(canvas.width, canvas.height);  // what a canvas shows can be copied in the task that drew it
     const size = fullSize(), context = still.getContext("2d");
     const isSame = still.width === size[0] && still.height === size[1];
-    context.globalAlpha = cover && isSame ? 1 - cover.left : 1;
+    context.globalAlpha = frozen && isSame ? 1 - frozen.left : 1;
     if (!isSame) [still.width, still.height] = size;
     context.drawImage(canvas, 0, 0, ...size);
-    cover = { began: null, left: 1 };
-    showCover();
+    frozen = { began: null, left: 1 };
+    showStill();
     changed();
   }
 
-  function updateCover(now) {
-    if (!cover) return;
-    if (cover.began === null && sorted.part === currentPart()) cover.began = now;
-    if (cover.began !== null) {
-      const t = clamp((now - cover.began) / FADE_MS, 0, 1);
-      cover.left = 1 - t * t * (3 - 2 * t);
-      if (t === 1) cover = null;
+  function updateStill(now) {
+    if (!frozen) return;
+    if (frozen.began === null && sorted.part === currentPart()) frozen.began = now;
+    if (frozen.began !== null) {
+      const t = clamp((now - frozen.began) / FADE_MS, 0, 1);
+      frozen.left = 1 - t * t * (3 - 2 * t);
+      if (t === 1) frozen = null;
     }
-    showCover();
+    showStill();
     changed();
   }
 
-  function showCover() {
-    const left = cover ? cover.left : 0;
-    still.hidden = !cover;
+  function showStill() {
+    const left = frozen ? frozen.left : 0;
+    still.hidden = !frozen;
     still.style.opacity = left;
     byId("spots").style.opacity = 1 - left;
   }
 
-  const isWaiting = () => cover !== null && cover.began === null;
+  const isWaiting = () => frozen !== null && frozen.began === null;
 
   // The heading after a fade: away from the link back, or the start view, or that of before.
   function arriveAt(node, from) {
@@ -861,7 +861,7 @@
     advanceFlight(now);
     advanceRoute(Math.min(elapsed, 100) / 1000);
     if (edges.length) updateEdge(now);
-    updateCover(now);
+    updateStill(now);
     requestSort();
     const moving = now - lastChange < 200;
     if (moving && drawnScale && elapsed < 1000) scale = clamp(scale * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);
