@@ -300,8 +300,7 @@ def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: 
         yield from steps.run()
     if "export" not in options.steps:
         return
-    edges = [] if unit.tour is None else [[*edge, round(overlap, 6)] for edge, overlap in unit.tour.overlaps.items()]
-    settings = [__version__, options.suffix, options.gaussians, edges]
+    settings = [__version__, options.suffix, options.gaussians, [] if unit.tour is None else _list_graph(unit.tour)]
     key = _join_hash(",".join(steps.key for steps in made), "export", settings)
     path = folder / f"export-{key}-{_shorten(unit.name)}{options.suffix}"
     is_new = not path.exists()
@@ -313,6 +312,17 @@ def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: 
             scene = merge_scenes(unit.tour, lambda views: of_views[views].read())
         _export(scene, path, unit, options)
     yield path, is_new
+
+
+def _list_graph(tour: TourGraph) -> list[Any]:
+    """What the scene of a tour states of its graph: edges, and titles, links and start views if there are any."""
+    edges = [[*edge, round(overlap, 6)] for edge, overlap in tour.overlaps.items()]
+    stated = [
+        [node, view.title, view.start, [dataclasses.astuple(link) for link in view.links]]
+        for node, view in enumerate(tour.panoramas)
+        if view.title or view.start or view.links
+    ]
+    return edges + stated
 
 
 class _PairSteps:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import os
 import re
-import time
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,18 +15,16 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from pansplat.atomic import is_unfinished, replacing
+from pansplat.cache_folders import cache_folders, write_cache_file
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
-from pansplat.errors import InputError
-from pansplat.files import expand_home, read_file
+from pansplat.files import read_file
 from pansplat.gaussians.scene import Gains, Gaussians
 from pansplat.predictor import Predictor
 
 _MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash
 _GAINS, _REFINEMENT = "gains", "refinement"
-_ABANDONED_SECONDS = 3600.0  # after which an unfinished file is that of a process that was killed
 _FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 
 
@@ -85,38 +80,6 @@ class CachedPrediction:
 def list_cache_folders(pair: Pair) -> list[Path]:
     """Folders for a pair's predictions, in order of preference."""
     return cache_folders(pair.folder)
-
-
-def cache_folders(folder: Path) -> list[Path]:
-    """Folders for what is computed from a folder's panoramas, in order of preference."""
-    folder_hash = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=8).hexdigest()
-    folders = [folder / ".pansplat"]
-    with contextlib.suppress(InputError):  # no home folder
-        home = os.environ.get("XDG_CACHE_HOME") or expand_home("~/.cache")
-        folders.append(Path(home) / "pansplat" / folder_hash)
-    return folders
-
-
-def write_cache_file(folders: Sequence[Path], name: str, *parts: bytes) -> Path | None:
-    """Write a file to the first writable folder; returns its path, or None if there is no such folder."""
-    for folder in folders:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with replacing(folder / name) as unfinished, open(unfinished, "wb") as file:
-                file.writelines(parts)
-        except (OSError, InputError):
-            continue
-        _remove_abandoned(folder)
-        return folder / name
-    return None
-
-
-def _remove_abandoned(folder: Path) -> None:
-    """Remove unfinished files of processes that were killed."""
-    with contextlib.suppress(OSError):
-        for file in folder.iterdir():
-            if is_unfinished(file) and time.time() - file.stat().st_mtime > _ABANDONED_SECONDS:
-                file.unlink()
 
 
 def _hash_inputs(views: Views, predictor: Predictor, refinement: str) -> str:

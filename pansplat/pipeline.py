@@ -22,7 +22,7 @@ from torch import Tensor
 from pansplat.cache import CachedPrediction, CachedScene
 from pansplat.data import folders
 from pansplat.data.pairs import Pair
-from pansplat.data.views import Views
+from pansplat.data.views import CAMERA_HEIGHT, Views
 from pansplat.errors import InputError
 from pansplat.files import expand_home, find_scene_suffix
 from pansplat.gaussians.formats import load_scene, save_scene
@@ -39,7 +39,7 @@ from pansplat.refinement import RefineConfig, Refinement, RefineReport, refineme
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
-from pansplat.tours import TourGraph, make_graph, merge_scenes
+from pansplat.tours import TourGraph, list_starts, make_graph, merge_scenes
 
 __all__ = [
     "estimate_poses",
@@ -76,26 +76,24 @@ def load_pairs(
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
-    The poses of a folder that holds panoramas only are estimated (docs/poses.md), with a warning, and cached.
+    The poses of a folder that holds panoramas only are estimated (docs/poses.md), with a warning, and cached. A
+    panorama without a pose is a pair of a single view; `Panorama.part` tells which panoramas have a common world.
 
     Args:
-        path: a pair folder, a folder of many panoramas, or a folder of such folders, in one of the formats of
-            docs/input.md. Also one of their files with poses.
+        path: a panorama, a pair folder, a folder of many panoramas, a web tour, or a folder of pair folders, in one of
+            the formats of docs/input.md. Also one of their files with poses, or the file that describes a tour.
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
         progress: called with a description of the estimate of poses and the completed fraction.
 
     Raises:
-        InputError: no known format was found, a file is missing or invalid, or no poses were found.
+        InputError: no known format was found, or a file is missing or invalid.
     """
-    folder = expand_home(path)
     try:
-        return folders.load_pairs(folder, convention=convention, near=near, far=far)
-    except folders.UnposedPanoramasError as unposed:
-        if not folder.is_dir():
-            raise
-        images = unposed.images
-    return estimate_pairs(folder, images, near=near, far=far, progress=progress)
+        return folders.load_pairs(path, convention=convention, near=near, far=far)
+    except folders.UnposedPanoramasError as error:
+        unposed = error
+    return estimate_pairs(unposed.folder, unposed.panoramas, near=near, far=far, progress=progress)
 
 
 def load_model(
@@ -209,7 +207,7 @@ def predict(
         compat, precision: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
-        refine_seconds: time limit of the refinement; 0 for none.
+        refine_seconds: time limit of the refinement; 0 for none. A single view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it.
         cache: whether to read and write the cache.
         progress: called with a description of the current work and the completed fraction.
@@ -225,18 +223,18 @@ def predict(
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
-    cached_pair = pair if cache and isinstance(pair, Pair) else None
     report: Progress = progress or (lambda what, fraction: None)
-    if not refine_seconds:
-        return _predict_views(cached_pair, views, predictor, height, report)
+    if not refine_seconds or len(views.images) == 1:  # one photograph does not show what is wrong seen from elsewhere
+        return _predict_views(pair, views, predictor, height, cache, report)
     refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
-    cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
+    is_cached = cache and isinstance(pair, Pair)
+    cached = CachedPrediction(pair, views, predictor, height, refinement) if is_cached else None
     found = None if cached is None else cached.read()
-    final = None if found is None or found.is_starved else _make_scene(found, views, predictor)
+    final = None if found is None or found.is_starved else _make_scene(found, pair, views, predictor)
     if final is not None and on_predicted is None:
         report("read from the cache", 1.0)
         return final
-    scene = _predict_views(cached_pair, views, predictor, height, lambda what, done: report(what, 0.5 * done))
+    scene = _predict_views(pair, views, predictor, height, cache, lambda what, done: report(what, 0.5 * done))
     if on_predicted is not None:
         on_predicted(scene)
     if final is not None:
@@ -253,22 +251,24 @@ def predict(
     if found is not None and found.steps > done.steps:
         refined = found._replace(is_starved=False)  # it runs once more only
     cached.write(refined)
-    return _make_scene(refined, views, predictor)
+    return _make_scene(refined, pair, views, predictor)
 
 
-def _predict_views(pair: Pair | None, views: Views, predictor: Predictor, height: int, progress: Progress) -> Scene:
-    """Predict without refinement; with a pair the cache is read and written."""
-    cached = None if pair is None else CachedPrediction(pair, views, predictor, height)
+def _predict_views(
+    source: Pair | Views, views: Views, predictor: Predictor, height: int, cache: bool, progress: Progress
+) -> Scene:
+    """Predict without refinement; of a pair, the cache is read and written if `cache`."""
+    cached = CachedPrediction(source, views, predictor, height) if cache and isinstance(source, Pair) else None
     found = None if cached is None else cached.read()
     if found is not None:
         progress("read from the cache", 1.0)
-        return _make_scene(found, views, predictor)
+        return _make_scene(found, source, views, predictor)
     gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress)
     assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
     predicted = CachedScene(gaussians)
     if cached is not None:
         cached.write(predicted)
-    return _make_scene(predicted, views, predictor)
+    return _make_scene(predicted, source, views, predictor)
 
 
 def refine(
@@ -437,8 +437,8 @@ def predict_to_file(
         )
         pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
         if suffix == ".ply":
-            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), views, predictor), pruned, path)
-        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), views, predictor)
+            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), pair, views, predictor), pruned, path)
+        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), pair, views, predictor)
     else:
         scene = predict(pair, predictor, height=height, refine_seconds=refine_seconds, cache=cache, progress=progress)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
@@ -569,14 +569,18 @@ def _load_only_pair(path: str | Path) -> Pair:
     return pairs[0]
 
 
-def _make_scene(content: CachedScene, views: Views, predictor: Predictor) -> Scene:
+def _make_scene(content: CachedScene, source: Pair | Views, views: Views, predictor: Predictor) -> Scene:
+    panoramas, gaussians = source.context if isinstance(source, Pair) else (), content.gaussians
+    if len(views.images) == 1:  # predicted as of a camera at the usual height
+        gaussians = gaussians.scaled(views.camera_height / CAMERA_HEIGHT, views.cam2world[0, :3, 3])
     return Scene(
-        content.gaussians,
+        gaussians,
         views.cam2world.double(),
         near=views.near,
         far=views.far,
-        names=views.names,
+        names=tuple(panorama.label for panorama in panoramas) or views.names,
         model=predictor.name,
         height=views.images.shape[-2],
         gains=content.gains,
+        starts=list_starts(panoramas),
     )

@@ -161,6 +161,14 @@ def _restored_signal_handlers() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
+def _unchanged_threads() -> Iterator[None]:
+    """No test changes the number of torch's threads: two on a busy core make later tests ten times slower."""
+    threads = torch.get_num_threads()
+    yield
+    assert torch.get_num_threads() == threads
+
+
+@pytest.fixture(autouse=True)
 def _restarted_checks() -> None:
     """Check the annotations of each function in each test."""
     restart_checks()

@@ -17,9 +17,11 @@ from pansplat.guided_sweep import (
 )
 from pansplat.model.depth_network import DepthNetworkConfig
 from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
+from pansplat.model.depth_sharpening import DepthSharpening, SharpeningConfig
 from pansplat.model.weights import pack_weights, save_weights
 from pansplat.pipeline import load_model, load_pairs, predict, render
 from pansplat.sweep.prior import DepthPrior
+from pansplat.sweep.surface import resize_sphere
 
 _OF_A_VIEW = ("images", "masks", "cam2world")
 _CONFIG = RefinementConfig(
@@ -38,6 +40,10 @@ def _network(seed=0):
     return network.eval()
 
 
+def _sharpening():
+    return DepthSharpening(SharpeningConfig(64, 24, 1, 3, (16, 12, 8, 8), 8)).eval()
+
+
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "depth.safetensors"
@@ -51,7 +57,7 @@ def _images(views=2, height=64):
 
 
 def test_saved_network_estimates_the_same_depth(weights):
-    loaded, network = load_guided_sweep(weights), NetworkPrior(_network(), "", 64)
+    loaded, network = load_guided_sweep(weights), NetworkPrior(_network(), _sharpening(), "", 64)
     assert isinstance(loaded.prior, NetworkPrior)
     loaded.prior.height = 64
     first, second = (prior.observe(_images()).priors for prior in (loaded.prior, network))
@@ -61,8 +67,19 @@ def test_saved_network_estimates_the_same_depth(weights):
         np.testing.assert_allclose(a.scale, b.scale, rtol=2e-2)
 
 
+def test_sharpened_depth_has_the_networks_size_and_the_views_order():
+    observed = NetworkPrior(_network(), _sharpening(), "", 64).observe(_images())
+    both = observed.sharpen()
+    assert [log_depth.shape for log_depth in both] == [(64, 128)] * 2
+    estimates = [prior.log_depth.ravel() for prior in observed.priors]
+    for view, log_depth in enumerate(both):  # an untrained network smooths the estimate
+        small = resize_sphere(log_depth, 32).ravel()
+        own, other = (np.corrcoef(small, estimates[n])[0, 1] for n in (view, 1 - view))
+        assert own > 0.3 and abs(other) < 0.5 * own
+
+
 def test_refined_depth_is_in_the_unit_of_the_poses():
-    prior = NetworkPrior(_network(), "", 64)
+    prior = NetworkPrior(_network(), _sharpening(), "", 64)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = (0, 0.5, 1)
     far = poses.copy()
@@ -136,14 +153,14 @@ def test_shipped_model_estimates_the_sample_within_a_fifth():
 @pytest.fixture(scope="module")
 def sample():
     (pair,) = load_pairs(Path(__file__).parents[1] / "assets" / "living_room")
-    return pair.load_context(128), pair.load_targets(128), load_model("default")
+    return pair.load_context(64), pair.load_targets(64), load_model("default")
 
 
 def _error_between(sample, **changes):
     """Error of the middle view, drawn from a prediction with other inputs, dB."""
     views, targets, model = sample
     views = dataclasses.replace(views, **changes)
-    middle = render(predict(views, model), targets.cam2world[0], size=(128, 256)).color
+    middle = render(predict(views, model), targets.cam2world[0], size=(64, 128)).color
     return ws_psnr(middle.clamp(0, 1), targets.images[0])
 
 
@@ -155,7 +172,7 @@ def test_errors_of_poses_and_depth_range_cost_little(sample):
         [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]], dtype=poses.dtype
     )
     poses[1, :3, 3] += torch.tensor([0.01, -0.01, 0.014], dtype=poses.dtype)  # 2 cm
-    assert _error_between(sample, cam2world=poses) > exact - 1.5
+    assert _error_between(sample, cam2world=poses) > exact - 0.5  # 1.46 for errors four times as large
     assert _error_between(sample, near=views.near / 2, far=2 * views.far) > exact - 0.5
 
 
@@ -164,5 +181,5 @@ def test_coincident_cameras_give_a_scene_that_is_better_than_a_sphere(sample, sp
     views, targets, _ = sample
     same = {name: getattr(views, name)[:1].repeat(2, *[1] * (getattr(views, name).ndim - 1)) for name in _OF_A_VIEW}
     sphere = predict(dataclasses.replace(views, **same), sphere_predictor())
-    drawn = render(sphere, targets.cam2world[0], size=(128, 256)).color.clamp(0, 1)
+    drawn = render(sphere, targets.cam2world[0], size=(64, 128)).color.clamp(0, 1)
     assert _error_between(sample, **same) > ws_psnr(drawn, targets.images[0]) + 2

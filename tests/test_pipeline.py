@@ -47,6 +47,14 @@ def test_a_predicted_scene_holds_its_cameras_and_predictor_name(scene: Scene) ->
     assert (scene.model, scene.height, scene.names) == ("sphere", HEIGHT, ("left", "right"))
 
 
+def test_a_scene_of_one_panorama_keeps_its_title_and_start_view(pair_folder: Path, sphere_predictor) -> None:
+    (pair,) = load_pairs(pair_folder)
+    single = replace(pair, context=(replace(pair.context[1], title="hall", start=(7.0, 0.1)),))
+    for cache in (True, True, False):
+        scene = predict(single, sphere_predictor(), height=HEIGHT, cache=cache)
+        assert scene.names == ("hall",) and scene.starts == ((pytest.approx(7 - 2 * np.pi), 0.1),)
+
+
 @pytest.mark.parametrize(
     ("photographs", "largest", "expected"), [(32, None, 64), (300, None, 300), (2048, None, 512), (2048, 1024, 1024)]
 )

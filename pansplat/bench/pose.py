@@ -56,7 +56,7 @@ def measure_folder(path: Path, report: Report, *, camera_height: float, tours: b
         camera_height: mean height of the cameras over the floor, metres.
         tours: also estimate all panoramas together.
     """
-    pairs = load_pairs(path)
+    pairs = [pair for pair in load_pairs(path) if len(pair.context) > 1]  # a single view has nothing to compare with
     contexts = {frozenset(view.image for view in pair.context): pair for pair in pairs}
     for pair in contexts.values():
         report.step(pair.name)

@@ -22,7 +22,7 @@ from torch import Tensor
 from pansplat import pipeline
 from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
 from pansplat.data.pairs import Pair
-from pansplat.data.views import Views
+from pansplat.data.views import Views, select_views
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.evaluation.report import measure_own_views, warm_up
@@ -46,25 +46,29 @@ class RefineCase:
         height: of the panoramas, pixels.
         limit_s: time limit of the refinement; 0 for none.
         limit_gaussians: None for no limit.
+        views: number of the pair's panoramas that the scene is made of; None for all.
     """
 
     model: str
     height: int
     limit_s: float = 0.0
     limit_gaussians: int | None = None
+    views: int | None = None
 
     def __str__(self) -> str:
         """The case as it is shown while it is measured."""
         refined = f" + {self.limit_s:g} s" if self.limit_s else ""
         limit = f", {self.limit_gaussians:,} Gaussians" if self.limit_gaussians else ""
-        return f"{self.model}{refined}, {self.height}x{2 * self.height}{limit}"
+        views = f", {self.views} view" if self.views else ""
+        return f"{self.model}{refined}, {self.height}x{2 * self.height}{limit}{views}"
 
 
 def list_refine_cases(*, quick: bool) -> list[RefineCase]:
     """The cases; with `quick`, two of the default predictor at height 256."""
     if quick:
-        return [RefineCase(CROSS_FADE, 256), *(RefineCase("default", 256, seconds) for seconds in (0.0, 5.0))]
-    cases = [RefineCase(CROSS_FADE, 512)]
+        cases = [RefineCase(CROSS_FADE, 256), RefineCase("default", 256, views=1)]
+        return cases + [RefineCase("default", 256, seconds) for seconds in (0.0, 5.0)]
+    cases = [RefineCase(CROSS_FADE, 512), *(RefineCase("default", height, views=1) for height in (256, 512))]
     cases += [RefineCase("sweep", 512, seconds) for seconds in (0.0, 10.0)]
     cases += [RefineCase("default", 256, seconds) for seconds in (0.0, 5.0, 10.0)]
     cases += [RefineCase("default", 512, seconds) for seconds in (0.0, 5.0, 10.0, 20.0)]
@@ -86,10 +90,11 @@ class RefineBench:
     def run(self, pairs: Sequence[Pair], cases: Sequence[RefineCase]) -> None:
         """Measure every case on every pair with targets, then add the means over the pairs."""
         for pair in pairs:
-            predicted: dict[tuple[str, int], tuple[Scene, float]] = {}
+            predicted: dict[tuple[str, int, int], tuple[Scene, float]] = {}
             for case in cases:
                 self._report.step(f"{pair.name}: {case}")
                 context, targets = pair.load_context(case.height), pair.load_targets(case.height)
+                context = select_views(context, range(case.views or len(context.images)))
                 self._report.add(Row("refine", pair.name, case, self._measure(case, context, targets, predicted)))
         if len(pairs) > 1:
             for row in average_rows(list(self._report.rows)):
@@ -100,14 +105,15 @@ class RefineBench:
         case: RefineCase,
         context: Views,
         targets: Views,
-        predicted: dict[tuple[str, int], tuple[Scene, float]],
+        predicted: dict[tuple[str, int, int], tuple[Scene, float]],
     ) -> dict[str, float]:
         if case.model == CROSS_FADE:
             errors = self._compare(partial(cross_fade, context.images, context.cam2world), targets)
             return {**errors, "predict_s": 0.0, "refine_s": 0.0, "steps": 0, "num_gaussians": 0}
-        if (case.model, case.height) not in predicted:
-            predicted[case.model, case.height] = self._predict(case.model, context)
-        scene, predict_s = predicted[case.model, case.height]
+        key = case.model, case.height, len(context.images)
+        if key not in predicted:
+            predicted[key] = self._predict(case.model, context)
+        scene, predict_s = predicted[key]
         refine_s, steps = 0.0, 0
         if case.limit_s:
             start = time.perf_counter()
@@ -147,15 +153,20 @@ def average_rows(rows: Sequence[Row]) -> Iterator[Row]:
         yield Row("refine", MEAN, case, {name: statistics.fmean(each[name] for each in results) for name in names})
 
 
+def _get_line(row: Row) -> tuple[str, int, int | None]:
+    """What the points of a line have in common."""
+    return row.case.model, row.case.height, row.case.views
+
+
 def plot_refine(rows: Sequence[Row], header: Header) -> Figure:
     """Plot the mean WS-PSNR and LPIPS over the seconds, and WS-PSNR over the number of Gaussians."""
     means = list(average_rows([row for row in rows if row.scene != MEAN]))
     figure, axes = make_axes(3, (13, 4.2))
     unlimited = [row for row in means if row.case.limit_gaussians is None]
-    for model, height in dict.fromkeys((row.case.model, row.case.height) for row in unlimited):
-        line = [row for row in unlimited if (row.case.model, row.case.height) == (model, height)]
+    for model, height, views in dict.fromkeys(map(_get_line, unlimited)):
+        line = [row for row in unlimited if _get_line(row) == (model, height, views)]
         seconds = [row.get("predict_s") + row.get("refine_s") for row in line]
-        label = model if model == CROSS_FADE else f"{model}, {height}x{2 * height}"
+        label = model if model == CROSS_FADE else f"{model}, {height}x{2 * height}{', one view' if views else ''}"
         axes[0].plot(seconds, [row.get("ws_psnr_db") for row in line], "o-", label=label)
         axes[1].plot(seconds, [row.get("lpips") for row in line], "o-", label=label)
     largest = max((row.case.limit_s for row in means if row.case.limit_gaussians), default=0.0)
@@ -179,6 +190,7 @@ REFINE = Benchmark(
     (
         Column("model", "model"),
         Column("height", "height", "{:d}"),
+        Column("views", lambda row: row.case.views or "all"),
         Column("refinement", lambda row: f"{row.case.limit_s:g} s" if row.case.limit_s else "none"),
         Column("limit", "limit_gaussians", "{:,}"),
         Column("Gaussians", "num_gaussians", "{:,.0f}"),

@@ -31,7 +31,7 @@ Precision = Literal["float32", "bfloat16"]
 
 @dataclass(frozen=True)
 class PairChoice:
-    """How to read a folder of panoramas, and which of its pairs to use."""
+    """How to read a panorama, a folder of panoramas or a web tour, and which of its pairs to use."""
 
     pair: str | None = None
     """Name or number (from 1) of the pair, if the folder holds several; the first by default."""

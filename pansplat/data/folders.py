@@ -1,4 +1,4 @@
-"""Folder formats of posed panoramas: `load_pairs` recognises and reads them (docs/input.md).
+"""Formats of panoramas on disk: `load_pairs` recognises and reads them (docs/input.md).
 
 Each format has a function that recognises a folder and one that reads it into a `Collection`. The argument `convention`
 of the readers overrides the format's pose convention. Readers raise an InputError for missing or invalid files; the
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.data.images import READABLE_SUFFIXES
 from pansplat.data.pairs import (
     FAR,
     FAR_SEQUENCE,
@@ -29,10 +31,13 @@ from pansplat.data.pairs import (
     ViewGroup,
     find_mask,
     list_panorama_files,
+    single_view_pairs,
     too_many_panoramas,
 )
+from pansplat.data.photographs import LINKS, add_links, list_further_photographs, list_photographs, read_photograph
 from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
-from pansplat.errors import InputError
+from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
+from pansplat.errors import InputError, InputWarning
 from pansplat.files import expand_home, read_file
 from pansplat.strict_json import list_field, number_field, read_json
 
@@ -51,42 +56,82 @@ def load_pairs(
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
     Args:
-        path: a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the formats of
-            docs/input.md (poses.json, PanoGRF, 360Loc, KITTI, TUM, game-map triplets). Also one of their files with
-            poses.
+        path: a panorama; a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the
+            formats of docs/input.md (poses.json, PanoGRF, 360Loc, KITTI, TUM, game-map triplets); or one of their files
+            with poses. A folder or web tour of a single panorama is a pair of one view.
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
 
     Raises:
-        UnposedPanoramasError: the folder holds panoramas only.
+        UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
         InputError: no known format was found, or a file is missing or invalid.
     """
     root = expand_home(path)
     if not root.exists():
-        raise InputError(f"{root}: needed a folder of posed panoramas, got no such path; check it.")
+        raise InputError(f"{root}: needed a panorama, or a folder of panoramas, got no such path; check it.")
     try:
+        if root.suffix.lower() in READABLE_SUFFIXES and root.is_file():
+            return single_view_pairs([read_photograph(root)], root.parent, near, far)
         if root.is_file() and root in triplet_files(root.parent):
             collections = [(root.parent, read_triplet(root, convention))]
+        elif root.is_file() and not _is_pose_file(root):
+            return _make_unposed_pairs(root.parent, _read_tour_file(root), near, far)
         else:
-            root = _pose_file_folder(root) if root.is_file() else root
+            root = root.parent if root.is_file() else root
             collections = _find_collections(root, convention, _MAX_DEPTH)
+        unposed = [] if collections else _list_unposed(root)
     except OSError as error:
         raise InputError(
             f"{error.filename or root}: needed a readable folder, got '{error.strerror}'; check its permissions."
         ) from error
+    if unposed:
+        return _make_unposed_pairs(root, unposed, near, far)
     if not collections:
         raise _nothing_found(root)
     pairs = [pair for folder, collection in collections for pair in collection.pairs(folder, near, far)]
-    return _make_names_unique(sorted(pairs, key=lambda pair: not pair.targets))
+    return make_names_unique(sorted(pairs, key=lambda pair: not pair.targets))
 
 
-def _pose_file_folder(file: Path) -> Path:
-    """The folder of a file with poses; an error for other files."""
-    if file.name in (_POSES, _PAIRS, _CAMERA_POSES) or file == find_trajectory(file.parent):
-        return file.parent
-    raise InputError(
-        f"{file}: needed a folder of posed panoramas or its file of poses, got another file; give the folder."
-    )
+def _is_pose_file(file: Path) -> bool:
+    return file.name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS) or file == find_trajectory(file.parent)
+
+
+def _read_tour_file(file: Path) -> list[Panorama]:
+    if not is_web_tour_file(file):
+        raise InputError(
+            f"{file}: needed a panorama, a folder of panoramas, its file of poses, or a web tour, got another file; "
+            "give the folder."
+        )
+    return read_web_tour(file)
+
+
+def _list_unposed(root: Path) -> list[Panorama]:
+    """The panoramas of a web tour in a folder, or else the pictures of the folder; a faulty tour gives a warning."""
+    source, problem = find_web_tour(root), None
+    if source is not None:
+        try:
+            return read_web_tour(source)
+        except InputError as error:
+            problem = error
+    try:
+        panoramas = list_photographs(root)
+    except InputError:
+        if problem is not None:
+            raise problem from None
+        raise
+    if problem is not None:
+        if not panoramas:
+            raise problem
+        warnings.warn(f"the web tour is left out: {problem}", category=InputWarning, stacklevel=3)
+    return panoramas
+
+
+def _make_unposed_pairs(folder: Path, panoramas: list[Panorama], near: float | None, far: float | None) -> list[Pair]:
+    """The pair of a single panorama; an error for more, whose poses must be estimated."""
+    if len(panoramas) > 1:
+        raise UnposedPanoramasError(folder, panoramas)
+    (pair,) = single_view_pairs(panoramas, folder, near, far)
+    return [dataclasses.replace(pair, name=folder.resolve().name)]
 
 
 def _find_collections(folder: Path, convention: str | None, depth: int) -> list[tuple[Path, Collection]]:
@@ -101,6 +146,8 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
         return [(folder, read_triplet(path, convention)) for path in triplets]
     if find_trajectory(folder) is not None:
         return [(folder, read_trajectory_folder(folder, convention))]
+    if find_web_tour(folder) is not None:
+        return []
     subfolders = _list_subfolders(folder, depth)
     return [found for sub in subfolders for found in _find_collections(sub, convention, depth - 1)]
 
@@ -118,6 +165,8 @@ def _find_panorama_folders(folder: Path, depth: int) -> list[Path]:
     has_poses = (folder / _POSES).exists() or is_loc360_sequence(folder) or is_matterport3d_scene(folder)
     if has_poses or triplet_files(folder) or find_trajectory(folder) is not None or list_panorama_files(folder):
         return [folder]
+    if find_web_tour(folder) is not None:
+        return [folder]
     return [found for sub in _list_subfolders(folder, depth) for found in _find_panorama_folders(sub, depth - 1)]
 
 
@@ -128,23 +177,22 @@ def _list_subfolders(folder: Path, depth: int) -> list[Path]:
 
 
 class UnposedPanoramasError(InputError):
-    """A folder holds two or more panoramas, and no poses in a known format."""
+    """A folder or web tour holds two or more panoramas, and no poses in a known format."""
 
-    def __init__(self, message: str, images: list[Path]) -> None:
-        super().__init__(message)
-        self.images = images
+    def __init__(self, folder: Path, panoramas: list[Panorama]) -> None:
+        names = _list_names([panorama.image.name for panorama in panoramas])
+        super().__init__(
+            f"{folder}: needed poses for the panoramas, got images only ({names}); add a pose file (docs/input.md)."
+        )
+        self.folder = folder
+        self.panoramas = panoramas
 
 
 def _nothing_found(root: Path) -> InputError:
-    images = list_panorama_files(root)
-    names = _list_names([path.name for path in images])
-    if len(images) >= 2:
-        message = f"{root}: needed poses for the panoramas, got images only ({names}); add a pose file (docs/input.md)."
-        return UnposedPanoramasError(message, images)
     inside = _list_names([str(folder.relative_to(root)) for folder in find_panorama_folders(root) if folder != root])
-    got = names or (f"some without poses in {inside}" if inside else "none")
+    got = f"some without poses in {inside}" if inside else "none"
     return InputError(
-        f"{root}: needed two or more panoramas (JPG, PNG, WebP or EXR), got {got}; give the folder that "
+        f"{root}: needed panoramas (JPG, PNG, WebP or EXR), got {got}; give the folder that "
         "holds them, or a folder whose subfolders have pose files (docs/input.md)."
     )
 
@@ -153,7 +201,7 @@ def _list_names(names: list[str]) -> str:
     return ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
 
 
-def _make_names_unique(pairs: list[Pair]) -> list[Pair]:
+def make_names_unique(pairs: list[Pair]) -> list[Pair]:
     """Prefix equal names with the folder's name, then append a number to names that are still equal."""
     counts = Counter(pair.name for pair in pairs)
     names = [p.name if counts[p.name] == 1 else f"{p.folder.resolve().name}_{p.name}" for p in pairs]
@@ -171,12 +219,12 @@ def _choose_convention(convention: str | None, default: str) -> str:
 # poses.json with an optional pairs.json: the package's own format.
 
 
-def read_pose_file_folder(folder: Path, convention: str | None = None, *, source: Path | None = None) -> Collection:
+def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collection:
     """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder.
 
-    `source` is the file of the poses, if it is not in the folder.
+    Warns about panoramas of the folder that have no pose.
     """
-    source = source or folder / _POSES
+    source = folder / _POSES
     content = read_json(source)
     entries = content.get("poses") if isinstance(content, dict) else None
     if not isinstance(entries, dict):
@@ -188,23 +236,29 @@ def read_pose_file_folder(folder: Path, convention: str | None = None, *, source
     text, origin = (content.get("convention"), source) if is_stated else (convention, "`convention`")
     convention = parse_convention(text, origin)
     panoramas = tuple(_read_pose_entry(folder, name, entry, convention, is_stated) for name, entry in entries.items())
-    if len(panoramas) < 2:
-        with_pose = {panorama.image.name for panorama in panoramas}
-        others = [path.name for path in list_panorama_files(folder) if path.name not in with_pose]
-        without = f"; images without a pose: {', '.join(others[:5])}" if others else ""
-        raise InputError(
-            f"{source}: needed poses of two or more panoramas, got {len(panoramas)}{without}; add what is missing."
+    if not panoramas:
+        raise InputError(f"{source}: needed poses of one or more panoramas, got none; add them or remove the file.")
+    files = [file for view in panoramas for file in (view.image, view.mask, view.depth) if file is not None]
+    unposed = list_further_photographs(folder, files)
+    if unposed:
+        warnings.warn(
+            f"{source} has no pose of {', '.join(view.image.name for view in unposed)}; each is a scene of its own.",
+            category=InputWarning,
+            stacklevel=4,
         )
+    linked = add_links([*panoramas, *unposed], folder)
     near, far = (number_field(content, key, source, needed="a number in metres") for key in ("near", "far"))
     groups = _read_groups(folder / _PAIRS, list(entries)) if (folder / _PAIRS).is_file() else None
-    is_single = (len(panoramas) - 1 if groups is None else len(groups)) == 1
+    count = max(len(panoramas) - 1, 1) if groups is None else len(groups)
+    is_single = count == 1 and (len(panoramas) > 1 or not unposed)
     return Collection(
         source,
-        panoramas,
+        tuple(linked[: len(panoramas)]),
         groups,
         near=NEAR if near is None else near,
         far=FAR if far is None else far,
         name=folder.resolve().name if is_single else None,
+        unposed=tuple(linked[len(panoramas) :]),
     )
 
 

@@ -14,22 +14,25 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray as Array
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from pansplat.atomic import replacing
+from pansplat.data.cube_images import CUBE_SUFFIX, read_cube
 from pansplat.data.panorama_metadata import make_gpano_xmp
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import read_file
+from pansplat.files import read_file, require_file
 
 READABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
 
 _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP")
 _MAX_BYTES = 1 << 31
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
+_ORIENTATION, _TURNED = 0x0112, (5, 6, 7, 8)  # tag of EXIF, and its values for a quarter turn
 _WRAP = 16  # margin of the wrap-around at +-180 degrees for the resampling filter, target pixels
 
 
@@ -61,7 +64,8 @@ def read_panorama(
     The image is resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees.
 
     Args:
-        path: JPG, PNG (8 or 16 bit), WebP or EXR file, 2:1.
+        path: JPG, PNG (8 or 16 bit), WebP or EXR file, 2:1; or a file that stands for cube faces
+            (pansplat.data.cube_images).
         height: pixels.
 
     Raises:
@@ -82,21 +86,49 @@ def read_panorama(
 
 
 def read_height(path: Path | str) -> int:
-    """Height of an image file, pixels; pixels of an EXR are decoded, those of other formats are not.
+    """Height of an image file, pixels; of cube faces that of the panorama that they give. No pixels are decoded.
 
     Raises:
         InputError: no such file, or an unknown format.
     """
+    return read_size(path)[1]
+
+
+def read_size(path: Path | str) -> tuple[int, int]:
+    """Width and height of an image file, pixels; see `read_height`."""
     path = Path(path)
-    data = _read_bytes(path)
-    if data.startswith(_EXR_MAGIC):
-        return len(_decode_exr(path).color)
-    return _open_with_pillow(path, data, load=False).height
+    if is_cube(path):
+        height = read_cube(path).height
+        return 2 * height, height
+    require_file(path, "a readable image file")
+    try:
+        with open(path, "rb") as file:
+            is_exr = file.read(len(_EXR_MAGIC)) == _EXR_MAGIC
+        if not is_exr:
+            with Image.open(path, formats=_PILLOW_FORMATS) as image:
+                if image.format == "PNG" and "exif" not in image.info:
+                    return image.size  # Pillow would decode the pixels to look for EXIF behind them
+                is_turned = image.getexif().get(_ORIENTATION) in _TURNED
+                return image.size[::-1] if is_turned else image.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return _open_with_pillow(path, _read_bytes(path), load=False).size  # its error names the reason
+    return _exr_size(path)
+
+
+def is_cube(path: Path) -> bool:
+    """Whether a file stands for the cube faces of a panorama."""
+    return path.name.endswith(CUBE_SUFFIX)
 
 
 def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height width"]:
     """A panorama at a small size; faster than `read_panorama`, because JPEGs are decoded at reduced size. No alpha."""
     return resize_panorama(_decode_panorama(path, height, reduced=True).color, height)
+
+
+def read_pixels(path: Path) -> UInt8[Array, "rows columns 3"]:
+    """Pixels of an image file of any proportions, 8 bit, without alpha."""
+    color = _decode(path).color
+    return color if color.dtype == np.uint8 else np.rint(color * 255).astype(np.uint8)
 
 
 def resize_panorama(pixels: NDArray[Any], height: int) -> Float[Tensor, "3 height width"]:
@@ -290,6 +322,8 @@ def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) ->
     """Pixels of a 2:1 image file. `reduced`: whether a JPEG may be decoded at a smaller size, of at least `height`."""
     path = Path(path)
     _check_height(height)
+    if is_cube(path):
+        return _DecodedImage(read_cube(path).read(height, read_pixels), None)
     decoded = _decode(path, height if reduced else None)
     _check_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
     return decoded
@@ -344,6 +378,19 @@ def _decode_png16(path: Path, data: bytes) -> _DecodedImage:
         return _DecodedImage(np.repeat(values[..., None], 3, axis=2), None)
     color = np.ascontiguousarray(values[..., 2::-1])
     return _DecodedImage(color, np.ascontiguousarray(values[..., 3]) if values.shape[2] == 4 else None)
+
+
+def _exr_size(path: Path) -> tuple[int, int]:
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            corners = np.array(file.header()["dataWindow"])
+    except Exception as error:  # OpenEXR has no base class of its errors
+        raise InputError(
+            f"{path}: needed a complete EXR image, got a damaged header ({error}); export it again."
+        ) from error
+    return int(corners[1, 0] - corners[0, 0] + 1), int(corners[1, 1] - corners[0, 1] + 1)
 
 
 def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:

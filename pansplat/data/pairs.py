@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_height, read_mask, read_panorama
 from pansplat.data.masks import lift_black_surfaces, scene_mask_of_files
-from pansplat.data.views import Views
+from pansplat.data.views import CAMERA_HEIGHT, Views
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import require_depth_range, working_factor
 
@@ -48,7 +49,7 @@ class Panorama:
 
     Attributes:
         name: the stem of the file name, or the view's folder where all files have the same name.
-        image: JPG, PNG, WebP or EXR file.
+        image: JPG, PNG, WebP or EXR file, or a file that stands for cube faces (pansplat.data.cube_images).
         cam2world: float64, OpenCV axes, metres.
         mask: image that is white where the panorama shows the scene; None to detect static content.
         depth: radial depth, 16-bit PNG in millimetres or EXR in metres; None when there is none.
@@ -78,15 +79,18 @@ class Panorama:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Context and target panoramas of one scene; a scene of a single view has one context panorama. Image files are read by `load_context` and `load_targets`.
+    """Context and target panoramas of one scene; a scene of a single view has one context panorama.
+
+    Image files are read by `load_context` and `load_targets`.
 
     Attributes:
         name: unique among the pairs that were loaded together; valid as a file name.
         folder: folder of the files.
-        context: one or more panoramas, the input of a predictor.
+        context: the input of a predictor; one panorama in a scene of a single view.
         targets: panoramas for comparison; may be empty.
         near, far: radial depth range to search, metres.
         siblings: all panoramas taken with the same camera; static content is detected in them.
+        camera_height: over the floor, metres; the scale of a single view.
     """
 
     name: str
@@ -96,6 +100,7 @@ class Pair:
     near: float
     far: float
     siblings: tuple[Path, ...] = field(default=(), repr=False)
+    camera_height: float = CAMERA_HEIGHT
 
     @property
     def image_height(self) -> int:
@@ -154,6 +159,7 @@ class Pair:
             near=self.near,
             far=self.far,
             names=tuple(p.name for p in panoramas),
+            camera_height=self.camera_height,
             depths=torch.stack(depths) if depths and len(depths) == len(panoramas) else None,
         )
 
@@ -188,6 +194,7 @@ class Collection:
         ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
         near, far: metres.
         name: name of the only pair; None to join the names of the context views.
+        unposed: panoramas of the folder without a pose; each is a scene of its own.
     """
 
     source: Path
@@ -197,18 +204,20 @@ class Collection:
     near: float = NEAR
     far: float = FAR
     name: str | None = None
+    unposed: tuple[Panorama, ...] = ()
 
     def pairs(self, folder: Path, near: float | None = None, far: float | None = None) -> list[Pair]:
-        """One pair per group, those with targets first. `near` and `far` (metres) override the collection's values.
+        """One pair per group, those with targets first, then one of a single view for each panorama without a pose.
+
+        Args:
+            folder: of the files.
+            near, far: metres; they override the collection's values.
 
         Raises:
-            InputError: fewer than two panoramas, or an invalid depth range.
+            InputError: no panorama has a pose, or the depth range is invalid.
         """
-        if len(self.panoramas) < 2:
-            raise InputError(
-                f"{self.source}: needed two or more posed panoramas, got {len(self.panoramas)}; "
-                "add the other panorama and its pose."
-            )
+        if not self.panoramas:
+            raise InputError(f"{self.source}: needed posed panoramas, got none; add them and their poses.")
         near, far = self.near if near is None else near, self.far if far is None else far
         require_depth_range(near, far, self.source, 'set "near" and "far" in poses.json or on the command line')
         siblings = tuple(panorama.image for panorama in self.panoramas)
@@ -217,10 +226,14 @@ class Collection:
             context, targets = (tuple(self.panoramas[i] for i in part) for part in indices)
             name = self.name or "-".join(view.name for view in context)
             pairs.append(Pair(name, folder, context, targets, near, far, siblings))
-        return pairs
+        first_part = 1 + max(panorama.part for panorama in self.panoramas)
+        every = (*self.panoramas, *self.unposed)
+        return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_part=first_part)
 
     def _select_groups(self) -> list[ViewGroup]:
         """The given groups without repeated contexts, those with targets first; else pairs of neighbours."""
+        if len(self.panoramas) == 1:
+            return [((0,), ())]
         if self.groups is None:
             return [(pair, ()) for pair in self._neighbours()]
         with_targets = [group for group in self.groups if group[1]]
@@ -255,6 +268,35 @@ class Collection:
             parent[distance_to_new < distance] = new
             distance = torch.minimum(distance, distance_to_new)
         return sorted(edges)
+
+
+def single_view_pairs(
+    panoramas: Sequence[Panorama],
+    folder: Path,
+    near: float | None,
+    far: float | None,
+    *,
+    siblings: Sequence[Panorama] | None = None,
+    first_part: int = 0,
+) -> list[Pair]:
+    """A pair of one view for each panorama.
+
+    Args:
+        folder: of the tour; predictions are cached there.
+        near, far: metres; None for the range of rooms.
+        siblings: panoramas of the same camera, by default the same ones.
+        first_part: number of the first part; each panorama is the next one.
+
+    Raises:
+        InputError: an invalid depth range.
+    """
+    near, far = NEAR if near is None else near, FAR if far is None else far
+    require_depth_range(near, far, folder, 'set "near" and "far" on the command line')
+    images = tuple(panorama.image for panorama in (panoramas if siblings is None else siblings))
+    return [
+        Pair(view.name, folder, (replace(view, part=part),), (), near, far, images)
+        for part, view in enumerate(panoramas, start=first_part)
+    ]
 
 
 def find_mask(image: Path, folder: Path) -> Path | None:

@@ -19,9 +19,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from PIL import Image
+
 Projection = Literal["equirect", "cubemap"]
 Stereo = Literal["mono", "top-bottom", "side-by-side"]
 
+_PACKETS = "xmp", "XML:com.adobe.xmp"  # where Pillow stores the packet, by the file's format
 _SPHERICAL_V1 = uuid.UUID("ffcc8263-f855-4a93-8814-587a02521fdd").bytes
 _STEREO_V1 = {"mono": "mono", "top-bottom": "top-bottom", "side-by-side": "left-right"}
 _STEREO_V2 = {"mono": b"\0", "top-bottom": b"\1", "side-by-side": b"\2"}
@@ -56,6 +59,16 @@ def make_gpano_xmp(width: int, height: int) -> bytes:
         f'<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {attributes}/>'
         '</rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
     ).encode()
+
+
+def read_xmp(path: Path) -> bytes:
+    """The XMP packet of an image file; empty if there is none, or the file cannot be read."""
+    try:
+        with Image.open(path) as image:
+            packet = next((image.info[name] for name in _PACKETS if name in image.info), b"")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # reported when the pixels are read
+        return b""
+    return packet if isinstance(packet, bytes) else str(packet).encode()
 
 
 def mark_spherical_video(path: Path, projection: Projection = "equirect", stereo: Stereo = "mono") -> None:

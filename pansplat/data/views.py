@@ -11,6 +11,8 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 
+CAMERA_HEIGHT = 1.5  # metres over the floor, of a camera whose height is not known
+
 
 @dataclass(frozen=True, eq=False)
 class Views:
@@ -23,6 +25,7 @@ class Views:
         near, far: radial depth range to search, metres.
         names: one per view, for messages and file names.
         depths: radial distance in metres, 0 where unknown; None when the data set has no depth.
+        camera_height: over the floor, metres; the scale of a single view.
     """
 
     images: Float[Tensor, "view 3 height width"]
@@ -32,6 +35,7 @@ class Views:
     far: float
     names: tuple[str, ...]
     depths: Float[Tensor, "view height width"] | None = None
+    camera_height: float = CAMERA_HEIGHT
 
 
 def select_views(views: Views, indices: Sequence[int]) -> Views:

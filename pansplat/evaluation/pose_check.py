@@ -17,6 +17,7 @@ from torch import Tensor
 
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
+from pansplat.errors import InputError
 from pansplat.geometry.equirect import pad_equirect, pixel_directions, row_weights, uv_from_directions
 from pansplat.geometry.pose import invert_pose
 
@@ -82,7 +83,13 @@ class PoseCheck:
 
 
 def check_pair(pair: Pair) -> PoseCheck:
-    """Check the poses of a pair's context views against their images; takes seconds."""
+    """Check the poses of a pair's context views against their images; takes seconds.
+
+    Raises:
+        InputError: an image cannot be used, or there is one view only.
+    """
+    if len(pair.context) < 2:
+        raise InputError(f"{pair.name}: needed two or more views to check their poses, got one; choose another pair.")
     return check_views(pair.load_context(_HEIGHT), pair.name)
 
 

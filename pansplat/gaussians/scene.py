@@ -93,11 +93,14 @@ class Gaussians:
             values.append(value.to(device=device, dtype=dtype if value.is_floating_point() else None))
         return Gaussians(*values)
 
-    def scaled(self, factor: float) -> Gaussians:
-        """The Gaussians in a world that is multiplied by a factor."""
+    def scaled(self, factor: float, centre: Float[Tensor, "3"] | None = None) -> Gaussians:
+        """The Gaussians in a world that is multiplied by a factor, about its origin or another centre."""
         if factor == 1:
             return self
-        return dataclasses.replace(self, means=self.means * factor, scales=self.scales * factor)
+        means = self.means * factor
+        if centre is not None:
+            means = means + (1 - factor) * centre.to(means)
+        return dataclasses.replace(self, means=means, scales=self.scales * factor)
 
     def rotated(self, rotation: Float[Tensor, "3 3"]) -> Gaussians:
         """The Gaussians after a rotation of the world about its origin; colours turn with it."""

@@ -23,7 +23,7 @@ from pansplat.model.efficientnet import CHANNELS, EfficientNetLite0
 from pansplat.model.layers import PanoramaConv2d, attend, convolve_and_normalize
 
 MAX_LOG_SCALE = 3.0  # bound of the logarithm of the Laplace scale
-_MEAN_LOG_DEPTH = 0.6  # of generated homes, in camera heights
+MEAN_LOG_DEPTH = 0.6  # of generated homes, in camera heights
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class DepthNetwork(nn.Module):
         """The estimate of decoded features."""
         maps = self.head(features)
         log_scale = MAX_LOG_SCALE * torch.tanh((maps[:, 1] - 1.0) / MAX_LOG_SCALE)
-        return DepthEstimate(maps[:, 0] + _MEAN_LOG_DEPTH, log_scale)
+        return DepthEstimate(maps[:, 0] + MEAN_LOG_DEPTH, log_scale)
 
     def encode(
         self, images: Float[Tensor, "batch 3 height width"]

@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
-from PIL import Image
 
-from pansplat.data.images import read_mask, read_panorama
+from pansplat.data.images import read_height, read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.pairs import FAR, NEAR, find_mask
 from pansplat.errors import InputError
@@ -125,7 +124,8 @@ def estimate_poses(
         The poses of the panoramas that could be placed; those that could not are named with the reason.
 
     Raises:
-        InputError: fewer than two images, an unreadable one, or no two panoramas could be placed.
+        NoPosesError: no two panoramas could be placed.
+        InputError: fewer than two images, or a file is missing.
     """
     paths = tuple(dict.fromkeys(Path(image) for image in images))
     report = progress or (lambda what, fraction: None)
@@ -187,9 +187,21 @@ def estimate_poses(
     )
 
 
-def _no_poses(paths: Sequence[Path], reasons: Mapping[int, str]) -> InputError:
-    listed = "; ".join(f"{paths[n].name}: {reasons[n]}" for n in sorted(reasons))
-    return InputError(f"no poses were found: {listed}.")
+class NoPosesError(InputError):
+    """No two panoramas could be placed.
+
+    Attributes:
+        reasons: for each file.
+    """
+
+    def __init__(self, reasons: Mapping[Path, str]) -> None:
+        listed = "; ".join(f"{path.name}: {reason}" for path, reason in reasons.items())
+        super().__init__(f"no poses were found: {listed}.")
+        self.reasons = dict(reasons)
+
+
+def _no_poses(paths: Sequence[Path], reasons: Mapping[int, str]) -> NoPosesError:
+    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)})
 
 
 def _read_images(
@@ -236,11 +248,7 @@ def _is_closed(grey: UInt8[Array, "height width"]) -> bool:
 
 def _working_height(path: Path) -> int:
     """The height of an image, at most `_HEIGHT`; enlarged images would have a wrong noise."""
-    try:
-        with Image.open(path) as image:
-            return min(max(image.height, _MIN_HEIGHT), _HEIGHT)
-    except (OSError, ValueError, Image.DecompressionBombError):  # an EXR, or reported by `read_panorama`
-        return _HEIGHT
+    return min(max(read_height(path), _MIN_HEIGHT), _HEIGHT)
 
 
 def _describe_views(

@@ -6,7 +6,8 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,19 @@ import numpy as np
 import torch
 
 from pansplat.atomic import replacing
-from pansplat.cache import cache_folders, write_cache_file
-from pansplat.data.folders import read_pose_file_folder
-from pansplat.data.pairs import Pair
-from pansplat.errors import InputError
+from pansplat.cache_folders import cache_folders, write_cache_file
+from pansplat.data.folders import make_names_unique
+from pansplat.data.images import read_thumbnail
+from pansplat.data.pairs import Collection, Pair, Panorama, single_view_pairs
+from pansplat.data.poses import rigid_matrix, to_cam2world
+from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
-from pansplat.poses.estimate import PoseEstimate, estimate_poses
+from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
 from pansplat.predictor import Progress
 from pansplat.strict_json import read_json
 
-_FORMAT = "2"  # version of the estimate; part of the cache's key
+_FORMAT = "3"  # version of the estimate and of its cached file; part of the cache's key
+_CONVENTION = "cam2world opencv"
 SUFFIXES = (".json", ".tum", ".kitti")
 
 
@@ -61,10 +65,8 @@ def _write(path: Path, text: str) -> None:
 
 def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
     return {
-        "convention": "cam2world opencv",
-        "near": round(estimate.near, 3),
-        "far": round(estimate.far, 3),
-        "poses": {names[image]: np.round(pose, 9).tolist() for image, pose in estimate.poses.items()},
+        "convention": _CONVENTION,
+        **_make_part(estimate, names),
         "estimate": {
             "summary": estimate.summary,
             "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
@@ -72,47 +74,117 @@ def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str
     }
 
 
+def _make_part(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
+    return {
+        "near": round(estimate.near, 3),
+        "far": round(estimate.far, 3),
+        "poses": {names[image]: np.round(pose, 9).tolist() for image, pose in estimate.poses.items()},
+    }
+
+
 def estimate_pairs(
     folder: Path,
-    images: list[Path],
+    panoramas: Sequence[Panorama],
     *,
     near: float | None = None,
     far: float | None = None,
     progress: Progress | None = None,
 ) -> list[Pair]:
-    """The pairs of a folder of panoramas without poses; the estimated poses are cached like predictions.
+    """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
 
-    A warning states the figures of the check, and the panoramas that have no pose.
+    Panoramas that are placed together are a part. Each other one is a part of its own, a pair of a single view, after
+    them. Warnings state the figures of the check, and name the panoramas without a pose and those that cannot be read.
+
+    Args:
+        folder: of the tour.
+        panoramas: two or more, of unique names.
+        near, far: metres; they override the estimated range.
+        progress: called with a description of the current work and the completed fraction.
 
     Raises:
-        InputError: see `estimate_poses`.
+        InputError: a file is missing, or none can be read.
     """
+    images = [panorama.image for panorama in panoramas]
     name = f"poses-{_hash_files(images)}.json"
     folders = cache_folders(folder)
     source = next((cache / name for cache in folders if (cache / name).is_file()), None)
     if source is None:
-        estimate = estimate_poses(images, progress=progress)
-        content = _make_content(estimate, {image: image.name for image in images})
+        content = _estimate(panoramas, progress)
         source = write_cache_file(folders, name, json.dumps(content).encode())
         if source is None:
             raise InputError(
                 f"{folder}: needed a writable cache folder for the poses, got none of {folders}; make one."
             )
-    _report(folder, read_json(source))
-    return read_pose_file_folder(folder, source=source).pairs(folder, near, far)
+    return _make_pairs(folder, panoramas, read_json(source), source, near, far)
 
 
-def _report(folder: Path, content: dict[str, Any]) -> None:
-    estimate = content["estimate"]
-    warnings.warn(
-        f"{folder} has no poses; they were estimated: {estimate['summary']}. `pansplat pose` writes them to a file.",
-        stacklevel=4,
-    )
-    for image, reason in estimate["unplaced"].items():
-        warnings.warn(f"{image} has no pose: {reason}", stacklevel=4)
+def _estimate(panoramas: Sequence[Panorama], progress: Progress | None) -> dict[str, Any]:
+    """What is cached: parts of placed panoramas, and the reasons for the others, by name."""
+    names = {panorama.image: panorama.name for panorama in panoramas}
+    try:
+        estimate = estimate_poses(list(names), progress=progress)
+    except NoPosesError as error:
+        parts, summary, unplaced = [], "", error.reasons
+    else:
+        parts, summary, unplaced = [_make_part(estimate, names)], estimate.summary, estimate.unplaced
+    unreadable = [image for image in unplaced if not _is_readable(image)]
+    if len(unreadable) == len(panoramas):
+        raise NoPosesError(unplaced)
+    return {
+        "parts": parts,
+        "summary": summary,
+        "unplaced": {names[image]: reason for image, reason in unplaced.items()},
+        "unreadable": [names[image] for image in unreadable],
+    }
 
 
-def _hash_files(images: list[Path]) -> str:
+def _is_readable(image: Path) -> bool:
+    try:
+        read_thumbnail(image, 16)
+    except InputError:
+        return False
+    return True
+
+
+def _make_pairs(
+    folder: Path,
+    panoramas: Sequence[Panorama],
+    content: Mapping[str, Any],
+    source: Path,
+    near: float | None,
+    far: float | None,
+) -> list[Pair]:
+    """The pairs of a cached estimate, with its warnings."""
+    by_name = {panorama.name: panorama for panorama in panoramas}
+    unplaced, unreadable = content["unplaced"], content["unreadable"]
+    if content["parts"]:
+        is_flat = all(panorama.image.parent == folder for panorama in panoramas)
+        advice = " `pansplat pose` writes them to a file." if is_flat else ""
+        warnings.warn(f"{folder} has no poses; they were estimated: {content['summary']}.{advice}", stacklevel=4)
+    for name, reason in unplaced.items():
+        panorama = by_name[name]
+        outcome = "cannot be read and is left out" if name in unreadable else "has no pose and is a scene of its own"
+        warnings.warn(f"{panorama.image}{_in_brackets(panorama.title)} {outcome}: {reason}", InputWarning, stacklevel=4)
+    pairs = []
+    for number, part in enumerate(content["parts"]):
+        placed = tuple(
+            replace(by_name[name], cam2world=to_cam2world(rigid_matrix(pose, str(source)), _CONVENTION), part=number)
+            for name, pose in part["poses"].items()
+        )
+        only = folder.resolve().name if len(placed) == 2 else None
+        pairs += Collection(source, placed, near=part["near"], far=part["far"], name=only).pairs(folder, near, far)
+    readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
+    single = [panorama for panorama in readable if panorama.name in unplaced]
+    first_part = len(content["parts"])
+    pairs += single_view_pairs(single, folder, near, far, siblings=readable, first_part=first_part)
+    return make_names_unique(pairs)
+
+
+def _in_brackets(title: str) -> str:
+    return f" ({title})" if title else ""
+
+
+def _hash_files(images: Sequence[Path]) -> str:
     digest = hashlib.blake2b(_FORMAT.encode(), digest_size=12)
     for image in images:
         state = image.stat()

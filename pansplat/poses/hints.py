@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
-from PIL import Image
+
+from pansplat.data.panorama_metadata import read_xmp
 
 _TAG = re.compile(r"(?<!/)GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)")
-_PACKETS = "xmp", "XML:com.adobe.xmp"  # where Pillow stores the packet, by the file's format
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +39,7 @@ class Hints:
 
 def read_hints(path: Path) -> Hints:
     """The hints of a file; none if it is unreadable or has no such tags."""
-    try:
-        with Image.open(path) as image:
-            packet = next((image.info[name] for name in _PACKETS if name in image.info), "")
-    except (OSError, ValueError, Image.DecompressionBombError):  # reported when the pixels are read
-        return Hints()
-    text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else str(packet)
+    text = read_xmp(path).decode("utf-8", "replace")
     tags = {name: attribute or element for name, attribute, element in _TAG.findall(text)}
     pitch, roll = _radians(tags, "PosePitchDegrees"), _radians(tags, "PoseRollDegrees")
     down = None

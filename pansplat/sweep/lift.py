@@ -187,8 +187,10 @@ def _lift_level(scene: _PosedSurfaces, view: int, level: int, replaced: np.ndarr
     """The points of a level that finer lattices do not replace."""
     image, inverse, mask = scene.posed.images[view], scene.surfaces[view].inverse_depth, scene.posed.masks[view]
     if level >= 2:
-        color, inverse = _background_layer(image, inverse, mask, level, scene.config)
-        return _lift_lattice(scene, view, level, color, inverse, mask)
+        # No other view shows what a single one masks, and its depth is the prior's: the background continues there.
+        covered = mask if len(scene.surfaces) > 1 else np.ones_like(mask)
+        color, inverse = _background_layer(image, inverse, mask, covered, level, scene.config)
+        return _lift_lattice(scene, view, level, color, inverse, covered)
     needed = mask & ~replaced & (_choose_levels(image, inverse, scene.config) == level)
     height = len(image) >> level
     return _lift_lattice(scene, view, level, resize_sphere(image, height), resize_sphere(inverse, height), needed)
@@ -258,11 +260,15 @@ def _choose_levels(image: np.ndarray, inverse: np.ndarray, config: LiftConfig) -
 
 
 def _background_layer(
-    image: np.ndarray, inverse: np.ndarray, mask: np.ndarray, level: int, config: LiftConfig
+    image: np.ndarray, inverse: np.ndarray, mask: np.ndarray, covered: np.ndarray, level: int, config: LiftConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Image and inverse depth of the background at level 2 or 3."""
+    """Image and inverse depth of the background at level 2 or 3.
+
+    Args:
+        mask, covered: where the image shows the scene, and where the depth is that of the scene.
+    """
     height = image.shape[0] >> level
-    far = _background_inverse_depth(inverse, mask, level, config)
+    far = _background_inverse_depth(inverse, covered, level, config)
     # Colours of the pixels at or behind the layer, extrapolated over the gaps between them.
     behind = mask & (inverse <= 1.15 * resize_sphere(far, image.shape[0]))
     weight = resize_sphere(behind.astype(np.float32), height)

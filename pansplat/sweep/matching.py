@@ -27,6 +27,7 @@ import numpy as np
 
 from pansplat.geometry.equirect import row_weights
 from pansplat.sweep.surface import pad_sphere, ray_grid
+from pansplat.threads import limit_numba_threads
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
 _BLOCK = 8  # hypotheses that a thread processes together
@@ -443,6 +444,7 @@ def compute_matching_cost(
     weights = _Weights(*(np.float32(getattr(config, name)) for name in _Weights._fields))
     count = sets[0].penalty.shape[1]
     cost = np.empty((height, width, len(sets) * count), np.float32)
+    limit_numba_threads()
     for n, own in enumerate(sets):
         back_facing = np.zeros((2, count), bool) if own.back_facing is None else own.back_facing
         hypotheses = _Set(own.base, own.step, own.penalty, own.side, back_facing)
@@ -612,9 +614,14 @@ def aggregate_costs(
     return first
 
 
-@nb.njit(parallel=True, cache=True)
 def select_labels(total: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Label of lowest cost (h, w) int32, and its subpixel offset in [-0.5, 0.5] labels by a parabola fit."""
+    limit_numba_threads()
+    return _select_labels(total, count)
+
+
+@nb.njit(parallel=True, cache=True)
+def _select_labels(total, count):
     height, width, labels = total.shape
     label = np.empty((height, width), np.int32)
     offset = np.zeros((height, width), np.float32)

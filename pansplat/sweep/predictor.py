@@ -109,8 +109,9 @@ class Sweep:
         report("placing Gaussians", 0.7)
         gaussians = lift(posed, surfaces, self.config.lift)
         report("fitting colours", 0.8)
-        # Holes of scans are fitted too: Gaussians next to a hole then do not reach into it.
+        # Holes of scans are fitted too: Gaussians next to a hole then do not reach into it. A single view fills them.
         visible = torch.ones_like(images[:, 0], dtype=torch.bool) if masks is None else masks
+        visible = torch.from_numpy(posed.masks) if len(images) == 1 else visible
         gaussians = fit_colors(
             gaussians, images.detach().cpu(), torch.from_numpy(posed.cam2world), visible.cpu(), self.config.colors
         )

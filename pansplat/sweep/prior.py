@@ -20,16 +20,17 @@ import numba as nb
 import numpy as np
 import torch
 
+from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.geometry.equirect import rotate_equirect
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
 from pansplat.sweep.surface import Surface, resize_sphere
+from pansplat.threads import limit_numba_threads
 
 _HEIGHT_CANDIDATES = 64
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
-_USUAL_HEIGHT = 1.5  # metres, of a camera over the floor
 _HEIGHT_PENALTY = 0.06  # matching cost of a height by a factor of e from the usual one
 _FLOOR_TOLERANCE = 0.15  # in camera heights, from the floor to the pixels that the model places on it
 _SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
@@ -83,6 +84,10 @@ class ObservedViews(Protocol):
 
     priors: list[DepthPrior]
 
+    def sharpen(self) -> list[np.ndarray]:
+        """Log-depth (h, w) of each panorama by itself, larger than the priors, with the edges of the photograph."""
+        ...
+
     def refine(self, estimates: Sequence[DepthPrior], cam2world: np.ndarray, iterations: int) -> list[DepthPrior]:
         """Estimates in the unit of the poses (v, 4, 4), refined by comparison of the views."""
         ...
@@ -126,14 +131,18 @@ class PriorEstimator:
                 pose[:3, :3] = pose[:3, :3] @ turn
         self._priors: list[list[DepthPrior]] = [[] for _ in self._turns]
 
-    def estimate_at_usual_height(self, limits: tuple[float, float]) -> list[DepthPrior]:
-        """The model's first estimates with a usual camera height, for cameras that coincide.
+    def sharpen(self, limits: tuple[float, float]) -> list[np.ndarray]:
+        """Log-depth (h, w) of each view by itself, with a usual camera height, for views that cannot be matched.
 
         Args:
             limits: smallest and largest inverse height of the cameras over the floor.
         """
-        height = min(max(_USUAL_HEIGHT, 1 / limits[1]), 1 / limits[0])
-        return self._turn_back(_scale_depth(self._observed.priors, [height] * len(self._turns)))
+        height = min(max(CAMERA_HEIGHT, 1 / limits[1]), 1 / limits[0])
+        upright = [log_depth + math.log(height) for log_depth in self._observed.sharpen()]
+        return [
+            log_depth if turn is None else _rotate_image(log_depth[..., None], turn.T)[..., 0]
+            for log_depth, turn in zip(upright, self._turns, strict=True)
+        ]
 
     def estimate_by_matching(
         self, views: Sequence[View], limits: tuple[float, float], matching: MatchingConfig
@@ -220,7 +229,7 @@ def _estimate_camera_heights(
     low, high = limits
     for penalty in (_HEIGHT_PENALTY, 0.01 * _HEIGHT_PENALTY):  # all heights, then the ones around the best
         candidates = np.linspace(low, high, _HEIGHT_CANDIDATES)  # inverse heights
-        total = unit * penalty * np.abs(np.log(_USUAL_HEIGHT * candidates))
+        total = unit * penalty * np.abs(np.log(CAMERA_HEIGHT * candidates))
         for n, prior in enumerate(priors):
             own = 1 / np.maximum(1 / candidates + above[n], 1 / limits[1])  # this camera's, by the mean's
             sampled = np.linspace(own[0], max(own[-1], own[0] + 1e-6), _HEIGHT_CANDIDATES)
@@ -273,6 +282,7 @@ def apply_prior_cost(
     log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
     scale = np.stack([np.maximum(prior.scale, config.min_scale) for prior in priors]).astype(np.float32)
     penalty = np.where(np.arange(len(priors)) > 0, config.further_penalty, 0).astype(np.float32)
+    limit_numba_threads()
     for n, hypotheses in enumerate(sets):
         _add_cost(
             cost, log_depth, scale, penalty, hypotheses.base, hypotheses.step, n * count, count,

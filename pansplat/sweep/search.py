@@ -37,7 +37,14 @@ from pansplat.sweep.planes import (
     make_empty_planes,
 )
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
-from pansplat.sweep.surface import Surface, consistency_mask, guided_upsample, resize_mask, resize_sphere
+from pansplat.sweep.surface import (
+    Surface,
+    consistency_mask,
+    guided_upsample,
+    resize_mask,
+    resize_nearest,
+    resize_sphere,
+)
 
 _DETECTION_HEIGHT = 128  # pixels; planes are detected at this size
 
@@ -114,17 +121,12 @@ def search_surfaces(
     step, candidates = depths.step(count), depths.sample(count)
     planes = make_empty_planes(posed.cam2world, axes, posed.near, 1 / depths.farthest)
     detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), planes, depths.limits, config, None)
-    coincident, estimator = posed.baseline < 1e-3 * posed.near, None
+    estimator = None
     if prior_model is not None:
         report("estimating depth", 0.02)
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
-    if coincident:  # nothing can be matched
-        shape = (finest, 2 * finest)
-        inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
-        if estimator is not None:
-            first = estimator.estimate_at_usual_height((low, high))
-            inverse = np.stack([np.exp(-prior.resize(finest).log_depth) for prior in first]).clip(low, high)
-        return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
+    if posed.baseline < 1e-3 * posed.near:  # of one view, or of views at one place: nothing can be matched
+        return _place_unmatched(posed, finest, depths, estimator)
     priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
         priors = estimator.estimate_by_matching(detection.views, (low, high), config.matching)
@@ -152,6 +154,19 @@ def search_surfaces(
         ]
     assert surfaces is not None
     return surfaces
+
+
+def _place_unmatched(
+    posed: PosedImages, height: int, depths: DepthRange, estimator: PriorEstimator | None
+) -> list[Surface]:
+    """Surfaces of the prior alone; without a prior, spheres in the middle of the range."""
+    shape = (height, 2 * height)
+    if estimator is None:
+        inverse = np.full((len(posed.images), *shape), 0.5 * (depths.low + depths.high))
+    else:
+        sharp = estimator.sharpen((depths.low, depths.high))
+        inverse = np.stack([np.exp(-resize_nearest(values, height)) for values in sharp]).clip(*depths.limits)
+    return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
 
 
 class _SearchLevel:

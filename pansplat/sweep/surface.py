@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from pansplat.geometry.equirect import pixel_directions, uv_from_directions
+from pansplat.threads import limit_numba_threads
 
 
 def ray_grid(height: int) -> np.ndarray:
@@ -50,6 +51,13 @@ def resize_sphere(image: np.ndarray, height: int) -> np.ndarray:
     size = 2 * (height + scaled), height + 2 * scaled
     large = cv2.resize(pad_sphere(image, margin), size, interpolation=cv2.INTER_LINEAR)
     return np.ascontiguousarray(large[scaled:-scaled, scaled:-scaled])
+
+
+def resize_nearest(values: np.ndarray, height: int) -> np.ndarray:
+    """A panorama (h, w) at another height: the nearest pixel when smaller, so that edges stay, bilinear when larger."""
+    if height >= len(values):
+        return resize_sphere(values, height)
+    return cv2.resize(values, (2 * height, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:
@@ -123,6 +131,7 @@ def guided_upsample(
     """
     if needed is None:
         needed = np.ones(fine.shape[:2], bool)
+    limit_numba_threads()
     return Surface(*_upsample(surface.inverse_depth, surface.orientation, coarse, fine, needed))
 
 

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 from torch import Tensor
 
 from pansplat.data.pairs import Link, Pair, Panorama
-from pansplat.gaussians.scene import Gains, Gaussians, Scene
+from pansplat.gaussians.scene import Gains, Gaussians, Scene, Starts
 from pansplat.geometry.path import level_pose, up_direction
 from pansplat.geometry.world import working_factor
 from pansplat.tours.layout import REACH, lay_out
@@ -286,13 +286,16 @@ class TourGraph:
 
         Args:
             start: its first node; None chooses the start of the shortest walk, of some starts for more than 100 nodes.
-                A tour of parts with links starts at its first node, as its author has chosen.
+                A tour of parts with links starts at its first node, as its author has chosen, and one without links in
+                its largest part.
         """
         costs, _ = self._shortest
-        count = len(self)
-        if start is None and self.links and max(self.parts) > 0:
-            start = 0
-        starts = range(0, count, math.ceil(count**2 / _MAX_STARTS)) if start is None else (start,)
+        starts = np.arange(len(self)) if start is None else np.array([start])
+        if start is None and max(self.parts) > 0:
+            starts = (
+                starts[:1] if self.links else np.flatnonzero(np.array(self.parts) == np.bincount(self.parts).argmax())
+            )
+        starts = starts[:: math.ceil(len(starts) * len(self) / _MAX_STARTS)].tolist()
         orders = [_improve_order(_order_by_distance(costs, first), costs) for first in starts]
         order = min(orders, key=lambda order: float(costs[order[:-1], order[1:]].sum()))
         first, *others = order.tolist()
@@ -423,7 +426,6 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
             panorama = tour.panoramas[node]
             names[node] = panorama.title or (scene.names[view] if view < len(scene.names) else panorama.name)
     assert scene is not None
-    starts = tuple(None if view.start is None else _wrap(view.start) for view in tour.panoramas)
     return dataclasses.replace(
         scene,
         gaussians=Gaussians.cat([parts[node] for node in range(len(tour))]),
@@ -434,8 +436,14 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
         gains=_join_gains(gains, tour.parts),
         overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
         links=tuple((a, b, *_wrap((link.yaw, link.pitch)), link.text) for (a, b), link in tour.links.items()),
-        starts=starts if any(starts) else (),
+        starts=list_starts(tour.panoramas),
     )
+
+
+def list_starts(panoramas: Sequence[Panorama]) -> Starts:
+    """The start views of panoramas, as a scene keeps them; nothing if there is none."""
+    starts = tuple(None if panorama.start is None else _wrap(panorama.start) for panorama in panoramas)
+    return starts if any(starts) else ()
 
 
 def _wrap(angles: tuple[float, float]) -> tuple[float, float]:

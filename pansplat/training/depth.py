@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -49,10 +49,7 @@ from pansplat.training.logs import CsvTable, ProgressDisplay
 from pansplat.training.optimization import ExponentialMovingAverage
 from pansplat.training.stopping import StopRequest
 
-_TERMS = ("loss", "mono_error", "mono_likelihood", "refined_error", "refined_likelihood")
-_COLUMNS = (*_TERMS, "rate", "gradient_norm", "seconds")
-_MEASURES = (*_TERMS[1:], "mono_relative_error", "refined_relative_error")
-_MAX_DEPTH = 12.0  # in camera heights; surfaces farther away are all "far"
+MAX_DEPTH = 12.0  # in camera heights; surfaces farther away are all "far"
 _TYPICAL_BASELINE = 2.0  # metres
 _SCALES = (1, 2, 4)  # pixels, of the loss on differences between neighbours
 
@@ -162,7 +159,7 @@ def depth_targets(
     if generator is not None:
         chosen = torch.randint(4, blocks.shape[:-1], generator=generator)
     depth = blocks.gather(-1, chosen[..., None]).squeeze(-1)
-    relative = (depth / camera_height[:, None, None]).clamp(1e-3, _MAX_DEPTH)
+    relative = (depth / camera_height[:, None, None]).clamp(1e-3, MAX_DEPTH)
     return relative.log(), depth > 0
 
 
@@ -232,7 +229,15 @@ def training_terms(
 
 
 class DepthTrainer:
-    """A training run, resumed from its latest checkpoint if there is one."""
+    """A training run, resumed from its latest checkpoint if there is one.
+
+    A subclass trains another network with other terms.
+    """
+
+    TERMS: ClassVar[tuple[str, ...]] = (
+        "loss", "mono_error", "mono_likelihood", "mono_relative_error",
+        "refined_error", "refined_likelihood", "refined_relative_error",
+    )  # fmt: skip
 
     def __init__(self, config: DepthTrainConfig, *, silent: bool = False) -> None:
         self.config, self.silent = config, silent
@@ -240,26 +245,46 @@ class DepthTrainer:
         torch.manual_seed(config.seed)
         self.tours = ShardReader(list(config.tours))
         self.device = torch.device(config.device)
-        self.network = DepthRefinement(config.network)
+        self.network = self.make_network()
         self.step = 0
-        latest = next(iter(list_checkpoints(config.out / "checkpoints")), None)
-        if latest is None and config.init is None:
-            self.network.mono.encoder.load_imagenet(load_imagenet_weights())
-        elif latest is None and config.init is not None:
-            load_matching(self.network, config.init)
+        if next(iter(list_checkpoints(config.out / "checkpoints")), None) is None:
+            self.load_start(config.init)
         self.network.to(self.device, memory_format=torch.channels_last)
-        encoder = {id(p) for p in self.network.mono.encoder.parameters()}
+        encoder, rest = [], []
+        for name, parameter in self.network.named_parameters():
+            (encoder if "encoder." in name else rest).append(parameter)
         self.optimizer = torch.optim.AdamW(
-            [
-                {"params": [p for p in self.network.parameters() if id(p) not in encoder], "peak": config.rate},
-                {"params": list(self.network.mono.encoder.parameters()), "peak": config.encoder_rate},
-            ],
+            [{"params": rest, "peak": config.rate}, {"params": encoder, "peak": config.encoder_rate}],
             lr=config.rate,
             weight_decay=config.weight_decay,
         )
         self.average = ExponentialMovingAverage(self.network, config.ema)
         load_latest(config.out / "checkpoints", self._restore)
         self.stop = StopRequest()
+
+    def make_network(self) -> Any:
+        """The network with random weights."""
+        return DepthRefinement(self.config.network)
+
+    def load_start(self, path: Path | None) -> None:
+        """Load the weights that a new run starts from: of a file, or those of the encoder."""
+        if path is None:
+            self.network.mono.encoder.load_imagenet(load_imagenet_weights())
+        else:
+            load_matching(self.network, path)
+
+    def compute_terms(
+        self, network: Any, samples: list[Sample], generator: torch.Generator | None
+    ) -> dict[str, Tensor]:
+        """Loss terms of a batch; without a generator those of a validation."""
+        if generator is None:
+            return training_terms(network, samples, None, iterations=2)
+        iterations = 2 if self.step % 4 == 0 else 1
+        return training_terms(network, samples, generator, iterations=iterations, factor_noise=self.config.factor_noise)
+
+    def save_network(self, path: Path) -> None:
+        """Write the averaged weights."""
+        save_depth_network(path, self.network, self.average.state)
 
     def _restore(self, path: Path, state: dict[str, Any]) -> None:
         """Restore the run from a checkpoint; a DamagedCheckpointError if it does not fit."""
@@ -273,8 +298,8 @@ class DepthTrainer:
         """Train the remaining steps. Returns whether all were done."""
         config = self.config
         config.out.mkdir(parents=True, exist_ok=True)
-        log = CsvTable(config.out / "log.csv", _COLUMNS, self.step)
-        scores = CsvTable(config.out / "validation.csv", _MEASURES, self.step + 1)
+        log = CsvTable(config.out / "log.csv", (*self.TERMS, "rate", "gradient_norm", "seconds"), self.step)
+        scores = CsvTable(config.out / "validation.csv", self.TERMS[1:], self.step + 1)
         began = saved = time.monotonic()
         try:
             with ProgressDisplay(self.step, config.steps, silent=self.silent) as display, self.stop.on_signal(display):
@@ -310,22 +335,22 @@ class DepthTrainer:
             "optimizer": self.optimizer.state_dict(),
         }
         save_checkpoint(self.config.out / "checkpoints", self.step, state, keep=2)
-        save_depth_network(self.config.out / "model.safetensors", self.network, self.average.state)
+        self.save_network(self.config.out / "model.safetensors")
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
         """Mean measures of the averaged weights over the validation tours."""
         assert self.config.validation is not None
         tours = ShardReader([self.config.validation])
-        network = DepthRefinement(self.config.network)
+        network = self.make_network()
         network.load_state_dict(self.average.state)
         network.to(self.device).eval()
-        sums = dict.fromkeys(_MEASURES, 0.0)
+        sums = dict.fromkeys(self.TERMS[1:], 0.0)
         count = min(self.config.validation_tours, len(tours))
         for index in range(count):
             views, heights = read_pair(tours, index, np.random.default_rng(index), self.config.baseline)
-            terms = training_terms(network, [(views, heights)], None, iterations=2)
-            for name in _MEASURES:
+            terms = self.compute_terms(network, [(views, heights)], None)
+            for name in sums:
                 sums[name] += float(terms[name]) / count
         return sums
 
@@ -354,10 +379,7 @@ class DepthTrainer:
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * factor
         self.network.train()
-        iterations = 2 if self.step % 4 == 0 else 1
-        terms = training_terms(
-            self.network, samples, generator, iterations=iterations, factor_noise=self.config.factor_noise
-        )
+        terms = self.compute_terms(self.network, samples, generator)
         self.optimizer.zero_grad()
         terms["loss"].backward()
         norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip))
@@ -366,9 +388,8 @@ class DepthTrainer:
             raise InputError(f"step {self.step}: needed finite numbers, got a loss of {loss}; lower --rate.")
         self.optimizer.step()
         self.average.update(self.network, self.step)
-        values = {name: float(value.detach()) for name, value in terms.items() if name in _COLUMNS}
         return {
-            **values,
+            **{name: float(terms[name].detach()) for name in self.TERMS},
             "rate": self.config.rate * factor,
             "gradient_norm": norm,
             "seconds": time.perf_counter() - began,
@@ -389,20 +410,23 @@ def load_matching(network: DepthRefinement, path: Path) -> None:
     network.load_state_dict({**own, **fitting})
 
 
-def main() -> None:
-    """Run the command line and exit."""
+def run_trainer(config_type: type[DepthTrainConfig], trainer_type: type[DepthTrainer]) -> int:
+    """Run the command line of a training; returns its exit status."""
     import tyro
 
     def train() -> int:
-        config = parse_arguments(lambda: tyro.cli(DepthTrainConfig))
+        config = parse_arguments(lambda: tyro.cli(config_type))
         require_output_folder("--out", config.out)
         with own_warnings():
-            trainer = DepthTrainer(config)
+            trainer = trainer_type(config)
             return 0 if trainer.train() else trainer.stop.status
 
-    exit_process(
-        run_command(train, memory_advice="choose fewer --pairs.", interruption="run the command again to resume")
-    )
+    return run_command(train, memory_advice="choose fewer --pairs.", interruption="run the command again to resume")
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    exit_process(run_trainer(DepthTrainConfig, DepthTrainer))
 
 
 if __name__ == "__main__":

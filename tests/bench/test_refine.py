@@ -41,7 +41,7 @@ def folder(tmp_path: Path, write_pair, sphere_predictor, monkeypatch: pytest.Mon
     monkeypatch.setitem(pipeline._MODELS, "default", DarkSphere)
     monkeypatch.setattr(bench, "warm_up", lambda predictor: None)
     cases = [RefineCase(CROSS_FADE, HEIGHT), RefineCase("default", HEIGHT), RefineCase("default", HEIGHT, 2.0)]
-    cases.append(RefineCase("default", HEIGHT, 2.0, 40))
+    cases += [RefineCase("default", HEIGHT, 2.0, 40), RefineCase("default", HEIGHT, views=1)]
     monkeypatch.setattr(bench, "list_refine_cases", lambda quick: cases)
     return tmp_path / "rooms"
 
@@ -52,12 +52,13 @@ def test_the_bench_writes_rows_means_table_and_plot(folder: Path, tmp_path: Path
     paths = [str(folder / name) for name in ("one", "two")]
     assert run(["bench", "refine", *paths, "--out", str(out), "--lpips", "none", "--threads", "1"]) == 0
     rows = json.loads((out / "refine.json").read_text())["rows"]
-    assert [row["scene"] for row in rows] == ["one"] * 4 + ["two"] * 4 + [MEAN] * 4
-    plain, refined, small = rows[1:4]
+    assert [row["scene"] for row in rows] == ["one"] * 5 + ["two"] * 5 + [MEAN] * 5
+    plain, refined, small, single = rows[1:5]
     assert refined["ws_psnr_db"] > plain["ws_psnr_db"] and refined["steps"] > 1 > plain["refine_s"] == 0
     assert small["num_gaussians"] <= 40 < refined["num_gaussians"] < plain["num_gaussians"]
-    assert rows[9]["ws_psnr_db"] == pytest.approx((rows[1]["ws_psnr_db"] + rows[5]["ws_psnr_db"]) / 2, rel=1e-4)
-    assert "| default | 16 | 2 s | 40 |" in (out / "refine.md").read_text()
+    assert single["num_gaussians"] == plain["num_gaussians"] // 2 and single["ws_psnr_db"] != plain["ws_psnr_db"]
+    assert rows[11]["ws_psnr_db"] == pytest.approx((rows[1]["ws_psnr_db"] + rows[6]["ws_psnr_db"]) / 2, rel=1e-4)
+    assert "| default | 16 | all | 2 s | 40 |" in (out / "refine.md").read_text()
     assert (out / "refine.png").stat().st_size > 1000 and "cross-fade" in capsys.readouterr().out
 
 

@@ -1,6 +1,7 @@
 """Every folder format gives the same cameras, and invalid folders are refused with the reason."""
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.data.folders import load_pairs
+from pansplat.data.folders import UnposedPanoramasError, find_panorama_folders, load_pairs
 from pansplat.data.images import write_image
+from pansplat.data.pairs import Link
 from pansplat.errors import InputError
 
 OPENCV = "cam2world opencv"
@@ -233,7 +235,7 @@ def test_trajectories_that_do_not_match_are_refused(tmp_path: Path) -> None:
         ({"convention": None}, 'needed a pose "convention", got none; write one of "cam2world opencv"'),
         ({"convention": "mine"}, "needed a known pose convention, got 'mine'"),
         ({"poses": None}, 'got no object "poses"'),
-        ({"poses": {"left.png": _pose(0)}}, "got 1; images without a pose: right.png"),
+        ({"poses": {}}, "needed poses of one or more panoramas, got none"),
         ({"poses": {"left.png": _pose(0), "right.png": None}}, "'right.png': needed a pose, got none"),
         ({"poses": {"left.png": _pose(0), "gone.png": _pose(1)}}, "needed the image .*gone.png"),
         ({"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}}, r"needed a pose, got only \['room'\]"),
@@ -274,21 +276,148 @@ def test_invalid_pairs_files_are_refused(tmp_path: Path, content: dict, message:
         load_pairs(folder)
 
 
-def test_folders_without_two_panoramas_with_poses_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="got none; give the folder"):
+def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"needed panoramas .* got none; give the folder"):
         load_pairs(tmp_path)
     with pytest.raises(InputError, match="got no such path"):
         load_pairs(tmp_path / "gone")
-    with pytest.raises(InputError, match="needed poses of two or more panoramas, got 1"):
-        load_pairs(_folder(tmp_path / "room", ["only.png"]))
+    _folder(tmp_path / "room")
     (tmp_path / "room" / "poses.json").write_text('{\n "convention": "cam2world opencv",\n}')
     with pytest.raises(InputError, match=r"poses\.json: needed JSON, got invalid text at line 3"):
         load_pairs(tmp_path / "room")
-    _write_panorama(tmp_path / "left" / "left.png")
-    with pytest.raises(InputError, match=r"needed two or more panoramas .*got left\.png; give"):
-        load_pairs(tmp_path / "left")
-    with pytest.raises(InputError, match="needed a folder of posed panoramas or its file of poses, got another file"):
-        load_pairs(tmp_path / "left" / "left.png")
+    _write_panorama(tmp_path / "flats" / "one" / "left.png")
+    with pytest.raises(InputError, match=r"flats: needed panoramas .* got some without poses in one"):
+        load_pairs(tmp_path / "flats")
+    (tmp_path / "note.txt").write_text("x")
+    with pytest.raises(InputError, match=r"note\.txt: needed a panorama, a folder of panoramas, .* got another file"):
+        load_pairs(tmp_path / "note.txt")
+
+
+def _check_single_view(pair, name: str, part: int = 0) -> None:
+    (view,) = pair.context
+    assert (pair.name, view.part, pair.targets) == (name, part, ())
+    assert torch.equal(view.cam2world, torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "exr"])
+def test_one_panorama_is_a_pair_of_one_view(tmp_path: Path, suffix: str) -> None:
+    image = tmp_path / "flat" / f"photo.{suffix}"
+    _write_panorama(image, 0.25)
+    for path, name in ((image, "photo"), (image.parent, "flat")):
+        (pair,) = load_pairs(path, near=0.3, far=5)
+        _check_single_view(pair, name)
+        assert (pair.near, pair.far, pair.folder) == (0.3, 5, image.parent)
+    views = pair.load_context(8)
+    assert views.images.mean() == pytest.approx(0.25, abs=0.01)
+    assert views.masks.all() and views.names == ("photo",)
+
+
+def test_one_picture_that_is_no_panorama_is_refused(tmp_path: Path) -> None:
+    write_image(tmp_path / "photo.png", torch.full((3, 16, 24), 0.5))
+    for path in (tmp_path, tmp_path / "photo.png"):
+        with pytest.raises(InputError, match=r"photo\.png: needed a 2:1 equirectangular panorama, got 24x16"):
+            load_pairs(path)
+    (tmp_path / "photo.png").write_text("x")
+    with pytest.raises(InputError, match=r"photo\.png: needed a JPG, PNG, WebP or EXR image"):
+        load_pairs(tmp_path)
+
+
+def test_panoramas_without_poses_are_listed_for_their_estimate(tmp_path: Path, write_scene) -> None:
+    for number in range(3):
+        write_scene(tmp_path / f"{number}.png", 8)
+    with pytest.raises(
+        UnposedPanoramasError, match=r"needed poses .* got images only \(0\.png, 1\.png, 2\.png\)"
+    ) as caught:
+        load_pairs(tmp_path)
+    assert caught.value.folder == tmp_path
+    assert [panorama.name for panorama in caught.value.panoramas] == ["0", "1", "2"]
+
+
+def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "room")
+    for name in ("attic.jpg", "cellar.png", ".hidden.png", "left_mask.png", "attic_depth.png"):
+        write_scene(folder / name, 8)
+    _write_panorama(folder / "film_frame.png")  # with the metadata of an own rendering
+    with pytest.warns(UserWarning, match=r"poses\.json has no pose of attic\.jpg, cellar\.png; each is a scene"):
+        pair, attic, cellar = load_pairs(folder)
+    assert (pair.name, [view.part for view in pair.context]) == ("room", [0, 0])
+    _check_single_view(attic, "attic", 1)
+    _check_single_view(cellar, "cellar", 2)
+    assert attic.context[0].mask is None
+    assert set(attic.siblings) == {folder / n for n in ("left.png", "right.png", "attic.jpg", "cellar.png")}
+
+
+def test_other_pictures_of_a_posed_folder_are_named(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    cv2.imwrite(str(folder / "plan.png"), np.full((20, 30, 3), (9, 90, 200), np.uint8))
+    cv2.imwrite(str(folder / "logo.png"), np.full((20, 20, 3), 90, np.uint8))
+    with pytest.warns(UserWarning) as caught:
+        (pair,) = load_pairs(folder)
+    assert pair.name == "room"
+    (message,) = {str(warning.message) for warning in caught if "logo" in str(warning.message)}
+    assert "logo.png: needed a 2:1 equirectangular panorama, got 20x20" in message
+
+
+def test_poses_of_one_panorama_are_enough(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "room", ["only.png"])
+    (pair,) = load_pairs(folder)
+    assert pair.name == "room" and pair.context[0].cam2world.tolist() == _pose(0)
+    write_scene(folder / "other.jpg", 8)
+    with pytest.warns(UserWarning, match=r"no pose of other\.jpg"):
+        first, second = load_pairs(folder)
+    assert (first.name, first.context[0].part) == ("only", 0)
+    _check_single_view(second, "other", 1)
+
+
+def test_targets_and_pictures_of_entries_are_no_scenes_of_their_own(tmp_path: Path) -> None:
+    names = ("left.png", "middle.png", "right.png")
+    entries = {name: {"cam2world": _pose(i)} for i, name in enumerate(names)}
+    entries["left.png"] |= {"depth": "far.png", "mask": "own.png"}
+    folder = _folder(tmp_path / "room", names, poses=entries)
+    _write_depth(folder / "far.png", 1000)
+    cv2.imwrite(str(folder / "own.png"), np.full((16, 32), 255, np.uint8))
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": [names[0], names[2]], "target": names[1]}]}))
+    assert [pair.name for pair in load_pairs(folder)] == ["room"]
+
+
+def test_links_of_a_posed_folder_are_kept(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    links = {"left.png": [{"to": "right.png", "yaw": 1.5, "pitch": 0.2}], "right.png": {"title": "Kitchen"}}
+    (folder / "links.json").write_text(json.dumps(links))
+    for path in (folder, folder / "links.json"):
+        (pair,) = load_pairs(path)
+        assert pair.context[0].links == (Link("right", 1.5, 0.2),)
+        assert [view.label for view in pair.context] == ["left", "Kitchen"]
+
+
+def test_a_faulty_web_tour_gives_way_to_the_pictures_of_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "tour.json").write_text("<html>404</html>")
+    with pytest.raises(InputError, match=r"tour\.json: needed a tour of Pannellum .* got an HTML page"):
+        load_pairs(tmp_path)
+    _write_panorama(tmp_path / "hall.png")
+    with pytest.warns(UserWarning, match=r"the web tour is left out: .*tour\.json"):
+        (pair,) = load_pairs(tmp_path)
+    assert pair.context[0].name == "hall"
+
+
+def test_a_web_tour_is_found_before_folders_below(tmp_path: Path, write_scene) -> None:
+    write_scene(tmp_path / "tiles" / "hall.jpg", 8)
+    (tmp_path / "tour.json").write_text(json.dumps({"title": "Hall", "panorama": "tiles/hall.jpg"}))
+    _folder(tmp_path / "tiles" / "room")
+    for path in (tmp_path, tmp_path / "tour.json"):
+        (pair,) = load_pairs(path)
+        assert pair.name == tmp_path.name and pair.context[0].label == "Hall"
+    assert find_panorama_folders(tmp_path) == [tmp_path]
+
+
+def test_two_hundred_panoramas_are_listed_without_their_pixels(tmp_path: Path, write_scene, monkeypatch) -> None:
+    write_scene(tmp_path / "0.jpg", 8)
+    for number in range(1, 200):
+        os.link(tmp_path / "0.jpg", tmp_path / f"{number}.jpg")
+    monkeypatch.setattr("pansplat.data.images._decode", None)
+    with pytest.raises(UnposedPanoramasError) as caught:
+        load_pairs(tmp_path)
+    assert len(caught.value.panoramas) == 200
 
 
 def test_incomplete_panogrf_views_are_refused(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from pansplat.data.images import (
     read_height,
     read_mask,
     read_panorama,
+    read_size,
     read_thumbnail,
     srgb_from_linear,
     write_image,
@@ -210,3 +211,29 @@ def test_unsupported_content_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needed an existing folder"):
         write_image(tmp_path / "none" / "a.png", _panorama())
     assert _entries(tmp_path) == []
+
+
+def test_the_size_of_an_image_is_read_without_its_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for suffix in (".png", ".jpg", ".webp", ".exr"):
+        write_image(tmp_path / f"a{suffix}", torch.rand(3, 20, 30))
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    Image.new("RGB", (30, 20)).save(tmp_path / "turned.jpg", exif=turned)
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", None)
+    monkeypatch.setattr("pansplat.data.images._exr_channels", None)
+    assert [read_size(tmp_path / f"a{suffix}") for suffix in (".png", ".jpg", ".webp", ".exr")] == [(30, 20)] * 4
+    assert read_size(tmp_path / "turned.jpg") == (20, 30)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "got a file of 0 bytes"),
+        (b"hello" * 9, "got an unknown format"),
+        (b"\x76\x2f\x31\x01", "a damaged header"),
+    ],
+)
+def test_the_size_of_a_damaged_image_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(InputError, match=rf"a\.png: needed .* {message}"):
+        read_size(tmp_path / "a.png")

@@ -8,6 +8,7 @@ import torch
 
 from pansplat.data.folders import load_pairs
 from pansplat.data.views import Views
+from pansplat.errors import InputError
 from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, PoseCheck, _describe_mistake, check_pair, check_views
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import invert_pose, rotations_from_quats
@@ -140,6 +141,12 @@ def test_unrelated_images_give_a_warning() -> None:
 
 
 @pytest.mark.slow
+def test_a_single_view_is_refused() -> None:
+    (pair,) = load_pairs(Path(__file__).parents[2] / "assets" / "living_room" / "left.jpg")
+    with pytest.raises(InputError, match="left: needed two or more views to check their poses, got one"):
+        check_pair(pair)
+
+
 @pytest.mark.shared
 @pytest.mark.parametrize(("data", "index"), [("mp3d_sample", 0), ("zind", 1), ("bsp_demo", 7)])
 def test_shared_poses_pass(shared: Path, data: str, index: int) -> None:

@@ -500,9 +500,9 @@ FILES = [
     Fault("a folder as a scene", "info pair.ply", lambda f: (f / "pair.ply").mkdir(), "folder"),
     Fault("a folder without a suffix as a scene", "info pair", says="pair: needed a scene file, got a folder"),
     Fault("a missing scene", "info no.ply", says="no.ply"),
-    *(Fault(f"a file that has no poses: {name}", f"check {name}", text("x", name), f"{name}: needed a folder of posed panoramas or its file of poses")
-      for name in ("pair/note.txt", "pair/note.json", "pair/a.xyz")),
-    Fault("panoramas without poses in subfolders", "check flats", copy_to_subfolders, "flats: needed two or more panoramas (JPG, PNG, WebP or EXR), got some without poses in one, two"),
+    *(Fault(f"a file that has no poses: {name}", f"check {name}", text("x", name), f"{name}: needed {needed}")
+      for name, needed in (("pair/note.txt", "a panorama, a folder"), ("pair/note.json", "a tour"), ("pair/a.xyz", "a panorama, a folder"))),
+    Fault("panoramas without poses in subfolders", "check flats", copy_to_subfolders, "flats: needed panoramas (JPG, PNG, WebP or EXR), got some without poses in one, two"),
     Fault("a scene with a name of 300 bytes", f"info {_LONG}.ply", says=_LONG),
     Fault("a FIFO as poses", PREDICT, fifo("pair/poses.json"), "pair"),
     Fault("a FIFO as an image", PREDICT, fifo("pair/a.png"), "a.png"),
@@ -572,7 +572,7 @@ FILES = [
     Fault("a batch of a missing folder", "batch nowhere --out out", says="nowhere"),
     Fault("a batch of a folder without panoramas", "batch empty --out out", lambda f: (f / "empty").mkdir(), "empty: needed folders with panoramas"),
     Fault("a batch into a file", "batch pair --out scene.ply", says="--out scene.ply"),
-    Fault("a pair that is a picture", "predict pair/a.png -o out.ply", says="a.png"),
+    Fault("a panorama is a pair of one view", "predict pair/a.png -o out.ply", status=0),
     Fault("a pair in the home of an unknown user", "predict ~nobody-at-all/x -o out.ply", says="~nobody-at-all"),
 ]  # fmt: skip
 

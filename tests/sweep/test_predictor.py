@@ -151,6 +151,17 @@ def test_fully_masked_panoramas_give_no_gaussians(small):
     assert len(Sweep()(*small, 0.5, 8.0, masks=torch.zeros(2, 64, 128, dtype=torch.bool))) == 0
 
 
+@pytest.mark.parametrize("views", (1, 2))
+def test_only_a_single_view_is_filled_where_it_is_masked(small, views):
+    images, poses = small[0][:views], small[1][:views]
+    masks = torch.ones(views, *images.shape[-2:], dtype=torch.bool)
+    masks[:, -12:] = False  # 34 degrees around the nadir
+    gaussians = Sweep()(images, poses, 0.5, 8.0, masks=masks)
+    local = (gaussians.means.double() - poses[0, :3, 3]) @ poses[0, :3, :3]
+    below = (local[:, 1] > math.cos(math.radians(25)) * local.norm(dim=-1)) & (gaussians.views == 0)
+    assert set(gaussians.levels[below].tolist()) == ({2, 3} if views == 1 else set())
+
+
 def test_moving_the_world_moves_the_gaussians(small, predicted, turn):
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = torch.from_numpy(turn("y", 90.0).round())  # exact, so that only the position can differ
@@ -212,16 +223,16 @@ def _decibels(pair: Pair, height: int) -> tuple[float, float]:
 @pytest.mark.slow
 def test_the_middle_view_of_a_scanned_room_is_rendered(shared: Path):
     (pair,) = (pair for pair in pansplat.load_pairs(shared / "data/mp3d_sample") if pair.targets)
-    reached, faded = _decibels(pair, 256)
-    assert reached >= 24.0  # 24.6 measured
-    assert reached >= faded + 7.0
+    reached, faded = _decibels(pair, 128)
+    assert reached >= 26.0  # 26.7 measured
+    assert reached >= faded + 9.5
 
 
 @pytest.mark.shared
 @pytest.mark.slow
 def test_photographed_homes_are_rendered_better_than_by_a_cross_fade(shared: Path):
     pairs = [pair for pair in pansplat.load_pairs(shared / "data/zind") if pair.targets]
-    figures = torch.tensor([_decibels(pair, 128) for pair in pairs])
+    figures = torch.tensor([_decibels(pair, 64) for pair in pairs])
     assert len(pairs) == 3
     assert (figures[:, 0] > figures[:, 1]).all()
-    assert float((figures[:, 0] - figures[:, 1]).mean()) >= 3.0
+    assert float((figures[:, 0] - figures[:, 1]).mean()) >= 4.0  # 4.6 measured

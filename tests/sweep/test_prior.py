@@ -28,6 +28,9 @@ class TrueDepth:
             self.priors.append(DepthPrior(np.log(depth), np.full(depth.shape, 0.05)))
         return self
 
+    def sharpen(self):
+        return [resize_sphere(prior.log_depth, 96) for prior in self.priors]
+
     def refine(self, estimates, cam2world, iterations):
         ratios = [np.median(e.log_depth - p.log_depth) for e, p in zip(estimates, self.priors, strict=True)]
         self.starts.append(np.exp(ratios))
@@ -173,15 +176,28 @@ def test_resized_prior_keeps_its_values():
     np.testing.assert_allclose(resize_sphere(prior.scale, 4), 0.2, rtol=1e-6)
 
 
-def test_coincident_cameras_have_the_first_estimate_at_a_usual_height(make_room):
+@pytest.mark.parametrize("views", (1, 2))
+def test_views_at_one_place_have_the_sharpened_depth_at_a_usual_height(make_room, views):
     room = make_room()
-    pose = room.pose((-0.4, 0.0, -0.2))
-    observed = room.observe(64, [pose, pose])
-    model = TrueDepth(room, [pose, pose])
-    surfaces = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, model)
+    poses = [room.pose((-0.4, 0.0, -0.2))] * views
+    observed = room.observe(64, poses)
+    surfaces = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, TrueDepth(room, poses))
+    assert len(surfaces) == views
     expected = observed.depths[0] * 1.5 / _CAMERA_HEIGHT
     for surface in surfaces:
         assert np.median(np.abs(surface.inverse_depth * expected - 1)) < 0.02
+
+
+def test_sharpened_depth_of_a_tilted_camera_is_turned_back(make_room, turn):
+    room = make_room()
+    pose = room.pose((-0.4, 0.0, -0.2), turn("x", 12) @ turn("z", -9))
+    upright = pose.copy()
+    upright[:3, :3] = pose[:3, :3] @ prior_module._upright_rotation(pose[:3, :3], _DOWN)
+    model = TrueDepth(room, [upright])
+    estimator = PriorEstimator(model, [room.cast(pose, 64)[0]], pose[None], _DOWN, PriorConfig())
+    sharp = estimator.sharpen((1 / 8, 1 / 0.3))[0]
+    expected = np.log(room.cast(pose, 96)[1] * 1.5 / _CAMERA_HEIGHT)
+    assert np.median(np.abs(sharp - expected)) < 0.02
 
 
 def test_prior_decides_where_photographs_are_blank(make_room):

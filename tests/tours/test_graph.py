@@ -126,7 +126,8 @@ def test_walks_fade_between_parts_preferably_along_links(home):
     assert home.find_way(home.positions[0] + (0, 0, 0.4), 3) == [1, 2, 3]
     assert home.find_way(home.positions[3], 2, part=home.parts[4])[0] in (4, 5)
     unlinked = dataclasses.replace(home, panoramas=tuple(dataclasses.replace(p, links=()) for p in home.panoramas))
-    assert set(unlinked.plan_walk()) == set(range(7)) and unlinked.find_walk(0, 6) == [0, 6]
+    assert set(unlinked.plan_walk()) == set(range(7)) and unlinked.plan_walk()[:3] in ([0, 1, 2], [2, 1, 0])
+    assert unlinked.find_walk(0, 6) == [0, 6]
 
 
 def test_a_link_is_a_direction_in_the_world(home):

@@ -26,8 +26,10 @@ from pansplat.training.step import TrainingStep, accumulate_gradients
 sys.path.insert(0, str(Path(__file__).parent))
 from conftest import PaintedSphere, micro_config
 
-METHODS = (("plain", 1), ("plain", 2), ("two-step", 1), ("two-step", 2))
-"""Method of backpropagation, and number of batches per step."""
+METHODS = ("plain", "two-step")
+"""Of backpropagation."""
+ROUNDS = 2
+"""Batches per step: the processes exchange the gradients of the last one only."""
 PROCESSES = 3
 
 
@@ -40,14 +42,14 @@ def split_batches(processes: ProcessGroup) -> dict[str, Tensor]:
     step = TrainingStep(network, None, None, LossWeights(), MemoryConfig())
     wrapped = data_parallel(step, processes)
     found = {}
-    for method, rounds in METHODS:
+    for method in METHODS:
         step.memory = MemoryConfig(method, 1 if method == "plain" else 2, "original")
         step.zero_grad()
-        indices = [range(PROCESSES * n, PROCESSES * (n + 1)) for n in range(rounds)]
+        indices = [range(PROCESSES * n, PROCESSES * (n + 1)) for n in range(ROUNDS)]
         own = indices if processes.count == 1 else [part[processes.rank : processes.rank + 1] for part in indices]
         batches = [collate([PaintedSphere().sample(n, 32, 0) for n in part]) for part in own]
         accumulate_gradients(wrapped, batches)
-        found |= {f"{method} {rounds} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
+        found |= {f"{method} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
     return found | {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
 
 

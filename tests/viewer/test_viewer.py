@@ -1153,12 +1153,12 @@ def test_a_click_on_a_link_fades_to_a_panorama_without_a_place_and_the_list_lead
         shown.append(user.read_screen())
         return user.viewer._tour.part == 1
 
-    user.draw_until(has_begun, "fade", 0.1)
+    user.draw_until(has_begun, "fade", 0.2)
     assert np.abs(shown[-1] - shown[-2]).mean() < 5, "without a jump"
     poses, front = user.viewer._fade.poses, user.viewer._fade.front
     assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 0.71, "the scene before stays"
     assert np.allclose(poses[front], user.state.camera.cam2world) and user.viewer._slots[1 - front].scene is left
-    fly(user)
+    fly(user, 0.5)
     assert find_node(user) == 3 and user.viewer._slot.scene is not left
     assert changed_fraction(shown[-1], user.read_image()) > 0.5
     user.click("visit")

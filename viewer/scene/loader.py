@@ -204,8 +204,9 @@ def _load_tour_scene(
     assert tour is not None
     if not views:
         tour = tour if entry.merged is not None else connect(tour, progress)
-        first, second = tour.plan_walk()[:2]
-        edge = tour.find_edge(first) if tour.is_fade(first, second) else (min(first, second), max(first, second))
+        first, *others = tour.plan_walk()
+        is_flown = others and not tour.is_fade(first, others[0])
+        edge = (min(first, others[0]), max(first, others[0])) if is_flown else tour.find_edge(first)
         views = tour.choose_scene_views()[edge]
         entry = replace(entry, tour=tour, views=views)
     pair = entry.pair or tour.make_pair(views)

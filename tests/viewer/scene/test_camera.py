@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.state import ViewerState, enter_scene
 
 # Right, down, forward of the level camera are x, -z, y: a world with z up.
 Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -99,3 +101,14 @@ def test_focus_looks_at_the_point_and_orbits_it():
     camera = cameras.focus_on_point(replace(Camera(), position=(0.5, 0, 0)), point)
     assert np.allclose(camera.orbit_center, point)
     assert cameras.focus_on_point(camera, np.asarray(camera.position)) == camera
+
+
+def test_a_scene_is_entered_in_the_direction_of_its_start_view(small_scene):
+    pose = small_scene.cam2world[:1].clone()
+    pose[0, :3, :3] = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # looks to the right
+    state, single = ViewerState(), replace(small_scene, cam2world=pose, starts=((0.5, 0.2),))
+    enter_scene(state, single)
+    ahead = np.array((math.cos(0.5) * math.cos(0.2), math.sin(0.2), -math.sin(0.5) * math.cos(0.2)))
+    assert np.allclose(state.camera.rotation[:, 2], ahead) and state.home == state.camera
+    enter_scene(state, replace(single, cam2world=small_scene.cam2world[1:], starts=()))
+    assert np.allclose(state.camera.rotation[:, 2], (0, 0, 1))

@@ -90,8 +90,10 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
     monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: tour)
     scene = load_house(TourScenes(tour).make_entry((0,))).scene
     monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, **options: scene)
-    loaded = load_entry(SceneEntry("house", tour=tour), LoadOptions(), ignore)
-    assert loaded.entry.views == (0,) and loaded.entry.tour is tour and loaded.scene is scene
+    single = replace(tour, panoramas=(alone,), overlaps={(0, 0): 1.0})
+    for each in (tour, single):
+        loaded = load_entry(SceneEntry("house", tour=each), LoadOptions(), ignore)
+        assert loaded.entry.views == (0,) and loaded.entry.tour is each and loaded.scene is scene
 
 
 @pytest.mark.shared

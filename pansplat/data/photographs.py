@@ -1,0 +1,165 @@
+"""Panoramas without poses: the pictures of a folder, and the links and titles of its links.json."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections import Counter
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pansplat.data.cube_faces import find_layout, group_faces
+from pansplat.data.cube_images import CubeImage, write_cube
+from pansplat.data.images import read_size
+from pansplat.data.pairs import Link, Panorama, find_mask, list_panorama_files
+from pansplat.data.panorama_metadata import read_xmp
+from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links, wrap
+from pansplat.errors import InputError, InputWarning
+from pansplat.strict_json import list_field, read_json, require_object
+
+LINKS = "links.json"
+
+
+def read_photograph(image: Path) -> Panorama:
+    """A 2:1 picture, or one that holds six cube faces, as a panorama at the origin of a world of its own.
+
+    Raises:
+        InputError: it cannot be read, or shows something else.
+    """
+    return _make_panorama(image.stem, _read_picture(image), image.parent)
+
+
+def list_photographs(folder: Path) -> list[Panorama]:
+    """The panoramas among the pictures of a folder, sorted by name, with the links of links.json.
+
+    Pictures that pansplat rendered count only if there are no other panoramas. Warns about pictures that are left out.
+
+    Raises:
+        InputError: there are pictures, and none can be used.
+    """
+    every = list_panorama_files(folder)
+    rendered = [image for image in every if _is_rendered(image)]
+    panoramas, problems = _read_pictures([image for image in every if image not in rendered], folder)
+    if panoramas:
+        problems += [f"{image}: it was rendered by pansplat." for image in rendered]
+    elif rendered:
+        panoramas, problems = _read_pictures(every, folder)
+    if problems and not panoramas:
+        raise InputError("; ".join(problem.rstrip(".") for problem in problems[:3]) + ".")
+    _warn_left_out(problems)
+    return add_links(panoramas, folder)
+
+
+def list_further_photographs(folder: Path, known: Collection[Path]) -> list[Panorama]:
+    """The panoramas of a folder other than the known files, without links.
+
+    Pictures that pansplat rendered do not count. Warns about pictures that are no panoramas.
+    """
+    files = {file.resolve() for file in known}
+    further = [
+        image for image in list_panorama_files(folder) if image.resolve() not in files and not _is_rendered(image)
+    ]
+    panoramas, problems = _read_pictures(further, folder)
+    _warn_left_out(problems)
+    return panoramas
+
+
+def _warn_left_out(problems: Sequence[str]) -> None:
+    for problem in problems:
+        warnings.warn(f"left out: {problem}", category=InputWarning, stacklevel=4)
+
+
+def _is_rendered(image: Path) -> bool:
+    """Whether the metadata name pansplat as the program that made the picture."""
+    return b'StitchingSoftware="pansplat"' in read_xmp(image)
+
+
+def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama], list[str]]:
+    """The panoramas among pictures, and what is wrong with the others."""
+    cubes, rest = group_faces(images)
+    pictures: dict[str, Path | CubeImage] = dict(cubes)
+    repeated = Counter(image.stem for image in rest)
+    problems = []
+    for image in rest:
+        name = image.stem if repeated[image.stem] == 1 and image.stem not in cubes else image.name.replace(".", "_")
+        try:
+            pictures[name] = _read_picture(image)
+        except InputError as error:
+            problems.append(str(error))
+    return [_make_panorama(name, pictures[name], folder) for name in sorted(pictures)], problems
+
+
+def _read_picture(image: Path) -> Path | CubeImage:
+    width, height = read_size(image)
+    if width == 2 * height:
+        return image
+    layout = find_layout(image)
+    if layout is None:
+        raise InputError(
+            f"{image}: needed a 2:1 equirectangular panorama, got {width}x{height} (width x height); crop or "
+            "resample it first."
+        )
+    return layout
+
+
+def _make_panorama(name: str, picture: Path | CubeImage, folder: Path) -> Panorama:
+    image = picture if isinstance(picture, Path) else write_cube(picture, folder, name)
+    mask = find_mask(folder / f"{name}.jpg" if isinstance(picture, CubeImage) else picture, folder)
+    return Panorama(name, image, torch.eye(4, dtype=torch.float64), mask)
+
+
+def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
+    """The panoramas with the links, titles and start views of the folder's links.json, if it has one.
+
+    Warns about entries and links that cannot be used, or about a file that cannot be read.
+    """
+    source = folder / LINKS
+    if not source.is_file():
+        return list(panoramas)
+    try:
+        content = require_object(read_json(source), source)
+    except InputError as error:
+        warnings.warn(f"links are left out: {error}", category=InputWarning, stacklevel=3)
+        return list(panoramas)
+    names = {key: panorama.name for panorama in panoramas for key in (panorama.name, panorama.image.name)}
+    entries: dict[str, Any] = {}
+    for key, entry in content.items():
+        if key in names:
+            entries[names[key]] = entry
+        else:
+            warnings.warn(
+                f"{source}: {key[:60]!r} is left out: it is no panorama of the folder.", InputWarning, stacklevel=3
+            )
+    result = []
+    for panorama in panoramas:
+        try:
+            result.append(_add_entry(panorama, entries.get(panorama.name, []), names, source))
+        except InputError as error:
+            warnings.warn(f"links of {panorama.name} are left out: {error}", category=InputWarning, stacklevel=3)
+            result.append(panorama)
+    return result
+
+
+def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Path) -> Panorama:
+    """The panorama with the content of its entry: a list of links, or {"title", "start", "links"}."""
+    content = {"links": entry} if isinstance(entry, list) else require_object(entry, source)
+    links = []
+    for item in list_field(content, "links", source):
+        link = require_object(item, source)
+        yaw, pitch = (
+            finite_number(link.get("yaw"), "yaw of a link"),
+            finite_number(link.get("pitch", 0), "pitch of a link"),
+        )
+        links.append(Link(str(link.get("to")), wrap(yaw), pitch, plain_text(link.get("text"))))
+    start = list_field(content, "start", source)
+    if len(start) not in (0, 2):
+        raise InputError(f'{source}: needed [yaw, pitch] as "start", got {str(start)[:40]}; correct it.')
+    return dataclasses.replace(
+        panorama,
+        title=plain_text(content.get("title")),
+        links=resolve_links(links, names, panorama.name, source),
+        start=(wrap(finite_number(start[0], "start")), finite_number(start[1], "start")) if start else None,
+    )

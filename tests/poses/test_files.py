@@ -1,0 +1,130 @@
+"""Panoramas without poses: placed ones are a part, each other one is a scene of its own, and the outcome is cached."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import pansplat
+from pansplat.errors import InputError
+from pansplat.poses.estimate import NoPosesError, PoseEstimate
+
+
+def _write(folder: Path, *names: str) -> None:
+    for number, name in enumerate(names):
+        noise = np.random.default_rng(number).integers(0, 255, (8, 16, 3), np.uint8)
+        ramp = cv2.resize(noise, (128, 64), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / name), ramp)
+
+
+def _place(*names: str):
+    """An estimate that places the files of these names, in metres along x."""
+
+    def estimate(images, progress=None) -> PoseEstimate:
+        poses = {image: np.eye(4) for image in images if image.name in names}
+        for number, pose in enumerate(poses.values()):
+            pose[0, 3] = number
+        unplaced = {image: f"no door in {image.stem}" for image in images if image.name not in names}
+        if not poses:
+            raise NoPosesError(unplaced)
+        return PoseEstimate(tuple(images), poses, unplaced, {}, 0.3, 7.0, 0.0, "a test")
+
+    return estimate
+
+
+def _load(folder: Path) -> list:
+    return pansplat.load_pairs(folder)
+
+
+def test_the_panoramas_that_are_not_placed_are_scenes_of_their_own(tmp_path: Path, monkeypatch) -> None:
+    _write(tmp_path, "a.png", "b.png", "c.png", "d.png", "e.png")
+    (tmp_path / "links.json").write_text(json.dumps({"b.png": {"title": "Bath", "links": [{"to": "c.png", "yaw": 1}]}}))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "c.png", "d.png"))
+    for _ in range(2):
+        with pytest.warns(UserWarning) as caught:
+            pairs = _load(tmp_path)
+        assert [pair.name for pair in pairs] == ["a-c", "c-d", "b", "e"]
+        assert [[view.part for view in pair.context] for pair in pairs] == [[0, 0], [0, 0], [1], [2]]
+        assert pairs[1].context[1].cam2world[0, 3] == 2 and (pairs[0].near, pairs[0].far) == (0.3, 7.0)
+        assert torch.equal(pairs[2].context[0].cam2world, torch.eye(4, dtype=torch.float64))
+        assert pairs[2].context[0].title == "Bath" and pairs[2].context[0].links[0].target == "c"
+        assert len(pairs[2].siblings) == 5
+        messages = [str(warning.message) for warning in caught]
+        assert "has no poses; they were estimated: 3 of 5 panoramas have a pose" in messages[0]
+        assert "b.png (Bath) has no pose and is a scene of its own: no door in b" in messages[1]
+        assert "e.png has no pose" in messages[2]
+        monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)  # the second call reads the cache
+
+
+def test_if_none_is_placed_all_are_scenes_of_their_own(tmp_path: Path, monkeypatch) -> None:
+    _write(tmp_path, "a.png", "b.png")
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place())
+    for _ in range(2):
+        with pytest.warns(UserWarning) as caught:
+            pairs = _load(tmp_path)
+        assert [(pair.name, pair.context[0].part) for pair in pairs] == [("a", 0), ("b", 1)]
+        assert [f"{name}.png has no pose" in str(w.message) for name, w in zip("ab", caught, strict=True)] == [True] * 2
+        monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)
+
+
+def test_a_changed_picture_is_estimated_anew(tmp_path: Path, monkeypatch) -> None:
+    _write(tmp_path, "a.png", "b.png")
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place())
+    with pytest.warns(UserWarning):
+        assert len(_load(tmp_path)) == 2
+    _write(tmp_path, "c.png", "b.png", "a.png")
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "b.png"))
+    with pytest.warns(UserWarning, match="2 of 3 panoramas"), pytest.warns(UserWarning, match=r"c\.png has no pose"):
+        assert [pair.name for pair in _load(tmp_path)] == [tmp_path.name, "c"]
+
+
+def test_a_damaged_picture_is_named_and_the_others_open(tmp_path: Path) -> None:
+    _write(tmp_path, "a.png", "b.png")
+    whole = (tmp_path / "b.png").read_bytes()
+    (tmp_path / "b.png").write_bytes(whole[:-30])
+    with pytest.warns(UserWarning) as caught:
+        (pair,) = _load(tmp_path)
+    assert (pair.name, pair.context[0].part) == ("a", 0)
+    messages = [str(warning.message) for warning in caught]
+    assert any("b.png cannot be read and is left out: needed a complete image" in message for message in messages)
+    assert any("a.png has no pose and is a scene of its own" in message for message in messages)
+    assert pair.siblings == (tmp_path / "a.png",)
+
+
+def test_if_no_picture_can_be_read_the_reasons_are_an_error(tmp_path: Path) -> None:
+    _write(tmp_path, "a.png", "b.png")
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-30])
+    with pytest.raises(InputError, match=r"a\.png: needed a complete image.*; b\.png: needed a complete image"):
+        _load(tmp_path)
+
+
+def test_the_panoramas_of_a_web_tour_keep_titles_links_and_start_views(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "img").mkdir()
+    _write(tmp_path / "img", "a.png", "b.png", "c.png")
+    spots = [{"type": "scene", "yaw": 90, "pitch": -20, "sceneId": "bath", "text": "to the bath"}]
+    scenes = {
+        "hall": {"title": "Hall", "panorama": "img/a.png", "hotSpots": spots, "yaw": 10},
+        "attic": {"title": "Attic", "panorama": "img/b.png", "hotSpots": spots},
+        "bath": {"title": "Bath", "panorama": "img/c.png"},
+    }
+    (tmp_path / "tour.json").write_text(json.dumps({"scenes": scenes}))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "c.png"))
+    for path in (tmp_path, tmp_path / "tour.json"):
+        with (
+            pytest.warns(UserWarning, match=r"2 of 3 panoramas have a pose, .* a test\.$"),
+            pytest.warns(UserWarning, match=r"b\.png \(Attic\) has no pose"),
+        ):
+            pair, attic = pansplat.load_pairs(path)
+        hall, bath = pair.context
+        assert [(view.name, view.label, view.part) for view in (hall, bath)] == [
+            ("hall", "Hall", 0),
+            ("bath", "Bath", 0),
+        ]
+        assert hall.links[0].target == "bath" and hall.start is not None and bath.cam2world[0, 3] == 1
+        assert (attic.name, attic.context[0].part) == ("attic", 1)
+        assert (attic.context[0].links[0].target, attic.context[0].links[0].text) == ("bath", "to the bath")
+        assert attic.folder == tmp_path
