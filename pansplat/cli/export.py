@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
 
 _PAGE_SUFFIX, _PLAN_SUFFIX = ".html", ".png"
+_FEW_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # of a panorama in a page
+_MOST_GAUSSIANS = 2_000_000  # of a page in one file
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class Export:
     web page (.html, docs/web.md) or as a floor plan (.png)."""
 
     path: Positional[Path]
-    """A scene file, the folder of a pair, or that of a tour of three or more panoramas."""
+    """A scene file, one panorama, the folder of a pair, or that of a tour, whose panoramas need no poses."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .png for a floor
     plan."""
@@ -102,6 +105,16 @@ class Export:
         print(
             f"{self.out}{beside}: {page.num_gaussians:,} Gaussians, {page.num_bytes / 1e6:.1f} MB; open it in a browser"
         )
+        panoramas = max(len(scene.cam2world), 1)
+        each = self._count_of_page() // panoramas
+        if self.gaussians is None and each < _FEW_GAUSSIANS:
+            more = min(_GOOD_GAUSSIANS * panoramas, _MOST_GAUSSIANS)
+            size = more * page.num_bytes / page.num_gaussians / 1e6
+            print(
+                f"note: {self.out}: {each:,} Gaussians for each of {panoramas} panoramas; "
+                f"--gaussians {more} shows more detail in about {size:.0f} MB",
+                file=sys.stderr,
+            )
 
 
 def _rotation_from(up: Literal["y", "z"]) -> Tensor:

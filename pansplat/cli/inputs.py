@@ -102,8 +102,12 @@ class ScenePrediction:
         tours = find_tours(pairs) if self.choice.pair is None else []
         if not tours:
             return self._predict_pair(pick_pair(path, pairs, self.choice))
+        alone = sum(a == b for a, b in tours[0].overlaps)
+        kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
         more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
-        print(f"note: {path}: a tour of {len(tours[0])} panoramas (--pair chooses one pair){more}", file=sys.stderr)
+        print(
+            f"note: {path}: a tour of {len(tours[0])} panoramas ({kinds}--pair chooses one pair){more}", file=sys.stderr
+        )
         model = self.model.load()
         with progress_bar() as progress:
             return pipeline.predict_tour(

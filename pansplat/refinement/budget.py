@@ -185,7 +185,7 @@ def _merge_cost(gaussians: Gaussians, contributions: Tensor, first: Tensor, seco
 
 
 def _merge_pairs(first: _Parts, second: _Parts) -> _Parts:
-    """Gaussians with the mean, covariance and integral of opacity of each pair."""
+    """Gaussians with the mean and covariance of each pair, and its integral of opacity below the limit of opacity."""
     masses = [part.gaussians.opacities.double() * _area(part.covariances) for part in (first, second)]
     total = (masses[0] + masses[1]).clamp_min(1e-30)
     share = (masses[0] / total)[:, None]
@@ -197,10 +197,14 @@ def _merge_pairs(first: _Parts, second: _Parts) -> _Parts:
     spread = (a.means.double() - b.means.double()) * (share * (1 - share)).sqrt()
     covariances = average(first.covariances, second.covariances, share[:, :, None])
     covariances = covariances + spread[:, :, None] * spread[:, None, :]
+    opacities = total / _area(covariances)
+    # Pairs that overlap have more opacity than fits into their covariance, which alone would leave gaps. Half of the
+    # surplus, in logarithms, becomes area (docs/refinement.md).
+    covariances = covariances * (opacities / _MAX_OPACITY).clamp_min(1).sqrt()[:, None, None]
     merged = dataclasses.replace(
         a,
         means=average(a.means, b.means, share).float(),
-        opacities=(total / _area(covariances)).clamp_max(_MAX_OPACITY).float(),
+        opacities=opacities.clamp_max(_MAX_OPACITY).float(),
         harmonics=average(a.harmonics, b.harmonics, share[:, :, None]).float(),
     )
     return _Parts(merged, covariances, torch.ones_like(first.is_merged))

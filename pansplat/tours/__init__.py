@@ -28,7 +28,7 @@ from pansplat.tours.graph import (
     select_views,
 )
 from pansplat.tours.overlap import connect
-from pansplat.tours.route import Route, plan_route
+from pansplat.tours.route import Route, find_angles, find_way_along_link, plan_route
 
 __all__ = [
     "EDGE_HYSTERESIS",
@@ -41,10 +41,12 @@ __all__ = [
     "choose_camera_height",
     "connect",
     "draw_floor_plan",
+    "find_angles",
     "find_camera_height",
     "find_floor_outline",
     "find_floor_outlines",
     "find_tours",
+    "find_way_along_link",
     "list_starts",
     "make_graph",
     "merge_scenes",

@@ -109,14 +109,14 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
         edges[leg] = edges[leg + 1] if is_flown else tour.find_edge(walk[leg + 1])
     level, yaw, pitch = tour.level_axes, None, 0.0
     if start is not None:
-        yaw, pitch = _find_angles(level.T @ start[:3, 2])
+        yaw, pitch = find_angles(level.T @ start[:3, 2])
     elif (view := tour.find_start_view(walk[0])) is not None:
-        yaw, pitch = _find_angles(level.T @ view)
+        yaw, pitch = find_angles(level.T @ view)
     sections = []
     for first, last in itertools.pairwise([-1, *fades, len(steps)]):
         nodes = walk[first + 1 : last + 1]
         places, legs = [tour.positions[node] for node in nodes], list(range(first + 1, last))
-        link = _find_way_along_link(tour, *steps[last]) if last < len(steps) else None
+        link = find_way_along_link(tour, *steps[last]) if last < len(steps) else None
         if link is not None:
             places.append(places[-1] + link)
             legs.append(legs[-1] if legs else first)
@@ -146,12 +146,12 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
     )
 
 
-def _find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
+def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
     """Yaw and pitch of a unit direction (right, down, forward)."""
     return math.atan2(direction[0], direction[2]), math.asin(min(max(-float(direction[1]), -1.0), 1.0))
 
 
-def _find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
+def find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
     """The level way, in world axes, along the link between two nodes; None without one, and if it is vertical."""
     direction = tour.find_direction(start, end)
     if direction is None:
@@ -163,10 +163,10 @@ def _find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndar
 
 def _find_arrival(tour: TourGraph, start: int, end: int) -> tuple[float, float] | None:
     """Yaw and pitch of a camera after a fade; None to keep the heading."""
-    back, view = _find_way_along_link(tour, end, start), tour.find_start_view(end)
+    back, view = find_way_along_link(tour, end, start), tour.find_start_view(end)
     if back is not None:
-        return _find_angles(-tour.level_axes.T @ back / _LINK_METRES)
-    return None if view is None else _find_angles(tour.level_axes.T @ view)
+        return find_angles(-tour.level_axes.T @ back / _LINK_METRES)
+    return None if view is None else find_angles(tour.level_axes.T @ view)
 
 
 def _fly(

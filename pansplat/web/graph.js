@@ -2,8 +2,9 @@
 // Vectors, and the graph of a tour. The functions of the graph give the results of the methods of
 // pansplat.tours.TourGraph that they name; tests/web/test_browser.py compares them.
 //
-// A graph has `positions` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama on the way
-// from one (row) to another one (column); and the `hysteresis` of a change of edge. Edges are numbers in `edges`.
+// A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
+// on the way from one (row) to another one (column); the `hysteresis` of a change of edge; and the `reach` around a part,
+// within which a camera that has jumped is in it. Edges are numbers in `edges`.
 
 const minus = (a, b) => a.map((value, i) => value - b[i]);
 const plus = (a, b) => a.map((value, i) => value + b[i]);
@@ -13,23 +14,33 @@ const distanceOf = (a, b) => Math.hypot(...minus(a, b));
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const lengthOf = (path) => path.slice(1).reduce((sum, point, i) => sum + distanceOf(point, path[i]), 0);
 
-// measure_distance
-function distanceToEdge(graph, edge, position) {
+function closestOnEdge(graph, edge, position) {
   const [from, to] = graph.edges[edge].slice(0, 2).map((node) => graph.positions[node]);
   const along = minus(to, from);
   const fraction = clamp(dot(minus(position, from), along) / Math.max(dot(along, along), 1e-12), 0, 1);
-  return distanceOf(position, plus(from, scaled(along, fraction)));
+  return plus(from, scaled(along, fraction));
 }
 
-// find_nearest_edge, without the distance
-function nearestEdge(graph, position) {
-  const distances = graph.edges.map((_, edge) => distanceToEdge(graph, edge, position));
+// measure_distance
+const distanceToEdge = (graph, edge, position) => distanceOf(position, closestOnEdge(graph, edge, position));
+
+const partOfEdge = (graph, edge) => graph.parts[graph.edges[edge][0]];
+
+// find_nearest_edge, without the distance; of one part if it is given
+function nearestEdge(graph, position, part = null) {
+  const distances = graph.edges.map((_, edge) => {
+    return part === null || part === partOfEdge(graph, edge) ? distanceToEdge(graph, edge, position) : Infinity;
+  });
   return distances.indexOf(Math.min(...distances));
 }
 
 // follow_edge
 function followEdge(graph, position, current) {
-  const nearest = nearestEdge(graph, position);
+  const part = partOfEdge(graph, current);
+  let nearest = nearestEdge(graph, position);
+  if (partOfEdge(graph, nearest) !== part && distanceToEdge(graph, nearest, position) > graph.reach) {
+    nearest = nearestEdge(graph, position, part);
+  }
   const limit = distanceToEdge(graph, nearest, position) + graph.hysteresis;
   return distanceToEdge(graph, current, position) <= limit ? current : nearest;
 }
@@ -40,13 +51,21 @@ function isReachable(graph, edge, node) {
   return graph.edges.some(([a, b]) => (a === node && ends.includes(b)) || (b === node && ends.includes(a)));
 }
 
+// is_fade
+const isFade = (graph, from, to) => graph.parts[from] !== graph.parts[to];
+
 // find_way
-function findWay(graph, position, node) {
-  const ways = graph.edges[nearestEdge(graph, position)].slice(0, 2).map((start) => {
+function findWay(graph, position, node, part = null) {
+  const ways = graph.edges[nearestEdge(graph, position, part)].slice(0, 2).map((start) => {
     const way = [start];
     while (way.at(-1) !== node) way.push(graph.next[way.at(-1)][node]);
     return way;
   });
-  const [first, second] = ways.map((way) => lengthOf([position, ...way.map((each) => graph.positions[each])]));
-  return first <= second ? ways[0] : ways[1];
+  const [first, second] = ways.map((way) => {
+    const places = [position, ...way.map((each) => graph.positions[each])];
+    const fades = way.map((each, i) => i > 0 && isFade(graph, way[i - 1], each));
+    const lengths = fades.map((fade, i) => fade ? 0 : distanceOf(places[i], places[i + 1]));
+    return [fades.filter(Boolean).length, lengths.reduce((a, b) => a + b)];
+  });
+  return first[0] < second[0] || (first[0] === second[0] && first[1] <= second[1]) ? ways[0] : ways[1];
 }

@@ -10,7 +10,9 @@
   const MIN_FOV = 20, MAX_FOV = 110;  // degrees, vertical
   const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
   const BATCH = HEADER.batch;         // quads of one instance
-  const FADE_MS = 1000;               // from the views of one edge to those of the next
+  const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
+  const SOFT = 0.3;                   // of the way to the limit of the camera, in which steps become shorter
+  const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
   const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
 
   // ---- loading ----
@@ -32,7 +34,7 @@
       PARTS[i] = null;
       if (i % 4 === 3) await report(0.7 + 0.1 * i / PARTS.length);
     }
-    if (PARTS.length !== HEADER.parts) throw new Error("A part of the scene is missing. Copy the whole folder.");
+    if (PARTS.length !== HEADER.dataParts) throw new Error("A part of the scene is missing. Copy the whole folder.");
     await report(0.8);
     const stream = new Blob(gzip).stream().pipeThrough(new DecompressionStream("gzip"));
     const data = new Uint8Array(await new Response(stream).arrayBuffer());
@@ -293,8 +295,9 @@
 
   // ---- the edge at the camera ----
 
-  const GRAPH = { positions: HEADER.spots.map((spot) => spot.position), edges: HEADER.edges, next: HEADER.next, hysteresis: HEADER.hysteresis };
-  let edge = 0, group = HEADER.edges.length ? HEADER.edges[0][2] : 0, fade = null;
+  const { edges, parts, next, hysteresis, reach } = HEADER;
+  const GRAPH = { positions: HEADER.spots.map((spot) => spot.position), edges, parts, next, hysteresis, reach };
+  let edge = 0, group = edges.length ? edges[0][2] : 0, fade = null;
 
   // Chooses the edge at the camera; its views fade in.
   function updateEdge(now) {
@@ -307,21 +310,80 @@
     }
     const chosen = followEdge(GRAPH, camera.position, edge);
     if (chosen === edge) return;
-    const old = group;
+    const old = group, part = currentPart();
     settle(chosen);
-    if (group !== old) fade = { group: old, began: now, done: 0 };
+    if (group !== old && part === currentPart()) fade = { group: old, began: now, done: 0 };
     changed();
   }
 
   // Shows the views of an edge at once.
   function settle(number) {
     edge = number;
-    group = HEADER.edges[number][2];
+    group = edges[number][2];
     fade = null;
   }
 
   function settleAt(position) {
-    if (HEADER.edges.length) settle(nearestEdge(GRAPH, position));
+    if (edges.length) settle(nearestEdge(GRAPH, position));
+  }
+
+  const currentPart = () => edges.length ? partOfEdge(GRAPH, edge) : 0;
+  const endsOfEdge = () => edges.length ? edges[edge].slice(0, 2) : [];
+
+  // ---- fades between parts ----
+
+  // The image of the last camera in the old part covers the new one until that is sorted, then it fades out.
+  const still = byId("still");
+  let frozen = null;
+
+  function freeze() {
+    if (!renderer || !sorted) return;
+    drawAt(canvas.width, canvas.height);  // what a canvas shows can be copied in the task that drew it
+    const size = fullSize(), context = still.getContext("2d");
+    const isSame = still.width === size[0] && still.height === size[1];
+    context.globalAlpha = frozen && isSame ? 1 - frozen.left : 1;
+    if (!isSame) [still.width, still.height] = size;
+    context.drawImage(canvas, 0, 0, ...size);
+    frozen = { began: null, left: 1 };
+    showStill();
+    changed();
+  }
+
+  function updateStill(now) {
+    if (!frozen) return;
+    if (frozen.began === null && sorted.part === currentPart()) frozen.began = now;
+    if (frozen.began !== null) {
+      const t = clamp((now - frozen.began) / FADE_MS, 0, 1);
+      frozen.left = 1 - t * t * (3 - 2 * t);
+      if (t === 1) frozen = null;
+    }
+    showStill();
+    changed();
+  }
+
+  function showStill() {
+    const left = frozen ? frozen.left : 0;
+    still.hidden = !frozen;
+    still.style.opacity = left;
+    byId("spots").style.opacity = 1 - left;
+  }
+
+  const isWaiting = () => frozen !== null && frozen.began === null;
+
+  // The heading after a fade: away from the link back, or the start view, or that of before.
+  function arriveAt(node, from) {
+    const back = findLink(node, from), { start } = HEADER.spots[node];
+    if (back && back.leave) return { yaw: back.yaw + Math.PI, pitch: 0 };
+    return start ? { yaw: start[0], pitch: start[1] } : { yaw: camera.yaw, pitch: 0 };
+  }
+
+  const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
+
+  function jump(position, { yaw, pitch }) {
+    freeze();
+    Object.assign(camera, { position: [...position], yaw, pitch });
+    settleAt(camera.position);
+    changed();
   }
 
   // ---- camera ----
@@ -351,41 +413,84 @@
     changed();
   }
 
-  // Moves along the camera's heading: right, up and forward in metres; stays near the panoramas.
+  // Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part, or
+  // near the panoramas of a scene without edges; steps away from them become shorter near the limit.
   function walk(right, up, forward) {
     const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
     const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
     const target = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
-    const from = nearestSpot(target), offset = minus(target, from), distance = Math.hypot(...offset);
-    camera.position = distance > HEADER.limit ? plus(from, scaled(offset, HEADER.limit / distance)) : target;
+    const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : nearestSpot(target);
+    const limit = HEADER.limits[currentPart()], before = distanceOf(camera.position, from), after = distanceOf(target, from);
+    const outward = Math.max(after - before, 0), slower = clamp((1 - before / limit) / SOFT, 0, 1);
+    const allowed = Math.min(after - (1 - slower) * outward, limit);
+    camera.position = after > allowed ? plus(from, scaled(minus(target, from), allowed / after)) : target;
     changed();
   }
 
   function nearestSpot(position) {
-    return GRAPH.positions.reduce((a, b) => distanceOf(b, position) < distanceOf(a, position) ? b : a);
+    return GRAPH.positions[nearestNode(position)];
   }
 
-  // A smooth flight to a panorama along the edges; the direction of view stays the user's.
+  // The nearest panorama, in a tour of the camera's part.
+  function nearestNode(position) {
+    const distances = GRAPH.positions.map((place, node) => parts[node] === currentPart() ? distanceOf(place, position) : Infinity);
+    return distances.indexOf(Math.min(...distances));
+  }
+
+  // A smooth flight to a panorama along the edges; the direction of view stays the user's. To another part, the camera
+  // turns to the link, goes a step along it, and the image fades; without a link it fades at once.
   let flight = null, touring = false;
   function flyTo(spot) {
-    const way = HEADER.edges.length ? findWay(GRAPH, camera.position, spot) : [spot];
-    const path = [[...camera.position], ...way.map((node) => GRAPH.positions[node])];
-    const length = lengthOf(path), seconds = clamp(1.2 * length / HEADER.speed, 0.6, 3 * (path.length - 1));
-    flight = { spot, path, length, seconds, began: performance.now() };
+    const way = edges.length ? findWay(GRAPH, camera.position, spot, partOfEdge(GRAPH, followEdge(GRAPH, camera.position, edge))) : [spot];
+    const legs = [];
+    let path = [[...camera.position]];
+    way.forEach((node, i) => {
+      if (i > 0 && isFade(GRAPH, way[i - 1], node)) {
+        const link = findLink(way[i - 1], node);
+        legs.push({ path });
+        if (link && link.leave) legs.push({ path: path.slice(-1), yaw: link.yaw }, { path: [path.at(-1), link.leave] });
+        legs.push({ path: [], from: way[i - 1], to: node });
+        path = [];
+      } else if (i + 1 < way.length && i === 0 && isFade(GRAPH, node, way[1])) return;  // it fades where the camera is
+      path.push(GRAPH.positions[node]);
+    });
+    legs.push({ path });
+    flight = { spot, legs, began: null };
     changed();
   }
 
   const ease = (t) => t * t * t * (t * (6 * t - 15) + 10);
 
   function advanceFlight(now) {
-    if (!flight) return;
-    const t = clamp((now - flight.began) / (1000 * flight.seconds), 0, 1);
-    camera.position = t < 1 ? pointAlong(flight.path, ease(t) * flight.length) : [...flight.path.at(-1)];
+    if (!flight || isWaiting()) return;
+    const leg = flight.legs[0];
+    if (leg.to !== undefined) {
+      jump(GRAPH.positions[leg.to], arriveAt(leg.to, leg.from));
+      flight.legs.shift();
+      return;
+    }
+    if (flight.began === null) beginLeg(leg, now);
+    const t = leg.seconds ? clamp((now - flight.began) / (1000 * leg.seconds), 0, 1) : 1;
+    if (leg.length) camera.position = t < 1 ? pointAlong(leg.path, ease(t) * leg.length) : [...leg.path.at(-1)];
+    turn(leg.turn[0] * (ease(t) - leg.done), leg.turn[1] * (ease(t) - leg.done));  // a drag adds to it
+    leg.done = ease(t);
     changed();
     if (t < 1) return;
+    flight.began = null;
+    flight.legs.shift();
+    if (flight.legs.length) return;
     const { spot } = flight;
     flight = null;
     if (touring) flyTo((spot + 1) % HEADER.spots.length);
+  }
+
+  function beginLeg(leg, now) {
+    flight.began = now;
+    leg.length = lengthOf(leg.path);
+    leg.done = 0;
+    leg.turn = leg.yaw === undefined ? [0, 0] : [Math.atan2(Math.sin(leg.yaw - camera.yaw), Math.cos(leg.yaw - camera.yaw)), -camera.pitch];
+    const turning = Math.hypot(...leg.turn) / TURN_SPEED;
+    leg.seconds = leg.length ? clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : turning;
   }
 
   function pointAlong(path, distance) {
@@ -398,32 +503,37 @@
   }
 
   // The flight through all panoramas of a tour. It begins at the point of the route that is nearest to the camera, and
-  // the difference in pose disappears in the first second. The camera turns with the route; a drag adds to it.
+  // the difference in pose disappears at first. The camera turns with the route; a drag adds to it until a fade.
   let route = null;
   function startRoute() {
     const distances = HEADER.route.map((sample) => distanceOf(sample.slice(0, 3), camera.position));
     const least = Math.min(...distances) + 0.02 * HEADER.speed;
     const first = distances.findIndex((distance) => distance <= least), sample = HEADER.route[first];
-    const turned = camera.yaw - sample[3];
-    route = {
-      time: first / HEADER.routeRate, began: first / HEADER.routeRate, last: null,
-      offset: [...minus(camera.position, sample.slice(0, 3)), turned - 2 * Math.PI * Math.round(turned / (2 * Math.PI)), camera.pitch],
-    };
+    const offset = minus([...camera.position, camera.yaw, camera.pitch], sample);
+    offset[3] -= 2 * Math.PI * Math.round(offset[3] / (2 * Math.PI));
+    const time = first / HEADER.routeRate, seconds = Math.max(1, Math.abs(offset[3]) / TURN_SPEED);
+    route = { time, began: time, seconds, last: null, offset };
   }
 
   function advanceRoute(seconds) {
-    if (!route) return;
+    if (!route || isWaiting()) return;
+    const end = HEADER.route.length - 1, before = Math.floor(route.time * HEADER.routeRate);
     route.time += seconds;
-    const at = Math.min(route.time * HEADER.routeRate, HEADER.route.length - 1), index = Math.min(Math.floor(at), HEADER.route.length - 2);
-    const sample = plus(HEADER.route[index], scaled(minus(HEADER.route[index + 1], HEADER.route[index]), at - index));
-    const left = 1 - ease(clamp(route.time - route.began, 0, 1));
-    const [x, y, z, yaw, pitch] = plus([...sample, 0], scaled(route.offset, left));
+    const at = Math.min(route.time * HEADER.routeRate, end), index = Math.min(Math.floor(at), end - 1);
+    if (HEADER.jumps.some((jumped) => before <= jumped && jumped < index)) {
+      const [x, y, z, yaw, pitch] = HEADER.route[index];
+      jump([x, y, z], { yaw, pitch });
+      Object.assign(route, { time: index / HEADER.routeRate, offset: [0, 0, 0, 0, 0], last: { yaw, pitch } });
+      return;
+    }
+    const part = HEADER.jumps.includes(index) ? 0 : at - index;
+    const sample = plus(HEADER.route[index], scaled(minus(HEADER.route[index + 1], HEADER.route[index]), part));
+    const left = 1 - ease(clamp((route.time - route.began) / route.seconds, 0, 1));
+    const [x, y, z, yaw, pitch] = plus(sample, scaled(route.offset, left));
     camera.position = [x, y, z];
-    camera.yaw += yaw - (route.last ? route.last.yaw : yaw);
-    camera.pitch = clamp(camera.pitch + pitch - (route.last ? route.last.pitch : pitch), -MAX_PITCH, MAX_PITCH);
+    turn(yaw - (route.last ? route.last.yaw : yaw), pitch - (route.last ? route.last.pitch : pitch));
     route.last = { yaw, pitch };
-    changed();
-    if (at === HEADER.route.length - 1) setTouring(false);
+    if (at === end) setTouring(false);
   }
 
   function setTouring(value) {
@@ -435,7 +545,7 @@
       flight = null;
       startRoute();
     } else if (!flight) {
-      flyTo((GRAPH.positions.indexOf(nearestSpot(camera.position)) + 1) % GRAPH.positions.length);
+      flyTo((nearestNode(camera.position) + 1) % GRAPH.positions.length);
     }
     changed();
   }
@@ -443,6 +553,7 @@
   function goHome() {
     setTouring(false);
     flight = null;
+    if (edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, HEADER.start.position)) !== currentPart()) freeze();
     Object.assign(camera, makeStart());
     settleAt(camera.position);
     changed();
@@ -460,10 +571,11 @@
     KeyF: () => toggleFull(),
     KeyR: () => goHome(),
     KeyH: () => byId("keys").showModal(),
+    KeyL: () => openList(),
   };
 
   function onKey(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || byId("keys").open) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
     const onButton = event.target.tagName === "BUTTON" && (event.code === "Space" || event.code === "Enter");
     if (onButton) return;
     const digit = /^(Digit|Numpad)([1-9])$/.exec(event.code);
@@ -572,65 +684,166 @@
       changed();
     }, { passive: false });
     byId("play").onclick = () => setTouring(!touring);
+    byId("home").onclick = goHome;
+    byId("place").onclick = openList;
+    byId("list").onclick = (event) => { if (event.target === byId("list")) byId("list").close(); };  // beside it
     byId("full").onclick = toggleFull;
     byId("help").onclick = () => byId("keys").showModal();
     byId("motion").onclick = toggleMotion;
     byId("motion").hidden = !("DeviceOrientationEvent" in window && matchMedia("(pointer: coarse)").matches);
     byId("full").hidden = !document.documentElement.requestFullscreen;
-    byId("play").hidden = HEADER.spots.length < 2;
+    byId("play").hidden = byId("place").hidden = HEADER.spots.length < 2;
     byId("buttons").hidden = false;
   }
 
   // ---- hotspots ----
 
-  function makeSpots() {
-    return HEADER.spots.map((spot, index) => {
-      const button = document.createElement("button");
-      button.title = button.ariaLabel = `Go to ${spot.name}`;
-      button.onclick = () => {
-        setTouring(false);
-        flyTo(index);
-        canvas.focus({ preventScroll: true });
-      };
+  function goTo(node) {
+    setTouring(false);
+    flyTo(node);
+    canvas.focus({ preventScroll: true });
+  }
+
+  // An element with children that are elements or text; text is never HTML.
+  function make(tag, className, ...children) {
+    const element = document.createElement(tag);
+    element.className = className;
+    element.append(...children);
+    return element;
+  }
+
+  // A ring for each panorama, and one where each link to another part meets the floor.
+  function makeRings() {
+    const links = HEADER.links.filter((link) => link.mark);
+    const marks = [...HEADER.spots.map((_, node) => ({ node, link: null })), ...links.map((link) => ({ node: link.to, link }))];
+    return marks.map(({ node, link }) => {
+      const { name, position, mark } = HEADER.spots[node], text = make("small", "");
+      const label = make("span", "", make("b", "", name), text), button = make("button", link ? "fade" : "", label);
+      const place = link ? { mark: link.mark, camera: null, radius: HEADER.spots[link.from].radius } : { mark, camera: position, radius: HEADER.spots[node].radius };
+      button.hidden = true;
+      button.onclick = () => goTo(node);
       byId("spots").append(button);
-      return button;
+      return { node, link, button, label, text, ...place, isNext: false, size: null };
     });
   }
 
-  // A ring on the floor under each panorama, in perspective.
-  function placeSpots(rotation) {
+  // The rings of panoramas next to the edge, and of links from its ends. A link's text is a part of the label.
+  function chooseRings() {
+    if (ringsOf === edge) return;
+    ringsOf = edge;
+    const ends = endsOfEdge();
+    for (const ring of rings) {
+      const { name } = HEADER.spots[ring.node];
+      const link = ring.link || HEADER.links.find(({ from, to }) => to === ring.node && ends.includes(from));
+      const isHere = parts[ring.node] === currentPart() && (link || !edges.length || isReachable(GRAPH, edge, ring.node));
+      ring.isNext = ring.link ? ends.includes(link.from) : isHere;
+      ring.text.textContent = link && link.text !== name ? link.text : "";
+      ring.button.title = ["Go to", name, ring.text.textContent].join(" ").trim();
+      ring.button.ariaLabel = ring.button.title;
+      ring.size = null;
+    }
+  }
+
+  // Rings in perspective. A label that would cover the label of a nearer ring is not shown.
+  function placeRings(rotation) {
+    chooseRings();
     const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
-    HEADER.spots.forEach((spot, index) => {
-      const button = spots[index], offset = minus(spot.mark, camera.position);
+    const taken = [], placed = [];
+    for (const ring of rings) {
+      const { radius } = ring, offset = minus(ring.mark, camera.position);
       const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
-      const away = distanceOf(spot.position, camera.position), isNext = !HEADER.edges.length || isReachable(GRAPH, edge, index);
-      button.hidden = z < 0.1 * spot.radius || away < 2 * spot.radius || !isNext;
-      if (button.hidden) return;
-      const size = clamp(2 * spot.radius * focal / z / 64, 0.25, 2), tilt = clamp(y / Math.hypot(x, y, z), 0.25, 1);
-      button.style.transform = `translate(${0.5 * width + focal * x / z}px, ${0.5 * height + focal * y / z}px) scale(${size}, ${size * tilt})`;
+      const isAtCamera = ring.camera !== null && distanceOf(ring.camera, camera.position) < 2 * radius;
+      ring.button.hidden = !ring.isNext || isAtCamera || z < 0.1 * radius;
+      if (!ring.button.hidden) placed.push({ ring, x, y, z, distance: Math.hypot(x, y, z) });
+    }
+    for (const { ring, x, y, z, distance } of placed.sort((a, b) => a.distance - b.distance)) {
+      const { style } = ring.button, size = clamp(2 * ring.radius * focal / z, 16, 128), tall = size * clamp(y / distance, 0.25, 1);
+      const [left, top] = [0.5 * width + focal * x / z, 0.5 * height + focal * y / z];
+      style.width = `${size}px`;
+      style.height = `${tall}px`;
+      style.borderWidth = `${clamp(0.09 * size, 2, 6)}px`;
+      style.transform = `translate(${left - 0.5 * size}px, ${top - 0.5 * tall}px)`;
+      if (!ring.size) ring.size = [ring.label.offsetWidth, ring.label.offsetHeight];
+      const box = [left - 0.5 * ring.size[0], top + 0.5 * tall, left + 0.5 * ring.size[0], top + 0.5 * tall + ring.size[1]];
+      const isFree = taken.every((other) => box[0] > other[2] || box[2] < other[0] || box[1] > other[3] || box[3] < other[1]);
+      ring.label.style.visibility = isFree ? "" : "hidden";
+      if (isFree) taken.push(box);
+    }
+  }
+
+  // ---- list of panoramas ----
+
+  const isSingle = (node) => parts.filter((part) => part === parts[node]).length === 1;
+
+  // The panoramas with a common world by part, then those without others.
+  function makeList() {
+    const nodes = [...HEADER.spots.keys()], placed = [...new Set(nodes.filter((node) => !isSingle(node)).map((node) => parts[node]))];
+    const sections = placed.map((part, i) => {
+      const title = placed.length > 1 ? `Placed panoramas, part ${i + 1}` : "Placed panoramas";
+      return [title, nodes.filter((node) => parts[node] === part)];
     });
+    sections.push(["Single photographs, not placed", nodes.filter(isSingle)]);
+    for (const [title, members] of sections.filter((section) => section[1].length)) {
+      byId("panoramas").append(make("h2", "", title));
+      for (const node of members) {
+        const button = make("button", "", `${node + 1}. ${HEADER.spots[node].name}`);
+        button.onclick = () => {
+          byId("list").close();
+          goTo(node);
+        };
+        listed[node] = button;
+        byId("panoramas").append(button);
+      }
+    }
+  }
+
+  function openList() {
+    if (HEADER.spots.length < 2) return;
+    byId("list").showModal();
+    listed[here].focus();
+  }
+
+  // Names the panorama at the camera.
+  function showPlace() {
+    const node = nearestNode(camera.position);
+    if (node === here) return;
+    if (listed[here]) listed[here].removeAttribute("aria-current");
+    here = node;
+    listed[here].setAttribute("aria-current", "location");
+    byId("name").textContent = HEADER.spots[here].name;
+    byId("kind").textContent = isSingle(here) ? "single photograph" : "";
   }
 
   // ---- frames ----
 
   // A frame is drawn only if something changed. While it moves, the scale of the resolution follows the time between
   // frames; at rest the image has the full resolution.
-  let renderer = null, spots = [], fast = false, dirty = true, scale = 1, lastChange = 0, lastFrame = 0, drawnScale = 0;
-  let sorter = null, sorting = false, sortedFor = null, latest = null;
+  let renderer = null, rings = [], ringsOf = null, listed = [], here = null, fast = false, dirty = true, scale = 1, lastChange = 0, lastFrame = 0, drawnScale = 0;
+  let sorter = null, sorting = false, sorted = null;
   const changed = () => { dirty = true; lastChange = performance.now(); };
 
+  const isSortedFor = (position, part) => {
+    return sorted !== null && sorted.part === part && sorted.position.every((value, i) => value === position[i]);
+  };
+
   function requestSort() {
-    if (sorting || (sortedFor && sortedFor.every((value, i) => value === camera.position[i]))) return;
+    if (sorting || isSortedFor(camera.position, currentPart())) return;
     sorting = true;
-    sorter.postMessage({ position: [...camera.position] });
+    sorter.postMessage({ position: [...camera.position], part: currentPart() });
   }
 
   function onSorted({ data }) {
     sorting = false;
-    sortedFor = data.position;
-    latest = data;
+    sorted = data;
     if (renderer) renderer.setSorted(data);
     dirty = true;
+  }
+
+  // Of the canvas at the full resolution.
+  function fullSize() {
+    const { clientWidth, clientHeight } = canvas, ratio = Math.min(devicePixelRatio || 1, 2);
+    const full = Math.min(ratio, Math.sqrt(MAX_PIXELS / (clientWidth * clientHeight || 1)));
+    return [clientWidth, clientHeight].map((side) => Math.max(Math.round(side * full), 1));
   }
 
   function drawAt(width, height) {
@@ -647,18 +860,17 @@
     walkByKeys(Math.min(elapsed, 100) / 1000, fast);
     advanceFlight(now);
     advanceRoute(Math.min(elapsed, 100) / 1000);
-    if (HEADER.edges.length) updateEdge(now);
+    if (edges.length) updateEdge(now);
+    updateStill(now);
     requestSort();
     const moving = now - lastChange < 200;
     if (moving && drawnScale && elapsed < 1000) scale = clamp(scale * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);
     const wanted = moving ? scale : 1;
-    if (!renderer || !sortedFor || !(dirty || wanted > drawnScale)) return;
+    if (!renderer || !sorted || !(dirty || wanted > drawnScale)) return;
     dirty = false;
     drawnScale = wanted;
-    const { clientWidth, clientHeight } = canvas, ratio = Math.min(devicePixelRatio || 1, 2);
-    const full = Math.min(ratio, Math.sqrt(MAX_PIXELS / (clientWidth * clientHeight || 1)));
-    const [width, height] = [clientWidth, clientHeight].map((side) => Math.max(Math.round(side * full * wanted), 1));
-    placeSpots(drawAt(width, height));
+    placeRings(drawAt(...fullSize().map((side) => Math.max(Math.round(side * wanted), 1))));
+    showPlace();
   }
 
   let failure = null;
@@ -679,7 +891,7 @@
     const makeRenderer = () => {
       if (!scene || gl.isContextLost()) return;
       renderer = new Renderer(gl, scene);
-      if (latest) renderer.setSorted(latest);
+      if (sorted) renderer.setSorted(sorted);
       changed();
     };
     canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); renderer = null; });
@@ -692,14 +904,15 @@
       sorter.onmessage = (event) => { onSorted(event); resolve(); };
       sorter.onerror = (event) => {
         const error = new Error(`The sorting failed: ${event.message}`);
-        if (sortedFor) fail(error);
+        if (sorted) fail(error);
         else reject(error);
       };
     });
     const { count, views, harmonicsScale, colorRange: range } = HEADER;
     const base = scene.harmonics ? scene.colors : null;
     const { means, harmonics } = scene, moved = [means, harmonics].filter(Boolean).map((array) => array.buffer);
-    sorter.postMessage({ count, views, means, harmonics, base, harmonicsScale, range }, moved);  // not copied
+    sorter.postMessage({ count, views, parts, means, harmonics, base, harmonicsScale, range }, moved);  // not copied
+    settleAt(camera.position);
     requestSort();
     makeRenderer();
     await first;
@@ -709,7 +922,8 @@
     }
     await report(1);
     listen();
-    spots = makeSpots();
+    rings = makeRings();
+    makeList();
     requestAnimationFrame(onFrame);
     byId("cover").className = "done";
     setTimeout(() => { byId("cover").hidden = !failure; }, 700);
@@ -723,7 +937,8 @@
     async render(width, height) {
       await this.ready;
       const place = [...camera.position];
-      while (!renderer || !sortedFor.every((value, i) => value === place[i])) {
+      settleAt(place);
+      while (!renderer || !isSortedFor(place, currentPart())) {
         if (failure) throw failure;
         await wait(5);
       }

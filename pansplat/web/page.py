@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
@@ -20,7 +21,7 @@ from urllib.parse import quote
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from PIL import Image
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
@@ -29,8 +30,8 @@ from torch import Tensor
 from pansplat import constants, pipeline
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Scene, prune
-from pansplat.geometry.path import path_poses
+from pansplat.gaussians.scene import Gaussians, Scene, prune
+from pansplat.geometry.path import path_poses, turn_pose
 from pansplat.geometry.world import working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement.budget import merge_to
@@ -38,12 +39,17 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.shaders import load_shader
 from pansplat.tours import (
     EDGE_HYSTERESIS,
+    Route,
     TourGraph,
     choose_camera_height,
+    find_angles,
     find_camera_height,
+    find_way_along_link,
     make_graph,
     plan_route,
+    select_views,
 )
+from pansplat.tours.layout import REACH
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 
 DEFAULT_GAUSSIANS = 300_000  # phones draw and hold them
@@ -56,6 +62,8 @@ _POSTER_SIZE = (540, 960)
 _START_FOV = 75.0  # degrees, vertical
 _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
+_SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
+_LINK_METRES = (1.0, 3.0)  # distance of a link's ring
 _BATCH = 256  # quads that are drawn together
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag")}
@@ -113,7 +121,7 @@ def write_page(
     flights = _plan_flights(scene, tour, factor)
     if len(scene.gaussians) > gaussians:
         report("merging Gaussians", 0.1)
-        scene = _merge(scene, gaussians)
+        scene = _merge(scene, flights.parts, gaussians)
     report("compressing", 0.6)
     degree = _choose_degree(scene)
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
@@ -121,7 +129,7 @@ def write_page(
     report("drawing the poster", 0.8)
     poster = _draw_poster(scene, flights.start)
     report("writing", 0.9)
-    header = _describe_scene(scene, packed, origin, flights)
+    header = _describe_scene(scene, packed, origin, flights, tour, factor)
     return _write_files(path, header, packed.content, poster, split, title or path.stem)
 
 
@@ -130,23 +138,29 @@ class _Flights:
     """How the camera moves, in a unit near metres.
 
     Attributes:
-        start: first pose, without roll and pitch.
+        start: first pose, without roll.
         level: axes of a level camera (columns right, down, forward); yaws are relative to it.
-        yaw: of the start, radians.
+        yaw, pitch: of the start, radians.
+        parts: of each view; the camera moves within a part, and the image fades to another one.
         groups: views that are blended together.
         edges: two views and the group that is blended between them; without edges all views are blended.
         next: the next panorama on the way from a panorama (row) to another one (column).
-        route: positions and yaws of the flight through all panoramas, `_ROUTE_RATE` a second; empty without edges.
+        route: positions, yaws and pitches of the flight through all panoramas, `_ROUTE_RATE` a second; empty without
+            edges.
+        jumps: samples of the route after which the camera jumps to another part.
         hysteresis: distance by which another edge must be nearer than the current one.
     """
 
     start: Float[Tensor, "4 4"]
     level: Float[np.ndarray, "3 3"]
-    yaw: float = 0.0
-    groups: tuple[tuple[int, ...], ...] = ()
+    yaw: float
+    pitch: float
+    parts: tuple[int, ...]
+    groups: tuple[tuple[int, ...], ...]
     edges: tuple[tuple[int, int, int], ...] = ()
     next: tuple[tuple[int, ...], ...] = ()
-    route: Float[np.ndarray, "time 4"] = field(default_factory=lambda: np.zeros((0, 4)))
+    route: Float[np.ndarray, "time 5"] = field(default_factory=lambda: np.zeros((0, 5)))
+    jumps: tuple[int, ...] = ()
     hysteresis: float = 0.0
 
 
@@ -158,29 +172,52 @@ def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
         tour: in metres.
         factor: of the scene's unit.
     """
+    views = tuple(range(len(scene.cam2world)))
+    first = tour.find_start_view(0) if len(tour) else None
     if not tour.overlaps:
         start = path_poses(scene.cam2world)[0]
-        return _Flights(start, start[:3, :3].numpy(), groups=(tuple(range(len(scene.cam2world))),))
-    views = tour.choose_scene_views()
-    groups = tuple(dict.fromkeys(views.values()))
-    walk = tour.plan_walk()
+        level = start[:3, :3].numpy()
+        yaw, pitch = (0.0, 0.0) if first is None else find_angles(level.T @ first)
+        return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
+    scenes = tour.choose_scene_views()
+    groups = tuple(dict.fromkeys(scenes.values()))
+    walk = tour.plan_walk(None if first is None else 0)
     route = plan_route(tour, [*walk, *tour.find_walk(walk[-1], walk[0])[1:]])  # ends where it begins
-    samples = max(round(route.seconds * _ROUTE_RATE), 1) + 1
-    at = np.linspace(0, len(route.yaws) - 1, samples)
-    steps = np.arange(len(route.yaws))
-    columns = [*(factor * route.positions.T), route.yaws]
+    samples, jumps = _resample(route, factor)
     start = torch.from_numpy(route.pose(0.0))
     start[:3, 3] *= factor
     return _Flights(
         start,
         route.level,
-        float(route.yaws[0]),
+        float(samples[0, 3]),
+        float(samples[0, 4]),
+        tour.parts,
         groups,
-        tuple((a, b, groups.index(views[a, b])) for a, b in tour.overlaps),
+        tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps),
         tuple(tuple(row) for row in tour.find_next_nodes()),
-        np.stack([np.interp(at, steps, column) for column in columns], axis=1),
+        samples,
+        jumps,
         factor * EDGE_HYSTERESIS,
     )
+
+
+def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: float, pitch: float) -> Tensor:
+    """The pose (4, 4) with the same position that looks in the direction of two angles, relative to `level`."""
+    turned = turn_pose(pose, yaw, torch.from_numpy(-level[:, 1]))
+    return turn_pose(turned, pitch, -turned[:3, 0])
+
+
+def _resample(route: Route, factor: float) -> tuple[Float[np.ndarray, "time 5"], tuple[int, ...]]:
+    """Positions, yaws and pitches at `_ROUTE_RATE`, and the samples after which the camera jumps."""
+    columns = np.stack([*(factor * route.positions.T), route.yaws, route.pitches])
+    rate = _ROUTE_RATE * route.seconds / (len(route.yaws) - 1)
+    sections = []
+    for section in np.split(columns, route.jumps + 1, axis=1):
+        steps = np.arange(section.shape[1])
+        at = np.linspace(0, steps[-1], max(round(steps[-1] * rate), 1) + 1)
+        sections.append(np.stack([np.interp(at, steps, column) for column in section], axis=1))
+    ends = np.cumsum([len(section) for section in sections])[:-1] - 1
+    return np.concatenate(sections), tuple(ends.tolist())
 
 
 def _prepare(scene: Scene, factor: float) -> Scene:
@@ -205,7 +242,26 @@ def _prepare(scene: Scene, factor: float) -> Scene:
     return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, names=names)
 
 
-def _merge(scene: Scene, count: int) -> Scene:
+def _merge(scene: Scene, parts: Sequence[int], count: int) -> Scene:
+    """At most `count` Gaussians, an equal number for each panorama of different parts.
+
+    Args:
+        scene: of `_prepare`.
+        parts: of each view; they are merged one after the other.
+    """
+    merged = []
+    for part in dict.fromkeys(parts):
+        views = tuple(view for view, other in enumerate(parts) if other == part)
+        chosen = select_views(scene, views)
+        kept = max(count * len(views) // len(parts), 1)
+        if len(chosen.gaussians) > kept:
+            chosen = _merge_part(chosen, kept)
+        labels = torch.tensor(views)[chosen.gaussians.views.long()]
+        merged.append(dataclasses.replace(chosen.gaussians, views=labels))
+    return dataclasses.replace(scene, gaussians=Gaussians.cat(merged))
+
+
+def _merge_part(scene: Scene, count: int) -> Scene:
     """At most `count` Gaussians. Their colours are fitted to the images of all Gaussians at the input cameras."""
     height = min(scene.height, _MERGE_HEIGHT)
     size = (height, 2 * height)
@@ -242,28 +298,31 @@ def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"]) -> bytes:
 
 
 def _describe_scene(
-    scene: Scene, packed: PackedGaussians, origin: Float[np.ndarray, "3"], flights: _Flights
+    scene: Scene,
+    packed: PackedGaussians,
+    origin: Float[np.ndarray, "3"],
+    flights: _Flights,
+    tour: TourGraph,
+    factor: float,
 ) -> dict[str, Any]:
     """The numbers of a page, without those of single Gaussians; page.js reads them as HEADER."""
     level = flights.level
     positions = scene.cam2world[:, :3, 3].numpy() - origin
-    means = scene.gaussians.means.double().numpy() - origin
-    views = scene.gaussians.views.numpy()
-    offsets = means - positions[views]
-    distances = np.linalg.norm(offsets, axis=1)
-    reach = max(float(np.median(distances)), 1e-3)
-    heights = [find_camera_height(scene, view, level) for view in range(len(positions))]
-    usual_height = choose_camera_height(heights, scene.far)
+    known = [find_camera_height(scene, view, level) for view in range(len(positions))]
+    usual_height = choose_camera_height(known, scene.far)
+    heights = [height or usual_height for height in known]
+    starts = [tour.find_start_view(node) for node in range(len(tour))] or [None]
     spots = [
         {
             "name": name,
             "position": _round(position),
-            "mark": _round(position + (height or usual_height) * level[:, 1]),
-            "radius": round(0.12 * (height or usual_height), 6),
+            "mark": _round(position + height * level[:, 1]),
+            "radius": round(0.12 * height, 6),
+            **({} if start is None else {"start": _round(np.array(find_angles(level.T @ start)))}),
         }
-        for name, position, height in zip(scene.names, positions, heights, strict=True)
+        for name, position, height, start in zip(scene.names, positions, heights, starts, strict=True)
     ]
-    longest_step = float(minimum_spanning_tree(cdist(positions, positions)).toarray().max(initial=0.0))
+    reaches = _measure_reaches(scene, np.array(flights.parts))
     views_of_page = [
         {"position": _round(position), "start": start, "count": end - start}
         for position, start, end in zip(positions, packed.starts, packed.starts[1:], strict=False)
@@ -275,25 +334,89 @@ def _describe_scene(
         "harmonicsScale": packed.harmonics_scale,
         "views": views_of_page,
         "spots": spots,
+        "links": _describe_links(tour, positions, heights, level, factor) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
             "yaw": round(flights.yaw, 5),
-            "pitch": 0.0,
+            "pitch": round(flights.pitch, 5),
             "fov": _START_FOV,
         },
+        "parts": flights.parts,
         "groups": flights.groups,
         "edges": flights.edges,
         "hysteresis": flights.hysteresis,
+        "reach": REACH,
         "next": flights.next,
         "routeRate": _ROUTE_RATE,
-        "route": (flights.route - [*origin, 0.0]).round(4).tolist(),
+        "route": (flights.route - [*origin, 0.0, 0.0]).round(4).tolist(),
+        "jumps": flights.jumps,
         "batch": _BATCH,
         "near": constants.NEAR,
         "filterVariance": constants.FILTER_VARIANCE["angular"],
-        "speed": _SPEED * reach,
-        "limit": max(reach, 0.75 * longest_step),
+        "speed": _SPEED * float(np.median(reaches)),
+        "limits": _limit_parts(reaches, positions, flights, len(tour)),
     }
+
+
+def _describe_links(
+    tour: TourGraph,
+    positions: Float[np.ndarray, "node 3"],
+    heights: list[float],
+    level: Float[np.ndarray, "3 3"],
+    factor: float,
+) -> list[dict[str, Any]]:
+    """The links of a page; those to other parts have a ring on the floor, and a place where the fade begins.
+
+    Args:
+        tour: in metres.
+        positions, heights: of the cameras, in the page's unit.
+        level: axes of a level camera.
+        factor: of the page's unit.
+    """
+    links = []
+    for (start, end), link in tour.links.items():
+        found: dict[str, Any] = {"from": start, "to": end, "text": link.text}
+        way, direction = find_way_along_link(tour, start, end), tour.find_direction(start, end)
+        if way is not None and direction is not None and tour.is_fade(start, end):
+            fall = float(direction @ level[:, 1])
+            least, most = _LINK_METRES
+            distance = heights[start] * math.sqrt(1 - fall**2) / fall if fall > 0 else most
+            flat = min(max(distance, least), most) / np.linalg.norm(way) * way
+            found["mark"] = _round(positions[start] + flat + heights[start] * level[:, 1])
+            found["leave"] = _round(positions[start] + factor * way)
+            found["yaw"] = round(find_angles(level.T @ direction)[0], 5)
+        links.append(found)
+    return links
+
+
+def _measure_reaches(scene: Scene, parts: Int[np.ndarray, "view"]) -> Float[np.ndarray, "part"]:
+    """Median distance of the Gaussians of each part from their cameras."""
+    views = scene.gaussians.views.long()
+    distances = (scene.gaussians.means.double() - scene.cam2world[views, :3, 3]).norm(dim=1).numpy()
+    reaches = np.full(parts.max() + 1, 1e-3)
+    for part in range(len(reaches)):
+        own = distances[parts[views] == part]
+        if len(own):
+            reaches[part] = max(float(np.median(own)), 1e-3)
+    return reaches
+
+
+def _limit_parts(
+    reaches: Float[np.ndarray, "part"], positions: Float[np.ndarray, "view 3"], flights: _Flights, num_panoramas: int
+) -> list[float]:
+    """How far the camera may move in each part from its edges; without edges, from the nearest panorama."""
+    parts = list(flights.parts)
+    if not flights.edges:
+        if num_panoramas == 1:
+            return [min(_SINGLE_REACH, 0.5 * float(reaches[0]))]
+        longest_step = float(minimum_spanning_tree(cdist(positions, positions)).toarray().max(initial=0.0))
+        return [max(float(reaches[0]), 0.75 * longest_step)]
+    most = REACH if len(reaches) > 1 else math.inf
+    return [
+        min(_SINGLE_REACH, 0.5 * reach) if parts.count(part) == 1 else min(reach, most)
+        for part, reach in enumerate(reaches.tolist())
+    ]
 
 
 def _round(vector: np.ndarray) -> list[float]:
@@ -316,7 +439,7 @@ def _write_files(
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
         count=f"{count:,}",
-        header=_to_script(header | {"parts": len(parts)}),
+        header=_to_script(header | {"dataParts": len(parts)}),
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         sorter=_to_script(_read("sorter.js")),
         parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),

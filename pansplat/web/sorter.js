@@ -1,24 +1,32 @@
 "use strict";
-// A worker: the drawing order and the colours of one camera position. Neither depends on the camera's rotation.
+// A worker: the drawing order and the colours of one camera position, of the views of one part. Neither depends on the
+// camera's rotation. What belongs to other parts is unchanged.
 
-let scene = null;
+let scene = null, order = null, colors = null;
 
 onmessage = (event) => {
-  if (event.data.means) scene = event.data;
-  else sort(event.data.position);
+  if (event.data.means) prepare(event.data);
+  else sort(event.data);
 };
 
-function sort(position) {
-  const order = new Uint32Array(scene.count);
-  for (const view of scene.views) sortView(view, position, order);
-  const colors = scene.harmonics ? evaluateColors(position) : null;
-  postMessage({ position, order, colors }, colors ? [order.buffer, colors.buffer] : [order.buffer]);
+function prepare(data) {
+  scene = data;
+  order = new Uint32Array(scene.count);
+  if (scene.harmonics) colors = new Uint8ClampedArray(4 * scene.count);
+}
+
+function sort({ position, part }) {
+  for (const view of scene.views.filter((_, index) => scene.parts[index] === part)) {
+    sortView(view, position);
+    if (colors) evaluateColors(view, position);
+  }
+  postMessage({ position, part, order, colors: colors && new Uint8Array(colors.buffer) });
 }
 
 // Writes the Gaussians of a view, farthest first: a stable radix sort of the bits of the squared distances, which
 // are in the order of the numbers.
-function sortView(view, [x, y, z], order) {
-  const { means } = scene, { start, count } = view;
+function sortView({ start, count }, [x, y, z]) {
+  const { means } = scene;
   const squared = new Float32Array(count);
   for (let i = 0; i < count; i++) {
     const k = 3 * (start + i), dx = means[k] - x, dy = means[k + 1] - y, dz = means[k + 2] - z;
@@ -37,12 +45,12 @@ function sortView(view, [x, y, z], order) {
   for (let i = 0; i < count; i++) order[start + i] = start + from[count - 1 - i];
 }
 
-// RGB and a padding byte of every Gaussian: base colour plus harmonics of degree 1 to 3 (docs/conventions.md).
-function evaluateColors([x, y, z]) {
+// RGB and a padding byte of a view's Gaussians: base colour plus harmonics of degree 1 to 3 (docs/conventions.md).
+function evaluateColors({ start, count }, [x, y, z]) {
   const { means, base, harmonics, harmonicsScale, range: [low, high] } = scene;
   const terms = harmonics.length / (3 * scene.count), basis = new Float32Array(terms);
-  const colors = new Uint8ClampedArray(4 * scene.count), unit = 255 / (high - low), step = unit * harmonicsScale / 127;
-  for (let i = 0; i < scene.count; i++) {
+  const unit = 255 / (high - low), step = unit * harmonicsScale / 127;
+  for (let i = start; i < start + count; i++) {
     let dx = means[3 * i] - x, dy = means[3 * i + 1] - y, dz = means[3 * i + 2] - z;
     const inverse = 1 / Math.max(Math.hypot(dx, dy, dz), 1e-12);
     evaluateBasis(dx * inverse, dy * inverse, dz * inverse, basis);
@@ -53,7 +61,6 @@ function evaluateColors([x, y, z]) {
       colors[4 * i + channel] = Math.max(base[4 * i + channel] + step * sum, black);
     }
   }
-  return new Uint8Array(colors.buffer);
 }
 
 // Real spherical harmonics without the constant one, in the order and with the signs of 3DGS.

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from pansplat import pipeline
+from pansplat.cli import export as export_module
 from pansplat.cli import run
 from pansplat.web import page as page_module
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
@@ -96,6 +97,27 @@ def test_a_folder_of_three_panoramas_is_exported_as_a_tour(
     assert len(pipeline.load(tmp_path / "house.glb").cam2world) == 3
     assert run([*command, str(tmp_path / "pair.glb"), "--pair", "2"]) == 0
     assert len(pipeline.load(tmp_path / "pair.glb").cam2world) == 2
+
+
+def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
+    tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    monkeypatch.setattr(export_module, "_FEW_GAUSSIANS", 200_000)
+    first, second = pipeline.load_pairs(write_tour(tmp_path / "house", height=64))
+    alone = dataclasses.replace(second.context[1], part=1, title="Attic")
+    single = dataclasses.replace(second, context=(alone,))
+    command = ["export", str(tmp_path / "house"), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
+    for name, pairs, note in (
+        ("house", [first, single], "3 panoramas (2 placed, 1 not placed"),
+        ("photo", [single], ""),
+    ):
+        monkeypatch.setattr(pipeline, "load_pairs", lambda *args, pairs=pairs, **options: pairs)
+        assert run([*command, str(tmp_path / f"{name}.html")]) == 0
+        printed = capsys.readouterr().err
+        assert note in printed and ("--gaussians 60000 shows more" in printed) == (name == "house")
+    assert '"parts": [0, 0, 1]' in (page := (tmp_path / "house.html").read_text()) and '"name": "Attic"' in page
+    assert '"groups": [[0]]' in (tmp_path / "photo.html").read_text()
 
 
 def test_a_floor_plan_needs_a_floor(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:

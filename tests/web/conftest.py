@@ -1,6 +1,7 @@
 """A scene of coloured Gaussians around three cameras."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -60,3 +61,25 @@ def plain_scene() -> Scene:
 def house(scene: Scene) -> Scene:
     """The scene as that of a tour: the three views in a row, two edges."""
     return dataclasses.replace(scene, overlaps=((0, 1, 0.5), (1, 2, 0.4)))
+
+
+@pytest.fixture(scope="session")
+def flat() -> Scene:
+    """A tour of three parts: two placed views, and two single ones 20 m and 40 m away.
+
+    A link leads from the first view to the third one on its right, and another one back, ahead.
+    """
+    scene = make_scene(num_views=4, per_view=400)
+    poses, means = scene.cam2world.clone(), scene.gaussians.means.clone()
+    for view in (2, 3):
+        poses[view, 0, 3] += 20 * (view - 1)
+        means[scene.gaussians.views == view, 0] += 20 * (view - 1)
+    return dataclasses.replace(
+        scene,
+        gaussians=dataclasses.replace(scene.gaussians, means=means),
+        cam2world=poses,
+        names=("room 0", "room 1", "</script><b>hall", "attic"),
+        overlaps=((0, 1, 0.5), (2, 2, 1.0), (3, 3, 1.0)),
+        links=((0, 2, 0.5 * math.pi, 0.6, "<i>down"), (2, 0, 0.0, 0.3, "")),
+        starts=((0.3, 0.2), None, None, (1.0, -0.2)),
+    )

@@ -18,10 +18,11 @@ from jaxtyping import Float
 from PIL import Image
 
 from pansplat import pipeline
-from pansplat.data.pairs import Panorama
+from pansplat.data.pairs import Link, Panorama
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import path_poses
 from pansplat.tours import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
+from pansplat.tours.layout import REACH
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
@@ -50,8 +51,8 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def folder(scene: Scene, house: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """tour.html, split.html with its parts, and house.html with a graph."""
+def folder(scene: Scene, house: Scene, flat: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """tour.html, split.html with its parts, house.html with a graph, and flat.html with parts."""
     folder = tmp_path_factory.mktemp("pages")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (18, 32))
@@ -59,6 +60,7 @@ def folder(scene: Scene, house: Scene, tmp_path_factory: pytest.TempPathFactory)
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
         write_page(house, folder / "house.html")
+        write_page(flat, folder / "flat.html")
     return folder
 
 
@@ -90,9 +92,13 @@ class OpenPage:
             self.page.wait_for_timeout(10)
 
     def draw(self) -> Float[np.ndarray, "height width 3"]:
-        url = self.run("([width, height]) => pansplat.render(width, height)", list(SIZE))
-        image = Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB")
-        return np.asarray(image, np.float64) / 255
+        return decode(self.run("([width, height]) => pansplat.render(width, height)", list(SIZE)))
+
+
+def decode(url: str) -> Float[np.ndarray, "height width 3"]:
+    """The image of a data URL."""
+    image = Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB")
+    return np.asarray(image, np.float64) / 255
 
 
 @contextmanager
@@ -188,7 +194,7 @@ def test_walking_stays_near_the_panoramas(home: OpenPage) -> None:
     distances = home.run(
         "HEADER.spots.map((s) => Math.hypot(...s.position.map((x, i) => x - pansplat.camera.position[i])))"
     )
-    assert min(distances) <= home.run("HEADER.limit") * 1.000001
+    assert min(distances) <= home.run("HEADER.limits[0]") * 1.000001
 
 
 def test_the_scene_follows_the_mouse(home: OpenPage) -> None:
@@ -336,42 +342,55 @@ def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) ->
 
 
 def test_the_graph_of_the_page_is_that_of_the_tour(page: OpenPage) -> None:
-    places = np.array(
-        [(0, 0, 0), (0, 0.1, 1), (0, 0, 2), (0.2, 0, 3), (1, 0, 1), (1, 0, 2.2), (2, 0, 2), (0.5, 0, 2.9)]
-    )
-    poses = torch.eye(4, dtype=torch.float64).repeat(8, 1, 1)
+    row = [(0, 0, 0), (0, 0.1, 1), (0, 0, 2), (0.2, 0, 3), (1, 0, 1), (1, 0, 2.2), (2, 0, 2), (0.5, 0, 2.9)]
+    others = [(9, 0, 0), (9, 0, 9), (10, 0, 9.5)]  # parts of one and of two panoramas
+    places = np.array([*row, *others])
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
     poses[:, :3, 3] = torch.from_numpy(places)
-    edges = [(0, 1), (1, 2), (2, 3), (1, 4), (2, 5), (4, 5), (5, 6), (3, 7)]
-    panoramas = tuple(Panorama(str(node), Path(), pose) for node, pose in enumerate(poses))
-    tour = TourGraph("", Path(), panoramas, 0.5, 10.0, (), {edge: 0.1 + 0.02 * edge[1] for edge in edges})
+    edges = [(0, 1), (1, 2), (2, 3), (1, 4), (2, 5), (4, 5), (5, 6), (3, 7), (8, 8), (9, 10)]
+    links = {6: (Link("8", 0.0),), 8: (Link("10", 0.0),)}
+    panoramas = tuple(Panorama(str(node), Path(), pose, links=links.get(node, ())) for node, pose in enumerate(poses))
+    overlaps = {edge: 0.1 + 0.02 * edge[1] for edge in edges}
+    tour = TourGraph("", Path(), panoramas, 0.5, 10.0, (), overlaps)
     graph = {
         "positions": places.tolist(),
+        "parts": tour.parts,
         "edges": edges,
         "next": tour.find_next_nodes(),
         "hysteresis": EDGE_HYSTERESIS,
+        "reach": REACH,
     }
     random = np.random.default_rng(0)
-    positions, nodes, current = (
-        random.uniform((-1, -0.5, -1), (3, 0.5, 4), (60, 3)),
-        range(8),
-        random.integers(8, size=60),
-    )
+    positions = random.uniform((-1, -0.5, -1), (3, 0.5, 4), (60, 3))
+    positions[40:] = random.uniform((3, -0.5, -1), (11, 0.5, 11), (20, 3))
+    nodes, current = range(len(places)), random.integers(len(edges), size=60)
     found = page.run(
         """([graph, positions, current]) => positions.map((position, i) => ({
             nearest: graph.edges[nearestEdge(graph, position)],
+            ofPart: graph.edges[nearestEdge(graph, position, partOfEdge(graph, current[i]))],
             followed: graph.edges[followEdge(graph, position, current[i])],
             reachable: graph.positions.map((_, node) => isReachable(graph, current[i], node)),
             ways: graph.positions.map((_, node) => findWay(graph, position, node)),
+            waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
+            fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
         }))""",
         [graph, positions.tolist(), current.tolist()],
     )
     for position, number, case in zip(positions, current, found, strict=True):
         edge = edges[number]
         assert tuple(case["nearest"]) == tour.find_nearest_edge(position)[0]
+        assert tuple(case["ofPart"]) == tour.find_nearest_edge(position, tour.parts[edge[0]])[0]
         assert tuple(case["followed"]) == tour.follow_edge(position, edge)
         assert set(np.flatnonzero(case["reachable"])) == tour.list_reachable(edge)
         assert case["ways"] == [tour.find_way(position, node) for node in nodes]
-    assert len({tuple(case["followed"]) == tuple(case["nearest"]) for case in found}) == 2, "the hysteresis matters"
+        assert case["waysOfPart"] == [tour.find_way(position, node, 0) for node in nodes]
+        assert case["fades"] == [tour.is_fade(node, edge[0]) for node in nodes]
+    followed = [tuple(case["followed"]) for case in found]
+    assert len({edge == tuple(case["nearest"]) for edge, case in zip(followed, found, strict=True)}) == 2, "hysteresis"
+    parts = [
+        (tour.parts[edge[0]], tour.parts[edges[number][0]]) for edge, number in zip(followed, current, strict=True)
+    ]
+    assert len({a == b for a, b in parts}) == 2, "a position near another part is in it"
 
 
 @pytest.mark.slow
@@ -419,4 +438,75 @@ def test_a_tour_blends_the_views_of_the_edge_and_flies_along_edges(chromium: Any
         assert abs(page.camera["yaw"] - start["yaw"]) > 0.1
         page.page.keyboard.press("Space")
         assert page.page.get_attribute("#play", "aria-pressed") == "false"
+        assert page.messages == []
+
+
+FRAMES = """
+    const request = requestAnimationFrame;
+    let time = performance.now();  // a frame takes 50 ms on every machine
+    performance.now = () => time;
+    requestAnimationFrame = (onFrame) => request(() => onFrame(time += 50));
+    record = () => {
+        const still = document.getElementById("still"), { position, yaw, pitch } = pansplat.camera;
+        const left = still.hidden ? 0 : Number(still.style.opacity);
+        const image = left && !passed.some((frame) => frame.image) ? still.toDataURL("image/png") : null;
+        passed.push({ position: [...position], yaw, pitch, left, image });
+        request(record);
+    };
+"""
+
+
+@pytest.mark.slow
+def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "flat.html", script=FRAMES) as page:
+        keyboard, start = page.page.keyboard, page.camera
+        assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
+        assert page.page.inner_text("#name") == "room 0" and page.page.inner_text("#kind") == ""
+        # Titles are text. The keyboard opens the list and chooses from it.
+        shown = "Array.from(document.querySelectorAll('#spots button:not([hidden])'), (button) => button.title)"
+        page.run("pansplat.camera.yaw = 1.5; pansplat.camera.pitch = -0.6; dispatchEvent(new Event('resize'))")
+        page.wait(f"{shown}.includes('Go to </script><b>hall <i>down')")
+        keyboard.press("l")
+        listed = page.page.inner_text("#panoramas").split("\n")
+        assert [line for line in listed if line] == [
+            *("Placed panoramas", "1. room 0", "2. room 1"),
+            *("Single photographs, not placed", "3. </script><b>hall", "4. attic"),
+        ]
+        assert page.run("document.activeElement.textContent") == "1. room 0"
+        page.run("passed = []; record()")
+        keyboard.press("Tab")
+        keyboard.press("Tab")
+        keyboard.press("Enter")
+        page.wait("document.getElementById('name').textContent === '</script><b>hall'")
+        page.wait("document.getElementById('still').hidden")
+        frames, (to, back) = page.run("passed"), page.run("HEADER.links")
+        assert page.camera["position"] == page.run("HEADER.spots[2].position")
+        assert math.cos(page.camera["yaw"] - back["yaw"]) == pytest.approx(-1), "away from the link back"
+        first = next(k for k, frame in enumerate(frames) if frame["left"])
+        old, left = frames[first - 1], [frame["left"] for frame in frames[first:]]
+        assert old["position"] == pytest.approx(to["leave"], abs=1e-6) and old["yaw"] == pytest.approx(to["yaw"])
+        assert left[0] == 1 and left == sorted(left, reverse=True) and any(0.3 < part < 0.7 for part in left)
+        # The image that fades out is that of the last camera.
+        frozen = decode(frames[first]["image"])
+        page.run(
+            "(camera) => Object.assign(pansplat.camera, camera)",
+            {key: old[key] for key in ("position", "yaw", "pitch")},
+        )
+        assert psnr(page.draw(), frozen) > 30
+        keyboard.press("4")  # without a link
+        page.wait("document.getElementById('name').textContent === 'attic'")
+        page.wait("document.getElementById('still').hidden")
+        assert page.camera["position"] == page.run("HEADER.spots[3].position")
+        assert (page.camera["yaw"], page.camera["pitch"]) == pytest.approx((3.1, 0.2), abs=1e-5)
+        assert page.page.inner_text("#kind") == "single photograph" and page.run(shown) == []
+        # The camera slows down near the limit.
+        page.run("passed = []; HEADER.speed *= 3")
+        keyboard.down("KeyW")
+        page.wait("passed.length > 40")
+        keyboard.up("KeyW")
+        steps = np.linalg.norm(np.diff([frame["position"] for frame in page.run("passed")], axis=0), axis=1)
+        away = math.dist(page.camera["position"], page.run("HEADER.spots[3].position"))
+        assert 0.8 < away < page.run("HEADER.limits[2]") and steps[-1] < 0.1 * steps.max()
+        page.page.click("#home")
+        assert page.camera == start
         assert page.messages == []

@@ -16,7 +16,7 @@ from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.refinement.budget import merge_to
-from pansplat.tours import find_camera_height
+from pansplat.tours import find_camera_height, select_views
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
@@ -62,6 +62,50 @@ def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: 
     assert header["start"]["yaw"] == pytest.approx(route[0, 3], abs=1e-3)
 
 
+def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scene, tmp_path: Path) -> None:
+    write_page(flat, tmp_path / "tour.html")
+    header = read_header(tmp_path / "tour.html")
+    assert header["parts"] == [0, 0, 1, 2] and header["edges"] == [[0, 1, 0], [2, 2, 1], [3, 3, 2]]
+    assert header["groups"] == [[0, 1], [2], [3]]
+    start, spots, level = header["start"], header["spots"], np.array(header["level"])
+    assert start["position"] == pytest.approx(spots[0]["position"], abs=1e-5)
+    assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
+    assert spots[3]["start"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and "start" not in spots[1]
+    to, back = header["links"]
+    assert (to["from"], to["to"], to["text"]) == (0, 2, "<i>down") and (back["from"], back["to"]) == (2, 0)
+    assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4)
+    right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
+    assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
+    assert right == pytest.approx(min(max(down / np.tan(0.6), 1), 3), abs=1e-5) and ahead == pytest.approx(0, abs=1e-5)
+    assert level.T @ np.subtract(to["leave"], spots[0]["position"]) == pytest.approx((0.7, 0, 0), abs=1e-5)
+    assert header["limits"] == pytest.approx([2.0, 1.0, 1.0]), "the part with two views, and single views"
+    route, jumps = np.array(header["route"]), header["jumps"]
+    distances = np.linalg.norm(route[:, None, :3] - [spot["position"] for spot in spots], axis=2)
+    assert distances.min(axis=0).max() < 0.2, "it passes all panoramas"
+    steps = np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1)
+    assert len(jumps) == 3 and steps[jumps].min() > 10 and np.delete(steps, jumps).max() < 1.05 / header["routeRate"]
+
+
+@pytest.mark.parametrize(("size", "limit"), [(1.0, 1.0), (0.5, 0.62)])
+def test_the_camera_stays_within_a_metre_of_a_single_photograph(
+    scene: Scene, tmp_path: Path, size: float, limit: float
+) -> None:
+    single = select_views(scene, (1,))  # its surfaces are 2 to 3 m away
+    center = single.cam2world[0, :3, 3].float()
+    gaussians = dataclasses.replace(single.gaussians, means=center + size * (single.gaussians.means - center))
+    write_page(dataclasses.replace(single, gaussians=gaussians, starts=((0.4, 0.1),)), tmp_path / "page.html")
+    header = read_header(tmp_path / "page.html")
+    assert header["limits"] == pytest.approx([limit], abs=0.01)
+    assert (header["start"]["yaw"], header["start"]["pitch"]) == pytest.approx((0.4, -0.1), abs=1e-4)
+
+
+def test_panoramas_of_all_parts_keep_as_many_gaussians(flat: Scene) -> None:
+    merged = page_module._merge(flat, (0, 0, 1, 2), 800)
+    counts = np.bincount(merged.gaussians.views.numpy())
+    assert counts[0] + counts[1] == 400 and counts[2] == counts[3] == 200
+    assert torch.equal(merged.cam2world, flat.cam2world)
+
+
 def test_the_page_loads_nothing_from_elsewhere(scene: Scene, tmp_path: Path) -> None:
     write_page(scene, tmp_path / "tour.html")
     text = (tmp_path / "tour.html").read_text()
@@ -83,7 +127,7 @@ def test_colours_of_merged_gaussians_are_fitted_to_all(request: pytest.FixtureRe
     needed = pipeline.render(full, pose, size=size, blend=0).color
     errors = [
         float((pipeline.render(scene, pose, size=size, blend=0).color - needed).square().mean())
-        for scene in (page_module._merge(full, 700), merge_to(full, (64, 128), 700))
+        for scene in (page_module._merge(full, (0,) * len(full.cam2world), 700), merge_to(full, (64, 128), 700))
     ]
     assert errors[0] < 0.8 * errors[1]
 
