@@ -162,7 +162,7 @@ def _place_unmatched(
     """Surfaces of the prior alone; without a prior, spheres in the middle of the range."""
     shape = (height, 2 * height)
     if estimator is None:
-        inverse = np.full((len(posed.images), *shape), 0.5 * (depths.low + depths.high))
+        inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far))
     else:
         sharp = estimator.sharpen((depths.low, depths.high))
         inverse = np.stack([np.exp(-resize_nearest(values, height)) for values in sharp]).clip(*depths.limits)
