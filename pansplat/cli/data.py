@@ -55,6 +55,37 @@ class DataHomes:
 
 
 @dataclass(frozen=True)
+class DataPhotographs:
+    """Render generated homes as folders of photographs with poses, one or two a room, to measure `pansplat pose`."""
+
+    out: Out
+    """Folder for the homes. Homes that are there are kept; run the command again after an interruption."""
+    count: Count = 20
+    """Number of homes."""
+    seed: Seed = 0
+    """Seed of the homes."""
+    height: Annotated[int, Range(256, 8192, "pixels", multiple=32), WHOLE] = 1024
+    """Height of the panoramas, pixels."""
+    furniture: Path | None = None
+    """As for `homes`."""
+
+    def run(self) -> int:
+        """Render with a progress bar, and print the number of photographs."""
+        from rich.progress import track
+
+        from pansplat.data.generated.photographs import write_home
+        from pansplat.data.generated.shards import load_library
+
+        require_output_folder("--out", self.out)
+        library = None if self.furniture is None else load_library(self.furniture)
+        photographs = 0
+        for number in track(range(self.count), "rendering homes"):
+            photographs += write_home(self.out / f"home_{number:03d}", (self.seed, number), self.height, library)
+        print(f"{self.out}: {photographs} photographs of {self.count} homes")
+        return 0
+
+
+@dataclass(frozen=True)
 class DataMaps:
     """Pack triplets that were rendered from game maps (PNG, depth in millimetres, JSON) into shards."""
 
@@ -76,9 +107,13 @@ class DataMaps:
 
 @dataclass(frozen=True)
 class Data:
-    """Make training data of the depth network."""
+    """Make training data of the depth network, and photographs with known poses."""
 
-    kind: Annotated[DataHomes, subcommand("homes")] | Annotated[DataMaps, subcommand("maps")]
+    kind: (
+        Annotated[DataHomes, subcommand("homes")]
+        | Annotated[DataPhotographs, subcommand("photographs")]
+        | Annotated[DataMaps, subcommand("maps")]
+    )
 
     def run(self) -> int:
         """Run the subcommand."""

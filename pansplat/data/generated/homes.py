@@ -44,6 +44,7 @@ Array = NDArray[np.float64]
 
 _GROUND = 27.0  # half the side of the ground, metres; within the sphere of the sky
 _CLEARANCE = 0.35  # least distance of a camera to a body, metres
+_LEAST_PHOTOGRAPHED, _LARGE = 3.0, 18.0  # square metres: of a room with a photograph; of one that may have two
 _DISTANCE = 0.3, 4.0  # between a camera and the nearest other one of its set, metres
 
 
@@ -97,6 +98,29 @@ class Home:
                     continue
             if self.variants[variant].clearance(centre[None])[0] >= _CLEARANCE:
                 cameras.append((variant, _pose(centre, yaw + spread * rng.uniform(-1, 1))))
+        return cameras
+
+    def sample_room_cameras(self, rng: np.random.Generator) -> list[tuple[int, Array]]:
+        """Variants and poses (cam2world) as agents take them: one camera in each room, or two in a third of large ones.
+
+        Rooms without a way from the first one have none. Doors may change between the photographs.
+        """
+        steps, cameras = self.plan.steps_from(0), []
+        for number, room in enumerate(self.plan.rooms):
+            if steps[number] < 0 or room.kind == RoomKind.CLOSET or room.area < _LEAST_PHOTOGRAPHED:
+                continue
+            x0, z0, x1, z1 = self.plan.interior(number)
+            count = 1 + int(room.area > _LARGE and rng.random() < 1 / 3)
+            for camera in range(count):
+                middle = 0.5 if count == 1 else 0.3 + 0.4 * camera
+                for _ in range(40):
+                    share = np.array((middle, 0.5)) + rng.uniform(-0.2, 0.2, 2)
+                    share = share if x1 - x0 > z1 - z0 else share[::-1]
+                    centre = np.array((x0 + share[0] * (x1 - x0), -self.camera_height, z0 + share[1] * (z1 - z0)))
+                    variant = int(rng.integers(len(self.variants)))
+                    if self.variants[variant].clearance(centre[None])[0] >= _CLEARANCE:
+                        cameras.append((variant, _pose(centre, rng.uniform(0, 2 * np.pi))))
+                        break
         return cameras
 
     def _sample_place(self, room: int, rng: np.random.Generator) -> tuple[float, float]:

@@ -77,7 +77,7 @@ def render_tour(settings: TourSettings, index: int) -> Tour:
     from pansplat.data.generated.homes import build_home
 
     rng = np.random.default_rng((settings.seed, index))
-    library = None if settings.furniture is None else _load_library(settings.furniture)
+    library = None if settings.furniture is None else load_library(settings.furniture)
     cameras = []
     while len(cameras) < settings.cameras:
         home = build_home(rng, library)
@@ -190,7 +190,7 @@ class ShardReader:
 
 
 @functools.cache
-def _load_library(folder: Path) -> FurnitureLibrary:
+def load_library(folder: Path) -> FurnitureLibrary:
     """The furniture in a folder, with a cache there if it is writable."""
     cache = folder / "pansplat_furniture.npz"
     return load_furniture(folder, cache if cache.exists() or os.access(folder, os.W_OK) else None)
