@@ -28,8 +28,6 @@ from pansplat.poses.two_view import (
     Hypothesis,
     RelativePose,
     estimate_relative_pose,
-    match_priors,
-    noise_of,
     polish_relative_pose,
 )
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_floor, level_poses
@@ -154,7 +152,7 @@ def estimate_poses(
         relations = _relate_views(views, seed, report)
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
-    noise = max(noise_of(v.features, v.features) for v in views)
+    noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
 
     @functools.cache
     def floor_height(pair: Pair) -> float | None:
@@ -301,8 +299,7 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
         if _is_mirrored(first, second, overlap.get(pair), relation.score):
             return replace(relation, problem="one of both looks mirrored left to right")
         further = match_features(first.turned, second.turned)
-        indices = further.indices + np.array((len(first.features), len(second.features)))
-        every = Matches(np.concatenate((matches.indices, indices)), np.concatenate((matches.ratio, further.ratio)))
+        every = matches.joined(further.shifted(len(first.features), len(second.features)))
         return polish_relative_pose(relation, first.joined, second.joined, every, prior)
 
     relations = {}
@@ -359,7 +356,7 @@ def _is_mirrored(first: _View, second: _View, overlap: float | None = None, scor
     if evidence < _MIRROR_RATIO * (_quick_overlap(first.features, second.features) if overlap is None else overlap):
         return False
     matches = match_features(mirrored, second.features)
-    if match_priors(matches.ratio).sum() < _MIRROR_EVIDENCE:
+    if matches.prior.sum() < _MIRROR_EVIDENCE:
         return False
     found = estimate_relative_pose(mirrored, second.features, matches)
     return found.is_reliable and found.score > score
@@ -368,7 +365,7 @@ def _is_mirrored(first: _View, second: _View, overlap: float | None = None, scor
 def _quick_overlap(first: Features, second: Features) -> float:
     """Expected number of right matches among the strongest features."""
     matches = match_features(first.strongest(_QUICK_FEATURES), second.strongest(_QUICK_FEATURES))
-    return float(match_priors(matches.ratio).sum())
+    return float(matches.prior.sum())
 
 
 def _find_scale(

@@ -20,12 +20,14 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from pansplat.poses.axes import NO_PRIOR, RotationPrior
+from pansplat.poses.depth import DepthMap, MatchDepths
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.solvers import (
     Bearings,
     Rotation,
     Vector,
     angle_between,
+    cross,
     decompose_essential,
     epipolar_angles,
     essential_from_five,
@@ -37,9 +39,6 @@ from pansplat.poses.solvers import (
     upright_from_two,
 )
 
-# Prior probability that a match is right, by its ratio; measured on pairs of real panoramas 2 to 3 m apart.
-_RATIOS, _PRIORS = (0.5, 0.65, 0.75, 0.8, 0.85, 0.9, 1.0), (0.8, 0.6, 0.3, 0.15, 0.06, 0.02, 0.005)
-_NOISE_PIXELS, _MIN_NOISE = 0.45, 8e-4  # standard deviation of a right match: pixels at the horizon; radians
 _WIDE_SHARE, _WIDE = 0.3, 3.0  # of right matches with larger errors; their standard deviation in that of the others
 _MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
 _DISTORTION, _DISTORTION_LENGTH = 1e-3, 0.15  # of stitched panoramas: deviation and correlation length, radians
@@ -48,7 +47,7 @@ _MAX_POLISHED, _MIN_POLISHED, _MIN_PROBABILITY = 1000, 8, 0.2  # matches of the 
 _POLISH_SIZE = 7.0  # pixels; of a feature with 1.4 times the noise of a small one
 _POLISH_WINDOW = 0.035  # largest residual, radians; what lies beyond the noise gives the density of wrong matches
 _POLISH_FACTORS, _POLISH_STEPS = (4, 2, 1), 4  # of the noise; steps with each
-_POLISH_RATIOS = (0.6, 0.7, 0.8, 0.85, 0.9, 0.95)  # limits of the groups of matches
+_POLISH_PRIORS = np.array((0.667, 0.45, 0.15, 0.06, 0.02, 0.0125))  # limits of the groups of matches
 _POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # of right matches in the window, a priori
 _POLISH_WEIGHT = 4.0  # of these shares, in matches
 _CALIBRATION = 1.5, 80.0  # factor of formal standard deviations: least one; that times the number of places
@@ -57,11 +56,16 @@ _MIN_MATCHES, _MAX_MATCHES = 8, 2500
 _TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
 _SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
 _QUICK, _RESCORED = 500, 3000  # best matches that rank all hypotheses; hypotheses that all matches rank
-_KEPT, _KEPT_PARALLEL = 20, 10  # hypotheses that are optimised: of all kinds, and of those with parallel walls
+_KEPT, _KEPT_PARALLEL = 10, 6  # hypotheses that are optimised: of all kinds, and of those with parallel walls
 _PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit vectors
 _MIN_PARALLAX = 5.0  # in the noise's standard deviation
 _MAX_UNCERTAINTY = math.radians(4)
 _FACTORS, _PARALLEL_FACTORS = (2, 1), (4, 2, 1)  # of the noise, in the optimisation of a hypothesis
+_VOTERS, _VOTE_WIDTH, _VOTE_LIMITS = 800, 0.06, (0.03, 0.25)  # matches; error of their depth; of translations
+_VOTE_YAW, _CLIMB = 0.05, 0.3  # radians; deviation of the difference of the cameras' heights, camera heights
+_PAIR_SAMPLES, _PAIRS = 20000, 1000  # of two matches; of them, those that agree
+_MODES, _KEPT_BY_DEPTH = 8, 12  # hypotheses by depth: of each rotation; that are optimised
+_DEPTH_FACTORS = (24, 6, 2, 1)  # of the noise, in their optimisation
 _EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
 
@@ -90,22 +94,19 @@ class Hypothesis:
     Attributes:
         score: natural logarithm of the likelihood ratio against chance.
         probability: of each match to be right.
+        distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
     """
 
     rotation: Rotation
     translation: Vector
     score: float
     probability: Float[Array, "match"]
+    distance: float = math.nan
 
 
-def noise_of(first: Features, second: Features) -> float:
-    """Standard deviation of a right match's epipolar angle, radians."""
-    return max(_NOISE_PIXELS * max(first.pixel, second.pixel), _MIN_NOISE)
-
-
-def match_priors(ratio: Float[Array, "match"]) -> Float[Array, "match"]:
-    """Prior probability of matches to be right."""
-    return np.interp(ratio, _RATIOS, _PRIORS)
+def _match_noise(first: Features, second: Features, indices: Int[Array, "match 2"]) -> Float[Array, "match"]:
+    """Standard deviation of each right match's epipolar angle, radians."""
+    return np.maximum(first.noise[indices[:, 0]], second.noise[indices[:, 1]])
 
 
 def _density(angle: Array, noise: float | Array) -> Array:
@@ -124,17 +125,23 @@ class _Evidence:
         prior: probability of each match to be right.
         noise: standard deviation of a right match's epipolar angle, radians.
         axes: gravity and walls of both panoramas.
+        depths: estimated at the matches, if they are known.
     """
 
     a: Float[Array, "match 3"]
     b: Float[Array, "match 3"]
     prior: Float[Array, "match"]
-    noise: float
+    noise: Float[Array, "match"]
     axes: RotationPrior
+    depths: MatchDepths | None = None
 
     def strongest(self, count: int) -> _Evidence:
         """The evidence of the first `count` matches."""
-        return replace(self, a=self.a[:count], b=self.b[:count], prior=self.prior[:count])
+        first = slice(count)
+        depths = None if self.depths is None else self.depths.select(first)
+        return replace(
+            self, a=self.a[first], b=self.b[first], prior=self.prior[first], noise=self.noise[first], depths=depths
+        )
 
     def with_noise(self, factor: float) -> _Evidence:
         """The evidence with another noise, in units of this one."""
@@ -148,11 +155,18 @@ class _Evidence:
         """
         angle = np.abs(epipolar_angles(self.a, self.b, rotation, translation))
         likelihood = np.where(angle < _MAX_ANGLE * _WIDE * self.noise, _density(angle, self.noise), 0.0)
-        behind = _are_behind(self.a, self.b, rotation, translation, self.noise)
-        ratio = np.where(behind, 0.0, 2 * likelihood)
+        points = two_view_depths(self.a, self.b, rotation, translation)
+        parallax = angle_between(self.a @ rotation.T, self.b)
+        behind = (points < 0).any(axis=1) & (parallax > 3 * self.noise)
+        ratio, distance = np.where(behind, 0.0, 2 * likelihood), math.nan
+        if self.depths is not None:
+            weight = np.where((points > 0).all(axis=1), self.prior * ratio / (1 - self.prior + self.prior * ratio), 0.0)
+            distance = self.depths.find_distance(points, weight)
+            if math.isfinite(distance):
+                ratio = ratio * self.depths.likelihood_ratio(points, distance, parallax, self.noise)
         total = 1 - self.prior + self.prior * ratio
         score = float(np.log(total).sum()) + self.axes.score(rotation)
-        return Hypothesis(rotation, translation, score, self.prior * ratio / total)
+        return Hypothesis(rotation, translation, score, self.prior * ratio / total, distance)
 
     def refine(self, start: Hypothesis, steps: int) -> Hypothesis:
         """The pose of the smallest weighted epipolar angles near a hypothesis, by Gauss-Newton with a robust loss."""
@@ -206,9 +220,9 @@ def _gauss_newton(
 def _tangent_basis(direction: Float[Array, "3"]) -> Float[Array, "3 2"]:
     """Two orthonormal vectors perpendicular to a unit vector."""
     helper = np.eye(3)[np.abs(direction).argmin()]
-    first = np.cross(direction, helper)
+    first = cross(direction, helper)
     first /= np.linalg.norm(first)
-    return np.stack((first, np.cross(direction, first)), axis=1)
+    return np.stack((first, cross(direction, first)), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,11 +242,11 @@ class _Linearised:
 
 def _linearise(a: Bearings, b: Bearings, rotation: Rotation, translation: Vector) -> _Linearised:
     g = a @ rotation.T
-    by_b, by_g = np.cross(translation, g), np.cross(b, translation)
+    by_b, by_g = cross(translation, g), cross(b, translation)
     e = (by_b * b).sum(axis=1, keepdims=True)
     squared = ((by_b - e * b) ** 2).sum(axis=1) + ((by_g - e * g) ** 2).sum(axis=1)
     scale = np.sqrt(np.maximum(squared, 1e-12))[:, None]
-    by_pose = np.concatenate((np.cross(g, by_g), np.cross(g, b) @ _tangent_basis(translation)), axis=1)
+    by_pose = np.concatenate((cross(g, by_g), cross(g, b) @ _tangent_basis(translation)), axis=1)
     return _Linearised((e / scale)[:, 0], by_pose / scale, by_g @ rotation / scale, by_b / scale)
 
 
@@ -313,6 +327,7 @@ def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> list[Hy
         return []
     free, parallel = _sample_essentials(evidence, rng)
     found = [_optimise(essential, evidence, _FACTORS) for essential in _choose_best(free, evidence, _KEPT)]
+    found += [_optimise(pose, evidence, _DEPTH_FACTORS) for pose in _propose_by_depth(evidence, rng)]
     if len(parallel):  # inexact: compared among themselves, with a larger tolerance
         chosen = _choose_best(parallel, evidence.with_noise(2), _KEPT_PARALLEL)
         found += [_optimise(essential, evidence, _PARALLEL_FACTORS) for essential in chosen]
@@ -335,8 +350,8 @@ def _sample_essentials(
             free.append(levels[1].T @ skew(translations) @ rotations @ levels[0])
         for rotation in axes.wall_rotations():
             chosen = _draw(rng, top, _SAMPLES[2], 2)
-            normals = np.cross(a[chosen] @ rotation.T, b[chosen])
-            translations = np.cross(normals[:, 0], normals[:, 1])
+            normals = cross(a[chosen] @ rotation.T, b[chosen])
+            translations = cross(normals[:, 0], normals[:, 1])
             translations /= np.maximum(np.linalg.norm(translations, axis=1, keepdims=True), 1e-12)
             parallel.append(skew(translations) @ rotation)
     return np.concatenate(free), np.concatenate(parallel)
@@ -347,6 +362,92 @@ def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: i
     quick = _score_essentials(essential, evidence.strongest(_QUICK))
     essential = essential[np.argsort(-quick)[:_RESCORED]]
     return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
+
+
+def _sample_depths(maps: tuple[DepthMap, DepthMap] | None, a: Bearings, b: Bearings) -> MatchDepths | None:
+    if maps is None:
+        return None
+    (first, first_deviation), (second, second_deviation) = maps[0].sample(a), maps[1].sample(b)
+    return MatchDepths(np.stack((first, second), axis=1), np.stack((first_deviation, second_deviation), axis=1))
+
+
+def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> list[Float[Array, "3 3"]]:
+    """Essential matrices on which the translations of many matches agree, by their estimated depths.
+
+    With parallel walls one match states the translation for each of four rotations. Without them, two matches of
+    levelled cameras state rotation and translation.
+    """
+    if evidence.depths is None:
+        return []
+    strongest = evidence.strongest(_VOTERS)
+    assert strongest.depths is not None
+    levels = evidence.axes.first.axes[_LEVEL], evidence.axes.second.axes[_LEVEL]
+    x, y = (
+        (rays * np.exp(strongest.depths.log_depth[:, side, None])) @ levels[side].T
+        for side, rays in enumerate((strongest.a, strongest.b))
+    )
+    reach = _VOTE_WIDTH * np.exp(strongest.depths.log_depth).mean(axis=1)
+    found = []
+    for rotation in evidence.axes.wall_rotations():
+        level = levels[1] @ rotation @ levels[0].T
+        found += [(level, t, s) for t, s in _vote(y - x @ level.T, reach, strongest.prior)]
+    found += _vote_pairs(x, y, reach, strongest.prior, rng)
+    found.sort(key=lambda item: -item[2])
+    return [
+        levels[1].T @ skew(t / max(float(np.linalg.norm(t)), 1e-9)) @ rotation @ levels[0]
+        for rotation, t, _ in found[:_KEPT_BY_DEPTH]
+    ]
+
+
+def _vote(
+    translations: Float[Array, "n 3"], reach: Float[Array, "n"], prior: Float[Array, "n"]
+) -> list[tuple[Float[Array, "3"], float]]:
+    """Translations around which the matches' own ones are dense, with their votes."""
+    reach = reach.clip(*_VOTE_LIMITS)
+    squared = ((translations[:, None] - translations[None]) ** 2).sum(axis=-1)
+    weights = np.exp(-0.5 * squared / reach[None] ** 2) * prior
+    votes = weights.sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2)
+    found: list[tuple[Array, float]] = []
+    for n in np.argsort(-votes):
+        if len(found) == _MODES:
+            break
+        if all(np.linalg.norm(translations[n] - t) > 2 * reach[n] for t, _ in found):
+            centre = (weights[n][:, None] * translations).sum(axis=0) / max(weights[n].sum(), 1e-9)
+            found.append((centre, float(votes[n])))
+    return found
+
+
+def _vote_pairs(
+    x: Float[Array, "n 3"], y: Float[Array, "n 3"], reach: Array, prior: Array, rng: np.random.Generator
+) -> list[tuple[Float[Array, "3 3"], Float[Array, "3"], float]]:
+    """Rotations about the third axis and translations of pairs of points, dense ones, with their votes."""
+    count = len(x)
+    weights = prior / prior.sum()
+    first, second = (rng.choice(count, _PAIR_SAMPLES, p=weights) for _ in range(2))
+    dx, dy = x[second] - x[first], y[second] - y[first]
+    lengths = np.linalg.norm(dx[:, :2], axis=1), np.linalg.norm(dy[:, :2], axis=1)
+    tolerance = reach[first] + reach[second]
+    kept = (np.abs(lengths[0] - lengths[1]) < tolerance) & (np.abs(dx[:, 2] - dy[:, 2]) < tolerance)
+    kept &= np.minimum(*lengths) > 5 * tolerance
+    first, second, dx, dy = first[kept][:_PAIRS], second[kept][:_PAIRS], dx[kept][:_PAIRS], dy[kept][:_PAIRS]
+    if not len(first):
+        return []
+    yaw = np.arctan2(dy[:, 1], dy[:, 0]) - np.arctan2(dx[:, 1], dx[:, 0])
+    cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw)), np.ones(len(yaw))
+    rotations = np.stack((cos, -sin, zero, sin, cos, zero, zero, zero, one), axis=1).reshape(-1, 3, 3)
+    middle = (x[first] + x[second]) / 2, (y[first] + y[second]) / 2
+    translations = middle[1] - np.einsum("nij,nj->ni", rotations, middle[0])
+    turns = np.stack((cos, sin), axis=1) / _VOTE_YAW
+    points = np.concatenate((translations / _VOTE_LIMITS[1], turns), axis=1)
+    squared = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
+    votes = np.exp(-0.5 * squared).sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2)
+    found: list[int] = []
+    for n in np.argsort(-votes):
+        if len(found) == _MODES:
+            break
+        if all(squared[n, other] > 4 for other in found):
+            found.append(int(n))
+    return [(rotations[n], translations[n], float(votes[n]) * count / len(first) * 0.1) for n in found]
 
 
 def _optimise(essential: Float[Array, "3 3"], evidence: _Evidence, factors: Sequence[float]) -> Hypothesis:
@@ -396,17 +497,17 @@ def _score_essentials(essential: Float[Array, "n 3 3"], evidence: _Evidence) -> 
 
     Squared Sampson denominators are |E a|^2 + |E' b|^2, up to the square of the residual.
     """
-    a, b, noise = evidence.a, evidence.b, evidence.noise
+    a, b, noise = evidence.a, evidence.b, evidence.noise.astype(np.float32)
     i, j = np.triu_indices(3)
     twice = np.where(i == j, 1.0, 2.0)
     products = (b[:, :, None] * a[:, None, :]).reshape(-1, 9).T.astype(np.float32)
     squares_a, squares_b = (np.ascontiguousarray((x[:, i] * x[:, j] * twice).T.astype(np.float32)) for x in (a, b))
-    limit = np.float32((_MAX_ANGLE * _WIDE * noise) ** 2)
+    limit = (_MAX_ANGLE * _WIDE * noise) ** 2
     scores = np.empty(len(essential))
     odds = evidence.prior / (1 - evidence.prior)
-    narrow, wide = np.float32(-0.5 / noise**2), np.float32(-0.5 / (_WIDE * noise) ** 2)
+    narrow, wide = -0.5 / noise**2, -0.5 / (_WIDE * noise) ** 2
     peak = math.sqrt(2 / math.pi) / noise
-    narrow_peak, wide_peak = np.float32(peak * (1 - _WIDE_SHARE)), np.float32(peak * _WIDE_SHARE / _WIDE)
+    narrow_peak, wide_peak = peak * (1 - _WIDE_SHARE), peak * _WIDE_SHARE / _WIDE
     for start in range(0, len(essential), 2048):
         part = essential[start : start + 2048]
         residual = part.reshape(-1, 9).astype(np.float32) @ products
@@ -415,7 +516,8 @@ def _score_essentials(essential: Float[Array, "n 3 3"], evidence: _Evidence) -> 
         squared = residual * residual / np.maximum(left + right, np.float32(1e-12))
         hypothesis, match = np.nonzero(squared < limit)
         angle = squared[hypothesis, match]
-        likelihood = narrow_peak * np.exp(narrow * angle) + wide_peak * np.exp(wide * angle)
+        likelihood = narrow_peak[match] * np.exp(narrow[match] * angle)
+        likelihood += wide_peak[match] * np.exp(wide[match] * angle)
         gain = np.log1p(odds[match] * likelihood)
         scores[start : start + len(part)] = np.bincount(hypothesis, gain, len(part))
     return scores + float(np.log(1 - evidence.prior).sum())
@@ -447,6 +549,7 @@ class RelativePose:
         parallax: 90 % quantile of the parallax of these matches, radians.
         uncertainty: standard deviations of rotation and direction by the noise of the matches, the distortion of the
             panoramas and the number of places, radians.
+        distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
         problem: why the pose must not be used; None if it passes the check.
     """
 
@@ -458,6 +561,7 @@ class RelativePose:
     places: float
     parallax: float
     uncertainty: tuple[float, float]
+    distance: float
     problem: str | None
 
     @property
@@ -473,6 +577,7 @@ def estimate_relative_pose(
     axes: RotationPrior = NO_PRIOR,
     agree_on_floor: Callable[[Hypothesis], bool] = lambda hypothesis: False,
     *,
+    depths: tuple[DepthMap, DepthMap] | None = None,
     seed: int = 0,
 ) -> RelativePose:
     """The most probable relative pose of two panoramas, with its check.
@@ -482,17 +587,20 @@ def estimate_relative_pose(
         matches: between them.
         axes: gravity and walls of both panoramas.
         agree_on_floor: whether both panoramas show one floor under a pose; called if matches and walls do not suffice.
+        depths: estimated of both panoramas.
         seed: of the random samples.
     """
     count = min(len(matches), _MAX_MATCHES)
     indices = matches.indices[:count]
     a, b = first.bearings[indices[:, 0]], second.bearings[indices[:, 1]]
-    evidence = _Evidence(a, b, match_priors(matches.ratio[:count]), noise_of(first, second), axes)
+    evidence = _Evidence(
+        a, b, matches.prior[:count], _match_noise(first, second, indices), axes, _sample_depths(depths, a, b)
+    )
     found = _search_hypotheses(evidence, np.random.default_rng(seed))
     if not found:
         no_match = f"only {count} features match"
         return RelativePose(
-            np.eye(3), np.array((0.0, 0, 1)), indices[:0], 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, no_match
+            np.eye(3), np.array((0.0, 0, 1)), indices[:0], 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, math.nan, no_match
         )
     best, support, confirmations = _choose_confirmed(found, evidence, agree_on_floor)
     right = best.probability > 0.5
@@ -500,16 +608,25 @@ def estimate_relative_pose(
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
     used = np.flatnonzero(right)[:_MAX_POLISHED]
     rotation, translation, deviations = polish_pose(
-        a[used], b[used], best.rotation, best.translation, evidence.noise, axes
+        a[used], b[used], best.rotation, best.translation, evidence.noise[used], axes
     )
     uncertainty = _calibrate(deviations, support.places)
     problem = _find_problem(support, confirmations)
-    if spread < _MIN_PARALLAX * evidence.noise and right.sum() >= _NEEDED[2].places:
+    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _NEEDED[2].places:
         problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
     elif problem is None and uncertainty[1] > _MAX_UNCERTAINTY:
         problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
     return RelativePose(
-        rotation, translation, indices[right], best.score, support.margin, support.places, spread, uncertainty, problem
+        rotation,
+        translation,
+        indices[right],
+        best.score,
+        support.margin,
+        support.places,
+        spread,
+        uncertainty,
+        best.distance,
+        problem,
     )
 
 
@@ -572,8 +689,8 @@ def polish_relative_pose(
     near = np.abs(epipolar_angles(*every, rotation, translation)) < 2 * _POLISH_WINDOW
     a, b, indices = every[0][near], every[1][near], matches.indices[near]
     sizes = np.maximum(first.sizes[indices[:, 0]], second.sizes[indices[:, 1]])
-    noise = noise_of(first, second) * np.hypot(1, sizes / _POLISH_SIZE)
-    weigh = _LocalWeights(a, b, np.searchsorted(_POLISH_RATIOS, matches.ratio[near], side="right"), noise)
+    noise = _match_noise(first, second, indices) * np.hypot(1, sizes / _POLISH_SIZE)
+    weigh = _LocalWeights(a, b, np.searchsorted(-_POLISH_PRIORS, -matches.prior[near], side="right"), noise)
     for factor in _POLISH_FACTORS:
         for _ in range(_POLISH_STEPS):
             probability = weigh(rotation, translation, factor)
@@ -585,7 +702,7 @@ def polish_relative_pose(
                 return relation
     rotation, translation, uncertainty = polish_pose(a, b, rotation, translation, noise, axes, weigh)
     # A tour has a robust loss, and needs as many points as possible that several panoramas see.
-    evidence = _Evidence(*every, match_priors(matches.ratio), noise_of(first, second), axes)
+    evidence = _Evidence(*every, matches.prior, _match_noise(first, second, matches.indices), axes)
     agreeing = evidence.evaluate(rotation, translation)
     return replace(
         relation,
