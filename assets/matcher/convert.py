@@ -1,10 +1,9 @@
 """Convert the published weights of ALIKED and LightGlue to `matcher.safetensors` (MODEL.md).
 
-    python assets/matcher/convert.py aliked-n16.pth aliked_lightglue.pth
+python assets/matcher/convert.py aliked-n16.pth aliked_lightglue.pth
 """
 
 import sys
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -68,9 +67,10 @@ def main(aliked: str, lightglue: str) -> None:
     """Write the weights file: kernels in float16, the rest in float32."""
     tensors = {}
     for name, file, convert in (("aliked", aliked, convert_aliked), ("lightglue", lightglue, convert_lightglue)):
-        tensors |= {f"{name}.{key}": value for key, value in convert(torch.load(file, "cpu", weights_only=True)).items()}
+        converted = convert(torch.load(file, "cpu", weights_only=True))
+        tensors |= {f"{name}.{key}": tensor for key, tensor in converted.items()}
     half = {name: tensor.half() if tensor.ndim > 1 else tensor for name, tensor in tensors.items()}
-    save_weights(Path(default_weights()), WeightsFile(MODEL, {}, "fixed", half))
+    save_weights(default_weights(), WeightsFile(MODEL, {}, "fixed", half))
 
 
 if __name__ == "__main__":

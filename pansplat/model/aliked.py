@@ -18,6 +18,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from pansplat.model.layers import to_channels_last
+
 _CHANNELS = (16, 32, 64, 128)  # of the levels
 _STRIDES = (1, 2, 8, 32)  # of the levels, pixels
 _LEVEL_FEATURES = 32  # of each level in a pixel's features
@@ -106,7 +108,7 @@ class Aliked(nn.Module):
 
     def extract(self, image: Float[Tensor, "3 h w"]) -> Levels:
         """The features of the four levels."""
-        maps, levels = image[None], []
+        maps, levels = to_channels_last(image[None]), []
         for level, (block, reduce) in enumerate(zip(self.blocks, self.reduce, strict=True)):
             if level:
                 maps = functional.avg_pool2d(maps, _STRIDES[level] // _STRIDES[level - 1])
@@ -143,7 +145,7 @@ class Aliked(nn.Module):
             weight = (x if step_x else 1 - x) * (y if step_y else 1 - y)
             pixels = corner.long() + torch.tensor((step_x, step_y), device=points.device)
             samples += weight[:, None] * _pixel_features(levels, pixels)
-        samples = functional.selu(self.mix(samples)).view(len(points), -1)
+        samples = functional.selu(self.mix(samples)).view(len(points), _POSITIONS * DESCRIPTOR)
         return functional.normalize(samples @ self.aggregate.flatten(0, 1), dim=1)
 
 
@@ -182,7 +184,9 @@ def _local_maxima(scores: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     """Pixels with the highest score in their square, and those that are it after the others' squares are cleared."""
 
     def spread(maps: Tensor) -> Tensor:
-        return functional.max_pool2d(maps[None, None], 2 * _RADIUS + 1, stride=1, padding=_RADIUS)[0, 0]
+        size = 2 * _RADIUS + 1
+        rows = functional.max_pool2d(maps[None], (1, size), stride=1, padding=(0, _RADIUS))
+        return functional.max_pool2d(rows, (size, 1), stride=1, padding=(_RADIUS, 0))[0]
 
     found = scores == spread(scores)
     for _ in range(2):

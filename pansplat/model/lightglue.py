@@ -122,7 +122,7 @@ class LightGlue(nn.Module):
             if unsure < (1 - _STOP_SHARE) * (len(first[0]) + len(second[0])):
                 break
             for n in range(2):
-                kept = ~sure[n] | (torch.sigmoid(self.matchable[layer](states[n]))[:, 0] > _MIN_MATCHABLE)
+                kept = ~sure[n] | (self._log_matchable(layer, states[n])[:, 0] > math.log(_MIN_MATCHABLE))
                 states[n], index[n] = states[n][kept], index[n][kept]
                 turns[n] = turns[n][0][kept], turns[n][1][kept]
         rows, columns, probability = self._assign(layer, *states)
@@ -132,9 +132,13 @@ class LightGlue(nn.Module):
         """Rows and columns of the mutually most probable pairs, and their probabilities."""
         a, b = self.similar[layer](first), self.similar[layer](second)
         similarity = a @ b.T / math.sqrt(_WIDTH)
-        partner = functional.logsigmoid(self.matchable[layer](first)), functional.logsigmoid(self.matchable[layer](second))
-        log = functional.log_softmax(similarity, 0) + functional.log_softmax(similarity, 1) + partner[0] + partner[1].T
+        log = functional.log_softmax(similarity, 0) + functional.log_softmax(similarity, 1)
+        log += self._log_matchable(layer, first) + self._log_matchable(layer, second).T
         best, column = log.max(dim=1)
         row = torch.arange(len(log), device=log.device)
         mutual = log.argmax(dim=0)[column] == row
         return row[mutual], column[mutual], best[mutual].exp()
+
+    def _log_matchable(self, layer: int, states: Keypoints) -> Float[Tensor, "keypoint 1"]:
+        """Logarithm of the probability to have a partner."""
+        return functional.logsigmoid(self.matchable[layer](states))

@@ -182,7 +182,7 @@ def match_learned(
     for i, j in np.stack(np.unravel_index(order, alike.shape), axis=1).tolist():
         with torch.inference_mode():
             found, score = matcher.lightglue(first.face(i), second.face(j))
-        indices.append(found.numpy() + (first.starts[i], second.starts[j]))
+        indices.append(found.numpy() + np.array((first.starts[i], second.starts[j])))
         scores.append(score.double().numpy())
     index, score = np.concatenate(indices), np.concatenate(scores)
     order = np.argsort(-score, kind="stable")[: int((score > _MIN_SCORE).sum())]
