@@ -51,9 +51,8 @@ class DeformedConv(nn.Module):
         y, x = rows + (tap // 3 - 1) + offset[:, :, 0], columns + (tap % 3 - 1) + offset[:, :, 1]
         grid = torch.stack((2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1), dim=-1)  # image 9 h w 2
         samples = functional.grid_sample(maps, grid.flatten(1, 2), align_corners=True)  # image channel 9*h w
-        samples = samples.view(count, channels * 9, height * width)
-        out = self.conv.weight.flatten(1) @ samples + self.conv.bias[:, None]
-        return out.unflatten(2, (height, width))
+        samples = samples.view(count, channels * 9, height, width)
+        return functional.conv2d(samples, self.conv.weight.flatten(1)[:, :, None, None], self.conv.bias)
 
 
 class _Block(nn.Module):
@@ -119,7 +118,7 @@ class Aliked(nn.Module):
     def score_pixels(self, levels: Levels) -> Float[Tensor, "h w"]:
         """Scores of all pixels as keypoints, in [0, 1]."""
         size = levels[0].shape[-2:]
-        parts = self.score[0].weight.split(_LEVEL_FEATURES, dim=1)
+        parts = self.score[0].get_parameter("weight").split(_LEVEL_FEATURES, dim=1)
         maps = torch.zeros(1, 8, *size, device=levels[0].device)
         for level, part in zip(levels, parts, strict=True):
             maps += functional.interpolate(functional.conv2d(level, part), size, mode="bilinear", align_corners=True)
