@@ -24,6 +24,7 @@ SUFFIXES = ".py .glsl .vert .frag .geom .comp .safetensors .html .css .js"
 FOLDERS = {
     "pansplat": "pansplat",
     "pansplat.default_model": "assets/default",
+    "pansplat.matcher": "assets/matcher",
     "pansplat.shaders": "shaders",
     "pansplat_viewer": "viewer",
 }
@@ -65,7 +66,7 @@ def run_in(site: Path, *command: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_package_list_equals_the_packages_on_disk() -> None:
     on_disk = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")}
-    on_disk |= {"pansplat.default_model", "pansplat.shaders", "pansplat_viewer"} | {
+    on_disk |= {"pansplat.default_model", "pansplat.matcher", "pansplat.shaders", "pansplat_viewer"} | {
         "pansplat_viewer." + ".".join(file.parent.relative_to(ROOT / "viewer").parts)
         for file in (ROOT / "viewer").glob("*/**/__init__.py")
     }

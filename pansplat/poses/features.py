@@ -149,7 +149,7 @@ def detect_features(
         rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ rotation.T
         own = (rays @ rotations[:, :, 2].T).argmax(axis=1) == face
         if mask is not None:
-            own &= _sample_mask(mask, rays)
+            own &= sample_mask(mask, rays)
         bearings.append(rays[own])
         descriptors.append(found[own])
         keypoints.append(np.array([(point.response, point.size) for point in points])[own])
@@ -161,9 +161,11 @@ def detect_features(
     return Features(np.concatenate(bearings)[order], descriptor.astype(np.float32), sizes[order], noise)
 
 
-def render_face(image: UInt8[Array, "height width"], rotation: Array, focal: float) -> UInt8[Array, "side side"]:
+def render_face(
+    image: UInt8[Array, "height width *channel"], rotation: Array, focal: float
+) -> UInt8[Array, "side side *channel"]:
     """The perspective image of a face."""
-    height, width = image.shape
+    height, width = image.shape[:2]
     side = int(2 * math.tan(math.radians(_FIELD_OF_VIEW / 2)) * focal)
     steps = ((np.arange(side) + 0.5 - side / 2) / focal).astype(np.float32)
     axes = rotation.astype(np.float32)
@@ -176,7 +178,8 @@ def render_face(image: UInt8[Array, "height width"], rotation: Array, focal: flo
     return cv2.remap(padded, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _sample_mask(mask: Bool[Array, "height width"], rays: Float[Array, "n 3"]) -> Bool[Array, "n"]:
+def sample_mask(mask: Bool[Array, "height width"], rays: Float[Array, "n 3"]) -> Bool[Array, "n"]:
+    """The mask of a panorama at directions."""
     height, width = mask.shape
     uv = uv_from_directions(torch.from_numpy(rays)).numpy()
     columns = (uv[:, 0] * width).astype(int).clip(0, width - 1)
@@ -218,14 +221,19 @@ def drop_repeated(first: Features, second: Features, matches: Matches) -> Matche
 
     SIFT describes a place again for each dominant orientation and size; such matches are not independent evidence.
     """
+    kept = are_distinct(first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]])
+    return Matches(matches.indices[kept], matches.prior[kept])
+
+
+def are_distinct(a: Float[Array, "match 3"], b: Float[Array, "match 3"]) -> Bool[Array, "match"]:
+    """Whether no earlier match that is kept connects the same two places; bearings of both panoramas, best first."""
     from scipy.spatial import cKDTree
 
-    if not len(matches):
-        return matches
-    places = np.concatenate((first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]]), axis=1)
-    near = cKDTree(places).query_pairs(_SAME_PLACE, output_type="ndarray")  # the better match first
-    kept = np.ones(len(matches), bool)
+    kept = np.ones(len(a), bool)
+    if not len(a):
+        return kept
+    near = cKDTree(np.concatenate((a, b), axis=1)).query_pairs(_SAME_PLACE, output_type="ndarray")  # better one first
     for better, worse in near[np.argsort(near[:, 1], kind="stable")].tolist():
         if kept[better]:
             kept[worse] = False
-    return Matches(matches.indices[kept], matches.prior[kept])
+    return kept

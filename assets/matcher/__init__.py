@@ -1,0 +1,1 @@
+"""The weights of the learned matcher; see MODEL.md."""

