@@ -195,7 +195,7 @@ def match_learned(
 
 
 def _join_faces(
-    first: LearnedFeatures, second: LearnedFeatures, found: Sequence[tuple[Int[Array, "n 2"], Float[Array, "n"]]]
+    first: LearnedFeatures, second: LearnedFeatures, found: Sequence[tuple[Int[Array, "_ 2"], Float[Array, "_"]]]
 ) -> LearnedMatches:
     """The matches of all pairs of faces, without those that contradict or repeat a more probable one."""
     indices = np.concatenate([index for index, _ in found])
