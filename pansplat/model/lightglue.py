@@ -21,9 +21,9 @@ _HEAD_WIDTH = _WIDTH // _HEADS
 _STOP_SHARE = 0.95  # of confident keypoints at which the network stops
 _MIN_MATCHABLE = 0.01  # probability to have a partner below which a confident keypoint is dropped
 
-Keypoints = Float[Tensor, "keypoint 256"]
+Keypoints = Float[Tensor, "_ 256"]
 """States of the keypoints of one image."""
-Rotation = tuple[Float[Tensor, "keypoint 32"], Float[Tensor, "keypoint 32"]]
+Turn = tuple[Float[Tensor, "_ 32"], Float[Tensor, "_ 32"]]
 """Cosines and sines that encode the positions of keypoints."""
 
 
@@ -53,7 +53,7 @@ class _Layer(nn.Module):
         self.cross_in = nn.Linear(_WIDTH, 2 * _WIDTH)
         self.cross_update = _Update()
 
-    def forward(self, first: Keypoints, second: Keypoints, turns: tuple[Rotation, Rotation]) -> tuple[Tensor, Tensor]:
+    def forward(self, first: Keypoints, second: Keypoints, turns: list[Turn]) -> tuple[Tensor, Tensor]:
         first, second = self._attend_within(first, turns[0]), self._attend_within(second, turns[1])
         (key_a, value_a), (key_b, value_b) = self._cross_parts(first), self._cross_parts(second)
         return (
@@ -61,7 +61,7 @@ class _Layer(nn.Module):
             self.cross_update(second, _attend(key_b, key_a, value_a)),
         )
 
-    def _attend_within(self, states: Keypoints, turn: Rotation) -> Keypoints:
+    def _attend_within(self, states: Keypoints, turn: Turn) -> Keypoints:
         query, key, value = self.self_in(states).unflatten(1, (3, _HEADS, -1)).permute(1, 2, 0, 3)
         return self.self_update(states, _attend(_rotate(query, turn), _rotate(key, turn), value))
 
@@ -74,7 +74,7 @@ def _attend(query: Tensor, key: Tensor, value: Tensor) -> Float[Tensor, "head ke
     return functional.scaled_dot_product_attention(query[None], key[None], value[None])[0]
 
 
-def _rotate(values: Float[Tensor, "head keypoint 64"], turn: Rotation) -> Float[Tensor, "head keypoint 64"]:
+def _rotate(values: Float[Tensor, "head keypoint 64"], turn: Turn) -> Float[Tensor, "head keypoint 64"]:
     """The values, of which the first half are real and the second half imaginary parts, turned by their positions."""
     cosine, sine = turn
     real, imaginary = values.chunk(2, dim=2)

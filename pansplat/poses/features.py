@@ -221,18 +221,19 @@ def drop_repeated(first: Features, second: Features, matches: Matches) -> Matche
 
     SIFT describes a place again for each dominant orientation and size; such matches are not independent evidence.
     """
-    kept = are_distinct(first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]])
+    places = first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]]
+    kept = are_distinct(np.concatenate(places, axis=1))
     return Matches(matches.indices[kept], matches.prior[kept])
 
 
-def are_distinct(a: Float[Array, "match 3"], b: Float[Array, "match 3"]) -> Bool[Array, "match"]:
-    """Whether no earlier match that is kept connects the same two places; bearings of both panoramas, best first."""
+def are_distinct(places: Float[Array, "match n"]) -> Bool[Array, "match"]:
+    """Whether no better match that is kept has the same place; bearings of one or both panoramas, best match first."""
     from scipy.spatial import cKDTree
 
-    kept = np.ones(len(a), bool)
-    if not len(a):
+    kept = np.ones(len(places), bool)
+    if not len(places):
         return kept
-    near = cKDTree(np.concatenate((a, b), axis=1)).query_pairs(_SAME_PLACE, output_type="ndarray")  # better one first
+    near = cKDTree(places).query_pairs(_SAME_PLACE, output_type="ndarray")  # the better match first
     for better, worse in near[np.argsort(near[:, 1], kind="stable")].tolist():
         if kept[better]:
             kept[worse] = False

@@ -1,8 +1,9 @@
 """Learned features of panoramas, and matches between two panoramas with the probability of each.
 
 ALIKED finds keypoints on the four horizontal faces of a cube, which should be turned along the walls: the same wall
-then has the same direction in both panoramas. Descriptors of face pairs that look alike are counted first, and
-LightGlue matches the best of them. Where SIFT needs the same texture, it also uses the arrangement of the keypoints.
+then has the same direction in both panoramas. Distinctive descriptors are counted for each pair of faces, and
+LightGlue matches the pairs with most of them. Where SIFT needs the same texture, it also uses the arrangement of the
+keypoints. How often a match is right depends on its score, and more on how many others its faces have in common.
 
 Source: docs/adr/0015-a-learned-matcher-is-shipped.md.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -33,8 +35,12 @@ _FACES = 4  # the horizontal ones; floor and ceiling have few keypoints, and no 
 _KEYPOINTS = 640  # of a face
 _STRIDE = 32  # pixels; the sides of an image are multiples of it
 _FACE_PAIRS = 6  # that LightGlue matches
-_LEAST_ALIKE = 0.7  # cosine of descriptors that count as alike
-_MIN_SCORE = 0.05  # of a match
+_DISTINCT_RATIO = 0.85  # largest ratio of distances to the nearest and the second nearest descriptor
+_MIN_SCORE, _MAX_SCORE = 0.1, 0.9995  # of a match that is used; in the calibration
+_CONFIDENT = 0.3  # score of matches that count for their pair of faces
+# Log-odds that a match is right: constant, per log-odds of its score, per logarithm of 1 + the sum of the confident
+# scores of its pair of faces. Logistic regression over the 78 pairs of a real home (docs/poses.md).
+_CALIBRATION = -4.84, 0.264, 1.586
 
 
 class MatcherMissingError(InputError):
@@ -110,15 +116,17 @@ class LearnedFeatures:
 
 @dataclass(frozen=True, eq=False)
 class LearnedMatches:
-    """Pairs of learned features, the most probable first.
+    """Pairs of learned features, the most probable first; a place of either panorama is in one of them.
 
     Attributes:
         indices: of the features in the first and in the second panorama.
-        score: LightGlue's probability; docs/poses.md states how often matches are right.
+        score: by LightGlue, in [0, 1].
+        probability: that the match is right, by its score and by the other matches of its faces.
     """
 
     indices: Int[Array, "match 2"]
     score: Float[Array, "match"]
+    probability: Float[Array, "match"]
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -171,34 +179,49 @@ def detect_learned(
 def match_learned(
     matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures, *, face_pairs: int = _FACE_PAIRS
 ) -> LearnedMatches:
-    """Matches of two panoramas; one for each pair of places.
+    """Matches of two panoramas.
 
     Args:
-        face_pairs: number of pairs of faces that are matched, those that look most alike.
+        face_pairs: number of pairs of faces that are matched, those with most distinctive descriptors in common.
     """
-    alike = count_alike(first, second)
-    order = np.argsort(-alike, axis=None, kind="stable")[:face_pairs]
-    indices, scores = [np.empty((0, 2), np.int64)], [np.empty(0)]
-    for i, j in np.stack(np.unravel_index(order, alike.shape), axis=1).tolist():
+    common = count_common(first, second)
+    order = np.argsort(-common, axis=None, kind="stable")[:face_pairs]
+    found = []
+    for i, j in np.stack(np.unravel_index(order, common.shape), axis=1).tolist():
         with torch.inference_mode():
-            found, score = matcher.lightglue(first.face(i), second.face(j))
-        indices.append(found.numpy() + np.array((first.starts[i], second.starts[j])))
-        scores.append(score.double().numpy())
-    index, score = np.concatenate(indices), np.concatenate(scores)
-    order = np.argsort(-score, kind="stable")[: int((score > _MIN_SCORE).sum())]
-    index, score = index[order], score[order]
-    kept = are_distinct(first.bearings[index[:, 0]], second.bearings[index[:, 1]])
-    return LearnedMatches(index[kept], score[kept])
+            indices, scores = matcher.lightglue(first.face(i), second.face(j))
+        found.append((indices.numpy() + np.array((first.starts[i], second.starts[j])), scores.double().numpy()))
+    return _join_faces(first, second, found)
 
 
-def count_alike(first: LearnedFeatures, second: LearnedFeatures) -> Int[Array, "face face"]:
-    """Number of mutually nearest and similar descriptors of each pair of faces."""
+def _join_faces(
+    first: LearnedFeatures, second: LearnedFeatures, found: Sequence[tuple[Int[Array, "_ 2"], Float[Array, "_"]]]
+) -> LearnedMatches:
+    """The matches of all pairs of faces, without those that contradict or repeat a more probable one."""
+    indices = np.concatenate([index for index, _ in found])
+    score = np.concatenate([score for _, score in found])
+    support = np.concatenate([np.full(len(score), score[score > _CONFIDENT].sum()) for _, score in found])
+    constant, by_score, by_support = _CALIBRATION
+    clipped = score.clip(_MIN_SCORE, _MAX_SCORE)
+    odds = constant + by_score * np.log(clipped / (1 - clipped)) + by_support * np.log1p(support)
+    probability = 1 / (1 + np.exp(-odds))
+    order = np.argsort(-probability, kind="stable")
+    order = order[score[order] > _MIN_SCORE]
+    a, b = first.bearings[indices[order, 0]], second.bearings[indices[order, 1]]
+    order = order[are_distinct(a) & are_distinct(b)]
+    return LearnedMatches(indices[order], score[order], probability[order])
+
+
+def count_common(first: LearnedFeatures, second: LearnedFeatures) -> Int[Array, "face face"]:
+    """Number of distinctive, mutually nearest descriptors of each pair of faces."""
     count = np.zeros((_FACES, _FACES), np.int64)
     for i, j in itertools.product(range(_FACES), repeat=2):
         similarity = first.face(i)[1] @ second.face(j)[1].T
-        if not similarity.numel():
+        if min(similarity.shape) < 2:
             continue
-        best, column = similarity.max(dim=1)
-        mutual = similarity.argmax(dim=0)[column] == torch.arange(len(similarity))
-        count[i, j] = int((mutual & (best > _LEAST_ALIKE)).sum())
+        nearest, index = similarity.topk(2, dim=1)
+        mutual = similarity.argmax(dim=0)[index[:, 0]] == torch.arange(len(similarity))
+        squared = (1 - nearest).clamp_min(0)  # half of the squared distances
+        distinct = squared[:, 0] < _DISTINCT_RATIO**2 * squared[:, 1]
+        count[i, j] = int((mutual & distinct).sum())
     return count

@@ -16,6 +16,7 @@ from pansplat.poses.learned import (
     LearnedFeatures,
     Matcher,
     MatcherMissingError,
+    _join_faces,
     detect_learned,
     load_matcher,
     match_learned,
@@ -74,10 +75,19 @@ def test_matches_of_a_room_are_right(matcher: Matcher, room: tuple) -> None:
     angle = epipolar_angles(
         first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]], rotation, translation
     )
-    likely = matches.score > 0.5
+    likely = matches.probability > 0.5
     assert likely.sum() > 60
     assert (np.abs(angle[likely]) < np.radians(1)).mean() > 0.9
-    assert (np.diff(matches.score) <= 0).all()
+    assert (np.diff(matches.probability) <= 0).all()
+    assert all(len(np.unique(column)) == len(matches) for column in matches.indices.T)
+
+
+def test_a_match_is_more_probable_with_others_of_its_faces(matcher: Matcher, room: tuple) -> None:
+    first, second, _, _ = room
+    many, few = np.stack((np.arange(40), np.arange(40)), axis=1), np.array(((len(first) - 1, len(second) - 1),))
+    matches = _join_faces(first, second, [(many, np.full(40, 0.9)), (few, np.array((0.9,)))])
+    assert tuple(matches.indices[-1]) == tuple(few[0])
+    assert matches.probability[-1] < 0.1 and matches.probability[0] > 0.8
 
 
 def test_masked_pixels_have_no_features(matcher: Matcher, render_room: Callable[..., Array]) -> None:
