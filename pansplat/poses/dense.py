@@ -63,7 +63,7 @@ class Surroundings:
     @functools.cached_property
     def rays(self) -> Float[Array, "n 3"]:
         """Directions in the camera's frame."""
-        return pixel_directions(_HEIGHT).reshape(-1, 3).double().numpy()
+        return pixel_directions(_HEIGHT, 2 * _HEIGHT).reshape(-1, 3).double().numpy()
 
     @functools.cached_property
     def weight(self) -> Float[Array, "n"]:

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from pansplat.poses.axes import NO_PRIOR, RotationPrior
+from pansplat.poses.dense import Comparison
 from pansplat.poses.depth import DepthMap, MatchDepths
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.solvers import (
@@ -78,13 +79,20 @@ class _Support:
     score: float
     margin: float
 
+    @property
+    def suffices(self) -> bool:
+        """Whether the matches alone support the pose."""
+        return self.places >= _NEEDED.places and self.score >= _NEEDED.score and self.margin >= _NEEDED.margin
 
-# By the number of confirmations that do not depend on the matches: the walls of both panoramas are parallel, and both
-# agree on a floor. Measured on pairs of a home, of which most have nothing in common: of the wrong poses with at least
-# 10 places and a score of 36, none is confirmed by both; repeated doors and windows give them up to 26 places.
-_NEEDED = _Support(32, 80, 20), _Support(24, 100, 10), _Support(10, 36, 4)
-_FLOOR_SCORE = 6.0  # gain of a pose that the floor confirms
-_ALTERNATIVES = 5  # best hypotheses that are compared by the floor
+
+# Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
+_NEEDED = _Support(32, 80, 20)
+_COMPARED = 12  # best hypotheses whose panoramas are compared
+# Logarithm of the odds that a hypothesis is right, linear in: 1, log(1 + score), log(1 + places), parallel walls,
+# conflict, likeness, shade, overlap, slope of the way (docs/poses.md).
+_ODDS = (-10.0, 0.62, 0.37, 6.4, -56.0, 6.9, 3.6, -2.0, -16.0)
+_LARGEST_CONFLICT, _LARGEST_SLOPE = 0.1, 0.3
+_CERTAIN_ODDS, _PROBABLE_ODDS = 4.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -550,6 +558,7 @@ class RelativePose:
         uncertainty: standard deviations of rotation and direction by the noise of the matches, the distortion of the
             panoramas and the number of places, radians.
         distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
+        log_odds: logarithm of the odds that the pose is right, by matches and comparison; infinite if matches suffice.
         problem: why the pose must not be used; None if it passes the check.
     """
 
@@ -562,6 +571,7 @@ class RelativePose:
     parallax: float
     uncertainty: tuple[float, float]
     distance: float
+    log_odds: float
     problem: str | None
 
     @property
@@ -569,14 +579,19 @@ class RelativePose:
         """Whether the pose passes the check."""
         return self.problem is None
 
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is wrong in less than one of 300 pairs; else it is probable."""
+        return self.is_reliable and self.log_odds >= _CERTAIN_ODDS
+
 
 def estimate_relative_pose(
     first: Features,
     second: Features,
     matches: Matches,
     axes: RotationPrior = NO_PRIOR,
-    agree_on_floor: Callable[[Hypothesis], bool] = lambda hypothesis: False,
     *,
+    compare: Callable[[Hypothesis], Comparison | None] = lambda hypothesis: None,
     depths: tuple[DepthMap, DepthMap] | None = None,
     seed: int = 0,
 ) -> RelativePose:
@@ -586,7 +601,7 @@ def estimate_relative_pose(
         first, second: features of both panoramas.
         matches: between them.
         axes: gravity and walls of both panoramas.
-        agree_on_floor: whether both panoramas show one floor under a pose; called if matches and walls do not suffice.
+        compare: all that both panoramas show under a hypothesis; None if its distance is unknown.
         depths: estimated of both panoramas.
         seed: of the random samples.
     """
@@ -600,9 +615,10 @@ def estimate_relative_pose(
     if not found:
         no_match = f"only {count} features match"
         return RelativePose(
-            np.eye(3), np.array((0.0, 0, 1)), indices[:0], 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, math.nan, no_match
+            np.eye(3), np.array((0.0, 0, 1)), indices[:0], 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, math.nan, -math.inf, no_match
         )
-    best, support, confirmations = _choose_confirmed(found, evidence, agree_on_floor)
+    best, log_odds, margin = _choose_compared(found, evidence, compare)
+    support = _Support(_count_all_places(best, evidence), best.score, margin)
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
@@ -611,8 +627,8 @@ def estimate_relative_pose(
         a[used], b[used], best.rotation, best.translation, evidence.noise[used], axes
     )
     uncertainty = _calibrate(deviations, support.places)
-    problem = _find_problem(support, confirmations)
-    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _NEEDED[2].places:
+    problem = _find_problem(support, log_odds)
+    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
         problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
     elif problem is None and uncertainty[1] > _MAX_UNCERTAINTY:
         problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
@@ -626,53 +642,50 @@ def estimate_relative_pose(
         spread,
         uncertainty,
         best.distance,
+        math.inf if support.suffices else log_odds,
         problem,
     )
 
 
-def _choose_confirmed(
-    found: list[Hypothesis], evidence: _Evidence, agree_on_floor: Callable[[Hypothesis], bool]
-) -> tuple[Hypothesis, _Support, int]:
-    """The best hypothesis, its support, and how many of walls and floor confirm it.
-
-    The floor is compared only if matches and walls do not suffice; it can change the order of the hypotheses.
-    """
-
-    def measure(ranked: list[Hypothesis]) -> _Support:
-        best = ranked[0]
-        places = min(_count_places(x, best.probability) for x in (evidence.a, evidence.b))
-        return _Support(places, best.score, best.score - ranked[1].score if len(ranked) > 1 else best.score)
-
-    support, confirmations = measure(found), int(evidence.axes.confirms(found[0].rotation))
-    if _find_problem(support, confirmations) is None or found[0].score < _NEEDED[2].score:
-        return found[0], support, confirmations
-    found = found[:_ALTERNATIVES]
-    on_floor = [agree_on_floor(h) for h in found]
-    found = [replace(h, score=h.score + _FLOOR_SCORE * floor) for h, floor in zip(found, on_floor, strict=True)]
-    order = sorted(range(len(found)), key=lambda n: -found[n].score)
-    found = [found[n] for n in order]
-    return found[0], measure(found), int(evidence.axes.confirms(found[0].rotation)) + on_floor[order[0]]
+def _choose_compared(
+    found: list[Hypothesis], evidence: _Evidence, compare: Callable[[Hypothesis], Comparison | None]
+) -> tuple[Hypothesis, float, float]:
+    """The hypothesis of the highest odds, their logarithm, and how much its score exceeds that of the others."""
+    odds = [_log_odds(h, evidence, compare(h)) for h in found[:_COMPARED]]
+    best = int(np.argmax(odds)) if max(odds) > -math.inf else 0
+    others = [h.score for n, h in enumerate(found) if n != best]
+    return found[best], odds[best], found[best].score - max(others, default=0.0)
 
 
-def _find_problem(support: _Support, confirmations: int) -> str | None:
-    """Why the support of a pose does not suffice; None if it does."""
-    needed = min(
-        _NEEDED[: confirmations + 1],
-        key=lambda n: (support.places < n.places) + (support.score < n.score) + (support.margin < n.margin),
+def _log_odds(hypothesis: Hypothesis, evidence: _Evidence, comparison: Comparison | None) -> float:
+    """Logarithm of the odds that a hypothesis is right; -inf if its panoramas cannot be compared."""
+    if comparison is None:
+        return -math.inf
+    slope = abs(float(hypothesis.translation @ (hypothesis.rotation @ evidence.axes.first.axes[0])))
+    values = (
+        1.0,
+        math.log1p(max(hypothesis.score, 0.0)),
+        math.log1p(_count_all_places(hypothesis, evidence)),
+        float(evidence.axes.confirms(hypothesis.rotation)),
+        min(comparison.conflict, _LARGEST_CONFLICT),
+        comparison.likeness,
+        comparison.shade,
+        comparison.overlap,
+        min(slope, _LARGEST_SLOPE),
     )
-    unconfirmed = ("", ", as only walls or floor confirm the pose", ", as neither walls nor floor confirm the pose")
-    if support.places < needed.places:
-        reason = f"{support.places:.0f} places match, {needed.places:.0f} are needed"
-    elif support.score < needed.score:
-        reason = f"the matches have a score of {support.score:.0f}, {needed.score:.0f} is needed"
-    elif support.margin < needed.margin:
-        return (
-            f"another pose fits as well (difference of the scores {support.margin:.1f}, {needed.margin:.0f} is needed"
-            f"{unconfirmed[2 - confirmations]})"
-        )
-    else:
+    return float(np.dot(_ODDS, values))
+
+
+def _count_all_places(hypothesis: Hypothesis, evidence: _Evidence) -> float:
+    return min(_count_places(rays, hypothesis.probability) for rays in (evidence.a, evidence.b))
+
+
+def _find_problem(support: _Support, log_odds: float) -> str | None:
+    """Why a pose must not be used; None if its matches suffice, or with the comparison of both panoramas."""
+    if support.suffices or log_odds >= _PROBABLE_ODDS:
         return None
-    return f"too little in common: {reason}{unconfirmed[2 - confirmations]}"
+    share = f"right with a probability of {100 / (1 + math.exp(-log_odds)):.0f} %" if log_odds > -math.inf else "unclear"
+    return f"too little in common: {support.places:.0f} places match, and the best pose is {share}"
 
 
 def polish_relative_pose(
