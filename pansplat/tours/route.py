@@ -121,7 +121,7 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
             places.append(places[-1] + link)
             legs.append(legs[-1] if legs else first)
         if first < 0 and start is not None:
-            if last == 0:  # a fade begins where the camera is, or near the link
+            if last == 0 < len(steps):  # a fade begins where the camera is, or near the link
                 places = places[1:]
             else:
                 legs = [-1, *legs]

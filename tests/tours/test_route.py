@@ -45,6 +45,15 @@ def test_a_route_to_the_panorama_at_the_camera_stays_there(comb):
     assert np.allclose(route.pose(0.5), pose)
 
 
+def test_a_route_to_the_only_panorama_of_its_walk_flies_there(comb):
+    start = np.eye(4)
+    start[2, 3] = 1.4
+    walk = comb.find_way(start[:3, 3], 2)
+    route = plan_route(comb, walk, start)
+    assert walk == [2] and route.walk == (2,), "an end of the edge at the camera"
+    assert np.allclose(route.pose(0), start) and np.allclose(route.pose(1)[:3, 3], comb.positions[2])
+
+
 def test_the_camera_looks_along_its_way_in_any_world(comb):
     turn = torch.tensor(((1.0, 0, 0), (0, 0, 1), (0, -1, 0)), dtype=torch.float64)  # z up
     panoramas = []
