@@ -278,7 +278,7 @@ def _connect(tour: TourGraph, folder: Path) -> tuple[TourGraph, Path, bool]:
     return dataclasses.replace(tour, overlaps={(a, b): overlap for a, b, overlap in rows}), path, is_new
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)  # that of the batch, and that of single views
 def _load_model(model: str, compat: pipeline.CompatChoice, precision: pipeline.Precision) -> Predictor:
     return pipeline.load_model(model, compat=compat, precision=precision)
 
@@ -295,7 +295,11 @@ def read_fingerprint(options: BatchOptions) -> str:
 def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: Path) -> Iterator[tuple[Path, bool]]:
     """Yield each output of a pair or tour, and whether it was written."""
     part = None if unit.tour is None else _count_of_page(options) / len(unit.tour)
-    made = [_PairSteps(pair, part, options, fingerprint, folder) for pair in unit.pairs]
+    of_single_views = _choose_for_single_views(unit, options, fingerprint)
+    made = [
+        _PairSteps(pair, part, *(of_single_views if len(pair.context) == 1 else (options, fingerprint)), folder)
+        for pair in unit.pairs
+    ]
     for steps in made:
         yield from steps.run()
     if "export" not in options.steps:
@@ -312,6 +316,19 @@ def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: 
             scene = merge_scenes(unit.tour, lambda views: of_views[views].read())
         _export(scene, path, unit, options)
     yield path, is_new
+
+
+def _choose_for_single_views(unit: _Unit, options: BatchOptions, fingerprint: str) -> tuple[BatchOptions, str]:
+    """Options and fingerprint for the single views of a tour; a warning states another predictor than the batch's."""
+    alone = [pair for pair in unit.pairs if len(pair.context) == 1]
+    if unit.tour is None or not alone:
+        return options, fingerprint
+    predictor = _load_model(options.model, options.compat, options.precision)
+    if pipeline.choose_predictor(alone[0], predictor) is predictor:
+        return options, fingerprint
+    pipeline.warn_of_single_views(unit.tour, predictor)
+    options = dataclasses.replace(options, model="default", compat="trained", precision="float32")
+    return options, read_fingerprint(options)
 
 
 def _list_graph(tour: TourGraph) -> list[Any]:

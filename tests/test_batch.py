@@ -122,6 +122,31 @@ def test_a_tour_has_a_file_for_each_scene_and_one_page(
     assert one.error is None and len(one.outputs) == 1
 
 
+@pytest.fixture
+def parted_house(tmp_path: Path, write_tour: Callable[..., Path]) -> Path:
+    """A folder of three panoramas; the last one has no pose."""
+    house = write_tour(tmp_path / "house", 3, height=HEIGHT)
+    content = json.loads((house / "poses.json").read_text())
+    del content["poses"]["p2.png"]
+    (house / "poses.json").write_text(json.dumps(content))
+    (house / "pairs.json").unlink()
+    return house
+
+
+def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
+    parted_house: Path, tmp_path: Path, sphere: None, sphere_predictor: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sphere_predictor, "min_views", 2, raising=False)
+    of_single_views = sphere_predictor("2")
+    of_single_views.min_views = 1
+    monkeypatch.setitem(pipeline._MODELS, "default", lambda: of_single_views)
+    options, item = BatchOptions(("predict",), "sphere", height=HEIGHT), Item("house", parted_house)
+    report = process_item(item, options, "1", tmp_path / "out")
+    assert report.error is None and len(report.outputs) == 3 and of_single_views.calls == 1
+    assert sum("single view is predicted by default" in note for note in report.notes) == 1
+    assert process_item(item, options, "1", tmp_path / "out").status == "skipped"
+
+
 def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path, sphere: None) -> None:
     options = BatchOptions(model="sphere", height=HEIGHT)
     report = process_item(Item("room0", rooms / "room0"), options, "2", tmp_path / "out")
