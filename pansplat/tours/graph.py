@@ -395,7 +395,8 @@ def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
     }
     overlaps = dict.fromkeys(sorted(edges), 0.0)
     overlaps |= {(node, node): 1.0 for node in sorted(set(range(len(images))) - {*itertools.chain(*edges)})}
-    near, far = min(pair.near for pair in pairs), max(pair.far for pair in pairs)
+    measured = [pair for pair in pairs if len(pair.context) > 1] or pairs  # the range of a single view is a default
+    near, far = min(pair.near for pair in measured), max(pair.far for pair in measured)
     originals = tuple(found[image] for image in images)
     name = f"{first.folder.resolve().name} tour"
     return TourGraph(name, first.folder, lay_out(originals, near), near, far, first.siblings, overlaps, originals)

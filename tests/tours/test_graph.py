@@ -77,6 +77,14 @@ def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
     assert find_tours([pairs[0], elsewhere]) == [], "each folder has its own tour"
 
 
+def test_the_depth_range_of_a_tour_is_that_of_the_pairs_with_several_views(home):
+    together, alone = home.make_pair((0, 1)), home.make_pair((3,))
+    (tour,) = find_tours([dataclasses.replace(together, near=0.8, far=4.0), alone])
+    assert (tour.near, tour.far) == (0.8, 4.0) and (alone.near, alone.far) == (0.45, 10.0)
+    (tour,) = find_tours([alone, home.make_pair((6,))])
+    assert (tour.near, tour.far) == (0.45, 10.0)
+
+
 def test_parts_are_level_and_far_apart(home):
     distances = np.linalg.norm(home.positions[:, None] - home.positions[None], axis=2)
     parts = np.array(home.parts)
