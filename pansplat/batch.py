@@ -295,6 +295,10 @@ def read_fingerprint(options: BatchOptions) -> str:
 def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: Path) -> Iterator[tuple[Path, bool]]:
     """Yield each output of a pair or tour, and whether it was written."""
     part = None if unit.tour is None else _count_of_page(options) / len(unit.tour)
+    alone = sum(len(pair.context) == 1 for pair in unit.pairs)
+    if alone and "refine" in options.steps:
+        count = f"{alone} single views are" if alone > 1 else "a single view is"
+        warnings.warn(f"{unit.name}: {count} not refined.", InputWarning, stacklevel=2)
     of_single_views = _choose_for_single_views(unit, options, fingerprint)
     made = [
         _PairSteps(pair, part, *(of_single_views if len(pair.context) == 1 else (options, fingerprint)), folder)
@@ -343,7 +347,7 @@ def _list_graph(tour: TourGraph) -> list[Any]:
 
 
 class _PairSteps:
-    """The prediction and refinement of a pair, or of a scene of a tour.
+    """The prediction and refinement of a pair, or of a scene of a tour. A single view is predicted only.
 
     Attributes:
         key: hash of all that the result depends on.
@@ -363,9 +367,10 @@ class _PairSteps:
         options = self._options
         name = options.model.rsplit("/", 1)[-1]
         self.key = _join_hash(self.key, "predict", [name, self._fingerprint, self._height])
-        if "predict" in options.steps:
+        is_refined = "refine" in options.steps and len(self._pair.context) > 1
+        if "predict" in options.steps or ("refine" in options.steps and not is_refined):
             yield self._write("predict", self._predict_to)
-        if "refine" in options.steps:
+        if is_refined:
             self.key = _join_hash(
                 self.key, "refine", [refinement_fingerprint(), options.refine_seconds, self._gaussians]
             )

@@ -270,7 +270,7 @@ def predict(
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
     report: Progress = progress or (lambda what, fraction: None)
-    if not refine_seconds or len(views.images) == 1:  # one photograph does not show what is wrong seen from elsewhere
+    if not refine_seconds or len(views.images) == 1:
         return _predict_views(pair, views, predictor, height, cache, report)
     refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
     is_cached = cache and isinstance(pair, Pair)
@@ -341,7 +341,7 @@ def refine(
         progress: called with a description of the current work and the completed fraction.
 
     Returns:
-        The refined scene, or the given one if held-out pixels show that it is better.
+        The refined scene, or the given one if held-out pixels show that it is better, or if it is of a single view.
 
     Raises:
         InputError: scene and views do not fit, or an argument is out of range.

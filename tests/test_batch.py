@@ -147,6 +147,23 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     assert process_item(item, options, "1", tmp_path / "out").status == "skipped"
 
 
+def test_single_views_are_not_refined_with_one_note(
+    parted_house: Path, tmp_path: Path, sphere: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refined = []
+
+    def refine(scene: Any, views: Any, path: Path, **options: Any) -> None:
+        refined.append(len(views.images))
+        pipeline.save(scene, path)
+
+    monkeypatch.setattr(pipeline, "refine_to_file", refine)
+    for steps, count in ((("predict", "refine", "export"), 5), (("refine",), 3)):
+        options = BatchOptions(steps, "sphere", height=HEIGHT, suffix=".splat")
+        report = process_item(Item("house", parted_house), options, "1", tmp_path / steps[0])
+        assert report.error is None and len(report.outputs) == count and refined.pop() == 2 and not refined
+        assert sum("a single view is not refined" in note for note in report.notes) == 1
+
+
 def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path, sphere: None) -> None:
     options = BatchOptions(model="sphere", height=HEIGHT)
     report = process_item(Item("room0", rooms / "room0"), options, "2", tmp_path / "out")
