@@ -30,6 +30,7 @@ from pansplat.atomic import replacing
 from pansplat.console import is_out_of_memory
 from pansplat.data.folders import find_panorama_folders
 from pansplat.data.pairs import Pair
+from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import SCENE_SUFFIXES, expand_home, read_file
 from pansplat.gaussians.scene import Scene
@@ -84,6 +85,7 @@ class BatchOptions:
         steps: a part of `STEPS`, in this order.
         model, compat, precision: see `pansplat.load_model`.
         height: see `pansplat.predict`.
+        camera_height: see `pansplat.load_pairs`.
         refine_seconds: time limit of the refinement.
         suffix: of the exported files; one of `EXPORT_SUFFIXES`.
         gaussians: largest number in a web page; None for the default.
@@ -94,6 +96,7 @@ class BatchOptions:
     compat: pipeline.CompatChoice = "trained"
     precision: pipeline.Precision = "float32"
     height: int | None = None
+    camera_height: float = CAMERA_HEIGHT
     refine_seconds: float = 10.0
     suffix: str = ".html"
     gaussians: int | None = None
@@ -208,7 +211,7 @@ def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path)
             folder = out / item.name
             folder.mkdir(parents=True, exist_ok=True)
             _remove_unfinished(folder)
-            for unit in _list_units(item, folder):
+            for unit in _list_units(item, options, folder):
                 for path, is_new in itertools.chain(unit.files, _process_unit(unit, options, fingerprint, folder)):
                     outputs.append(path.relative_to(out).as_posix())
                     num_written += is_new
@@ -246,9 +249,11 @@ class _Unit:
     files: tuple[tuple[Path, bool], ...] = ()
 
 
-def _list_units(item: Item, folder: Path) -> list[_Unit]:
+def _list_units(item: Item, options: BatchOptions, folder: Path) -> list[_Unit]:
     """The tours of an item, and the pairs that belong to none. The graphs of the tours are written to the folder."""
-    pairs = pipeline.load_pairs(item.folder, convention=item.convention, near=item.near, far=item.far)
+    pairs = pipeline.load_pairs(
+        item.folder, convention=item.convention, near=item.near, far=item.far, camera_height=options.camera_height
+    )
     if item.pair is not None:
         chosen = [pair for pair in pairs if pair.name == item.pair]
         if not chosen:
@@ -439,15 +444,19 @@ def _export(scene: Scene, path: Path, unit: _Unit, options: BatchOptions) -> Non
 
 
 def _hash_pair(pair: Pair) -> str:
-    """Hash of all that a prediction depends on: names, poses, depth range, and the files of images and masks."""
+    """Hash of all that the file of a prediction depends on, besides the predictor."""
     context = [
-        [view.name, view.cam2world.tolist(), _hash_file(view.image), view.mask and _hash_file(view.mask)]
+        [
+            *(view.name, view.title, view.start, view.cam2world.tolist()),
+            *(_hash_file(view.image), view.mask and _hash_file(view.mask)),
+        ]
         for view in pair.context
     ]
+    heights = [view.camera_height for view in pair.context] if len(pair.context) == 1 else []
     # Static content is detected in the siblings of a panorama without a mask.
     needs_siblings = any(view.mask is None for view in pair.context)
     siblings = [_hash_file(image) for image in pair.siblings] if needs_siblings else []
-    return _join_hash(_LAYOUT, pair.name, [pair.near, pair.far, context, siblings])
+    return _join_hash(_LAYOUT, pair.name, [pair.near, pair.far, context, heights, siblings])
 
 
 @lru_cache(maxsize=4096)
