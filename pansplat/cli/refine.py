@@ -116,6 +116,7 @@ def _describe(report: RefineReport) -> str:
         "done": "",
         "converged": ", converged",
         "interrupted": ", interrupted",
+        "single view": "; a single view is not refined",
         "worse": "; the given scene is kept, because the refined one is not better",
     }[report.stopped]
     errors = f"{report.before:.4f} before, {report.after:.4f} after"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -227,7 +228,7 @@ class Collection:
             name = self.name or "-".join(view.name for view in context)
             pairs.append(Pair(name, folder, context, targets, near, far, siblings))
         first_part = 1 + max(panorama.part for panorama in self.panoramas)
-        every = (*self.panoramas, *self.unposed)
+        every = tuple(heapq.merge(self.panoramas, self.unposed, key=lambda panorama: panorama.name))
         return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_part=first_part)
 
     def _select_groups(self) -> list[ViewGroup]:

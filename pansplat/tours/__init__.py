@@ -28,10 +28,11 @@ from pansplat.tours.graph import (
     select_views,
 )
 from pansplat.tours.overlap import connect
-from pansplat.tours.route import Route, find_angles, find_way_along_link, plan_route
+from pansplat.tours.route import FADE_SECONDS, Route, find_angles, find_way_along_link, plan_route
 
 __all__ = [
     "EDGE_HYSTERESIS",
+    "FADE_SECONDS",
     "Edge",
     "FloorOutline",
     "FloorPlan",

@@ -285,16 +285,17 @@ class TourGraph:
         Nearest neighbours first, improved by exchanging parts of the order (2-opt).
 
         Args:
-            start: its first node; None chooses the start of the shortest walk, of some starts for more than 100 nodes.
-                A tour of parts with links starts at its first node, as its author has chosen, and one without links in
-                its largest part.
+            start: its first node. None starts at the first node if that has a start view, or in a tour of parts with
+                links: its author has chosen so. Else it chooses the start of the shortest walk, of some starts for more
+                than 100 nodes; in a tour of parts one in the largest part.
         """
         costs, _ = self._shortest
         starts = np.arange(len(self)) if start is None else np.array([start])
-        if start is None and max(self.parts) > 0:
-            starts = (
-                starts[:1] if self.links else np.flatnonzero(np.array(self.parts) == np.bincount(self.parts).argmax())
-            )
+        has_parts = max(self.parts) > 0
+        if start is None and (self.panoramas[0].start is not None or (has_parts and self.links)):
+            starts = starts[:1]
+        elif start is None and has_parts:
+            starts = np.flatnonzero(np.array(self.parts) == np.bincount(self.parts).argmax())
         starts = starts[:: math.ceil(len(starts) * len(self) / _MAX_STARTS)].tolist()
         orders = [_improve_order(_order_by_distance(costs, first), costs) for first in starts]
         order = min(orders, key=lambda order: float(costs[order[:-1], order[1:]].sum()))
@@ -385,7 +386,8 @@ def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
     """The tour of all panoramas of some pairs."""
     first = pairs[0]
     found = {panorama.image: panorama for pair in pairs for panorama in pair.context}
-    rank = {image: index for index, image in enumerate(first.siblings)}
+    every = max((pair.siblings for pair in pairs), key=len)  # those of a single view include panoramas of other parts
+    rank = {image: index for index, image in enumerate(every)}
     images = sorted(found, key=lambda image: rank.get(image, len(rank)))
     number = {image: index for index, image in enumerate(images)}
     edges = {
@@ -395,7 +397,8 @@ def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
     }
     overlaps = dict.fromkeys(sorted(edges), 0.0)
     overlaps |= {(node, node): 1.0 for node in sorted(set(range(len(images))) - {*itertools.chain(*edges)})}
-    near, far = min(pair.near for pair in pairs), max(pair.far for pair in pairs)
+    measured = [pair for pair in pairs if len(pair.context) > 1] or pairs  # the range of a single view is a default
+    near, far = min(pair.near for pair in measured), max(pair.far for pair in measured)
     originals = tuple(found[image] for image in images)
     name = f"{first.folder.resolve().name} tour"
     return TourGraph(name, first.folder, lay_out(originals, near), near, far, first.siblings, overlaps, originals)

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from pansplat.tours.graph import Edge, TourGraph
 
+FADE_SECONDS = 1.0
 _FLY_SPEED = 1.0  # metres per second
 _TURN_DEGREES = 45.0  # per second
 _LOOK_AHEAD = 1.5  # metres along the way, the point that the camera looks at
@@ -76,6 +77,20 @@ class Route:
         pose[:3, 3] = [np.interp(at, steps, column) for column in self.positions.T]
         return pose
 
+    def fade(self, fraction: float) -> list[tuple[Float[np.ndarray, "4 4"], float]]:
+        """The poses from which a fraction of the duration is drawn, with their weights.
+
+        They are the pose there, and in the `FADE_SECONDS` after a jump the last pose before it.
+        """
+        steps = len(self.legs) - 1
+        at = min(max(fraction, 0.0), 1.0) * steps
+        passed = self.jumps[self.jumps < round(at)]
+        done = (at - passed[-1]) / (FADE_SECONDS * _SAMPLES_PER_SECOND) if len(passed) else 1.0
+        if done >= 1:
+            return [(self.pose(fraction), 1.0)]
+        weight = done * done * (3 - 2 * done)
+        return [(self.pose(passed[-1] / steps), 1 - weight), (self.pose(fraction), weight)]
+
     def edge(self, fraction: float) -> Edge | None:
         """The edge that is flown at a fraction of the duration; None before the first panorama."""
         leg = self.leg(fraction)
@@ -121,7 +136,7 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
             places.append(places[-1] + link)
             legs.append(legs[-1] if legs else first)
         if first < 0 and start is not None:
-            if last == 0:  # a fade begins where the camera is, or near the link
+            if last == 0 < len(steps):  # a fade begins where the camera is, or near the link
                 places = places[1:]
             else:
                 legs = [-1, *legs]

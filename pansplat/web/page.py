@@ -173,15 +173,15 @@ def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
         factor: of the scene's unit.
     """
     views = tuple(range(len(scene.cam2world)))
-    first = tour.find_start_view(0) if len(tour) else None
     if not tour.overlaps:
+        first = tour.find_start_view(0) if len(tour) else None
         start = path_poses(scene.cam2world)[0]
         level = start[:3, :3].numpy()
         yaw, pitch = (0.0, 0.0) if first is None else find_angles(level.T @ first)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
-    walk = tour.plan_walk(None if first is None else 0)
+    walk = tour.plan_walk()
     route = plan_route(tour, [*walk, *tour.find_walk(walk[-1], walk[0])[1:]])  # ends where it begins
     samples, jumps = _resample(route, factor)
     start = torch.from_numpy(route.pose(0.0))

@@ -36,6 +36,17 @@ def test_pairs_that_share_panoramas_are_one_tour(make_tour):
     assert len(tour) == 5
 
 
+def test_a_walk_starts_at_the_first_panorama_if_that_has_a_start_view(comb):
+    assert comb.plan_walk()[0] != 1
+    order = [1, 0, 2, 3, 4, 5]
+    first, *others = (comb.panoramas[node] for node in order)
+    overlaps = {(0, 1): 0.3, (0, 2): 0.3, (2, 3): 0.3, (0, 4): 0.3, (2, 5): 0.3}
+    tour = dataclasses.replace(comb, panoramas=(first, *others), overlaps=overlaps)
+    assert tour.plan_walk()[0] != 0, "a walk from there is longer"
+    started = dataclasses.replace(tour, panoramas=(dataclasses.replace(first, start=(0.3, 0.0)), *others))
+    assert started.plan_walk()[0] == 0 and started.plan_walk(3)[0] == 3
+
+
 def test_a_walk_follows_edges_and_visits_all_panoramas(comb):
     for start in (None, 0, 2, 4):
         walk = comb.plan_walk(start)
@@ -75,6 +86,23 @@ def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
     assert find_tours(pairs[:1]) == [] and find_tours([home.make_pair((0, 1))]) == []
     elsewhere = dataclasses.replace(pairs[1], folder=Path("other"))
     assert find_tours([pairs[0], elsewhere]) == [], "each folder has its own tour"
+
+
+def test_single_views_are_between_the_other_panoramas_of_a_tour_in_file_order(make_tour):
+    a, b, c = make_tour([(0, 0), (0, 1), (0, 2)], ()).panoramas
+    together = Pair("", Path("house"), (a, c), (), 0.45, 10.0, (a.image, c.image))
+    alone = Pair("", Path("house"), (dataclasses.replace(b, part=1),), (), 0.45, 10.0, (a.image, b.image, c.image))
+    (tour,) = find_tours([together, alone])
+    assert [panorama.name for panorama in tour.panoramas] == ["p0", "p1", "p2"] and tour.parts == (0, 1, 0)
+    assert set(tour.overlaps) == {(0, 2), (1, 1)} and tour.make_pair((0, 2)).context == (a, c)
+
+
+def test_the_depth_range_of_a_tour_is_that_of_the_pairs_with_several_views(home):
+    together, alone = home.make_pair((0, 1)), home.make_pair((3,))
+    (tour,) = find_tours([dataclasses.replace(together, near=0.8, far=4.0), alone])
+    assert (tour.near, tour.far) == (0.8, 4.0) and (alone.near, alone.far) == (0.45, 10.0)
+    (tour,) = find_tours([alone, home.make_pair((6,))])
+    assert (tour.near, tour.far) == (0.45, 10.0)
 
 
 def test_parts_are_level_and_far_apart(home):

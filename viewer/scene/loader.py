@@ -130,9 +130,17 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
         if not scenes:
             raise
         pairs, notes = [], []
+    from pansplat.pipeline import load_model, warn_of_single_views
     from pansplat.tours import find_tours
 
-    entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in find_tours(pairs)]
+    tours = find_tours(pairs)
+    if any(a == b for tour in tours for a, b in tour.overlaps):
+        predictor = load_model(options.model, compat=options.compat, precision=options.precision)
+        with _collect_notes() as replaced:
+            for tour in tours:
+                warn_of_single_views(tour, predictor)
+        notes += replaced
+    entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in tours]
     entries += [SceneEntry(pair.name, pair=pair, notes=tuple(notes)) for pair in pairs]
     return entries + [SceneEntry(p.stem, file=p) for p in scenes]
 
@@ -223,11 +231,10 @@ def _load_tour_scene(
 
     if entry.merged is not None:
         return finish(select_views(entry.merged, views), is_final=True)
+    predictor = pipeline.load_model(options.model, compat=options.compat, precision=options.precision)
     scene = pipeline.predict(
         pair,
-        model=options.model,
-        compat=options.compat,
-        precision=options.precision,
+        model=pipeline.choose_predictor(pair, predictor),
         height=options.height or pipeline.choose_tour_height(pair),
         refine_seconds=options.refine_seconds,
         cache=options.cache,

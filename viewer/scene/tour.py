@@ -13,12 +13,20 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import Edge, FloorOutline, Route, TourGraph, Views, choose_camera_height, plan_route
+from pansplat.tours import (
+    FADE_SECONDS,
+    Edge,
+    FloorOutline,
+    Route,
+    TourGraph,
+    Views,
+    choose_camera_height,
+    plan_route,
+)
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
 
-FADE_SECONDS = 1.0
 DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
 _NEXT_SCENES = 3  # that are predicted before they are needed
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor
