@@ -27,7 +27,7 @@ from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
 from pansplat.predictor import Progress
 from pansplat.strict_json import read_json
 
-_FORMAT = "3"  # version of the estimate and of its cached file; part of the cache's key
+_FORMAT = "4"  # version of the estimate and of its cached file; part of the cache's key
 _CONVENTION = "cam2world opencv"
 SUFFIXES = (".json", ".tum", ".kitti")
 
@@ -107,8 +107,7 @@ def estimate_pairs(
     Raises:
         InputError: a file is missing, or none can be read.
     """
-    images = [panorama.image for panorama in panoramas]
-    name = f"poses-{_hash_inputs(images, camera_height)}.json"
+    name = f"poses-{_hash_inputs(panoramas, camera_height)}.json"
     folders = cache_folders(folder)
     source = next((cache / name for cache in folders if (cache / name).is_file()), None)
     if source is None:
@@ -187,9 +186,18 @@ def _in_brackets(title: str) -> str:
     return f" ({title})" if title else ""
 
 
-def _hash_inputs(images: Sequence[Path], camera_height: float) -> str:
+def _hash_inputs(panoramas: Sequence[Panorama], camera_height: float) -> str:
+    """A hash of the names, by which the cached file states its poses, and of the pictures' and masks' states."""
     digest = hashlib.blake2b(f"{_FORMAT} {camera_height:g}".encode(), digest_size=12)
-    for image in images:
-        state = image.stat()
-        digest.update(os.fsencode(f"{image.name} {state.st_size} {state.st_mtime_ns};"))
+    for panorama in panoramas:
+        digest.update(os.fsencode(f"{panorama.name};"))
+        for file in (panorama.image, panorama.mask):
+            digest.update(os.fsencode(f"{_stamp(file)};"))
     return digest.hexdigest()
+
+
+def _stamp(file: Path | None) -> str:
+    if file is None:
+        return "none"
+    state = file.stat()
+    return f"{file.name} {state.st_size} {state.st_mtime_ns}"

@@ -81,6 +81,21 @@ def test_a_changed_picture_is_estimated_anew(tmp_path: Path, monkeypatch) -> Non
         assert [pair.name for pair in _load(tmp_path)] == [tmp_path.name, "c"]
 
 
+def test_a_renamed_scene_and_a_new_mask_are_estimated_anew(tmp_path: Path, monkeypatch) -> None:
+    _write(tmp_path, "a.png", "b.png")
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "b.png"))
+    for keys in (("hall", "bath"), ("Halle", "Bad")):
+        scenes = {key: {"panorama": f"{file}.png"} for key, file in zip(keys, "ab", strict=True)}
+        (tmp_path / "tour.json").write_text(json.dumps({"scenes": scenes}))
+        with pytest.warns(UserWarning, match="2 of 2 panoramas"):
+            (pair,) = _load(tmp_path)
+        assert tuple(view.name for view in pair.context) == keys
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((8, 16), 255, np.uint8))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png"))
+    with pytest.warns(UserWarning, match="1 of 2 panoramas"), pytest.warns(UserWarning, match=r"b\.png has no pose"):
+        assert len(_load(tmp_path)) == 2
+
+
 def test_a_damaged_picture_is_named_and_the_others_open(tmp_path: Path) -> None:
     _write(tmp_path, "a.png", "b.png")
     whole = (tmp_path / "b.png").read_bytes()
