@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.images import READABLE_SUFFIXES
+from pansplat.data.images import READABLE_SUFFIXES, require_panorama
 from pansplat.data.pairs import (
     FAR,
     FAR_SEQUENCE,
@@ -88,6 +88,7 @@ def load_pairs(
         return _make_unposed_pairs(root, unposed, near, far)
     if not collections:
         raise _nothing_found(root)
+    collections = [(folder, _leave_out_damaged(collection)) for folder, collection in collections]
     pairs = [pair for folder, collection in collections for pair in collection.pairs(folder, near, far)]
     return make_names_unique(sorted(pairs, key=lambda pair: not pair.targets))
 
@@ -150,6 +151,33 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
         return []
     subfolders = _list_subfolders(folder, depth)
     return [found for sub in subfolders for found in _find_collections(sub, convention, depth - 1)]
+
+
+def _leave_out_damaged(collection: Collection) -> Collection:
+    """The collection without the panoramas that cannot be used, and without the pairs that need them.
+
+    Raises:
+        InputError: fewer than two are left, or none of the stated pairs; it names the first one that cannot be used.
+    """
+    problems: dict[int, InputError] = {}
+    for number, panorama in enumerate(collection.panoramas):
+        try:
+            require_panorama(panorama.image)
+        except InputError as error:
+            problems[number] = error
+    if not problems:
+        return collection
+    kept = [number for number in range(len(collection.panoramas)) if number not in problems]
+    place = {number: index for index, number in enumerate(kept)}
+    groups = None
+    if collection.groups is not None:
+        left = [[tuple(place[n] for n in part if n in place) for part in group] for group in collection.groups]
+        groups = tuple((context, targets) for context, targets in left if len(context) > 1)
+    if len(kept) < 2 or groups == ():
+        raise next(iter(problems.values()))
+    for error in problems.values():
+        warnings.warn(f"left out: {error}", category=InputWarning, stacklevel=3)
+    return dataclasses.replace(collection, panoramas=tuple(collection.panoramas[n] for n in kept), groups=groups)
 
 
 def find_panorama_folders(root: Path) -> list[Path]:

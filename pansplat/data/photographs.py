@@ -13,7 +13,7 @@ import torch
 
 from pansplat.data.cube_faces import find_layout, group_faces
 from pansplat.data.cube_images import CubeImage, write_cube
-from pansplat.data.images import read_size
+from pansplat.data.images import read_size, require_complete
 from pansplat.data.pairs import Link, Panorama, find_mask, list_panorama_files
 from pansplat.data.panorama_metadata import read_xmp
 from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links, wrap
@@ -95,6 +95,7 @@ def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama]
 def _read_picture(image: Path) -> Path | CubeImage:
     width, height = read_size(image)
     if width == 2 * height:
+        require_complete(image)
         return image
     layout = find_layout(image)
     if layout is None:

@@ -60,13 +60,29 @@ def test_two_images_with_poses_are_a_pair(tmp_path: Path) -> None:
     assert pair.load_targets(8).images.shape == (0, 3, 8, 16)
 
 
-def test_the_path_may_be_the_pose_file_and_images_are_read_only_by_load_context(tmp_path: Path) -> None:
+def test_the_path_may_be_the_pose_file_and_pixels_are_decoded_only_by_load_context(tmp_path: Path, monkeypatch) -> None:
     folder = _folder(tmp_path / "room")
-    (folder / "left.png").write_bytes(b"")
+    monkeypatch.setattr("pansplat.data.images._decode", None)
     assert load_pairs(folder / "poses.json")[0].name == load_pairs(str(folder))[0].name == "room"
-    (pair,) = load_pairs(folder)
-    with pytest.raises(InputError, match="0 bytes"):
-        pair.load_context(8)
+
+
+def test_a_damaged_picture_of_three_is_left_out_with_its_pairs(tmp_path: Path) -> None:
+    names = ("left.png", "middle.png", "right.png")
+    folder = _folder(tmp_path / "room", names)
+    (folder / "middle.png").write_bytes((folder / "middle.png").read_bytes()[:-30])
+    groups = [{"context": list(names[:2])}, {"context": ["left.png", "right.png"], "target": "middle.png"}]
+    for pairs in (None, groups):
+        if pairs is not None:
+            (folder / "pairs.json").write_text(json.dumps({"pairs": pairs}))
+        with pytest.warns(UserWarning, match=r"left out: .*middle\.png: needed a complete image"):
+            (pair,) = load_pairs(folder)
+        assert [view.name for view in pair.context] == ["left", "right"] and not pair.targets
+    write_image(folder / "middle.png", torch.full((3, 16, 24), 0.5))
+    with pytest.warns(UserWarning, match=r"left out: .*middle\.png: needed a 2:1"):
+        assert len(load_pairs(folder)) == 1
+    (folder / "left.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"left\.png: needed an image, got a file of 0 bytes"):
+        load_pairs(folder)
 
 
 def test_a_pair_has_depth_masks_range_and_targets(tmp_path: Path) -> None:

@@ -100,20 +100,30 @@ def test_a_damaged_picture_is_named_and_the_others_open(tmp_path: Path) -> None:
     _write(tmp_path, "a.png", "b.png")
     whole = (tmp_path / "b.png").read_bytes()
     (tmp_path / "b.png").write_bytes(whole[:-30])
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning, match=r"left out: .*b\.png: needed a complete image"):
         (pair,) = _load(tmp_path)
-    assert (pair.name, pair.context[0].part) == ("a", 0)
-    messages = [str(warning.message) for warning in caught]
-    assert any("b.png cannot be read and is left out: needed a complete image" in message for message in messages)
-    assert any("a.png has no pose and is a scene of its own" in message for message in messages)
+    assert (pair.name, pair.context[0].name) == (tmp_path.name, "a")
     assert pair.siblings == (tmp_path / "a.png",)
+
+
+def test_a_picture_that_looks_whole_and_cannot_be_decoded_is_left_out(tmp_path: Path) -> None:
+    _write(tmp_path, "a.png", "b.jpg", "c.png")
+    content = (tmp_path / "b.jpg").read_bytes()
+    table = content.index(b"\xff\xc4") + 5  # numbers of codes of each length
+    (tmp_path / "b.jpg").write_bytes(content[:table] + bytes([255] * 16) + content[table + 16 :])
+    with pytest.warns(UserWarning) as caught:
+        pairs = _load(tmp_path)
+    assert [pair.name for pair in pairs] == ["a", "c"]
+    messages = [str(warning.message) for warning in caught]
+    assert any("b.jpg cannot be read and is left out: needed a complete image" in message for message in messages)
+    assert any("a.png has no pose and is a scene of its own" in message for message in messages)
 
 
 def test_if_no_picture_can_be_read_the_reasons_are_an_error(tmp_path: Path) -> None:
     _write(tmp_path, "a.png", "b.png")
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-30])
-    with pytest.raises(InputError, match=r"a\.png: needed a complete image.*; b\.png: needed a complete image"):
+    with pytest.raises(InputError, match=r"a\.png: needed a complete image.*; .*b\.png: needed a complete image"):
         _load(tmp_path)
 
 
