@@ -54,7 +54,7 @@ class Panorama:
         mask: image that is white where the panorama shows the scene; None to detect static content.
         depth: radial depth, 16-bit PNG in millimetres or EXR in metres; None when there is none.
         is_scan: whether the panorama is rendered from a scan, whose holes are exactly black.
-        part: panoramas of different parts have no common world. One without a known pose is a part of its own.
+        world: number of the coordinate frame of the pose; one without a known pose has a world of its own.
         title: for people, if it differs from the name.
         links: to other panoramas of the tour.
         start: yaw and pitch, as of a link, of the view that a visitor sees first; None if there is none.
@@ -67,7 +67,7 @@ class Panorama:
     mask: Path | None = None
     depth: Path | None = None
     is_scan: bool = False
-    part: int = 0
+    world: int = 0
     title: str = ""
     links: tuple[Link, ...] = ()
     start: tuple[float, float] | None = None
@@ -226,9 +226,9 @@ class Collection:
             context, targets = (tuple(self.panoramas[i] for i in part) for part in indices)
             name = self.name or "-".join(view.name for view in context)
             pairs.append(Pair(name, folder, context, targets, near, far, siblings))
-        first_part = 1 + max(panorama.part for panorama in self.panoramas)
+        first_world = 1 + max(panorama.world for panorama in self.panoramas)
         every = (*self.panoramas, *self.unposed)
-        return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_part=first_part)
+        return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_world=first_world)
 
     def _select_groups(self) -> list[ViewGroup]:
         """The given groups without repeated contexts, those with targets first; else pairs of neighbours."""
@@ -277,7 +277,7 @@ def single_view_pairs(
     far: float | None,
     *,
     siblings: Sequence[Panorama] | None = None,
-    first_part: int = 0,
+    first_world: int = 0,
 ) -> list[Pair]:
     """A pair of one view for each panorama.
 
@@ -285,7 +285,7 @@ def single_view_pairs(
         folder: of the tour; predictions are cached there.
         near, far: metres; None for the range of rooms.
         siblings: panoramas of the same camera, by default the same ones.
-        first_part: number of the first part; each panorama is the next one.
+        first_world: of the first panorama; each has a world of its own.
 
     Raises:
         InputError: an invalid depth range.
@@ -294,8 +294,8 @@ def single_view_pairs(
     require_depth_range(near, far, folder, 'set "near" and "far" on the command line')
     images = tuple(panorama.image for panorama in (panoramas if siblings is None else siblings))
     return [
-        Pair(view.name, folder, (replace(view, part=part),), (), near, far, images)
-        for part, view in enumerate(panoramas, start=first_part)
+        Pair(view.name, folder, (replace(view, world=world),), (), near, far, images)
+        for world, view in enumerate(panoramas, start=first_world)
     ]
 
 

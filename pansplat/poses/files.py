@@ -67,7 +67,7 @@ def _write(path: Path, text: str) -> None:
 def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
     return {
         "convention": _CONVENTION,
-        **_make_part(estimate, names),
+        **_make_world(estimate, names),
         "estimate": {
             "summary": estimate.summary,
             "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
@@ -75,7 +75,7 @@ def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str
     }
 
 
-def _make_part(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
+def _make_world(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
     return {
         "near": round(estimate.near, 3),
         "far": round(estimate.far, 3),
@@ -94,8 +94,8 @@ def estimate_pairs(
 ) -> list[Pair]:
     """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
 
-    Panoramas that are placed together are a part. Each other one is a part of its own, a pair of a single view, after
-    them. Warnings state the figures of the check, and name the panoramas without a pose and those that cannot be read.
+    Panoramas that are placed together have one world. Each other one has a world of its own, a pair of a single view,
+    after them. Warnings state the figures of the check, and name the panoramas without a pose and those that cannot be read.
 
     Args:
         folder: of the tour.
@@ -121,19 +121,19 @@ def estimate_pairs(
 
 
 def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Progress | None) -> dict[str, Any]:
-    """What is cached: parts of placed panoramas, and the reasons for the others, by name."""
+    """What is cached: worlds of placed panoramas, and the reasons for the others, by name."""
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
         estimate = estimate_poses(list(names), camera_height=camera_height, progress=progress)
     except NoPosesError as error:
-        parts, summary, unplaced = [], "", error.reasons
+        worlds, summary, unplaced = [], "", error.reasons
     else:
-        parts, summary, unplaced = [_make_part(estimate, names)], estimate.summary, estimate.unplaced
+        worlds, summary, unplaced = [_make_world(estimate, names)], estimate.summary, estimate.unplaced
     unreadable = [image for image in unplaced if not _is_readable(image)]
     if len(unreadable) == len(panoramas):
         raise NoPosesError(unplaced)
     return {
-        "parts": parts,
+        "worlds": worlds,
         "summary": summary,
         "unplaced": {names[image]: reason for image, reason in unplaced.items()},
         "unreadable": [names[image] for image in unreadable],
@@ -159,7 +159,7 @@ def _make_pairs(
     """The pairs of a cached estimate, with its warnings."""
     by_name = {panorama.name: panorama for panorama in panoramas}
     unplaced, unreadable = content["unplaced"], content["unreadable"]
-    if content["parts"]:
+    if content["worlds"]:
         is_flat = all(panorama.image.parent == folder for panorama in panoramas)
         advice = " `pansplat pose` writes them to a file." if is_flat else ""
         warnings.warn(f"{folder} has no poses; they were estimated: {content['summary']}.{advice}", stacklevel=4)
@@ -168,17 +168,17 @@ def _make_pairs(
         outcome = "cannot be read and is left out" if name in unreadable else "has no pose and is a scene of its own"
         warnings.warn(f"{panorama.image}{_in_brackets(panorama.title)} {outcome}: {reason}", InputWarning, stacklevel=4)
     pairs = []
-    for number, part in enumerate(content["parts"]):
+    for number, world in enumerate(content["worlds"]):
         placed = tuple(
-            replace(by_name[name], cam2world=to_cam2world(rigid_matrix(pose, str(source)), _CONVENTION), part=number)
-            for name, pose in part["poses"].items()
+            replace(by_name[name], cam2world=to_cam2world(rigid_matrix(pose, str(source)), _CONVENTION), world=number)
+            for name, pose in world["poses"].items()
         )
         only = folder.resolve().name if len(placed) == 2 else None
-        pairs += Collection(source, placed, near=part["near"], far=part["far"], name=only).pairs(folder, near, far)
+        pairs += Collection(source, placed, near=world["near"], far=world["far"], name=only).pairs(folder, near, far)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
     single = [panorama for panorama in readable if panorama.name in unplaced]
-    first_part = len(content["parts"])
-    pairs += single_view_pairs(single, folder, near, far, siblings=readable, first_part=first_part)
+    first_world = len(content["worlds"])
+    pairs += single_view_pairs(single, folder, near, far, siblings=readable, first_world=first_world)
     return make_names_unique(pairs)
 
 

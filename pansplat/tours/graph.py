@@ -42,8 +42,8 @@ _UNLINKED_FADE = 2.5  # cost of another fade, as a factor, so that two fades alo
 class TourGraph:
     """Panoramas of one place and the edges between them.
 
-    Panoramas that edges connect are a part. Parts have no common world; `lay_out` places them side by side. From part
-    to part the image fades.
+    Panoramas that edges connect are a part. Within a part the camera flies; from part to part the image fades. Parts
+    without a common world are side by side (`lay_out`).
 
     Attributes:
         name: for lists and folders.
@@ -53,7 +53,7 @@ class TourGraph:
         siblings: all panoramas taken with the same camera.
         overlaps: of each edge: 1 if one panorama explains the other at each pixel, 0 for unrelated panoramas. That of a
             self-edge is 1.
-        originals: the panoramas with poses in the worlds of their parts, which scenes are predicted from; none if these
+        originals: the panoramas with poses in their own worlds, which scenes are predicted from; none if these
             are `panoramas`.
     """
 
@@ -191,9 +191,9 @@ class TourGraph:
         return float(np.linalg.norm(a - b))
 
     def make_pair(self, views: Sequence[int]) -> Pair:
-        """The panoramas of a scene as the input of a prediction, in the world of their part.
+        """The panoramas of a scene as the input of a prediction, in their own world.
 
-        It does not depend on the other parts, so that cached predictions stay valid when panoramas are added.
+        It does not depend on other worlds, so that cached predictions stay valid when panoramas are added.
         """
         context = tuple((self.originals or self.panoramas)[view] for view in views)
         name = "-".join(panorama.name for panorama in context)
@@ -358,27 +358,34 @@ def _improve_order(order: Int[np.ndarray, "node"], costs: Float[np.ndarray, "nod
 def find_tours(pairs: Sequence[Pair]) -> list[TourGraph]:
     """Tours of the pairs of folders; their edges are the pairs, without overlaps (0).
 
-    All panoramas of a folder are one tour if they are of two or more parts; a panorama that is in no pair with another
-    one has a self-edge. Else three or more panoramas that pairs connect are a tour.
+    Three or more panoramas that pairs connect are a tour. But if a panorama of a folder is in no pair with another one,
+    or the folder has several worlds, all its panoramas are one tour; a panorama without another one has a self-edge.
     """
     of_folder: dict[Path, list[Pair]] = {}
     for pair in pairs:
         of_folder.setdefault(pair.folder, []).append(pair)
-    parts = {folder: {view.part for pair in group for view in pair.context} for folder, group in of_folder.items()}
+    joint = {folder for folder, group in of_folder.items() if _is_one_tour(group)}
     components: list[list[Pair]] = []
     for pair in pairs:
-        if len(parts[pair.folder]) > 1:
+        if pair.folder in joint:
             continue
         images = {panorama.image for panorama in pair.context}
-        joined = [part for part in components if any(images & _list_images(other) for other in part)]
-        components = [part for part in components if part not in joined]
+        joined = [group for group in components if any(images & _list_images(other) for other in group)]
+        components = [group for group in components if group not in joined]
         components.append([*itertools.chain.from_iterable(joined), pair])
-    components = [part for part in components if len(set().union(*map(_list_images, part))) >= _MIN_PANORAMAS]
-    components += [group for folder, group in of_folder.items() if len(parts[folder]) > 1]
+    components = [group for group in components if len(set().union(*map(_list_images, group))) >= _MIN_PANORAMAS]
+    components += [group for folder, group in of_folder.items() if folder in joint]
     tours = [_make_tour(component) for component in components]
     if len(tours) > 1:
         tours = [dataclasses.replace(tour, name=f"{tour.name} {i}") for i, tour in enumerate(tours, start=1)]
     return tours
+
+
+def _is_one_tour(pairs: Sequence[Pair]) -> bool:
+    """Whether the panoramas of a folder are one tour of several parts."""
+    images = set().union(*map(_list_images, pairs))
+    is_alone = any(len(pair.context) == 1 for pair in pairs)
+    return len({view.world for pair in pairs for view in pair.context}) > 1 or (is_alone and len(images) > 1)
 
 
 def _make_tour(pairs: Sequence[Pair]) -> TourGraph:

@@ -309,9 +309,9 @@ def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
         load_pairs(tmp_path / "note.txt")
 
 
-def _check_single_view(pair, name: str, part: int = 0) -> None:
+def _check_single_view(pair, name: str, world: int = 0) -> None:
     (view,) = pair.context
-    assert (pair.name, view.part, pair.targets) == (name, part, ())
+    assert (pair.name, view.world, pair.targets) == (name, world, ())
     assert torch.equal(view.cam2world, torch.eye(4, dtype=torch.float64))
 
 
@@ -356,7 +356,7 @@ def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path,
     _write_panorama(folder / "film_frame.png")  # with the metadata of an own rendering
     with pytest.warns(UserWarning, match=r"poses\.json has no pose of attic\.jpg, cellar\.png; each is a scene"):
         pair, attic, cellar = load_pairs(folder)
-    assert (pair.name, [view.part for view in pair.context]) == ("room", [0, 0])
+    assert (pair.name, [view.world for view in pair.context]) == ("room", [0, 0])
     _check_single_view(attic, "attic", 1)
     _check_single_view(cellar, "cellar", 2)
     assert attic.context[0].mask is None
@@ -381,7 +381,7 @@ def test_poses_of_one_panorama_are_enough(tmp_path: Path, write_scene) -> None:
     write_scene(folder / "other.jpg", 8)
     with pytest.warns(UserWarning, match=r"no pose of other\.jpg"):
         first, second = load_pairs(folder)
-    assert (first.name, first.context[0].part) == ("only", 0)
+    assert (first.name, first.context[0].world) == ("only", 0)
     _check_single_view(second, "other", 1)
 
 

@@ -47,7 +47,7 @@ def test_the_panoramas_that_are_not_placed_are_scenes_of_their_own(tmp_path: Pat
         with pytest.warns(UserWarning) as caught:
             pairs = _load(tmp_path)
         assert [pair.name for pair in pairs] == ["a-c", "c-d", "b", "e"]
-        assert [[view.part for view in pair.context] for pair in pairs] == [[0, 0], [0, 0], [1], [2]]
+        assert [[view.world for view in pair.context] for pair in pairs] == [[0, 0], [0, 0], [1], [2]]
         assert pairs[1].context[1].cam2world[0, 3] == 2 and (pairs[0].near, pairs[0].far) == (0.3, 7.0)
         assert torch.equal(pairs[2].context[0].cam2world, torch.eye(4, dtype=torch.float64))
         assert pairs[2].context[0].title == "Bath" and pairs[2].context[0].links[0].target == "c"
@@ -65,7 +65,7 @@ def test_if_none_is_placed_all_are_scenes_of_their_own(tmp_path: Path, monkeypat
     for _ in range(2):
         with pytest.warns(UserWarning) as caught:
             pairs = _load(tmp_path)
-        assert [(pair.name, pair.context[0].part) for pair in pairs] == [("a", 0), ("b", 1)]
+        assert [(pair.name, pair.context[0].world) for pair in pairs] == [("a", 0), ("b", 1)]
         assert [f"{name}.png has no pose" in str(w.message) for name, w in zip("ab", caught, strict=True)] == [True] * 2
         monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)
 
@@ -145,11 +145,11 @@ def test_the_panoramas_of_a_web_tour_keep_titles_links_and_start_views(tmp_path:
         ):
             pair, attic = pansplat.load_pairs(path)
         hall, bath = pair.context
-        assert [(view.name, view.label, view.part) for view in (hall, bath)] == [
+        assert [(view.name, view.label, view.world) for view in (hall, bath)] == [
             ("hall", "Hall", 0),
             ("bath", "Bath", 0),
         ]
         assert hall.links[0].target == "bath" and hall.start is not None and bath.cam2world[0, 3] == 1
-        assert (attic.name, attic.context[0].part) == ("attic", 1)
+        assert (attic.name, attic.context[0].world) == ("attic", 1)
         assert (attic.context[0].links[0].target, attic.context[0].links[0].text) == ("bath", "to the bath")
         assert attic.folder == tmp_path
