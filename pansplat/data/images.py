@@ -117,6 +117,14 @@ def read_size(path: Path | str) -> tuple[int, int]:
     return _exr_size(path)
 
 
+def list_pictures(path: Path) -> list[Path]:
+    """The image file, or those of the cube faces that it stands for."""
+    if not is_cube(path):
+        return [path]
+    cube = read_cube(path)
+    return [cube.folder / file for level in cube.levels for file in level.list_files()]
+
+
 def require_complete(path: Path | str) -> None:
     """Check that an image file is not damaged, by its structure; it is decoded only if the structure is in doubt.
 

@@ -22,6 +22,7 @@ FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, s
 
 MAX_CONTEXT = 64  # context panoramas of a pair
 
+_MAX_NAMES = 20  # in a note
 _COINCIDENT = 1e-3  # metres, in a world of metres
 _MATCHING_SECONDS = 2.0  # for two panoramas of 512 rows on two cores
 
@@ -194,7 +195,8 @@ class Collection:
         ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
         near, far: metres.
         name: name of the only pair; None to join the names of the context views.
-        unposed: panoramas of the folder without a pose; each is a scene of its own.
+        unposed: panoramas without a pose beside the others; each is a scene of its own.
+        folders: those of which all panoramas are in the collection.
     """
 
     source: Path
@@ -205,9 +207,12 @@ class Collection:
     far: float = FAR
     name: str | None = None
     unposed: tuple[Panorama, ...] = ()
+    folders: tuple[Path, ...] = ()
 
     def pairs(self, folder: Path, near: float | None = None, far: float | None = None) -> list[Pair]:
-        """One pair per group, those with targets first, then one of a single view for each panorama without a pose.
+        """One pair per group, those with targets first, then one of a single view for each other panorama.
+
+        Warns about posed panoramas that are in no group.
 
         Args:
             folder: of the files.
@@ -221,11 +226,21 @@ class Collection:
         near, far = self.near if near is None else near, self.far if far is None else far
         require_depth_range(near, far, self.source, 'set "near" and "far" in poses.json or on the command line')
         siblings = tuple(panorama.image for panorama in self.panoramas)
-        pairs = []
-        for indices in self._select_groups():
+        pairs, groups = [], self._select_groups()
+        for indices in groups:
             context, targets = (tuple(self.panoramas[i] for i in part) for part in indices)
             name = self.name or "-".join(view.name for view in context)
             pairs.append(Pair(name, folder, context, targets, near, far, siblings))
+        used = {i for group in groups for part in group for i in part}
+        alone = [panorama for i, panorama in enumerate(self.panoramas) if i not in used]
+        if alone:
+            warnings.warn(
+                f"{self.source}: in no pair of pairs.json, and each a scene of its own: "
+                f"{list_names([view.image for view in alone])}.",
+                category=InputWarning,
+                stacklevel=4,
+            )
+        pairs += [Pair(view.name, folder, (view,), (), near, far, siblings) for view in alone]
         first_world = 1 + max(panorama.world for panorama in self.panoramas)
         every = (*self.panoramas, *self.unposed)
         return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_world=first_world)
@@ -297,6 +312,12 @@ def single_view_pairs(
         Pair(view.name, folder, (replace(view, world=world),), (), near, far, images)
         for world, view in enumerate(panoramas, start=first_world)
     ]
+
+
+def list_names(files: Sequence[Path]) -> str:
+    """The names of files, for notes; of many the first ones."""
+    names = ", ".join(file.name for file in files[:_MAX_NAMES])
+    return names if len(files) <= _MAX_NAMES else f"{names} and {len(files) - _MAX_NAMES} more"
 
 
 def find_mask(image: Path, folder: Path) -> Path | None:

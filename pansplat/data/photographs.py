@@ -53,18 +53,46 @@ def list_photographs(folder: Path) -> list[Panorama]:
     return add_links(panoramas, folder)
 
 
-def list_further_photographs(folder: Path, known: Collection[Path]) -> list[Panorama]:
-    """The panoramas of a folder other than the known files, without links.
+def list_further_photographs(
+    folders: Sequence[Path], known: Collection[Path], names: Collection[str]
+) -> list[Panorama]:
+    """The panoramas of folders other than the known files, without links.
 
     Pictures that pansplat rendered do not count. Warns about pictures that are no panoramas.
+
+    Args:
+        folders: each once.
+        known: files that are no further ones.
+        names: that are taken; a panorama of such a name gets the folder's name before its own.
     """
-    files = {file.resolve() for file in known}
-    further = [
-        image for image in list_panorama_files(folder) if image.resolve() not in files and not _is_rendered(image)
-    ]
-    panoramas, problems = _read_pictures(further, folder)
-    _warn_left_out(problems)
-    return panoramas
+    files, taken = {file.resolve() for file in known}, set(names)
+    further: list[Panorama] = []
+    for folder in folders:
+        panoramas, problems = _read_pictures(_list_others(folder, files), folder)
+        _warn_left_out(problems)
+        for panorama in panoramas:
+            name = panorama.name if panorama.name not in taken else f"{folder.resolve().name}_{panorama.name}"
+            taken.add(name)
+            further.append(dataclasses.replace(panorama, name=name))
+    return further
+
+
+def list_unread_panoramas(folder: Path, known: Collection[Path]) -> list[Path]:
+    """The 2:1 pictures of a folder other than the known files, which pansplat has not rendered; no pixels are read."""
+    return [image for image in _list_others(folder, known) if _is_two_to_one(image)]
+
+
+def _list_others(folder: Path, known: Collection[Path]) -> list[Path]:
+    """The pictures of a folder other than the known files (resolved), which pansplat has not rendered."""
+    return [image for image in list_panorama_files(folder) if image.resolve() not in known and not _is_rendered(image)]
+
+
+def _is_two_to_one(image: Path) -> bool:
+    try:
+        width, height = read_size(image)
+    except InputError:
+        return False
+    return width == 2 * height
 
 
 def _warn_left_out(problems: Sequence[str]) -> None:

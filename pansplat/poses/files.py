@@ -95,7 +95,8 @@ def estimate_pairs(
     """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
 
     Panoramas that are placed together have one world. Each other one has a world of its own, a pair of a single view,
-    after them. Warnings state the figures of the check, and name the panoramas without a pose and those that cannot be read.
+    after them. Warnings state the figures of the check, and name the panoramas without a pose and those that cannot be
+    read.
 
     Args:
         folder: of the tour.

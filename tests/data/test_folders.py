@@ -363,6 +363,70 @@ def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path,
     assert set(attic.siblings) == {folder / n for n in ("left.png", "right.png", "attic.jpg", "cellar.png")}
 
 
+def test_panoramas_beside_posed_ones_in_subfolders_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
+    names = ("up/hall.png", "up/bath.png", "down/cellar.png")
+    folder = _folder(tmp_path / "house", names)
+    for name in ("up/attic.jpg", "down/hall.jpg", "loose.jpg"):
+        write_scene(folder / name, 8)
+    (folder / "links.json").write_text(json.dumps({"attic": [{"to": "down_hall", "yaw": 1}]}))
+    with pytest.warns(UserWarning, match=r"poses\.json has no pose of loose\.jpg, attic\.jpg, hall\.jpg; each is"):
+        *pairs, loose, attic, hall = load_pairs(folder)
+    assert len(pairs) == 2
+    for number, (pair, name) in enumerate(((loose, "loose"), (attic, "attic"), (hall, "down_hall")), start=1):
+        _check_single_view(pair, name, number)
+    assert attic.context[0].links == (Link("down_hall", 1.0),)
+
+
+def test_panoramas_of_other_folders_are_named_in_a_note(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "house" / "up")
+    write_scene(folder / "more" / "attic.jpg", 8)
+    write_scene(folder.parent / "garden.jpg", 8)
+    write_scene(folder.parent / "old" / "img" / "hall.jpg", 8)
+    (folder.parent / "old" / "tour.json").write_text(json.dumps({"panorama": "img/hall.jpg"}))
+    with pytest.warns(UserWarning) as caught:
+        (pair,) = load_pairs(folder.parent)
+    assert pair.name == "up"
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == 3
+    assert f"{folder.parent}: panoramas are left out" in messages[0] and "garden.jpg" in messages[0]
+    assert f"{folder.parent / 'old' / 'tour.json'} is another tour" in messages[1]
+    assert f"{folder / 'more'}: panoramas are left out" in messages[2] and "attic.jpg" in messages[2]
+
+
+def test_panoramas_below_or_beside_those_of_a_folder_without_poses_are_named(tmp_path: Path, write_scene) -> None:
+    write_scene(tmp_path / "hall.jpg", 8)
+    write_scene(tmp_path / "up" / "attic.jpg", 8)
+    with pytest.warns(UserWarning, match=r"up: panoramas are left out, .*: attic\.jpg; open"):
+        assert len(load_pairs(tmp_path)) == 1
+    (tmp_path / "tour.json").write_text(json.dumps({"panorama": "up/attic.jpg"}))
+    with pytest.warns(UserWarning, match=r"panoramas are left out, .*: hall\.jpg; open"):
+        assert load_pairs(tmp_path)[0].context[0].image.name == "attic.jpg"
+
+
+def test_posed_panoramas_in_no_pair_are_scenes_of_their_own(tmp_path: Path) -> None:
+    names = ("left.png", "right.png", "attic.png")
+    folder = _folder(tmp_path / "house", names)
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": list(names[:2])}]}))
+    with pytest.warns(UserWarning, match=r"in no pair of pairs\.json, and each a scene of its own: attic\.png"):
+        pair, attic = load_pairs(folder)
+    assert (pair.name, attic.name, attic.targets) == ("house", "attic", ())
+    assert attic.context[0].cam2world.tolist() == _pose(2) and attic.context[0].world == 0
+
+
+def test_frames_of_360loc_without_a_pose_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
+    names = _sequence(tmp_path)
+    (tmp_path / "camera_pose.json").write_text(json.dumps({name: _pose(i) for i, name in enumerate(names)}))
+    write_scene(tmp_path / "image" / "lost.jpg", 8)
+    write_scene(tmp_path / "loose.jpg", 8)
+    with (
+        pytest.warns(UserWarning, match=r"camera_pose\.json has no pose of lost\.jpg; each is a scene of its own"),
+        pytest.warns(UserWarning, match=r"panoramas are left out, .*: loose\.jpg; open"),
+    ):
+        pairs = load_pairs(tmp_path)
+    assert [len(pair.context) for pair in pairs] == [2, 2, 1]
+    _check_single_view(pairs[2], "lost", 1)
+
+
 def test_other_pictures_of_a_posed_folder_are_named(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     cv2.imwrite(str(folder / "plan.png"), np.full((20, 30, 3), (9, 90, 200), np.uint8))
