@@ -108,6 +108,16 @@ def _is_pose_file(file: Path) -> bool:
     return file.name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS) or file == find_trajectory(file.parent)
 
 
+def list_stated_files(folder: Path) -> list[Path]:
+    """The files of a folder that state poses, pairs, links or a web tour; those of fixed names need not exist."""
+    files = [folder / name for name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS)]
+    try:
+        others = (find_trajectory(folder), find_web_tour(folder), *triplet_files(folder))
+    except (OSError, InputError):
+        return files
+    return files + [file for file in others if file is not None]
+
+
 def _read_tour_file(file: Path) -> list[Panorama]:
     if not is_web_tour_file(file):
         raise InputError(

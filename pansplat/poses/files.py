@@ -125,7 +125,8 @@ def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Pro
     """What is cached: worlds of placed panoramas, and the reasons for the others, by name."""
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
-        estimate = estimate_poses(list(names), camera_height=camera_height, progress=progress)
+        masks = {panorama.image: panorama.mask for panorama in panoramas}
+        estimate = estimate_poses(list(names), masks=masks, camera_height=camera_height, progress=progress)
     except NoPosesError as error:
         worlds, summary, unplaced = [], "", error.reasons
     else:

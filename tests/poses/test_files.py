@@ -96,6 +96,25 @@ def test_a_renamed_scene_and_a_new_mask_are_estimated_anew(tmp_path: Path, monke
         assert len(_load(tmp_path)) == 2
 
 
+def test_the_mask_of_cube_faces_is_used(tmp_path: Path, monkeypatch) -> None:
+    for number, (name, face) in enumerate((name, face) for name in "ab" for face in "frblud"):
+        noise = np.random.default_rng(number).integers(0, 255, (8, 8, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{name}_{face}.png"), cv2.resize(noise, (128, 128), interpolation=cv2.INTER_CUBIC))
+    mask = np.full((16, 32), 255, np.uint8)
+    mask[8:] = 0
+    cv2.imwrite(str(tmp_path / "b_mask.png"), mask)
+    shown = []
+
+    def detect(pixels, scene, **options) -> None:
+        shown.append(float(scene.mean()))
+        raise InterruptedError
+
+    monkeypatch.setattr("pansplat.poses.estimate.detect_features", detect)
+    with pytest.raises(InterruptedError):
+        _load(tmp_path)
+    assert sorted(shown)[0] == 0.5
+
+
 def test_a_damaged_picture_is_named_and_the_others_open(tmp_path: Path) -> None:
     _write(tmp_path, "a.png", "b.png")
     whole = (tmp_path / "b.png").read_bytes()
