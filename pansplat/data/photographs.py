@@ -16,8 +16,9 @@ from pansplat.data.cube_images import CubeImage, write_cube
 from pansplat.data.images import read_size, require_complete
 from pansplat.data.pairs import Link, Panorama, find_mask, list_panorama_files
 from pansplat.data.panorama_metadata import read_xmp
-from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links, wrap
+from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links
 from pansplat.errors import InputError, InputWarning
+from pansplat.geometry.path import wrap_angle
 from pansplat.strict_json import list_field, read_json, require_object
 
 LINKS = "links.json"
@@ -182,7 +183,7 @@ def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Pa
             finite_number(link.get("yaw"), "yaw of a link"),
             finite_number(link.get("pitch", 0), "pitch of a link"),
         )
-        links.append(Link(str(link.get("to")), wrap(yaw), pitch, plain_text(link.get("text"))))
+        links.append(Link(str(link.get("to")), wrap_angle(yaw), pitch, plain_text(link.get("text"))))
     start = list_field(content, "start", source)
     if len(start) not in (0, 2):
         raise InputError(f'{source}: needed [yaw, pitch] as "start", got {str(start)[:40]}; correct it.')
@@ -190,5 +191,5 @@ def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Pa
         panorama,
         title=plain_text(content.get("title")),
         links=resolve_links(links, names, panorama.name, source),
-        start=(wrap(finite_number(start[0], "start")), finite_number(start[1], "start")) if start else None,
+        start=(wrap_angle(finite_number(start[0], "start")), finite_number(start[1], "start")) if start else None,
     )

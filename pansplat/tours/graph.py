@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pansplat.data.pairs import Link, Pair, Panorama
 from pansplat.gaussians.scene import Gains, Gaussians, Scene, Starts
-from pansplat.geometry.path import level_pose, up_direction
+from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
 from pansplat.geometry.world import working_factor
 from pansplat.tours.layout import REACH, lay_out
 
@@ -107,16 +107,12 @@ class TourGraph:
     def find_direction(self, start: int, end: int) -> Float[np.ndarray, "3"] | None:
         """The unit direction, in world axes, of the link from a node to another one; None if there is none."""
         link = self.links.get((start, end))
-        return None if link is None else self._direct(start, link.yaw, link.pitch)
+        return None if link is None else find_direction(self.cam2world[start], link.yaw, link.pitch).numpy()
 
     def find_start_view(self, node: int) -> Float[np.ndarray, "3"] | None:
         """The unit direction, in world axes, of the view that a visitor of a node sees first; None if it has none."""
         start = self.panoramas[node].start
-        return None if start is None else self._direct(node, *start)
-
-    def _direct(self, node: int, yaw: float, pitch: float) -> Float[np.ndarray, "3"]:
-        local = math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)
-        return self.cam2world[node, :3, :3].numpy() @ local
+        return None if start is None else find_direction(self.cam2world[node], *start).numpy()
 
     def neighbours(self, node: int) -> list[int]:
         """The other nodes that share an edge with a node."""
@@ -442,21 +438,17 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
         names=tuple(names[node] for node in range(len(tour))),
         gains=_join_gains(gains, tour.parts),
         overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
-        links=tuple((a, b, *_wrap((link.yaw, link.pitch)), link.text) for (a, b), link in tour.links.items()),
+        links=tuple(
+            (a, b, wrap_angle(link.yaw), wrap_angle(link.pitch), link.text) for (a, b), link in tour.links.items()
+        ),
         starts=list_starts(tour.panoramas),
     )
 
 
 def list_starts(panoramas: Sequence[Panorama]) -> Starts:
     """The start views of panoramas, as a scene keeps them; nothing if there is none."""
-    starts = tuple(None if panorama.start is None else _wrap(panorama.start) for panorama in panoramas)
+    starts = tuple(view.start and (wrap_angle(view.start[0]), wrap_angle(view.start[1])) for view in panoramas)
     return starts if any(starts) else ()
-
-
-def _wrap(angles: tuple[float, float]) -> tuple[float, float]:
-    """The angles within half a turn, radians."""
-    yaw, pitch = (math.remainder(angle, 2 * math.pi) for angle in angles)
-    return yaw, pitch
 
 
 def _join_gains(gains: dict[Views, Gains], parts: Sequence[int]) -> Gains:

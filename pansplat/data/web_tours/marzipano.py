@@ -31,10 +31,10 @@ from pansplat.data.web_tours.entries import (
     read_entries,
     read_text,
     require_tiles,
-    wrap,
 )
 from pansplat.data.web_tours.javascript import parse_literal
 from pansplat.errors import InputError, InputWarning
+from pansplat.geometry.path import wrap_angle
 
 _DATA = "data.js"
 _FILES = "app-files"  # folder in the archive of the Tool
@@ -109,7 +109,7 @@ def _read_link(spot: Mapping[str, Any]) -> Link:
 def _read_direction(content: Any) -> tuple[float, float]:
     if not isinstance(content, dict):
         raise InputError(f"needed yaw and pitch, got {str(content)[:_SHOWN]!r}")
-    return wrap(finite_number(content.get("yaw", 0), "yaw")), finite_number(content.get("pitch", 0), "pitch")
+    return wrap_angle(finite_number(content.get("yaw", 0), "yaw")), finite_number(content.get("pitch", 0), "pitch")
 
 
 def _objects(value: Any) -> list[dict[str, Any]]:

@@ -32,10 +32,10 @@ from pansplat.data.web_tours.entries import (
     read_entries,
     read_text,
     require_tiles,
-    wrap,
 )
 from pansplat.data.web_tours.javascript import parse_literal
 from pansplat.errors import InputError, InputWarning
+from pansplat.geometry.path import wrap_angle
 
 SUFFIXES = (".json", ".html", ".htm", ".js")
 _NAMES = ("tour.json", "pannellum.json", "config.json")  # looked at first
@@ -182,7 +182,7 @@ def _read_link(spot: Mapping[str, Any]) -> Link:
 
 def _read_direction(content: Mapping[str, Any]) -> tuple[float, float]:
     yaw, pitch = (math.radians(finite_number(content.get(name, 0), name)) for name in ("yaw", "pitch"))
-    return wrap(yaw), -pitch
+    return wrap_angle(yaw), -pitch
 
 
 def _base(scene: Mapping[str, Any]) -> list[Any]:
