@@ -157,7 +157,7 @@ def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor, blending: str
 ) -> None:
     pairs = load_pairs(write_tour(tmp_path / "house", 3))
-    alone = replace(pairs[1].context[1], part=1)
+    alone = replace(pairs[1].context[1], world=1)
     (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
     whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
     assert [edge[:2] for edge in whole.overlaps] == [(0, 1), (2, 2)]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pansplat.tours.graph import Edge, TourGraph
+from pansplat.tours.links import find_way_along_link
 
 FADE_SECONDS = 1.0
 _FLY_SPEED = 1.0  # metres per second
@@ -21,7 +22,6 @@ _TURN_BACK_DEGREES = 120.0  # of the way at a panorama, at which the camera turn
 _TURN_IN_PLACE_DEGREES = 60.0  # between the heading and the way, at which the camera stands still
 _SMOOTHING_SECONDS = 1.2
 _SAMPLES_PER_SECOND = 60
-_LINK_METRES = 0.7  # that the camera goes along a link, before the fade
 _LOOK_AROUND_DEGREES = 90.0  # that the camera turns in a part without a way, before the fade
 
 
@@ -166,21 +166,11 @@ def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
     return math.atan2(direction[0], direction[2]), math.asin(min(max(-float(direction[1]), -1.0), 1.0))
 
 
-def find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
-    """The level way, in world axes, along the link between two nodes; None without one, and if it is vertical."""
-    direction = tour.find_direction(start, end)
-    if direction is None:
-        return None
-    flat = direction - (direction @ tour.level_axes[:, 1]) * tour.level_axes[:, 1]
-    length = float(np.linalg.norm(flat))
-    return None if length < 0.1 else _LINK_METRES / length * flat
-
-
 def _find_arrival(tour: TourGraph, start: int, end: int) -> tuple[float, float] | None:
     """Yaw and pitch of a camera after a fade; None to keep the heading."""
     back, view = find_way_along_link(tour, end, start), tour.find_start_view(end)
     if back is not None:
-        return find_angles(-tour.level_axes.T @ back / _LINK_METRES)
+        return find_angles(-tour.level_axes.T @ back / np.linalg.norm(back))
     return None if view is None else find_angles(tour.level_axes.T @ view)
 
 

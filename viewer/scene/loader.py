@@ -53,13 +53,20 @@ class SceneEntry:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that the scene is made from, and the folders of the panoramas."""
+        """The files that the scene is made from, those that state its poses and links, and the panoramas' folders."""
         source = self.tour or self.pair
         if self.file is not None or source is None:
             return () if self.file is None else (self.file,)
-        images = [panorama.image for panorama in self.panoramas]
-        stated = [source.folder / name for name in ("poses.json", "pairs.json")]
-        return (*images, *stated, *{image.parent: None for image in images})
+        from pansplat.data.folders import list_stated_files
+        from pansplat.data.images import list_pictures
+
+        files = dict.fromkeys(list_stated_files(source.folder))
+        folders = {source.folder: None}
+        for panorama in self.panoramas:
+            pictures = list_pictures(panorama.image)
+            files |= dict.fromkeys((panorama.image, *pictures, panorama.mask))
+            folders |= {} if len(pictures) > 1 else {panorama.image.parent: None}
+        return (*(file for file in files if file is not None), *folders)
 
     @property
     def folder_name(self) -> str:
