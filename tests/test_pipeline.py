@@ -370,7 +370,7 @@ class PairsOnly:
 def parted_tour(tmp_path: Path, write_tour: Callable[..., Path]) -> TourGraph:
     """Two panoramas that are a pair, and one of another part."""
     pairs = load_pairs(write_tour(tmp_path / "house", 3))
-    alone = replace(pairs[1], name="p2", context=(replace(pairs[1].context[1], part=1),))
+    alone = replace(pairs[1], name="p2", context=(replace(pairs[1].context[1], world=1),))
     (tour,) = find_tours([pairs[0], alone])
     return tour
 

@@ -81,7 +81,7 @@ def test_a_video_moves_between_the_cameras(scene: Path, tmp_path: Path) -> None:
 def parted_scene(room: Path, tmp_path: Path) -> Path:
     """The scene of two panoramas in one part and one in another part, far away."""
     (pair,) = pipeline.load_pairs(room)
-    alone = replace(pair, context=(replace(pair.targets[0], part=1),), targets=())
+    alone = replace(pair, context=(replace(pair.targets[0], world=1),), targets=())
     (tour,) = find_tours([replace(pair, targets=()), alone])
     pipeline.save(pipeline.predict_tour(tour, "sphere", height=HEIGHT, cache=False), tmp_path / "tour.ply")
     return tmp_path / "tour.ply"

@@ -101,7 +101,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     monkeypatch.setattr("pansplat.pipeline.load_model", lambda name="default", **options: networks[name])
     monkeypatch.setattr("pansplat.pipeline.load_pairs", lambda path, **options: pairs)
     pairs = [parted_house.make_pair(views) for views in ((0, 1), (1, 2), (3,))]
-    pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], part=1),))
+    pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], world=1),))
     with pytest.warns(InputWarning, match="1 single view is predicted by default"):
         entries = find_entries(parted_house.folder, LoadOptions(model="pairs"))
     assert all(any("predicted by default" in note for note in entry.notes) for entry in entries)
