@@ -32,11 +32,11 @@ class Refine:
     """
 
     path: Positional[Path]
-    """Folder of a pair, or a scene file with --photographs."""
+    """A folder of two or more panoramas, or a scene file with --photographs."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
     photographs: Path | None = None
-    """Folder of the pair that a scene file was predicted from."""
+    """Folder of the panoramas that a scene file was predicted from."""
     seconds: Seconds | None = None
     """Time limit; 10 by default."""
     steps: Count | None = None

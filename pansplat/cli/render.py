@@ -37,7 +37,7 @@ class Render:
     .webm)."""
 
     path: Positional[Path]
-    """A scene file, or the folder of a pair."""
+    """A scene file, one panorama, a folder of panoramas, or a web tour."""
     out: Out
     """The file to write; its suffix chooses the format."""
     at: Annotated[float, Range(-1000, 1000), REAL] | None = None
