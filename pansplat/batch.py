@@ -30,6 +30,7 @@ from pansplat.atomic import replacing
 from pansplat.console import is_out_of_memory
 from pansplat.data.folders import find_panorama_folders
 from pansplat.data.pairs import Pair
+from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import SCENE_SUFFIXES, expand_home, read_file
 from pansplat.gaussians.scene import Scene
@@ -84,6 +85,7 @@ class BatchOptions:
         steps: a part of `STEPS`, in this order.
         model, compat, precision: see `pansplat.load_model`.
         height: see `pansplat.predict`.
+        camera_height: see `pansplat.load_pairs`.
         refine_seconds: time limit of the refinement.
         suffix: of the exported files; one of `EXPORT_SUFFIXES`.
         gaussians: largest number in a web page; None for the default.
@@ -94,6 +96,7 @@ class BatchOptions:
     compat: pipeline.CompatChoice = "trained"
     precision: pipeline.Precision = "float32"
     height: int | None = None
+    camera_height: float = CAMERA_HEIGHT
     refine_seconds: float = 10.0
     suffix: str = ".html"
     gaussians: int | None = None
@@ -208,7 +211,7 @@ def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path)
             folder = out / item.name
             folder.mkdir(parents=True, exist_ok=True)
             _remove_unfinished(folder)
-            for unit in _list_units(item, folder):
+            for unit in _list_units(item, options, folder):
                 for path, is_new in itertools.chain(unit.files, _process_unit(unit, options, fingerprint, folder)):
                     outputs.append(path.relative_to(out).as_posix())
                     num_written += is_new
@@ -246,9 +249,11 @@ class _Unit:
     files: tuple[tuple[Path, bool], ...] = ()
 
 
-def _list_units(item: Item, folder: Path) -> list[_Unit]:
+def _list_units(item: Item, options: BatchOptions, folder: Path) -> list[_Unit]:
     """The tours of an item, and the pairs that belong to none. The graphs of the tours are written to the folder."""
-    pairs = pipeline.load_pairs(item.folder, convention=item.convention, near=item.near, far=item.far)
+    pairs = pipeline.load_pairs(
+        item.folder, convention=item.convention, near=item.near, far=item.far, camera_height=options.camera_height
+    )
     if item.pair is not None:
         chosen = [pair for pair in pairs if pair.name == item.pair]
         if not chosen:
@@ -278,7 +283,7 @@ def _connect(tour: TourGraph, folder: Path) -> tuple[TourGraph, Path, bool]:
     return dataclasses.replace(tour, overlaps={(a, b): overlap for a, b, overlap in rows}), path, is_new
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)  # that of the batch, and that of single views
 def _load_model(model: str, compat: pipeline.CompatChoice, precision: pipeline.Precision) -> Predictor:
     return pipeline.load_model(model, compat=compat, precision=precision)
 
@@ -295,7 +300,15 @@ def read_fingerprint(options: BatchOptions) -> str:
 def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: Path) -> Iterator[tuple[Path, bool]]:
     """Yield each output of a pair or tour, and whether it was written."""
     part = None if unit.tour is None else _count_of_page(options) / len(unit.tour)
-    made = [_PairSteps(pair, part, options, fingerprint, folder) for pair in unit.pairs]
+    alone = sum(len(pair.context) == 1 for pair in unit.pairs)
+    if alone and "refine" in options.steps:
+        count = f"{alone} single views are" if alone > 1 else "a single view is"
+        warnings.warn(f"{unit.name}: {count} not refined.", InputWarning, stacklevel=2)
+    of_single_views = _choose_for_single_views(unit, options, fingerprint)
+    made = [
+        _PairSteps(pair, part, *(of_single_views if len(pair.context) == 1 else (options, fingerprint)), folder)
+        for pair in unit.pairs
+    ]
     for steps in made:
         yield from steps.run()
     if "export" not in options.steps:
@@ -314,6 +327,19 @@ def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: 
     yield path, is_new
 
 
+def _choose_for_single_views(unit: _Unit, options: BatchOptions, fingerprint: str) -> tuple[BatchOptions, str]:
+    """Options and fingerprint for the single views of a tour; a warning states another predictor than the batch's."""
+    alone = [pair for pair in unit.pairs if len(pair.context) == 1]
+    if unit.tour is None or not alone:
+        return options, fingerprint
+    predictor = _load_model(options.model, options.compat, options.precision)
+    if pipeline.choose_predictor(alone[0], predictor) is predictor:
+        return options, fingerprint
+    pipeline.warn_of_single_views(unit.tour, predictor)
+    options = dataclasses.replace(options, model="default", compat="trained", precision="float32")
+    return options, read_fingerprint(options)
+
+
 def _list_graph(tour: TourGraph) -> list[Any]:
     """What the scene of a tour states of its graph: edges, and titles, links and start views if there are any."""
     edges = [[*edge, round(overlap, 6)] for edge, overlap in tour.overlaps.items()]
@@ -326,7 +352,7 @@ def _list_graph(tour: TourGraph) -> list[Any]:
 
 
 class _PairSteps:
-    """The prediction and refinement of a pair, or of a scene of a tour.
+    """The prediction and refinement of a pair, or of a scene of a tour. A single view is predicted only.
 
     Attributes:
         key: hash of all that the result depends on.
@@ -346,9 +372,10 @@ class _PairSteps:
         options = self._options
         name = options.model.rsplit("/", 1)[-1]
         self.key = _join_hash(self.key, "predict", [name, self._fingerprint, self._height])
-        if "predict" in options.steps:
+        is_refined = "refine" in options.steps and len(self._pair.context) > 1
+        if "predict" in options.steps or ("refine" in options.steps and not is_refined):
             yield self._write("predict", self._predict_to)
-        if "refine" in options.steps:
+        if is_refined:
             self.key = _join_hash(
                 self.key, "refine", [refinement_fingerprint(), options.refine_seconds, self._gaussians]
             )
@@ -417,15 +444,19 @@ def _export(scene: Scene, path: Path, unit: _Unit, options: BatchOptions) -> Non
 
 
 def _hash_pair(pair: Pair) -> str:
-    """Hash of all that a prediction depends on: names, poses, depth range, and the files of images and masks."""
+    """Hash of all that the file of a prediction depends on, besides the predictor."""
     context = [
-        [view.name, view.cam2world.tolist(), _hash_file(view.image), view.mask and _hash_file(view.mask)]
+        [
+            *(view.name, view.title, view.start, view.cam2world.tolist()),
+            *(_hash_file(view.image), view.mask and _hash_file(view.mask)),
+        ]
         for view in pair.context
     ]
+    heights = [view.camera_height for view in pair.context] if len(pair.context) == 1 else []
     # Static content is detected in the siblings of a panorama without a mask.
     needs_siblings = any(view.mask is None for view in pair.context)
     siblings = [_hash_file(image) for image in pair.siblings] if needs_siblings else []
-    return _join_hash(_LAYOUT, pair.name, [pair.near, pair.far, context, siblings])
+    return _join_hash(_LAYOUT, pair.name, [pair.near, pair.far, context, heights, siblings])
 
 
 @lru_cache(maxsize=4096)

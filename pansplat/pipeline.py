@@ -8,9 +8,10 @@ from __future__ import annotations
 import itertools
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -23,7 +24,7 @@ from pansplat.cache import CachedPrediction, CachedScene
 from pansplat.data import folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import CAMERA_HEIGHT, Views
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.files import expand_home, find_scene_suffix
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.ply import save_ply_parts
@@ -78,7 +79,7 @@ def load_pairs(
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
     The poses of a folder that holds panoramas only are estimated (docs/poses.md), with a warning, and cached. A
-    panorama without a pose is a pair of a single view; `Panorama.part` tells which panoramas have a common world.
+    panorama without a pose is a pair of a single view; `Panorama.world` tells which poses have a common world.
 
     Args:
         path: a panorama, a pair folder, a folder of many panoramas, a web tour, or a folder of pair folders, in one of
@@ -149,6 +150,7 @@ def load_model(
     return load_predictor(path, compat, precision=precision, **options)
 
 
+@lru_cache(maxsize=1)
 def _load_default() -> Predictor:
     from pansplat.guided_sweep import default_weights, load_guided_sweep
 
@@ -162,6 +164,38 @@ def _load_sweep(**options: Any) -> Predictor:
 
 
 _MODELS: dict[str, Callable[..., Predictor]] = {"default": _load_default, "sweep": _load_sweep}
+
+
+def choose_predictor(pair: Pair, predictor: Predictor) -> Predictor:
+    """The predictor of a scene of a tour: `default` for a single view if the given one needs two or more views."""
+    return predictor if len(pair.context) >= _find_min_views(predictor) else load_model()
+
+
+def warn_of_single_views(tour: TourGraph, predictor: Predictor) -> None:
+    """Warn if `choose_predictor` replaces the predictor in some scenes of a tour."""
+    count = sum(len(views) == 1 for views in set(tour.choose_scene_views().values()))
+    if count and _find_min_views(predictor) > 1:
+        warnings.warn(
+            f"{tour.name}: {count} single view{'s are' if count > 1 else ' is'} predicted by default, because "
+            f"{predictor.name} needs {_find_min_views(predictor)} or more panoramas of one place.",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+def _find_min_views(predictor: Predictor) -> int:
+    return getattr(predictor, "min_views", 1)
+
+
+def _require_views(source: Pair | Views, predictor: Predictor) -> None:
+    """Raise an InputError for fewer panoramas than the predictor needs, before they are read."""
+    count = len(source.context) if isinstance(source, Pair) else len(source.images)
+    if count < _find_min_views(predictor):
+        names = [str(view.image) for view in source.context] if isinstance(source, Pair) else source.names
+        raise InputError(
+            f"{', '.join(names) or 'the input'}: {predictor.name} needed {_find_min_views(predictor)} or more "
+            f"panoramas of one place, got {count}; choose the model default, which accepts a single one, or add one."
+        )
 
 
 def choose_height(pair: Pair, predictor: Predictor) -> int:
@@ -232,10 +266,11 @@ def predict(
     config = RefineConfig(gaussians=gaussians)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
+    _require_views(pair, predictor)
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
     report: Progress = progress or (lambda what, fraction: None)
-    if not refine_seconds or len(views.images) == 1:  # one photograph does not show what is wrong seen from elsewhere
+    if not refine_seconds or len(views.images) == 1:
         return _predict_views(pair, views, predictor, height, cache, report)
     refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
     is_cached = cache and isinstance(pair, Pair)
@@ -306,7 +341,7 @@ def refine(
         progress: called with a description of the current work and the completed fraction.
 
     Returns:
-        The refined scene, or the given one if held-out pixels show that it is better.
+        The refined scene, or the given one if held-out pixels show that it is better, or if it is of a single view.
 
     Raises:
         InputError: scene and views do not fit, or an argument is out of range.
@@ -371,7 +406,8 @@ def predict_tour(
 ) -> Scene:
     """Predict one scene of all panoramas of a tour: several scenes of two or three panoramas, merged.
 
-    Without `gaussians`, the scenes and their cache are those of the viewer.
+    Single views are predicted by `default`, with a warning, if the model needs two or more views. Without `gaussians`,
+    the scenes and their cache are those of the viewer.
 
     Args:
         tour: of `pansplat.tours.connect`.
@@ -384,6 +420,7 @@ def predict_tour(
         InputError: the input cannot be used.
     """
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
+    warn_of_single_views(tour, predictor)
     report: Progress = progress or (lambda what, fraction: None)
     total = len(tour.choose_sources())
     part = math.inf if gaussians is None else gaussians / len(tour)  # of a panorama
@@ -394,7 +431,7 @@ def predict_tour(
         rows, count = choose_tour_size(pair, part, height)
         return predict(
             pair,
-            predictor,
+            choose_predictor(pair, predictor),
             height=rows,
             refine_seconds=refine_seconds,
             gaussians=count,
@@ -440,6 +477,7 @@ def predict_to_file(
     suffix = find_scene_suffix(path)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
+    _require_views(pair, predictor)
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     if can_stream(predictor) and not refine_seconds and not (cache and height <= _MAX_CACHED_HEIGHT):
         views = pair if isinstance(pair, Views) else pair.load_context(height)

@@ -21,7 +21,7 @@ import pytest
 from pansplat import batch, pipeline, tours
 from pansplat.batch import BatchOptions, Item, list_items, process_item
 from pansplat.cli import run
-from pansplat.cli.batch import ReportFile
+from pansplat.cli.batch import Batch, ReportFile
 from pansplat.errors import InputError
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
@@ -120,6 +120,71 @@ def test_a_tour_has_a_file_for_each_scene_and_one_page(
     assert (out / whole.outputs[1]).stat().st_size == 32 * 4 * HEIGHT * 2 * HEIGHT
     one = process_item(Item("pair", house, "p1-p2"), BatchOptions(("predict",), "sphere", height=HEIGHT), "1", out)
     assert one.error is None and len(one.outputs) == 1
+
+
+@pytest.fixture
+def parted_house(tmp_path: Path, write_tour: Callable[..., Path]) -> Path:
+    """A folder of three panoramas; the last one has no pose."""
+    house = write_tour(tmp_path / "house", 3, height=HEIGHT)
+    content = json.loads((house / "poses.json").read_text())
+    del content["poses"]["p2.png"]
+    (house / "poses.json").write_text(json.dumps(content))
+    (house / "pairs.json").unlink()
+    return house
+
+
+def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
+    parted_house: Path, tmp_path: Path, sphere: None, sphere_predictor: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sphere_predictor, "min_views", 2, raising=False)
+    of_single_views = sphere_predictor("2")
+    of_single_views.min_views = 1
+    monkeypatch.setitem(pipeline._MODELS, "default", lambda: of_single_views)
+    options, item = BatchOptions(("predict",), "sphere", height=HEIGHT), Item("house", parted_house)
+    report = process_item(item, options, "1", tmp_path / "out")
+    assert report.error is None and len(report.outputs) == 3 and of_single_views.calls == 1
+    assert sum("single view is predicted by default" in note for note in report.notes) == 1
+    assert process_item(item, options, "1", tmp_path / "out").status == "skipped"
+
+
+def test_predictions_depend_on_titles_start_views_and_of_single_views_the_camera_height(
+    parted_house: Path, tmp_path: Path, sphere: None
+) -> None:
+    def process(camera_height: float = 1.5, **entry: Any) -> dict[str, str]:
+        (parted_house / "links.json").write_text(json.dumps({"p0.png": entry, "p2.png": entry}))
+        options = BatchOptions(("predict",), "sphere", height=HEIGHT, camera_height=camera_height)
+        report = process_item(Item("house", parted_house), options, "1", tmp_path / "out")
+        assert report.error is None
+        return {name.split("-", 2)[2]: name for name in report.outputs if "predict-" in name}
+
+    first, tall, titled, turned = process(), process(3.0), process(title="hall"), process(start=[1.0, 0.1])
+    pair, single = sorted(first, key=len, reverse=True)
+    assert tall[pair] == first[pair] and len({files[pair] for files in (first, titled, turned)}) == 3
+    assert len({files[single] for files in (first, tall, titled, turned)}) == 4
+    scenes = [pipeline.load(tmp_path / "out" / files[single]) for files in (first, tall, titled, turned)]
+    assert scenes[1].gaussians.means.abs().max() > 1.9 * scenes[0].gaussians.means.abs().max()
+    assert scenes[2].names == ("hall",) and scenes[3].starts == ((1.0, 0.1),)
+
+
+def test_the_command_passes_the_camera_height_to_its_items() -> None:
+    assert Batch(Path("rooms"), Path("out"), camera_height=2.0)._make_options().camera_height == 2.0
+
+
+def test_single_views_are_not_refined_with_one_note(
+    parted_house: Path, tmp_path: Path, sphere: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refined = []
+
+    def refine(scene: Any, views: Any, path: Path, **options: Any) -> None:
+        refined.append(len(views.images))
+        pipeline.save(scene, path)
+
+    monkeypatch.setattr(pipeline, "refine_to_file", refine)
+    for steps, count in ((("predict", "refine", "export"), 5), (("refine",), 3)):
+        options = BatchOptions(steps, "sphere", height=HEIGHT, suffix=".splat")
+        report = process_item(Item("house", parted_house), options, "1", tmp_path / steps[0])
+        assert report.error is None and len(report.outputs) == count and refined.pop() == 2 and not refined
+        assert sum("a single view is not refined" in note for note in report.notes) == 1
 
 
 def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path, sphere: None) -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.harmonics import official_harmonics
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.model import network
@@ -31,7 +31,7 @@ from pansplat.pipeline import (
     save,
 )
 from pansplat.rendering import blend, rasterize
-from pansplat.tours import find_tours, select_views
+from pansplat.tours import TourGraph, find_tours, select_views
 
 HEIGHT = 16
 
@@ -157,7 +157,7 @@ def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor, blending: str
 ) -> None:
     pairs = load_pairs(write_tour(tmp_path / "house", 3))
-    alone = replace(pairs[1].context[1], part=1)
+    alone = replace(pairs[1].context[1], world=1)
     (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
     whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
     assert [edge[:2] for edge in whole.overlaps] == [(0, 1), (2, 2)]
@@ -351,3 +351,47 @@ def test_the_scene_of_a_tour_holds_each_panorama_once(
     assert [edge[:2] for edge in scene.overlaps] == list(tour.overlaps)
     distances = (scene.gaussians.means - scene.cam2world[scene.gaussians.views, :3, 3].float()).norm(dim=1)
     torch.testing.assert_close(distances, torch.full_like(distances, 2.0))
+
+
+class PairsOnly:
+    """A predictor that refuses a single view, as networks do."""
+
+    name, min_views = "pairs", 2
+
+    def __init__(self, predict: Callable[..., Gaussians]) -> None:
+        self.predict, self.fingerprint = predict, "1"
+
+    def __call__(self, images: torch.Tensor, *arguments: Any, **options: Any) -> Gaussians:
+        assert len(images) >= 2
+        return self.predict(images, *arguments, **options)
+
+
+@pytest.fixture
+def parted_tour(tmp_path: Path, write_tour: Callable[..., Path]) -> TourGraph:
+    """Two panoramas that are a pair, and one of another part."""
+    pairs = load_pairs(write_tour(tmp_path / "house", 3))
+    alone = replace(pairs[1], name="p2", context=(replace(pairs[1].context[1], world=1),))
+    (tour,) = find_tours([pairs[0], alone])
+    return tour
+
+
+def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
+    parted_tour: TourGraph, sphere_predictor: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_pairs, of_single_views = sphere_predictor(), sphere_predictor()
+    monkeypatch.setitem(pipeline._MODELS, "default", lambda: of_single_views)
+    with pytest.warns(InputWarning, match=r"house tour: 1 single view is predicted by default, because pairs needs 2"):
+        scene = predict_tour(parted_tour, PairsOnly(of_pairs), cache=False)
+    assert len(scene.cam2world) == 3 and (of_pairs.calls, of_single_views.calls) == (1, 1)
+    predict_tour(parted_tour, of_pairs, cache=False)
+    assert (of_pairs.calls, of_single_views.calls) == (3, 1), "without a warning"
+
+
+def test_a_photograph_alone_is_refused_by_a_model_that_needs_two(pair_folder: Path, weights: Path) -> None:
+    (single,) = load_pairs(pair_folder / "left.png")
+    message = r"left\.png: pansplat needed 2 or more panoramas of one place, got 1; choose the model default"
+    for run_prediction in (predict, lambda pair, model: predict_to_file(pair, pair_folder / "x.ply", model)):
+        with pytest.raises(InputError, match=message):
+            run_prediction(single, weights)
+    with pytest.raises(InputError, match=r"left: pansplat needed 2"):
+        predict(single.load_context(64), weights)

@@ -18,7 +18,7 @@ from pansplat.cli.inputs import Compat, Out, Precision, progress_bar
 from pansplat.console import print_message
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
-from pansplat.options import Count, Height, Seconds, Threads
+from pansplat.options import Count, Height, Positive, Seconds, Threads
 
 if TYPE_CHECKING:
     from pansplat.batch import BatchOptions, Item, ItemReport
@@ -52,6 +52,8 @@ class Batch:
     height: Height | None = None
     """Panoramas are resized to this height, pixels; by default that of the photographs, at most 1024 (for networks
     512)."""
+    camera_height: Positive = 1.5
+    """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
     refine: Seconds = 10.0
     """Time limit of the refinement of a pair, seconds."""
     format: str = "html"
@@ -108,6 +110,7 @@ class Batch:
             compat=self.compat,
             precision=self.precision,
             height=self.height,
+            camera_height=self.camera_height,
             refine_seconds=self.refine,
             suffix=suffix,
             gaussians=self.gaussians,

@@ -16,7 +16,7 @@ class Check:
     """Check that the poses of a pair fit its panoramas; exit status 1 if a mistake is likely."""
 
     path: Positional[Path]
-    """Folder of the pair."""
+    """A folder of two or more panoramas with poses."""
     choice: PairChoice = field(default_factory=PairChoice)
 
     def run(self) -> int:

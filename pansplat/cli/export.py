@@ -31,7 +31,7 @@ class Export:
     web page (.html, docs/web.md) or as a floor plan (.png)."""
 
     path: Positional[Path]
-    """A scene file, one panorama, the folder of a pair, or that of a tour, whose panoramas need no poses."""
+    """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .png for a floor
     plan."""

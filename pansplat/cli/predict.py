@@ -1,4 +1,4 @@
-"""`pansplat predict`: a pair of panoramas to a file of Gaussians."""
+"""`pansplat predict`: one panorama or a pair to a file of Gaussians."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from pansplat.options import WHOLE, Fraction, Height, Range, Seconds
 
 @dataclass(frozen=True)
 class Predict:
-    """Predict the 3D Gaussians of a pair of panoramas and write them in the format of the file's suffix
+    """Predict the 3D Gaussians of one panorama or of a pair, and write them in the format of the file's suffix
     (docs/formats.md)."""
 
     path: Positional[Path]
-    """Folder of the pair."""
+    """One panorama, a folder of panoramas, or a web tour; of several pairs the first, or that of --pair."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
     model: ModelChoice = field(default_factory=ModelChoice)

@@ -32,11 +32,11 @@ class Refine:
     """
 
     path: Positional[Path]
-    """Folder of a pair, or a scene file with --photographs."""
+    """A folder of two or more panoramas, or a scene file with --photographs."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
     photographs: Path | None = None
-    """Folder of the pair that a scene file was predicted from."""
+    """Folder of the panoramas that a scene file was predicted from."""
     seconds: Seconds | None = None
     """Time limit; 10 by default."""
     steps: Count | None = None
@@ -116,6 +116,7 @@ def _describe(report: RefineReport) -> str:
         "done": "",
         "converged": ", converged",
         "interrupted": ", interrupted",
+        "single view": "; a single view is not refined",
         "worse": "; the given scene is kept, because the refined one is not better",
     }[report.stopped]
     errors = f"{report.before:.4f} before, {report.after:.4f} after"

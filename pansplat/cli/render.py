@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
     from pansplat.gaussians.scene import Scene
     from pansplat.predictor import Progress
+    from pansplat.tours import Route
+
+    Frame = list[tuple[Tensor, float]]  # poses whose images are mixed, and their weights
 
 _VIDEO_SUFFIXES = (".mp4", ".webm")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
@@ -33,11 +37,12 @@ class Render:
     .webm)."""
 
     path: Positional[Path]
-    """A scene file, or the folder of a pair."""
+    """A scene file, one panorama, a folder of panoramas, or a web tour."""
     out: Out
     """The file to write; its suffix chooses the format."""
     at: Annotated[float, Range(-1000, 1000), REAL] | None = None
-    """Camera position between the first (0) and the last (1) input camera; 0.5 by default."""
+    """Camera position between the first (0) and the last (1) input camera, or on the flight through a tour of several
+    parts; 0.5 by default."""
     pose: Path | None = None
     """File with the camera pose: a JSON matrix (cam2world, OpenCV axes, metres), 16 numbers, or a KITTI or TUM
     trajectory, which a video follows."""
@@ -56,8 +61,8 @@ class Render:
     """deferred (images of single views, weighted by nearness), joint (all Gaussians at once), or view0, view1, ..."""
     fov: Annotated[float, Range(1, 170, "degrees"), REAL] = 90.0
     """Vertical field of view of `perspective`, degrees."""
-    seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] = 4.0
-    """Length of a video."""
+    seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] | None = None
+    """Length of a video; 4 by default, for a tour of several parts that of the flight at 1 m/s."""
     fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
     """Frames per second of a video."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
@@ -82,13 +87,13 @@ class Render:
         size = f"{options['size'][1]}x{options['size'][0] * (2 if self.stereo else 1)}"
         stereo = "top-bottom" if self.stereo else "mono"
         if self._is_video:
-            poses = self._path_between_cameras(scene) if poses is None else poses
+            path = self._path_between_cameras(scene) if poses is None else [[(pose, 1.0)] for pose in poses]
             with progress_bar() as progress:
-                frames = _render_frames(scene, poses, options, progress)
+                frames = _render_frames(scene, path, options, progress)
                 count = write_video(self.out, frames, self.fps, panorama=layout != "perspective", stereo=stereo)
             print(f"{self.out}: {count} frames of {size}, {layout}")
             return 0
-        pose = scene.pose_between(0.5 if self.at is None else self.at) if poses is None else poses[0]
+        pose = self._pose_between_cameras(scene) if poses is None else poses[0]
         with torch.no_grad():
             image = pipeline.render(scene, pose, **options)
         panorama = layout != "perspective" and not self.stereo  # GPano has no property for stereo
@@ -129,14 +134,42 @@ class Render:
         stereo = {"eye_distance": self.ipd} if self.stereo else {}
         return options | stereo | {"layout": layout, "size": (height, 2 * height)}
 
-    def _path_between_cameras(self, scene: Scene) -> list[Tensor]:
-        """A pose for each frame, through all input cameras."""
+    def _pose_between_cameras(self, scene: Scene) -> Tensor:
+        import torch
+
+        fraction, route = 0.5 if self.at is None else self.at, _plan_flight(scene)
+        return scene.pose_between(fraction) if route is None else torch.from_numpy(route.pose(fraction))
+
+    def _path_between_cameras(self, scene: Scene) -> list[Frame]:
+        """A frame for each time, through all input cameras."""
+        import torch
+
         from pansplat.geometry.path import fly_path
 
         if not len(scene.cam2world):
             raise InputError(f"{self.path} has no input cameras to fly between; give a trajectory with --pose")
-        count = max(2, round(self.seconds * self.fps))
-        return list(fly_path(scene.cam2world, [i / (count - 1) for i in range(count)]))
+        route = _plan_flight(scene)
+        count = max(2, round((self.seconds or (4.0 if route is None else route.seconds)) * self.fps))
+        fractions = [i / (count - 1) for i in range(count)]
+        if route is None:
+            return [[(pose, 1.0)] for pose in fly_path(scene.cam2world, fractions)]
+        return [[(torch.from_numpy(pose), weight) for pose, weight in route.fade(at)] for at in fractions]
+
+
+def _plan_flight(scene: Scene) -> Route | None:
+    """The flight through a tour of several parts; None for another scene. Between parts there is nothing to see."""
+    from pansplat.geometry.world import scale_poses, working_factor
+    from pansplat.tours import make_graph, plan_route
+
+    if not scene.overlaps:
+        return None
+    factor = working_factor(scene.near)
+    poses = scale_poses(scene.cam2world, factor)
+    tour = make_graph(dataclasses.replace(scene, cam2world=poses, near=scene.near * factor, far=scene.far * factor))
+    if not max(tour.parts):
+        return None
+    route = plan_route(tour, tour.plan_walk())
+    return dataclasses.replace(route, positions=route.positions / factor)
 
 
 def read_poses(path: Path) -> list[Tensor]:
@@ -165,15 +198,17 @@ def read_poses(path: Path) -> list[Tensor]:
 
 
 def _render_frames(
-    scene: Scene, poses: list[Tensor], options: dict[str, Any], progress: Progress
+    scene: Scene, frames: list[Frame], options: dict[str, Any], progress: Progress
 ) -> Iterator[np.ndarray]:
-    """8-bit RGB images at the poses."""
+    """8-bit RGB images of the frames."""
     import torch
 
     from pansplat import pipeline
 
-    for index, pose in enumerate(poses):
-        progress(f"frame {index + 1} of {len(poses)}", index / len(poses))
+    for index, frame in enumerate(frames):
+        progress(f"frame {index + 1} of {len(frames)}", index / len(frames))
         with torch.no_grad():
-            color = pipeline.render(scene, pose, **options).color
+            color = torch.stack([weight * pipeline.render(scene, pose, **options).color for pose, weight in frame]).sum(
+                0
+            )
         yield (color.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()

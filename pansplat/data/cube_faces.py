@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 
 from pansplat.data.cube_images import MAX_SIZE, CubeImage, CubeLevel, measure_seams
-from pansplat.data.images import read_pixels, read_size
+from pansplat.data.images import read_pixels, read_size, require_complete
 from pansplat.errors import InputError, InputWarning
 
 # Endings of file names for each face, in the order front, right, back, left, up, down. The axes are those of OpenGL's
@@ -94,7 +94,7 @@ def require_faces(files: Sequence[Path]) -> int:
     """The size of six pictures of faces, pixels.
 
     Raises:
-        InputError: one is missing, not square, or of another size.
+        InputError: one is missing, damaged, not square, or of another size.
     """
     sizes = {file: read_size(file) for file in files}
     size = sizes[files[0]]
@@ -104,7 +104,21 @@ def require_faces(files: Sequence[Path]) -> int:
                 f"{file}: needed six square cube faces of one size, at most {MAX_SIZE} pixels, got {width}x{height} "
                 f"(and {size[0]}x{size[1]} in {files[0].name}); export them again."
             )
+        require_complete(file)
     return size[0]
+
+
+def find_gap(level: CubeLevel, folder: Path) -> str | None:
+    """The first picture of a level that is missing or damaged, in words; None if the level is complete."""
+    for file in level.list_files():
+        if not (folder / file).is_file():
+            return f"{file} is missing"
+    for file in level.list_files():
+        try:
+            require_complete(folder / file)
+        except InputError:
+            return f"{file} is damaged"
+    return None
 
 
 def find_layout(image: Path) -> CubeImage | None:

@@ -130,11 +130,6 @@ class CubeImage:
         return equirect_from_faces(level.read(self.folder, decode), height)
 
 
-def find_missing_file(level: CubeLevel, folder: Path) -> str | None:
-    """The first picture of a level that does not exist."""
-    return next((file for file in level.list_files() if not (folder / file).is_file()), None)
-
-
 def write_cube(cube: CubeImage, folder: Path, name: str) -> Path:
     """Write the file that stands for a cube, if its content has changed; it changes with every picture's time or size.
 

@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 import warnings
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.images import READABLE_SUFFIXES
+from pansplat.data.images import READABLE_SUFFIXES, list_pictures, require_panorama
 from pansplat.data.pairs import (
     FAR,
     FAR_SEQUENCE,
@@ -30,11 +31,19 @@ from pansplat.data.pairs import (
     Panorama,
     ViewGroup,
     find_mask,
+    list_names,
     list_panorama_files,
     single_view_pairs,
     too_many_panoramas,
 )
-from pansplat.data.photographs import LINKS, add_links, list_further_photographs, list_photographs, read_photograph
+from pansplat.data.photographs import (
+    LINKS,
+    add_links,
+    list_further_photographs,
+    list_photographs,
+    list_unread_panoramas,
+    read_photograph,
+)
 from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.errors import InputError, InputWarning
@@ -79,6 +88,8 @@ def load_pairs(
         else:
             root = root.parent if root.is_file() else root
             collections = _find_collections(root, convention, _MAX_DEPTH)
+            if collections:
+                _note_unread_panoramas(root, *_list_files(collections))
         unposed = [] if collections else _list_unposed(root)
     except OSError as error:
         raise InputError(
@@ -88,12 +99,23 @@ def load_pairs(
         return _make_unposed_pairs(root, unposed, near, far)
     if not collections:
         raise _nothing_found(root)
+    collections = [(folder, _leave_out_damaged(collection)) for folder, collection in collections]
     pairs = [pair for folder, collection in collections for pair in collection.pairs(folder, near, far)]
     return make_names_unique(sorted(pairs, key=lambda pair: not pair.targets))
 
 
 def _is_pose_file(file: Path) -> bool:
     return file.name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS) or file == find_trajectory(file.parent)
+
+
+def list_stated_files(folder: Path) -> list[Path]:
+    """The files of a folder that state poses, pairs, links or a web tour; those of fixed names need not exist."""
+    files = [folder / name for name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS)]
+    try:
+        others = (find_trajectory(folder), find_web_tour(folder), *triplet_files(folder))
+    except (OSError, InputError):
+        return files
+    return files + [file for file in others if file is not None]
 
 
 def _read_tour_file(file: Path) -> list[Panorama]:
@@ -110,9 +132,12 @@ def _list_unposed(root: Path) -> list[Panorama]:
     source, problem = find_web_tour(root), None
     if source is not None:
         try:
-            return read_web_tour(source)
+            panoramas = read_web_tour(source)
         except InputError as error:
             problem = error
+        else:
+            _note_unread_panoramas(root, _list_pictures(panoramas), set(), depth=0)
+            return panoramas
     try:
         panoramas = list_photographs(root)
     except InputError:
@@ -123,7 +148,46 @@ def _list_unposed(root: Path) -> list[Panorama]:
         if not panoramas:
             raise problem
         warnings.warn(f"the web tour is left out: {problem}", category=InputWarning, stacklevel=3)
+    if panoramas:
+        _note_unread_panoramas(root, set(), {root})
     return panoramas
+
+
+def _list_pictures(panoramas: Iterable[Panorama]) -> set[Path]:
+    """The files that panoramas are made from, resolved."""
+    files = [file for view in panoramas for file in (*list_pictures(view.image), view.mask, view.depth)]
+    return {file.resolve() for file in files if file is not None}
+
+
+def _list_files(collections: Sequence[tuple[Path, Collection]]) -> tuple[set[Path], set[Path]]:
+    """The files of collections, and the folders of which all panoramas are in them."""
+    files = _list_pictures(view for _, found in collections for view in (*found.panoramas, *found.unposed))
+    return files, {folder for _, found in collections for folder in found.folders}
+
+
+def _note_unread_panoramas(folder: Path, known: set[Path], read: set[Path], depth: int = _MAX_DEPTH) -> None:
+    """Warn about the panoramas in a folder and those below it that are not read.
+
+    Args:
+        folder: at the path that the user gave, or below.
+        known: resolved files that are read.
+        read: folders of which all panoramas are read.
+        depth: levels of folders below.
+    """
+    unread = [] if folder in read else list_unread_panoramas(folder, known)
+    if unread:
+        warnings.warn(
+            f"{folder}: panoramas are left out, because the tour or the poses in another folder do not name them: "
+            f"{list_names(unread)}; open them by their own path, or add their poses.",
+            category=InputWarning,
+            stacklevel=3,
+        )
+    for sub in _list_subfolders(folder, depth):
+        tour = None if sub in read else find_web_tour(sub)
+        if tour is None:
+            _note_unread_panoramas(sub, known, read, depth - 1)
+        else:
+            warnings.warn(f"left out: {tour} is another tour; open it by its own path.", InputWarning, stacklevel=3)
 
 
 def _make_unposed_pairs(folder: Path, panoramas: list[Panorama], near: float | None, far: float | None) -> list[Pair]:
@@ -139,7 +203,7 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
     if (folder / _POSES).exists():  # the reader refuses what is no file
         return [(folder, read_pose_file_folder(folder, convention))]
     if is_loc360_sequence(folder):
-        return [(folder, read_loc360_sequence(folder, convention))]
+        return [(folder, _with_further(read_loc360_sequence(folder, convention)))]
     if is_matterport3d_scene(folder):
         return [(folder, read_matterport3d_scene(folder, convention))]
     if triplets := triplet_files(folder):
@@ -150,6 +214,40 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
         return []
     subfolders = _list_subfolders(folder, depth)
     return [found for sub in subfolders for found in _find_collections(sub, convention, depth - 1)]
+
+
+def _leave_out_damaged(collection: Collection) -> Collection:
+    """The collection without the panoramas that cannot be used, and without the pairs that need them.
+
+    Raises:
+        InputError: fewer than two are left, or none of the stated pairs; it names the first one that cannot be used.
+    """
+    problems: dict[int, InputError] = {}
+    for number, panorama in enumerate(collection.panoramas):
+        try:
+            require_panorama(panorama.image)
+        except InputError as error:
+            problems[number] = error
+    if not problems:
+        return collection
+    kept = [number for number in range(len(collection.panoramas)) if number not in problems]
+    place = {number: index for index, number in enumerate(kept)}
+    groups = None
+    if collection.groups is not None:
+        left = [[tuple(place[n] for n in part if n in place) for part in group] for group in collection.groups]
+        groups = tuple((context, targets) for context, targets in left if len(context) > 1)
+    if len(kept) < 2 or groups == ():
+        raise next(iter(problems.values()))
+    for error in problems.values():
+        warnings.warn(f"left out: {error}", category=InputWarning, stacklevel=3)
+    return dataclasses.replace(collection, panoramas=tuple(collection.panoramas[n] for n in kept), groups=groups)
+
+
+def _with_further(sequence: Collection) -> Collection:
+    """A sequence with the panoramas beside its frames that have no pose."""
+    folders = tuple(dict.fromkeys(view.image.parent for view in sequence.panoramas))
+    unposed = tuple(_list_further(sequence.source, folders, sequence.panoramas))
+    return dataclasses.replace(sequence, unposed=unposed, folders=folders)
 
 
 def find_panorama_folders(root: Path) -> list[Path]:
@@ -180,7 +278,7 @@ class UnposedPanoramasError(InputError):
     """A folder or web tour holds two or more panoramas, and no poses in a known format."""
 
     def __init__(self, folder: Path, panoramas: list[Panorama]) -> None:
-        names = _list_names([panorama.image.name for panorama in panoramas])
+        names = _list_first([panorama.image.name for panorama in panoramas])
         super().__init__(
             f"{folder}: needed poses for the panoramas, got images only ({names}); add a pose file (docs/input.md)."
         )
@@ -189,7 +287,7 @@ class UnposedPanoramasError(InputError):
 
 
 def _nothing_found(root: Path) -> InputError:
-    inside = _list_names([str(folder.relative_to(root)) for folder in find_panorama_folders(root) if folder != root])
+    inside = _list_first([str(folder.relative_to(root)) for folder in find_panorama_folders(root) if folder != root])
     got = f"some without poses in {inside}" if inside else "none"
     return InputError(
         f"{root}: needed panoramas (JPG, PNG, WebP or EXR), got {got}; give the folder that "
@@ -197,7 +295,7 @@ def _nothing_found(root: Path) -> InputError:
     )
 
 
-def _list_names(names: list[str]) -> str:
+def _list_first(names: list[str]) -> str:
     return ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
 
 
@@ -222,7 +320,7 @@ def _choose_convention(convention: str | None, default: str) -> str:
 def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collection:
     """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder.
 
-    Warns about panoramas of the folder that have no pose.
+    Warns about other panoramas of the folder, and of the folders of those in poses.json, which have no pose.
     """
     source = folder / _POSES
     content = read_json(source)
@@ -238,14 +336,8 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     panoramas = tuple(_read_pose_entry(folder, name, entry, convention, is_stated) for name, entry in entries.items())
     if not panoramas:
         raise InputError(f"{source}: needed poses of one or more panoramas, got none; add them or remove the file.")
-    files = [file for view in panoramas for file in (view.image, view.mask, view.depth) if file is not None]
-    unposed = list_further_photographs(folder, files)
-    if unposed:
-        warnings.warn(
-            f"{source} has no pose of {', '.join(view.image.name for view in unposed)}; each is a scene of its own.",
-            category=InputWarning,
-            stacklevel=4,
-        )
+    folders = tuple(dict.fromkeys((folder, *(view.image.parent for view in panoramas))))
+    unposed = _list_further(source, folders, panoramas)
     linked = add_links([*panoramas, *unposed], folder)
     near, far = (number_field(content, key, source, needed="a number in metres") for key in ("near", "far"))
     groups = _read_groups(folder / _PAIRS, list(entries)) if (folder / _PAIRS).is_file() else None
@@ -259,7 +351,21 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
         far=FAR if far is None else far,
         name=folder.resolve().name if is_single else None,
         unposed=tuple(linked[len(panoramas) :]),
+        folders=folders,
     )
+
+
+def _list_further(source: Path, folders: Sequence[Path], panoramas: Sequence[Panorama]) -> list[Panorama]:
+    """The panoramas of folders that have no pose, with a warning that names them."""
+    files = [file for view in panoramas for file in (view.image, view.mask, view.depth) if file is not None]
+    unposed = list_further_photographs(folders, files, [view.name for view in panoramas])
+    if unposed:
+        warnings.warn(
+            f"{source} has no pose of {list_names([view.image for view in unposed])}; each is a scene of its own.",
+            category=InputWarning,
+            stacklevel=5,
+        )
+    return unposed
 
 
 def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_stated: bool) -> Panorama:

@@ -32,6 +32,8 @@ READABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
 _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP")
 _MAX_BYTES = 1 << 31
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
+_JPEG_MAGIC, _JPEG_END, _PNG_MAGIC = b"\xff\xd8", b"\xff\xd9", b"\x89PNG"
+_TAIL = 4096  # bytes at the end of a file that are read to find the end of a JPEG
 _ORIENTATION, _TURNED = 0x0112, (5, 6, 7, 8)  # tag of EXIF, and its values for a quarter turn
 _WRAP = 16  # margin of the wrap-around at +-180 degrees for the resampling filter, target pixels
 
@@ -113,6 +115,57 @@ def read_size(path: Path | str) -> tuple[int, int]:
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return _open_with_pillow(path, _read_bytes(path), load=False).size  # its error names the reason
     return _exr_size(path)
+
+
+def list_pictures(path: Path) -> list[Path]:
+    """The image file, or those of the cube faces that it stands for."""
+    if not is_cube(path):
+        return [path]
+    cube = read_cube(path)
+    return [cube.folder / file for level in cube.levels for file in level.list_files()]
+
+
+def require_complete(path: Path | str) -> None:
+    """Check that an image file is not damaged, by its structure; it is decoded only if the structure is in doubt.
+
+    That of a JPG or WebP shows whether the file is whole, and that of a PNG has check sums. An EXR is decoded.
+
+    Raises:
+        InputError: no such file, an unknown format, damaged or truncated data.
+    """
+    path = Path(path)
+    require_file(path, "a readable image file")
+    if not _is_complete(path):
+        _decode(path)
+
+
+def require_panorama(path: Path | str) -> None:
+    """Check that a file is a 2:1 image that is not damaged (`require_complete`).
+
+    Raises:
+        InputError: it is not.
+    """
+    _check_two_to_one(Path(path), *read_size(path))
+    require_complete(path)
+
+
+def _is_complete(path: Path) -> bool:
+    """Whether the structure of a JPG, PNG or WebP file is whole; False if it is in doubt."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(12)
+            size = file.seek(0, io.SEEK_END)
+            file.seek(max(size - _TAIL, 0))
+            tail = file.read()
+        if head.startswith(_PNG_MAGIC):
+            with Image.open(path, formats=("PNG",)) as image:
+                image.verify()
+            return True
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return False
+    if head.startswith(b"RIFF"):
+        return size >= 8 + int.from_bytes(head[4:8], "little")
+    return head.startswith(_JPEG_MAGIC) and tail.rstrip(b"\0").endswith(_JPEG_END)
 
 
 def is_cube(path: Path) -> bool:
@@ -334,7 +387,7 @@ def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:
     data = _read_bytes(path)
     if data.startswith(_EXR_MAGIC):
         return _decode_exr(path)
-    if data.startswith(b"\x89PNG") and len(data) > 24 and data[24] == 16:
+    if data.startswith(_PNG_MAGIC) and len(data) > 24 and data[24] == 16:
         return _decode_png16(path, data)
     image = _open_with_pillow(path, data, at_least)
     if "A" in image.getbands() or "transparency" in image.info:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, s
 
 MAX_CONTEXT = 64  # context panoramas of a pair
 
+_MAX_NAMES = 20  # in a note
 _COINCIDENT = 1e-3  # metres, in a world of metres
 _MATCHING_SECONDS = 2.0  # for two panoramas of 512 rows on two cores
 
@@ -54,7 +56,7 @@ class Panorama:
         mask: image that is white where the panorama shows the scene; None to detect static content.
         depth: radial depth, 16-bit PNG in millimetres or EXR in metres; None when there is none.
         is_scan: whether the panorama is rendered from a scan, whose holes are exactly black.
-        part: panoramas of different parts have no common world. One without a known pose is a part of its own.
+        world: number of the coordinate frame of the pose; one without a known pose has a world of its own.
         title: for people, if it differs from the name.
         links: to other panoramas of the tour.
         start: yaw and pitch, as of a link, of the view that a visitor sees first; None if there is none.
@@ -67,7 +69,7 @@ class Panorama:
     mask: Path | None = None
     depth: Path | None = None
     is_scan: bool = False
-    part: int = 0
+    world: int = 0
     title: str = ""
     links: tuple[Link, ...] = ()
     start: tuple[float, float] | None = None
@@ -194,7 +196,8 @@ class Collection:
         ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
         near, far: metres.
         name: name of the only pair; None to join the names of the context views.
-        unposed: panoramas of the folder without a pose; each is a scene of its own.
+        unposed: panoramas without a pose beside the others; each is a scene of its own.
+        folders: those of which all panoramas are in the collection.
     """
 
     source: Path
@@ -205,9 +208,12 @@ class Collection:
     far: float = FAR
     name: str | None = None
     unposed: tuple[Panorama, ...] = ()
+    folders: tuple[Path, ...] = ()
 
     def pairs(self, folder: Path, near: float | None = None, far: float | None = None) -> list[Pair]:
-        """One pair per group, those with targets first, then one of a single view for each panorama without a pose.
+        """One pair per group, those with targets first, then one of a single view for each other panorama.
+
+        Warns about posed panoramas that are in no group.
 
         Args:
             folder: of the files.
@@ -221,14 +227,24 @@ class Collection:
         near, far = self.near if near is None else near, self.far if far is None else far
         require_depth_range(near, far, self.source, 'set "near" and "far" in poses.json or on the command line')
         siblings = tuple(panorama.image for panorama in self.panoramas)
-        pairs = []
-        for indices in self._select_groups():
+        pairs, groups = [], self._select_groups()
+        for indices in groups:
             context, targets = (tuple(self.panoramas[i] for i in part) for part in indices)
             name = self.name or "-".join(view.name for view in context)
             pairs.append(Pair(name, folder, context, targets, near, far, siblings))
-        first_part = 1 + max(panorama.part for panorama in self.panoramas)
-        every = (*self.panoramas, *self.unposed)
-        return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_part=first_part)
+        used = {i for group in groups for part in group for i in part}
+        alone = [panorama for i, panorama in enumerate(self.panoramas) if i not in used]
+        if alone:
+            warnings.warn(
+                f"{self.source}: in no pair of pairs.json, and each a scene of its own: "
+                f"{list_names([view.image for view in alone])}.",
+                category=InputWarning,
+                stacklevel=4,
+            )
+        pairs += [Pair(view.name, folder, (view,), (), near, far, siblings) for view in alone]
+        first_world = 1 + max(panorama.world for panorama in self.panoramas)
+        every = tuple(heapq.merge(self.panoramas, self.unposed, key=lambda panorama: panorama.name))
+        return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_world=first_world)
 
     def _select_groups(self) -> list[ViewGroup]:
         """The given groups without repeated contexts, those with targets first; else pairs of neighbours."""
@@ -277,7 +293,7 @@ def single_view_pairs(
     far: float | None,
     *,
     siblings: Sequence[Panorama] | None = None,
-    first_part: int = 0,
+    first_world: int = 0,
 ) -> list[Pair]:
     """A pair of one view for each panorama.
 
@@ -285,7 +301,7 @@ def single_view_pairs(
         folder: of the tour; predictions are cached there.
         near, far: metres; None for the range of rooms.
         siblings: panoramas of the same camera, by default the same ones.
-        first_part: number of the first part; each panorama is the next one.
+        first_world: of the first panorama; each has a world of its own.
 
     Raises:
         InputError: an invalid depth range.
@@ -294,9 +310,15 @@ def single_view_pairs(
     require_depth_range(near, far, folder, 'set "near" and "far" on the command line')
     images = tuple(panorama.image for panorama in (panoramas if siblings is None else siblings))
     return [
-        Pair(view.name, folder, (replace(view, part=part),), (), near, far, images)
-        for part, view in enumerate(panoramas, start=first_part)
+        Pair(view.name, folder, (replace(view, world=world),), (), near, far, images)
+        for world, view in enumerate(panoramas, start=first_world)
     ]
+
+
+def list_names(files: Sequence[Path]) -> str:
+    """The names of files, for notes; of many the first ones."""
+    names = ", ".join(file.name for file in files[:_MAX_NAMES])
+    return names if len(files) <= _MAX_NAMES else f"{names} and {len(files) - _MAX_NAMES} more"
 
 
 def find_mask(image: Path, folder: Path) -> Path | None:

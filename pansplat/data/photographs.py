@@ -13,11 +13,12 @@ import torch
 
 from pansplat.data.cube_faces import find_layout, group_faces
 from pansplat.data.cube_images import CubeImage, write_cube
-from pansplat.data.images import read_size
+from pansplat.data.images import read_size, require_complete
 from pansplat.data.pairs import Link, Panorama, find_mask, list_panorama_files
 from pansplat.data.panorama_metadata import read_xmp
-from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links, wrap
+from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links
 from pansplat.errors import InputError, InputWarning
+from pansplat.geometry.path import wrap_angle
 from pansplat.strict_json import list_field, read_json, require_object
 
 LINKS = "links.json"
@@ -53,18 +54,46 @@ def list_photographs(folder: Path) -> list[Panorama]:
     return add_links(panoramas, folder)
 
 
-def list_further_photographs(folder: Path, known: Collection[Path]) -> list[Panorama]:
-    """The panoramas of a folder other than the known files, without links.
+def list_further_photographs(
+    folders: Sequence[Path], known: Collection[Path], names: Collection[str]
+) -> list[Panorama]:
+    """The panoramas of folders other than the known files, without links.
 
     Pictures that pansplat rendered do not count. Warns about pictures that are no panoramas.
+
+    Args:
+        folders: each once.
+        known: files that are no further ones.
+        names: that are taken; a panorama of such a name gets the folder's name before its own.
     """
-    files = {file.resolve() for file in known}
-    further = [
-        image for image in list_panorama_files(folder) if image.resolve() not in files and not _is_rendered(image)
-    ]
-    panoramas, problems = _read_pictures(further, folder)
-    _warn_left_out(problems)
-    return panoramas
+    files, taken = {file.resolve() for file in known}, set(names)
+    further: list[Panorama] = []
+    for folder in folders:
+        panoramas, problems = _read_pictures(_list_others(folder, files), folder)
+        _warn_left_out(problems)
+        for panorama in panoramas:
+            name = panorama.name if panorama.name not in taken else f"{folder.resolve().name}_{panorama.name}"
+            taken.add(name)
+            further.append(dataclasses.replace(panorama, name=name))
+    return further
+
+
+def list_unread_panoramas(folder: Path, known: Collection[Path]) -> list[Path]:
+    """The 2:1 pictures of a folder other than the known files, which pansplat has not rendered; no pixels are read."""
+    return [image for image in _list_others(folder, known) if _is_two_to_one(image)]
+
+
+def _list_others(folder: Path, known: Collection[Path]) -> list[Path]:
+    """The pictures of a folder other than the known files (resolved), which pansplat has not rendered."""
+    return [image for image in list_panorama_files(folder) if image.resolve() not in known and not _is_rendered(image)]
+
+
+def _is_two_to_one(image: Path) -> bool:
+    try:
+        width, height = read_size(image)
+    except InputError:
+        return False
+    return width == 2 * height
 
 
 def _warn_left_out(problems: Sequence[str]) -> None:
@@ -95,6 +124,7 @@ def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama]
 def _read_picture(image: Path) -> Path | CubeImage:
     width, height = read_size(image)
     if width == 2 * height:
+        require_complete(image)
         return image
     layout = find_layout(image)
     if layout is None:
@@ -153,7 +183,7 @@ def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Pa
             finite_number(link.get("yaw"), "yaw of a link"),
             finite_number(link.get("pitch", 0), "pitch of a link"),
         )
-        links.append(Link(str(link.get("to")), wrap(yaw), pitch, plain_text(link.get("text"))))
+        links.append(Link(str(link.get("to")), wrap_angle(yaw), pitch, plain_text(link.get("text"))))
     start = list_field(content, "start", source)
     if len(start) not in (0, 2):
         raise InputError(f'{source}: needed [yaw, pitch] as "start", got {str(start)[:40]}; correct it.')
@@ -161,5 +191,5 @@ def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Pa
         panorama,
         title=plain_text(content.get("title")),
         links=resolve_links(links, names, panorama.name, source),
-        start=(wrap(finite_number(start[0], "start")), finite_number(start[1], "start")) if start else None,
+        start=(wrap_angle(finite_number(start[0], "start")), finite_number(start[1], "start")) if start else None,
     )

@@ -79,6 +79,17 @@ def turn_pose(pose: Float[Tensor, "4 4"], yaw_radians: float, up: Float[Tensor, 
     return turned
 
 
+def find_direction(cam2world: Float[Tensor, "4 4"], yaw: float, pitch: float) -> Float[Tensor, "3"]:
+    """The unit direction, in world axes, of angles in a panorama: right of its centre, below its horizon, radians."""
+    local = math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)
+    return cam2world[:3, :3].double() @ torch.tensor(local, dtype=torch.float64)
+
+
+def wrap_angle(angle: float) -> float:
+    """The same direction within half a turn, radians."""
+    return math.remainder(angle, 2 * math.pi)
+
+
 def path_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
     """A level pose at each camera that looks along the path.
 

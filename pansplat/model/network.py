@@ -55,6 +55,9 @@ class NetworkPredictor:
         tiles: tiles along each side of the panorama; by default `choose_tiles`.
     """
 
+    min_views = 2
+    """Number of panoramas below which nothing is predicted; 1 if a predictor states none."""
+
     def __init__(self, name: str, network: Network, *, tiles: int | None = None) -> None:
         self.name = name
         network.eval()

@@ -104,6 +104,7 @@ class _View:
 def estimate_poses(
     images: Sequence[Path | str],
     *,
+    masks: Mapping[Path, Path | None] | None = None,
     camera_height: float = CAMERA_HEIGHT,
     baseline: tuple[Path | str, Path | str, float] | None = None,
     seed: int = 0,
@@ -113,6 +114,7 @@ def estimate_poses(
 
     Args:
         images: files, 2:1; one that is repeated is used once.
+        masks: the mask file of each image, if it has one; by default those beside the images (docs/input.md).
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images and their distance in metres, instead of the camera's height.
         seed: of the random samples.
@@ -148,7 +150,8 @@ def estimate_poses(
     if len(kept) < 2:
         raise _no_poses(paths, unplaced | {n: "no other panorama is left" for n in kept})
     with one_thread():  # panoramas and pairs are divided among threads
-        views = _describe_views(paths, pixels, hints, kept, report)
+        files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
+        views = _describe_views(paths, files, pixels, hints, kept, report)
         relations = _relate_views(views, seed, report)
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
@@ -250,14 +253,19 @@ def _working_height(path: Path) -> int:
 
 
 def _describe_views(
-    paths: Sequence[Path], pixels: dict[int, Array], hints: Sequence[Hints], kept: Sequence[int], report: Progress
+    paths: Sequence[Path],
+    masks: Mapping[Path, Path | None],
+    pixels: dict[int, Array],
+    hints: Sequence[Hints],
+    kept: Sequence[int],
+    report: Progress,
 ) -> list[_View]:
     headings = {hints[n].heading for n in kept} - {None}
     is_compass = len(headings) > 1  # one value for all pictures is a program's default
     static = scene_mask_of_files(tuple(paths[n] for n in kept), _HEIGHT).numpy()
 
     def describe(n: int) -> _View:
-        mask = find_mask(paths[n], paths[n].parent)
+        mask = masks.get(paths[n])
         scene = static if mask is None else read_mask(mask, _HEIGHT).numpy()
         small = cv2.resize(pixels[n], (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
         axes = with_hints(find_axes(pixels[n]), hints[n].down, hints[n].heading if is_compass else None)

@@ -27,7 +27,7 @@ from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
 from pansplat.predictor import Progress
 from pansplat.strict_json import read_json
 
-_FORMAT = "3"  # version of the estimate and of its cached file; part of the cache's key
+_FORMAT = "4"  # version of the estimate and of its cached file; part of the cache's key
 _CONVENTION = "cam2world opencv"
 SUFFIXES = (".json", ".tum", ".kitti")
 
@@ -67,7 +67,7 @@ def _write(path: Path, text: str) -> None:
 def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
     return {
         "convention": _CONVENTION,
-        **_make_part(estimate, names),
+        **_make_world(estimate, names),
         "estimate": {
             "summary": estimate.summary,
             "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
@@ -75,7 +75,7 @@ def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str
     }
 
 
-def _make_part(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
+def _make_world(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
     return {
         "near": round(estimate.near, 3),
         "far": round(estimate.far, 3),
@@ -94,8 +94,9 @@ def estimate_pairs(
 ) -> list[Pair]:
     """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
 
-    Panoramas that are placed together are a part. Each other one is a part of its own, a pair of a single view, after
-    them. Warnings state the figures of the check, and name the panoramas without a pose and those that cannot be read.
+    Panoramas that are placed together have one world. Each other one has a world of its own, a pair of a single view,
+    after them. Warnings state the figures of the check, and name the panoramas without a pose and those that cannot be
+    read.
 
     Args:
         folder: of the tour.
@@ -107,8 +108,7 @@ def estimate_pairs(
     Raises:
         InputError: a file is missing, or none can be read.
     """
-    images = [panorama.image for panorama in panoramas]
-    name = f"poses-{_hash_inputs(images, camera_height)}.json"
+    name = f"poses-{_hash_inputs(panoramas, camera_height)}.json"
     folders = cache_folders(folder)
     source = next((cache / name for cache in folders if (cache / name).is_file()), None)
     if source is None:
@@ -122,19 +122,20 @@ def estimate_pairs(
 
 
 def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Progress | None) -> dict[str, Any]:
-    """What is cached: parts of placed panoramas, and the reasons for the others, by name."""
+    """What is cached: worlds of placed panoramas, and the reasons for the others, by name."""
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
-        estimate = estimate_poses(list(names), camera_height=camera_height, progress=progress)
+        masks = {panorama.image: panorama.mask for panorama in panoramas}
+        estimate = estimate_poses(list(names), masks=masks, camera_height=camera_height, progress=progress)
     except NoPosesError as error:
-        parts, summary, unplaced = [], "", error.reasons
+        worlds, summary, unplaced = [], "", error.reasons
     else:
-        parts, summary, unplaced = [_make_part(estimate, names)], estimate.summary, estimate.unplaced
+        worlds, summary, unplaced = [_make_world(estimate, names)], estimate.summary, estimate.unplaced
     unreadable = [image for image in unplaced if not _is_readable(image)]
     if len(unreadable) == len(panoramas):
         raise NoPosesError(unplaced)
     return {
-        "parts": parts,
+        "worlds": worlds,
         "summary": summary,
         "unplaced": {names[image]: reason for image, reason in unplaced.items()},
         "unreadable": [names[image] for image in unreadable],
@@ -160,7 +161,7 @@ def _make_pairs(
     """The pairs of a cached estimate, with its warnings."""
     by_name = {panorama.name: panorama for panorama in panoramas}
     unplaced, unreadable = content["unplaced"], content["unreadable"]
-    if content["parts"]:
+    if content["worlds"]:
         is_flat = all(panorama.image.parent == folder for panorama in panoramas)
         advice = " `pansplat pose` writes them to a file." if is_flat else ""
         warnings.warn(f"{folder} has no poses; they were estimated: {content['summary']}.{advice}", stacklevel=4)
@@ -169,17 +170,17 @@ def _make_pairs(
         outcome = "cannot be read and is left out" if name in unreadable else "has no pose and is a scene of its own"
         warnings.warn(f"{panorama.image}{_in_brackets(panorama.title)} {outcome}: {reason}", InputWarning, stacklevel=4)
     pairs = []
-    for number, part in enumerate(content["parts"]):
+    for number, world in enumerate(content["worlds"]):
         placed = tuple(
-            replace(by_name[name], cam2world=to_cam2world(rigid_matrix(pose, str(source)), _CONVENTION), part=number)
-            for name, pose in part["poses"].items()
+            replace(by_name[name], cam2world=to_cam2world(rigid_matrix(pose, str(source)), _CONVENTION), world=number)
+            for name, pose in world["poses"].items()
         )
         only = folder.resolve().name if len(placed) == 2 else None
-        pairs += Collection(source, placed, near=part["near"], far=part["far"], name=only).pairs(folder, near, far)
+        pairs += Collection(source, placed, near=world["near"], far=world["far"], name=only).pairs(folder, near, far)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
     single = [panorama for panorama in readable if panorama.name in unplaced]
-    first_part = len(content["parts"])
-    pairs += single_view_pairs(single, folder, near, far, siblings=readable, first_part=first_part)
+    first_world = len(content["worlds"])
+    pairs += single_view_pairs(single, folder, near, far, siblings=readable, first_world=first_world)
     return make_names_unique(pairs)
 
 
@@ -187,9 +188,18 @@ def _in_brackets(title: str) -> str:
     return f" ({title})" if title else ""
 
 
-def _hash_inputs(images: Sequence[Path], camera_height: float) -> str:
+def _hash_inputs(panoramas: Sequence[Panorama], camera_height: float) -> str:
+    """A hash of the names, by which the cached file states its poses, and of the pictures' and masks' states."""
     digest = hashlib.blake2b(f"{_FORMAT} {camera_height:g}".encode(), digest_size=12)
-    for image in images:
-        state = image.stat()
-        digest.update(os.fsencode(f"{image.name} {state.st_size} {state.st_mtime_ns};"))
+    for panorama in panoramas:
+        digest.update(os.fsencode(f"{panorama.name};"))
+        for file in (panorama.image, panorama.mask):
+            digest.update(os.fsencode(f"{_stamp(file)};"))
     return digest.hexdigest()
+
+
+def _stamp(file: Path | None) -> str:
+    if file is None:
+        return "none"
+    state = file.stat()
+    return f"{file.name} {state.st_size} {state.st_mtime_ns}"

@@ -83,7 +83,8 @@ class RefineReport:
 
     Attributes:
         steps, seconds: of the run.
-        stopped: why it ended: "done", "converged", "interrupted", or "worse" if the given scene is kept.
+        stopped: why it ended: "done", "converged", "interrupted", "worse" if the given scene is kept, or "single view",
+            which is not refined.
         before, after: mean absolute error of the held-out blocks at the start, within the limit of Gaussians, and
             before the last part of the run, which fits them; at the end of a run without that part.
         gains: factors of the photographs' channels relative to their geometric mean.
@@ -284,7 +285,8 @@ class Refinement:
     ) -> RefineReport:
         """Refine for a number of steps, or of seconds.
 
-        The run goes over to its last part early if the held-out error stagnates. An object runs once.
+        The run goes over to its last part early if the held-out error stagnates. An object runs once. A single view is
+        left as it is, within the limit of Gaussians.
 
         Args:
             seconds: time limit since this object was made; the result depends on the speed of the machine.
@@ -298,6 +300,9 @@ class Refinement:
         clock = _Clock(seconds, steps, self.config.release, self._created)
         report = progress or (lambda what, fraction: None)
         history: list[tuple[int, float, float]] = []
+        if len(self._photographs) == 1:  # one photograph does not show what is wrong seen from elsewhere
+            self._result, error = self._start, self.held_out_error()
+            return RefineReport(0, clock.elapsed, "single view", error, error, self._start.gains, ())
 
         def measure() -> float:
             error = self.held_out_error()

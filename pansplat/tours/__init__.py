@@ -27,11 +27,13 @@ from pansplat.tours.graph import (
     merge_scenes,
     select_views,
 )
+from pansplat.tours.links import find_link_ring, find_way_along_link
 from pansplat.tours.overlap import connect
-from pansplat.tours.route import Route, find_angles, find_way_along_link, plan_route
+from pansplat.tours.route import FADE_SECONDS, Route, find_angles, plan_route
 
 __all__ = [
     "EDGE_HYSTERESIS",
+    "FADE_SECONDS",
     "Edge",
     "FloorOutline",
     "FloorPlan",
@@ -45,6 +47,7 @@ __all__ = [
     "find_camera_height",
     "find_floor_outline",
     "find_floor_outlines",
+    "find_link_ring",
     "find_tours",
     "find_way_along_link",
     "list_starts",

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pansplat.data.pairs import Link, Pair, Panorama
 from pansplat.gaussians.scene import Gains, Gaussians, Scene, Starts
-from pansplat.geometry.path import level_pose, up_direction
+from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
 from pansplat.geometry.world import working_factor
 from pansplat.tours.layout import REACH, lay_out
 
@@ -42,8 +42,8 @@ _UNLINKED_FADE = 2.5  # cost of another fade, as a factor, so that two fades alo
 class TourGraph:
     """Panoramas of one place and the edges between them.
 
-    Panoramas that edges connect are a part. Parts have no common world; `lay_out` places them side by side. From part
-    to part the image fades.
+    Panoramas that edges connect are a part. Within a part the camera flies; from part to part the image fades. Parts
+    without a common world are side by side (`lay_out`).
 
     Attributes:
         name: for lists and folders.
@@ -53,7 +53,7 @@ class TourGraph:
         siblings: all panoramas taken with the same camera.
         overlaps: of each edge: 1 if one panorama explains the other at each pixel, 0 for unrelated panoramas. That of a
             self-edge is 1.
-        originals: the panoramas with poses in the worlds of their parts, which scenes are predicted from; none if these
+        originals: the panoramas with poses in their own worlds, which scenes are predicted from; none if these
             are `panoramas`.
     """
 
@@ -107,16 +107,12 @@ class TourGraph:
     def find_direction(self, start: int, end: int) -> Float[np.ndarray, "3"] | None:
         """The unit direction, in world axes, of the link from a node to another one; None if there is none."""
         link = self.links.get((start, end))
-        return None if link is None else self._direct(start, link.yaw, link.pitch)
+        return None if link is None else find_direction(self.cam2world[start], link.yaw, link.pitch).numpy()
 
     def find_start_view(self, node: int) -> Float[np.ndarray, "3"] | None:
         """The unit direction, in world axes, of the view that a visitor of a node sees first; None if it has none."""
         start = self.panoramas[node].start
-        return None if start is None else self._direct(node, *start)
-
-    def _direct(self, node: int, yaw: float, pitch: float) -> Float[np.ndarray, "3"]:
-        local = math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)
-        return self.cam2world[node, :3, :3].numpy() @ local
+        return None if start is None else find_direction(self.cam2world[node], *start).numpy()
 
     def neighbours(self, node: int) -> list[int]:
         """The other nodes that share an edge with a node."""
@@ -191,9 +187,9 @@ class TourGraph:
         return float(np.linalg.norm(a - b))
 
     def make_pair(self, views: Sequence[int]) -> Pair:
-        """The panoramas of a scene as the input of a prediction, in the world of their part.
+        """The panoramas of a scene as the input of a prediction, in their own world.
 
-        It does not depend on the other parts, so that cached predictions stay valid when panoramas are added.
+        It does not depend on other worlds, so that cached predictions stay valid when panoramas are added.
         """
         context = tuple((self.originals or self.panoramas)[view] for view in views)
         name = "-".join(panorama.name for panorama in context)
@@ -285,16 +281,17 @@ class TourGraph:
         Nearest neighbours first, improved by exchanging parts of the order (2-opt).
 
         Args:
-            start: its first node; None chooses the start of the shortest walk, of some starts for more than 100 nodes.
-                A tour of parts with links starts at its first node, as its author has chosen, and one without links in
-                its largest part.
+            start: its first node. None starts at the first node if that has a start view, or in a tour of parts with
+                links: its author has chosen so. Else it chooses the start of the shortest walk, of some starts for more
+                than 100 nodes; in a tour of parts one in the largest part.
         """
         costs, _ = self._shortest
         starts = np.arange(len(self)) if start is None else np.array([start])
-        if start is None and max(self.parts) > 0:
-            starts = (
-                starts[:1] if self.links else np.flatnonzero(np.array(self.parts) == np.bincount(self.parts).argmax())
-            )
+        has_parts = max(self.parts) > 0
+        if start is None and (self.panoramas[0].start is not None or (has_parts and self.links)):
+            starts = starts[:1]
+        elif start is None and has_parts:
+            starts = np.flatnonzero(np.array(self.parts) == np.bincount(self.parts).argmax())
         starts = starts[:: math.ceil(len(starts) * len(self) / _MAX_STARTS)].tolist()
         orders = [_improve_order(_order_by_distance(costs, first), costs) for first in starts]
         order = min(orders, key=lambda order: float(costs[order[:-1], order[1:]].sum()))
@@ -358,34 +355,42 @@ def _improve_order(order: Int[np.ndarray, "node"], costs: Float[np.ndarray, "nod
 def find_tours(pairs: Sequence[Pair]) -> list[TourGraph]:
     """Tours of the pairs of folders; their edges are the pairs, without overlaps (0).
 
-    All panoramas of a folder are one tour if they are of two or more parts; a panorama that is in no pair with another
-    one has a self-edge. Else three or more panoramas that pairs connect are a tour.
+    Three or more panoramas that pairs connect are a tour. But if a panorama of a folder is in no pair with another one,
+    or the folder has several worlds, all its panoramas are one tour; a panorama without another one has a self-edge.
     """
     of_folder: dict[Path, list[Pair]] = {}
     for pair in pairs:
         of_folder.setdefault(pair.folder, []).append(pair)
-    parts = {folder: {view.part for pair in group for view in pair.context} for folder, group in of_folder.items()}
+    joint = {folder for folder, group in of_folder.items() if _is_one_tour(group)}
     components: list[list[Pair]] = []
     for pair in pairs:
-        if len(parts[pair.folder]) > 1:
+        if pair.folder in joint:
             continue
         images = {panorama.image for panorama in pair.context}
-        joined = [part for part in components if any(images & _list_images(other) for other in part)]
-        components = [part for part in components if part not in joined]
+        joined = [group for group in components if any(images & _list_images(other) for other in group)]
+        components = [group for group in components if group not in joined]
         components.append([*itertools.chain.from_iterable(joined), pair])
-    components = [part for part in components if len(set().union(*map(_list_images, part))) >= _MIN_PANORAMAS]
-    components += [group for folder, group in of_folder.items() if len(parts[folder]) > 1]
+    components = [group for group in components if len(set().union(*map(_list_images, group))) >= _MIN_PANORAMAS]
+    components += [group for folder, group in of_folder.items() if folder in joint]
     tours = [_make_tour(component) for component in components]
     if len(tours) > 1:
         tours = [dataclasses.replace(tour, name=f"{tour.name} {i}") for i, tour in enumerate(tours, start=1)]
     return tours
 
 
+def _is_one_tour(pairs: Sequence[Pair]) -> bool:
+    """Whether the panoramas of a folder are one tour of several parts."""
+    images = set().union(*map(_list_images, pairs))
+    is_alone = any(len(pair.context) == 1 for pair in pairs)
+    return len({view.world for pair in pairs for view in pair.context}) > 1 or (is_alone and len(images) > 1)
+
+
 def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
     """The tour of all panoramas of some pairs."""
     first = pairs[0]
     found = {panorama.image: panorama for pair in pairs for panorama in pair.context}
-    rank = {image: index for index, image in enumerate(first.siblings)}
+    every = max((pair.siblings for pair in pairs), key=len)  # those of a single view include panoramas of other parts
+    rank = {image: index for index, image in enumerate(every)}
     images = sorted(found, key=lambda image: rank.get(image, len(rank)))
     number = {image: index for index, image in enumerate(images)}
     edges = {
@@ -395,7 +400,8 @@ def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
     }
     overlaps = dict.fromkeys(sorted(edges), 0.0)
     overlaps |= {(node, node): 1.0 for node in sorted(set(range(len(images))) - {*itertools.chain(*edges)})}
-    near, far = min(pair.near for pair in pairs), max(pair.far for pair in pairs)
+    measured = [pair for pair in pairs if len(pair.context) > 1] or pairs  # the range of a single view is a default
+    near, far = min(pair.near for pair in measured), max(pair.far for pair in measured)
     originals = tuple(found[image] for image in images)
     name = f"{first.folder.resolve().name} tour"
     return TourGraph(name, first.folder, lay_out(originals, near), near, far, first.siblings, overlaps, originals)
@@ -435,21 +441,17 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
         names=tuple(names[node] for node in range(len(tour))),
         gains=_join_gains(gains, tour.parts),
         overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
-        links=tuple((a, b, *_wrap((link.yaw, link.pitch)), link.text) for (a, b), link in tour.links.items()),
+        links=tuple(
+            (a, b, wrap_angle(link.yaw), wrap_angle(link.pitch), link.text) for (a, b), link in tour.links.items()
+        ),
         starts=list_starts(tour.panoramas),
     )
 
 
 def list_starts(panoramas: Sequence[Panorama]) -> Starts:
     """The start views of panoramas, as a scene keeps them; nothing if there is none."""
-    starts = tuple(None if panorama.start is None else _wrap(panorama.start) for panorama in panoramas)
+    starts = tuple(view.start and (wrap_angle(view.start[0]), wrap_angle(view.start[1])) for view in panoramas)
     return starts if any(starts) else ()
-
-
-def _wrap(angles: tuple[float, float]) -> tuple[float, float]:
-    """The angles within half a turn, radians."""
-    yaw, pitch = (math.remainder(angle, 2 * math.pi) for angle in angles)
-    return yaw, pitch
 
 
 def _join_gains(gains: dict[Views, Gains], parts: Sequence[int]) -> Gains:

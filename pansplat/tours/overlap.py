@@ -32,7 +32,7 @@ def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = Non
         InputError: an image cannot be read.
     """
     report = progress or (lambda what, done: None)
-    world = np.array([panorama.part for panorama in tour.panoramas])
+    world = np.array([panorama.world for panorama in tour.panoramas])
     distances = np.linalg.norm(tour.positions[:, None] - tour.positions[None], axis=2)
     distances[world[:, None] != world] = np.inf
     compared = {(a, b) for a, b in tour.overlaps if a != b}

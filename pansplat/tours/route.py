@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pansplat.tours.graph import Edge, TourGraph
+from pansplat.tours.links import find_way_along_link
 
+FADE_SECONDS = 1.0
 _FLY_SPEED = 1.0  # metres per second
 _TURN_DEGREES = 45.0  # per second
 _LOOK_AHEAD = 1.5  # metres along the way, the point that the camera looks at
@@ -20,7 +22,6 @@ _TURN_BACK_DEGREES = 120.0  # of the way at a panorama, at which the camera turn
 _TURN_IN_PLACE_DEGREES = 60.0  # between the heading and the way, at which the camera stands still
 _SMOOTHING_SECONDS = 1.2
 _SAMPLES_PER_SECOND = 60
-_LINK_METRES = 0.7  # that the camera goes along a link, before the fade
 _LOOK_AROUND_DEGREES = 90.0  # that the camera turns in a part without a way, before the fade
 
 
@@ -76,6 +77,20 @@ class Route:
         pose[:3, 3] = [np.interp(at, steps, column) for column in self.positions.T]
         return pose
 
+    def fade(self, fraction: float) -> list[tuple[Float[np.ndarray, "4 4"], float]]:
+        """The poses from which a fraction of the duration is drawn, with their weights.
+
+        They are the pose there, and in the `FADE_SECONDS` after a jump the last pose before it.
+        """
+        steps = len(self.legs) - 1
+        at = min(max(fraction, 0.0), 1.0) * steps
+        passed = self.jumps[self.jumps < round(at)]
+        done = (at - passed[-1]) / (FADE_SECONDS * _SAMPLES_PER_SECOND) if len(passed) else 1.0
+        if done >= 1:
+            return [(self.pose(fraction), 1.0)]
+        weight = done * done * (3 - 2 * done)
+        return [(self.pose(passed[-1] / steps), 1 - weight), (self.pose(fraction), weight)]
+
     def edge(self, fraction: float) -> Edge | None:
         """The edge that is flown at a fraction of the duration; None before the first panorama."""
         leg = self.leg(fraction)
@@ -121,7 +136,7 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
             places.append(places[-1] + link)
             legs.append(legs[-1] if legs else first)
         if first < 0 and start is not None:
-            if last == 0:  # a fade begins where the camera is, or near the link
+            if last == 0 < len(steps):  # a fade begins where the camera is, or near the link
                 places = places[1:]
             else:
                 legs = [-1, *legs]
@@ -151,21 +166,11 @@ def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
     return math.atan2(direction[0], direction[2]), math.asin(min(max(-float(direction[1]), -1.0), 1.0))
 
 
-def find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
-    """The level way, in world axes, along the link between two nodes; None without one, and if it is vertical."""
-    direction = tour.find_direction(start, end)
-    if direction is None:
-        return None
-    flat = direction - (direction @ tour.level_axes[:, 1]) * tour.level_axes[:, 1]
-    length = float(np.linalg.norm(flat))
-    return None if length < 0.1 else _LINK_METRES / length * flat
-
-
 def _find_arrival(tour: TourGraph, start: int, end: int) -> tuple[float, float] | None:
     """Yaw and pitch of a camera after a fade; None to keep the heading."""
     back, view = find_way_along_link(tour, end, start), tour.find_start_view(end)
     if back is not None:
-        return find_angles(-tour.level_axes.T @ back / _LINK_METRES)
+        return find_angles(-tour.level_axes.T @ back / np.linalg.norm(back))
     return None if view is None else find_angles(tour.level_axes.T @ view)
 
 

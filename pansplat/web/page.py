@@ -44,6 +44,7 @@ from pansplat.tours import (
     choose_camera_height,
     find_angles,
     find_camera_height,
+    find_link_ring,
     find_way_along_link,
     make_graph,
     plan_route,
@@ -63,7 +64,6 @@ _START_FOV = 75.0  # degrees, vertical
 _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
-_LINK_METRES = (1.0, 3.0)  # distance of a link's ring
 _BATCH = 256  # quads that are drawn together
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag")}
@@ -169,19 +169,19 @@ def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
 
     Args:
         scene: of `_prepare`.
-        tour: in metres.
+        tour: in the unit of the scene before.
         factor: of the scene's unit.
     """
     views = tuple(range(len(scene.cam2world)))
-    first = tour.find_start_view(0) if len(tour) else None
     if not tour.overlaps:
+        first = tour.find_start_view(0) if len(tour) else None
         start = path_poses(scene.cam2world)[0]
         level = start[:3, :3].numpy()
         yaw, pitch = (0.0, 0.0) if first is None else find_angles(level.T @ first)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
-    walk = tour.plan_walk(None if first is None else 0)
+    walk = tour.plan_walk()
     route = plan_route(tour, [*walk, *tour.find_walk(walk[-1], walk[0])[1:]])  # ends where it begins
     samples, jumps = _resample(route, factor)
     start = torch.from_numpy(route.pose(0.0))
@@ -369,7 +369,7 @@ def _describe_links(
     """The links of a page; those to other parts have a ring on the floor, and a place where the fade begins.
 
     Args:
-        tour: in metres.
+        tour: in the unit of the scene.
         positions, heights: of the cameras, in the page's unit.
         level: axes of a level camera.
         factor: of the page's unit.
@@ -377,15 +377,12 @@ def _describe_links(
     links = []
     for (start, end), link in tour.links.items():
         found: dict[str, Any] = {"from": start, "to": end, "text": link.text}
-        way, direction = find_way_along_link(tour, start, end), tour.find_direction(start, end)
-        if way is not None and direction is not None and tour.is_fade(start, end):
-            fall = float(direction @ level[:, 1])
-            least, most = _LINK_METRES
-            distance = heights[start] * math.sqrt(1 - fall**2) / fall if fall > 0 else most
-            flat = min(max(distance, least), most) / np.linalg.norm(way) * way
-            found["mark"] = _round(positions[start] + flat + heights[start] * level[:, 1])
+        way = find_way_along_link(tour, start, end)
+        ring = find_link_ring(tour, start, end, heights[start] / factor)
+        if way is not None and ring is not None and tour.is_fade(start, end):
+            found["mark"] = _round(positions[start] + factor * ring)
             found["leave"] = _round(positions[start] + factor * way)
-            found["yaw"] = round(find_angles(level.T @ direction)[0], 5)
+            found["yaw"] = round(find_angles(level.T @ way / np.linalg.norm(way))[0], 5)
         links.append(found)
     return links
 

@@ -105,7 +105,7 @@ def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
     monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
     monkeypatch.setattr(export_module, "_FEW_GAUSSIANS", 200_000)
     first, second = pipeline.load_pairs(write_tour(tmp_path / "house", height=64))
-    alone = dataclasses.replace(second.context[1], part=1, title="Attic")
+    alone = dataclasses.replace(second.context[1], world=1, title="Attic")
     single = dataclasses.replace(second, context=(alone,))
     command = ["export", str(tmp_path / "house"), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
     for name, pairs, note in (

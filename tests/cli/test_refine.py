@@ -43,6 +43,19 @@ def test_a_budget_limits_the_gaussians(room: Path, tmp_path: Path, capsys) -> No
     assert "(given: 1,024)" in capsys.readouterr().out
 
 
+def test_a_single_view_is_written_as_it_is(room: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("pansplat.refinement.Refinement.step", None)
+    photograph, out, report = room / "a.png", tmp_path / "refined.ply", tmp_path / "report.json"
+    options = ["--model", "sphere", "--height", HEIGHT]
+    assert refine(photograph, out, *options, "--report", report) == 0
+    assert capsys.readouterr().out.count("a single view is not refined") == 1
+    assert json.loads(report.read_text())["steps"] == 0
+    assert run(["predict", str(photograph), "-o", str(tmp_path / "scene.ply"), *map(str, options)]) == 0
+    assert out.read_bytes() == (tmp_path / "scene.ply").read_bytes()
+    assert refine(photograph, tmp_path / "few.ply", *options, "--gaussians", 100) == 0
+    assert len(pipeline.load(tmp_path / "few.ply").gaussians) <= 100
+
+
 def test_ctrl_c_ends_the_refinement_and_writes_the_scene(room: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     from pansplat.refinement import Refinement
 

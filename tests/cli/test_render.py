@@ -1,6 +1,7 @@
 """`pansplat render`: images and videos of scenes and pairs, camera poses, refused arguments."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -12,6 +13,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.data.images import read_depth
+from pansplat.tours import find_tours
 
 HEIGHT = 64
 
@@ -73,6 +75,37 @@ def test_a_video_moves_between_the_cameras(scene: Path, tmp_path: Path) -> None:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert len(frames) == 4 and frames[0].shape == (18, 32, 3)
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
+
+
+@pytest.fixture
+def parted_scene(room: Path, tmp_path: Path) -> Path:
+    """The scene of two panoramas in one part and one in another part, far away."""
+    (pair,) = pipeline.load_pairs(room)
+    alone = replace(pair, context=(replace(pair.targets[0], world=1),), targets=())
+    (tour,) = find_tours([replace(pair, targets=()), alone])
+    pipeline.save(pipeline.predict_tour(tour, "sphere", height=HEIGHT, cache=False), tmp_path / "tour.ply")
+    return tmp_path / "tour.ply"
+
+
+def test_the_camera_stays_at_the_panoramas_of_parts_and_fades_between_them(
+    parted_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places, seen = pipeline.load(parted_scene).cam2world[:, :3, 3], []
+    draw = pipeline.render
+
+    def record(scene, pose, **options):
+        seen.append(torch.as_tensor(pose)[:3, 3])
+        return draw(scene, pose, **options)
+
+    monkeypatch.setattr(pipeline, "render", record)
+    for fraction in (None, 0.3, 0.9):
+        render(parted_scene, tmp_path / "x.png", *([] if fraction is None else ["--at", fraction]))
+    assert run(["render", str(parted_scene), "-o", str(tmp_path / "x.mp4"), "--height", "18", "--fps", "6"]) == 0
+    with av.open(str(tmp_path / "x.mp4")) as video:
+        count = sum(1 for _ in video.decode(video=0))
+    assert len(seen) > 3 + count, "the frames of the fade mix two images"
+    distances = (torch.stack(seen)[:, None] - places).norm(dim=2)
+    assert distances.min(dim=1).values.max() < 1.01 and set(distances.argmin(dim=1).tolist()) == {0, 1, 2}
 
 
 def test_stereo_panoramas_have_the_left_eye_above_the_right(scene: Path, tmp_path: Path) -> None:

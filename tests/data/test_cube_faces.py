@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pansplat.data.cube_faces import find_layout, group_faces
-from pansplat.data.cube_images import write_cube
+from pansplat.data.cube_faces import find_gap, find_layout, group_faces
+from pansplat.data.cube_images import CubeLevel, write_cube
 from pansplat.data.images import read_panorama
 
 NAMES = {
@@ -51,6 +51,26 @@ def test_faces_of_several_sizes_are_left_out_with_a_warning(tmp_path: Path, colo
         Image.fromarray(color_face(face, 8 if face == "u" else 16)).save(file)
     with pytest.warns(UserWarning, match=r"hall_u\.png: needed six square cube faces of one size.* got 8x8"):
         assert group_faces(files) == ({}, [])
+
+
+def test_a_damaged_face_is_named(tmp_path: Path, color_face) -> None:
+    files = [tmp_path / f"hall_{face}.png" for face in "frblud"]
+    for face, file in zip("frblud", files, strict=True):
+        Image.fromarray(color_face(face, 16)).save(file)
+    files[2].write_bytes(files[2].read_bytes()[:-30])
+    with pytest.warns(UserWarning, match=r"cube faces are left out: .*hall_b\.png: needed a complete image"):
+        assert group_faces(files) == ({}, [])
+
+
+def test_a_gap_of_a_level_is_a_missing_or_damaged_tile(tmp_path: Path, write_tiles) -> None:
+    write_tiles(40, 16, lambda face, row, column: tmp_path / f"40/{face}/{row}_{column}.jpg")
+    level = CubeLevel(40, 16, tuple(f"40/{face}/{{row}}_{{column}}.jpg" for face in "frblud"))
+    assert find_gap(level, tmp_path) is None
+    tile = tmp_path / "40/l/1_2.jpg"
+    tile.write_bytes(tile.read_bytes()[:-30])
+    assert find_gap(level, tmp_path) == "40/l/1_2.jpg is damaged"
+    tile.unlink()
+    assert find_gap(level, tmp_path) == "40/l/1_2.jpg is missing"
 
 
 LAYOUTS = {

@@ -60,13 +60,29 @@ def test_two_images_with_poses_are_a_pair(tmp_path: Path) -> None:
     assert pair.load_targets(8).images.shape == (0, 3, 8, 16)
 
 
-def test_the_path_may_be_the_pose_file_and_images_are_read_only_by_load_context(tmp_path: Path) -> None:
+def test_the_path_may_be_the_pose_file_and_pixels_are_decoded_only_by_load_context(tmp_path: Path, monkeypatch) -> None:
     folder = _folder(tmp_path / "room")
-    (folder / "left.png").write_bytes(b"")
+    monkeypatch.setattr("pansplat.data.images._decode", None)
     assert load_pairs(folder / "poses.json")[0].name == load_pairs(str(folder))[0].name == "room"
-    (pair,) = load_pairs(folder)
-    with pytest.raises(InputError, match="0 bytes"):
-        pair.load_context(8)
+
+
+def test_a_damaged_picture_of_three_is_left_out_with_its_pairs(tmp_path: Path) -> None:
+    names = ("left.png", "middle.png", "right.png")
+    folder = _folder(tmp_path / "room", names)
+    (folder / "middle.png").write_bytes((folder / "middle.png").read_bytes()[:-30])
+    groups = [{"context": list(names[:2])}, {"context": ["left.png", "right.png"], "target": "middle.png"}]
+    for pairs in (None, groups):
+        if pairs is not None:
+            (folder / "pairs.json").write_text(json.dumps({"pairs": pairs}))
+        with pytest.warns(UserWarning, match=r"left out: .*middle\.png: needed a complete image"):
+            (pair,) = load_pairs(folder)
+        assert [view.name for view in pair.context] == ["left", "right"] and not pair.targets
+    write_image(folder / "middle.png", torch.full((3, 16, 24), 0.5))
+    with pytest.warns(UserWarning, match=r"left out: .*middle\.png: needed a 2:1"):
+        assert len(load_pairs(folder)) == 1
+    (folder / "left.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"left\.png: needed an image, got a file of 0 bytes"):
+        load_pairs(folder)
 
 
 def test_a_pair_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
@@ -293,9 +309,9 @@ def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
         load_pairs(tmp_path / "note.txt")
 
 
-def _check_single_view(pair, name: str, part: int = 0) -> None:
+def _check_single_view(pair, name: str, world: int = 0) -> None:
     (view,) = pair.context
-    assert (pair.name, view.part, pair.targets) == (name, part, ())
+    assert (pair.name, view.world, pair.targets) == (name, world, ())
     assert torch.equal(view.cam2world, torch.eye(4, dtype=torch.float64))
 
 
@@ -340,11 +356,76 @@ def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path,
     _write_panorama(folder / "film_frame.png")  # with the metadata of an own rendering
     with pytest.warns(UserWarning, match=r"poses\.json has no pose of attic\.jpg, cellar\.png; each is a scene"):
         pair, attic, cellar = load_pairs(folder)
-    assert (pair.name, [view.part for view in pair.context]) == ("room", [0, 0])
+    assert (pair.name, [view.world for view in pair.context]) == ("room", [0, 0])
     _check_single_view(attic, "attic", 1)
     _check_single_view(cellar, "cellar", 2)
     assert attic.context[0].mask is None
-    assert set(attic.siblings) == {folder / n for n in ("left.png", "right.png", "attic.jpg", "cellar.png")}
+    names = ("attic.jpg", "cellar.png", "left.png", "right.png")
+    assert attic.siblings == tuple(folder / name for name in names), "in file order"
+
+
+def test_panoramas_beside_posed_ones_in_subfolders_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
+    names = ("up/hall.png", "up/bath.png", "down/cellar.png")
+    folder = _folder(tmp_path / "house", names)
+    for name in ("up/attic.jpg", "down/hall.jpg", "loose.jpg"):
+        write_scene(folder / name, 8)
+    (folder / "links.json").write_text(json.dumps({"attic": [{"to": "down_hall", "yaw": 1}]}))
+    with pytest.warns(UserWarning, match=r"poses\.json has no pose of loose\.jpg, attic\.jpg, hall\.jpg; each is"):
+        *pairs, loose, attic, hall = load_pairs(folder)
+    assert len(pairs) == 2
+    for number, (pair, name) in enumerate(((loose, "loose"), (attic, "attic"), (hall, "down_hall")), start=1):
+        _check_single_view(pair, name, number)
+    assert attic.context[0].links == (Link("down_hall", 1.0),)
+
+
+def test_panoramas_of_other_folders_are_named_in_a_note(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "house" / "up")
+    write_scene(folder / "more" / "attic.jpg", 8)
+    write_scene(folder.parent / "garden.jpg", 8)
+    write_scene(folder.parent / "old" / "img" / "hall.jpg", 8)
+    (folder.parent / "old" / "tour.json").write_text(json.dumps({"panorama": "img/hall.jpg"}))
+    with pytest.warns(UserWarning) as caught:
+        (pair,) = load_pairs(folder.parent)
+    assert pair.name == "up"
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == 3
+    assert f"{folder.parent}: panoramas are left out" in messages[0] and "garden.jpg" in messages[0]
+    assert f"{folder.parent / 'old' / 'tour.json'} is another tour" in messages[1]
+    assert f"{folder / 'more'}: panoramas are left out" in messages[2] and "attic.jpg" in messages[2]
+
+
+def test_panoramas_below_or_beside_those_of_a_folder_without_poses_are_named(tmp_path: Path, write_scene) -> None:
+    write_scene(tmp_path / "hall.jpg", 8)
+    write_scene(tmp_path / "up" / "attic.jpg", 8)
+    with pytest.warns(UserWarning, match=r"up: panoramas are left out, .*: attic\.jpg; open"):
+        assert len(load_pairs(tmp_path)) == 1
+    (tmp_path / "tour.json").write_text(json.dumps({"panorama": "up/attic.jpg"}))
+    with pytest.warns(UserWarning, match=r"panoramas are left out, .*: hall\.jpg; open"):
+        assert load_pairs(tmp_path)[0].context[0].image.name == "attic.jpg"
+
+
+def test_posed_panoramas_in_no_pair_are_scenes_of_their_own(tmp_path: Path) -> None:
+    names = ("left.png", "right.png", "attic.png")
+    folder = _folder(tmp_path / "house", names)
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": list(names[:2])}]}))
+    with pytest.warns(UserWarning, match=r"in no pair of pairs\.json, and each a scene of its own: attic\.png"):
+        pair, attic = load_pairs(folder)
+    assert (pair.name, attic.name, attic.targets) == ("house", "attic", ())
+    assert attic.context[0].cam2world.tolist() == _pose(2) and attic.context[0].world == 0
+
+
+def test_frames_of_360loc_without_a_pose_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
+    names = _sequence(tmp_path)
+    (tmp_path / "camera_pose.json").write_text(json.dumps({name: _pose(i) for i, name in enumerate(names)}))
+    write_scene(tmp_path / "image" / "lost.jpg", 8)
+    write_scene(tmp_path / "loose.jpg", 8)
+    with (
+        pytest.warns(UserWarning, match=r"camera_pose\.json has no pose of lost\.jpg; each is a scene of its own"),
+        pytest.warns(UserWarning, match=r"panoramas are left out, .*: loose\.jpg; open"),
+    ):
+        pairs = load_pairs(tmp_path)
+    assert [len(pair.context) for pair in pairs] == [2, 2, 1]
+    _check_single_view(pairs[2], "lost", 1)
 
 
 def test_other_pictures_of_a_posed_folder_are_named(tmp_path: Path) -> None:
@@ -365,7 +446,7 @@ def test_poses_of_one_panorama_are_enough(tmp_path: Path, write_scene) -> None:
     write_scene(folder / "other.jpg", 8)
     with pytest.warns(UserWarning, match=r"no pose of other\.jpg"):
         first, second = load_pairs(folder)
-    assert (first.name, first.context[0].part) == ("only", 0)
+    assert (first.name, first.context[0].world) == ("only", 0)
     _check_single_view(second, "other", 1)
 
 

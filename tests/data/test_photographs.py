@@ -42,6 +42,26 @@ def test_pictures_that_cannot_be_used_are_named_and_the_others_open(tmp_path: Pa
         list_photographs(tmp_path)
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+def test_a_damaged_picture_is_named_and_the_others_open(tmp_path: Path, write_scene, suffix: str) -> None:
+    for name in "ab":
+        write_scene(tmp_path / f"{name}.{suffix}", 64)
+    whole = (tmp_path / f"b.{suffix}").read_bytes()
+    middle = len(whole) // 2
+    flipped = whole[:middle] + bytes([whole[middle] ^ 255]) + whole[middle + 1 :]
+    for content in (whole[:-30], *([flipped] if suffix == "png" else [])):
+        (tmp_path / f"b.{suffix}").write_bytes(content)
+        with pytest.warns(UserWarning, match=rf"left out: .*b\.{suffix}: needed a complete image"):
+            assert [panorama.name for panorama in list_photographs(tmp_path)] == ["a"]
+
+
+def test_a_picture_with_other_data_behind_it_is_whole(tmp_path: Path, write_scene) -> None:
+    write_scene(tmp_path / "a.jpg", 64)
+    with open(tmp_path / "a.jpg", "ab") as file:
+        file.write(b"SEFT" * 9)  # as some phones do
+    assert len(list_photographs(tmp_path)) == 1
+
+
 def test_own_renderings_count_only_if_there_is_nothing_else(tmp_path: Path, write_panorama, write_scene) -> None:
     for name in ("out.png", "out_2.jpg"):
         write_panorama(tmp_path / name)

@@ -47,7 +47,7 @@ def test_the_panoramas_that_are_not_placed_are_scenes_of_their_own(tmp_path: Pat
         with pytest.warns(UserWarning) as caught:
             pairs = _load(tmp_path)
         assert [pair.name for pair in pairs] == ["a-c", "c-d", "b", "e"]
-        assert [[view.part for view in pair.context] for pair in pairs] == [[0, 0], [0, 0], [1], [2]]
+        assert [[view.world for view in pair.context] for pair in pairs] == [[0, 0], [0, 0], [1], [2]]
         assert pairs[1].context[1].cam2world[0, 3] == 2 and (pairs[0].near, pairs[0].far) == (0.3, 7.0)
         assert torch.equal(pairs[2].context[0].cam2world, torch.eye(4, dtype=torch.float64))
         assert pairs[2].context[0].title == "Bath" and pairs[2].context[0].links[0].target == "c"
@@ -65,7 +65,7 @@ def test_if_none_is_placed_all_are_scenes_of_their_own(tmp_path: Path, monkeypat
     for _ in range(2):
         with pytest.warns(UserWarning) as caught:
             pairs = _load(tmp_path)
-        assert [(pair.name, pair.context[0].part) for pair in pairs] == [("a", 0), ("b", 1)]
+        assert [(pair.name, pair.context[0].world) for pair in pairs] == [("a", 0), ("b", 1)]
         assert [f"{name}.png has no pose" in str(w.message) for name, w in zip("ab", caught, strict=True)] == [True] * 2
         monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)
 
@@ -81,24 +81,68 @@ def test_a_changed_picture_is_estimated_anew(tmp_path: Path, monkeypatch) -> Non
         assert [pair.name for pair in _load(tmp_path)] == [tmp_path.name, "c"]
 
 
+def test_a_renamed_scene_and_a_new_mask_are_estimated_anew(tmp_path: Path, monkeypatch) -> None:
+    _write(tmp_path, "a.png", "b.png")
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "b.png"))
+    for keys in (("hall", "bath"), ("Halle", "Bad")):
+        scenes = {key: {"panorama": f"{file}.png"} for key, file in zip(keys, "ab", strict=True)}
+        (tmp_path / "tour.json").write_text(json.dumps({"scenes": scenes}))
+        with pytest.warns(UserWarning, match="2 of 2 panoramas"):
+            (pair,) = _load(tmp_path)
+        assert tuple(view.name for view in pair.context) == keys
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((8, 16), 255, np.uint8))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png"))
+    with pytest.warns(UserWarning, match="1 of 2 panoramas"), pytest.warns(UserWarning, match=r"b\.png has no pose"):
+        assert len(_load(tmp_path)) == 2
+
+
+def test_the_mask_of_cube_faces_is_used(tmp_path: Path, monkeypatch) -> None:
+    for number, (name, face) in enumerate((name, face) for name in "ab" for face in "frblud"):
+        noise = np.random.default_rng(number).integers(0, 255, (8, 8, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{name}_{face}.png"), cv2.resize(noise, (128, 128), interpolation=cv2.INTER_CUBIC))
+    mask = np.full((16, 32), 255, np.uint8)
+    mask[8:] = 0
+    cv2.imwrite(str(tmp_path / "b_mask.png"), mask)
+    shown = []
+
+    def detect(pixels, scene, **options) -> None:
+        shown.append(float(scene.mean()))
+        raise InterruptedError
+
+    monkeypatch.setattr("pansplat.poses.estimate.detect_features", detect)
+    with pytest.raises(InterruptedError):
+        _load(tmp_path)
+    assert sorted(shown)[0] == 0.5
+
+
 def test_a_damaged_picture_is_named_and_the_others_open(tmp_path: Path) -> None:
     _write(tmp_path, "a.png", "b.png")
     whole = (tmp_path / "b.png").read_bytes()
     (tmp_path / "b.png").write_bytes(whole[:-30])
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning, match=r"left out: .*b\.png: needed a complete image"):
         (pair,) = _load(tmp_path)
-    assert (pair.name, pair.context[0].part) == ("a", 0)
-    messages = [str(warning.message) for warning in caught]
-    assert any("b.png cannot be read and is left out: needed a complete image" in message for message in messages)
-    assert any("a.png has no pose and is a scene of its own" in message for message in messages)
+    assert (pair.name, pair.context[0].name) == (tmp_path.name, "a")
     assert pair.siblings == (tmp_path / "a.png",)
+
+
+def test_a_picture_that_looks_whole_and_cannot_be_decoded_is_left_out(tmp_path: Path) -> None:
+    _write(tmp_path, "a.png", "b.jpg", "c.png")
+    content = (tmp_path / "b.jpg").read_bytes()
+    table = content.index(b"\xff\xc4") + 5  # numbers of codes of each length
+    (tmp_path / "b.jpg").write_bytes(content[:table] + bytes([255] * 16) + content[table + 16 :])
+    with pytest.warns(UserWarning) as caught:
+        pairs = _load(tmp_path)
+    assert [pair.name for pair in pairs] == ["a", "c"]
+    messages = [str(warning.message) for warning in caught]
+    assert any("b.jpg cannot be read and is left out: needed a complete image" in message for message in messages)
+    assert any("a.png has no pose and is a scene of its own" in message for message in messages)
 
 
 def test_if_no_picture_can_be_read_the_reasons_are_an_error(tmp_path: Path) -> None:
     _write(tmp_path, "a.png", "b.png")
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-30])
-    with pytest.raises(InputError, match=r"a\.png: needed a complete image.*; b\.png: needed a complete image"):
+    with pytest.raises(InputError, match=r"a\.png: needed a complete image.*; .*b\.png: needed a complete image"):
         _load(tmp_path)
 
 
@@ -120,11 +164,11 @@ def test_the_panoramas_of_a_web_tour_keep_titles_links_and_start_views(tmp_path:
         ):
             pair, attic = pansplat.load_pairs(path)
         hall, bath = pair.context
-        assert [(view.name, view.label, view.part) for view in (hall, bath)] == [
+        assert [(view.name, view.label, view.world) for view in (hall, bath)] == [
             ("hall", "Hall", 0),
             ("bath", "Bath", 0),
         ]
         assert hall.links[0].target == "bath" and hall.start is not None and bath.cam2world[0, 3] == 1
-        assert (attic.name, attic.context[0].part) == ("attic", 1)
+        assert (attic.name, attic.context[0].world) == ("attic", 1)
         assert (attic.context[0].links[0].target, attic.context[0].links[0].text) == ("bath", "to the bath")
         assert attic.folder == tmp_path

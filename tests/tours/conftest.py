@@ -36,18 +36,18 @@ def comb() -> TourGraph:
 
 @pytest.fixture
 def home(make_tour) -> TourGraph:
-    """A tour of four parts: p0 to p2 in a row, p4 and p5 in another world with z up, and p3 and p6 alone.
+    """A tour of four worlds: p0 to p2 in a row, p4 and p5 in one with z up, and p3 and p6 alone.
 
     A link leads from p2 to p3 on the left, one back behind p3, and one from p3 to p6 ahead.
     """
-    places, parts = ((0, 0), (0, 1), (0, 2), (0, 0), (5, 5), (5, 6), (0, 0)), (1, 1, 1, 2, 3, 3, 4)
+    places, worlds = ((0, 0), (0, 1), (0, 2), (0, 0), (5, 5), (5, 6), (0, 0)), (1, 1, 1, 2, 3, 3, 4)
     turn = torch.eye(4, dtype=torch.float64)
     turn[:3, :3] = torch.tensor(((1.0, 0, 0), (0, 0, 1), (0, -1, 0)))
     links = {2: (Link("p3", -math.pi / 2, 0.4, "to the hall"),), 3: (Link("p2", math.pi, 0.3), Link("p6", 0.0))}
     panoramas = [
-        dataclasses.replace(panorama, part=part, links=links.get(node, ()), cam2world=pose)
-        for node, (panorama, part) in enumerate(zip(make_tour(places, ()).panoramas, parts, strict=True))
-        for pose in [turn @ panorama.cam2world if part == 3 else panorama.cam2world]
+        dataclasses.replace(panorama, world=world, links=links.get(node, ()), cam2world=pose)
+        for node, (panorama, world) in enumerate(zip(make_tour(places, ()).panoramas, worlds, strict=True))
+        for pose in [turn @ panorama.cam2world if world == 3 else panorama.cam2world]
     ]
     siblings = tuple(panorama.image for panorama in panoramas)
     groups = ((0, 1), (1, 2), (3,), (4, 5), (6,))

@@ -36,6 +36,17 @@ def test_pairs_that_share_panoramas_are_one_tour(make_tour):
     assert len(tour) == 5
 
 
+def test_a_walk_starts_at_the_first_panorama_if_that_has_a_start_view(comb):
+    assert comb.plan_walk()[0] != 1
+    order = [1, 0, 2, 3, 4, 5]
+    first, *others = (comb.panoramas[node] for node in order)
+    overlaps = {(0, 1): 0.3, (0, 2): 0.3, (2, 3): 0.3, (0, 4): 0.3, (2, 5): 0.3}
+    tour = dataclasses.replace(comb, panoramas=(first, *others), overlaps=overlaps)
+    assert tour.plan_walk()[0] != 0, "a walk from there is longer"
+    started = dataclasses.replace(tour, panoramas=(dataclasses.replace(first, start=(0.3, 0.0)), *others))
+    assert started.plan_walk()[0] == 0 and started.plan_walk(3)[0] == 3
+
+
 def test_a_walk_follows_edges_and_visits_all_panoramas(comb):
     for start in (None, 0, 2, 4):
         walk = comb.plan_walk(start)
@@ -77,17 +88,42 @@ def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
     assert find_tours([pairs[0], elsewhere]) == [], "each folder has its own tour"
 
 
-def test_parts_are_level_and_far_apart(home):
+def test_single_views_are_between_the_other_panoramas_of_a_tour_in_file_order(make_tour):
+    a, b, c = make_tour([(0, 0), (0, 1), (0, 2)], ()).panoramas
+    together = Pair("", Path("house"), (a, c), (), 0.45, 10.0, (a.image, c.image))
+    alone = Pair("", Path("house"), (dataclasses.replace(b, world=1),), (), 0.45, 10.0, (a.image, b.image, c.image))
+    (tour,) = find_tours([together, alone])
+    assert [panorama.name for panorama in tour.panoramas] == ["p0", "p1", "p2"] and tour.parts == (0, 1, 0)
+    assert set(tour.overlaps) == {(0, 2), (1, 1)} and tour.make_pair((0, 2)).context == (a, c)
+
+
+def test_the_depth_range_of_a_tour_is_that_of_the_pairs_with_several_views(home):
+    together, alone = home.make_pair((0, 1)), home.make_pair((3,))
+    (tour,) = find_tours([dataclasses.replace(together, near=0.8, far=4.0), alone])
+    assert (tour.near, tour.far) == (0.8, 4.0) and (alone.near, alone.far) == (0.45, 10.0)
+    (tour,) = find_tours([alone, home.make_pair((6,))])
+    assert (tour.near, tour.far) == (0.45, 10.0)
+
+
+def test_a_panorama_in_no_pair_is_a_part_of_its_own_at_its_place(make_tour):
+    a, b, c = make_tour(((0, 0), (0, 1), (3, 0)), ()).panoramas
+    images = (a.image, b.image, c.image)
+    (tour,) = find_tours([Pair("", Path(), context, (), 0.45, 10.0, images) for context in ((a, b), (c,))])
+    assert tour.parts == (0, 0, 1) and set(tour.overlaps) == {(0, 1), (2, 2)}
+    assert np.allclose(tour.positions, [(0, 0, 0), (0, 0, 1), (3, 0, 0)]), "they have a common world"
+
+
+def test_worlds_are_level_and_far_apart(home):
     distances = np.linalg.norm(home.positions[:, None] - home.positions[None], axis=2)
     parts = np.array(home.parts)
     assert distances[parts[:, None] != parts].min() >= 8
     assert distances[4, 5] == pytest.approx(1) and np.allclose(home.positions[:3], [(0, 0, z) for z in range(3)])
     axes = home.cam2world[:, :3, :3].numpy()
-    assert np.allclose(axes, np.eye(3)), "up is up, and the first panorama of each part looks ahead"
+    assert np.allclose(axes, np.eye(3)), "up is up, and the first panorama of each world looks ahead"
     assert np.allclose(home.positions[:, 1], 0), "the cameras have one height"
     pair = home.make_pair((4, 5))
     (place, _), poses = pair.context, torch.stack([panorama.cam2world for panorama in pair.context])
-    assert np.allclose(place.cam2world[:3, 3], (5, 5, 0)), "scenes are predicted in the world of their part"
+    assert np.allclose(place.cam2world[:3, 3], (5, 5, 0)), "scenes are predicted in their own world"
     means = poses[:, :3, 3].float() + place.cam2world[:3, 2].float()  # 1 m ahead
     gaussians = dataclasses.replace(make_gaussians(2), means=means)
     scene = home.place(Scene(gaussians, poses, 1.0, 2.0), (4, 5))
@@ -101,7 +137,7 @@ def test_parts_are_level_and_far_apart(home):
 
 def test_two_hundred_parts_stay_near_each_other(make_tour):
     single = make_tour(((0, 0),), ()).panoramas[0]
-    panoramas = tuple(dataclasses.replace(single, image=Path(f"{k}.jpg"), part=k) for k in range(200))
+    panoramas = tuple(dataclasses.replace(single, image=Path(f"{k}.jpg"), world=k) for k in range(200))
     (tour,) = find_tours([Pair("", Path(), (panorama,), (), 0.45, 10.0, ()) for panorama in panoramas])
     assert np.ptp(tour.positions, axis=0).max() < 250 and len(tour.plan_walk()) == 200
 

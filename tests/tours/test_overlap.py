@@ -33,6 +33,6 @@ def test_panoramas_of_one_room_overlap_and_those_of_two_rooms_do_not(tmp_path, m
     assert set(overlaps) == {(0, 1), (0, 2), (1, 2), (0, 3)}, "given edges are kept, self-edges where there is no other"
     assert min(overlaps[0, 1], overlaps[0, 2], overlaps[1, 2]) > 0.25 > 0.1 > overlaps[0, 3]
     assert tasks == sorted(tasks) and tasks[-1] < 1
-    other_world = dataclasses.replace(tour.panoramas[2], part=1)
+    other_world = dataclasses.replace(tour.panoramas[2], world=1)
     parts = dataclasses.replace(given, panoramas=(*tour.panoramas[:2], other_world, tour.panoramas[3]))
     assert set(connect(parts).overlaps) == {(0, 1), (0, 3), (2, 2)}, "only panoramas of one world are compared"

@@ -45,6 +45,15 @@ def test_a_route_to_the_panorama_at_the_camera_stays_there(comb):
     assert np.allclose(route.pose(0.5), pose)
 
 
+def test_a_route_to_the_only_panorama_of_its_walk_flies_there(comb):
+    start = np.eye(4)
+    start[2, 3] = 1.4
+    walk = comb.find_way(start[:3, 3], 2)
+    route = plan_route(comb, walk, start)
+    assert walk == [2] and route.walk == (2,), "an end of the edge at the camera"
+    assert np.allclose(route.pose(0), start) and np.allclose(route.pose(1)[:3, 3], comb.positions[2])
+
+
 def test_the_camera_looks_along_its_way_in_any_world(comb):
     turn = torch.tensor(((1.0, 0, 0), (0, 0, 1), (0, -1, 0)), dtype=torch.float64)  # z up
     panoramas = []
@@ -76,6 +85,20 @@ def test_a_route_goes_along_a_link_then_jumps_and_looks_away_from_the_link_back(
     assert np.linalg.norm(places[:, None] - home.positions[None], axis=2).min(axis=1).max() < 0.8, "never between parts"
     seen = [route.edge(k / count) for k in range(count + 1)]
     assert [edge for edge, _ in itertools.groupby(seen)] == [(1, 2), (3, 3), (6, 6)]
+
+
+def test_the_last_view_of_a_part_fades_out_for_a_second_after_a_jump(home):
+    route = plan_route(home, [1, 2, 3])
+    (jump,) = route.jumps
+    steps = len(route.legs) - 1
+    before, after = ([route.fade((jump + k) / steps) for k in range(*span)] for span in ((-9, 1), (1, 70)))
+    assert all(len(frame) == 1 for frame in before) and len(after[-1]) == 1
+    weights = [frame[-1][1] for frame in after[:60]]
+    assert np.all(np.diff(weights) > 0) and weights[0] < 0.01 and weights[-1] == 1
+    for k, frame in enumerate(after, start=1):
+        assert sum(weight for _, weight in frame) == pytest.approx(1)
+        assert np.array_equal(frame[-1][0], route.pose((jump + k) / steps))
+        assert len(frame) == 1 or np.allclose(frame[0][0], route.pose(jump / steps))
 
 
 def test_a_fade_without_a_link_begins_at_once_and_ends_in_the_start_view_or_the_heading(home):

@@ -86,6 +86,17 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     assert len(jumps) == 3 and steps[jumps].min() > 10 and np.delete(steps, jumps).max() < 1.05 / header["routeRate"]
 
 
+def test_links_have_the_same_lengths_in_a_page_of_another_unit(flat: Scene, tmp_path: Path) -> None:
+    write_page(flat, tmp_path / "metres.html")
+    write_page(flat.scaled(2.0**-12), tmp_path / "small.html")
+    metres, small = (read_header(tmp_path / f"{name}.html") for name in ("metres", "small"))
+    factor = small["spots"][0]["radius"] / metres["spots"][0]["radius"]  # of the units of the pages
+    assert factor == pytest.approx(1, abs=0.01)
+    for first, second in zip(metres["links"], small["links"], strict=True):
+        for place in ("mark", "leave"):
+            assert second[place] == pytest.approx(first[place], abs=1e-3)
+
+
 @pytest.mark.parametrize(("size", "limit"), [(1.0, 1.0), (0.5, 0.62)])
 def test_the_camera_stays_within_a_metre_of_a_single_photograph(
     scene: Scene, tmp_path: Path, size: float, limit: float

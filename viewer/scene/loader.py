@@ -53,13 +53,20 @@ class SceneEntry:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that the scene is made from, and the folders of the panoramas."""
+        """The files that the scene is made from, those that state its poses and links, and the panoramas' folders."""
         source = self.tour or self.pair
         if self.file is not None or source is None:
             return () if self.file is None else (self.file,)
-        images = [panorama.image for panorama in self.panoramas]
-        stated = [source.folder / name for name in ("poses.json", "pairs.json")]
-        return (*images, *stated, *{image.parent: None for image in images})
+        from pansplat.data.folders import list_stated_files
+        from pansplat.data.images import list_pictures
+
+        files = dict.fromkeys(list_stated_files(source.folder))
+        folders = {source.folder: None}
+        for panorama in self.panoramas:
+            pictures = list_pictures(panorama.image)
+            files |= dict.fromkeys((panorama.image, *pictures, panorama.mask))
+            folders |= {} if len(pictures) > 1 else {panorama.image.parent: None}
+        return (*(file for file in files if file is not None), *folders)
 
     @property
     def folder_name(self) -> str:
@@ -130,9 +137,17 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
         if not scenes:
             raise
         pairs, notes = [], []
+    from pansplat.pipeline import load_model, warn_of_single_views
     from pansplat.tours import find_tours
 
-    entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in find_tours(pairs)]
+    tours = find_tours(pairs)
+    if any(a == b for tour in tours for a, b in tour.overlaps):
+        predictor = load_model(options.model, compat=options.compat, precision=options.precision)
+        with _collect_notes() as replaced:
+            for tour in tours:
+                warn_of_single_views(tour, predictor)
+        notes += replaced
+    entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in tours]
     entries += [SceneEntry(pair.name, pair=pair, notes=tuple(notes)) for pair in pairs]
     return entries + [SceneEntry(p.stem, file=p) for p in scenes]
 
@@ -223,11 +238,10 @@ def _load_tour_scene(
 
     if entry.merged is not None:
         return finish(select_views(entry.merged, views), is_final=True)
+    predictor = pipeline.load_model(options.model, compat=options.compat, precision=options.precision)
     scene = pipeline.predict(
         pair,
-        model=options.model,
-        compat=options.compat,
-        precision=options.precision,
+        model=pipeline.choose_predictor(pair, predictor),
         height=options.height or pipeline.choose_tour_height(pair),
         refine_seconds=options.refine_seconds,
         cache=options.cache,

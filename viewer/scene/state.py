@@ -1,6 +1,5 @@
 """The viewer's state: values that keys and panels change and that a frame reads. Needs neither window nor GL."""
 
-import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,7 +8,7 @@ from jaxtyping import Float
 
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, up_direction
+from pansplat.geometry.path import find_direction, fly_pose, level_pose, look_pose, path_poses, up_direction
 from pansplat.tours import Route, TourGraph
 from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
@@ -94,18 +93,13 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     level = create_level_camera(scene).level
     camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
     if state.flight == 0 and scene.starts and scene.starts[0] is not None:
-        camera = _look_along(camera, scene.cam2world[0].numpy(), *scene.starts[0])
+        forward = find_direction(scene.cam2world[0], *scene.starts[0]).numpy()
+        camera = focus_on_point(camera, np.asarray(camera.position) + forward)
     state.camera = state.home = replace(camera, distance=_measure_distance(scene, 50))
     if before is not None:
         state.camera = replace(before, distance=state.home.distance)
     state.depth_max, state.photograph = _measure_distance(scene, 98), None
     choose_display(state, state.settings.display)
-
-
-def _look_along(camera: Camera, cam2world: Float[np.ndarray, "4 4"], yaw: float, pitch: float) -> Camera:
-    """The camera, turned to a direction of a panorama: to the right of its centre, and below its horizon, radians."""
-    forward = cam2world[:3, :3] @ (math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch))
-    return focus_on_point(camera, np.asarray(camera.position) + forward)
 
 
 def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, *, at: float = 0.0) -> None:

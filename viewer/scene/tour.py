@@ -13,17 +13,25 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import Edge, FloorOutline, Route, TourGraph, Views, choose_camera_height, plan_route
+from pansplat.tours import (
+    FADE_SECONDS,
+    Edge,
+    FloorOutline,
+    Route,
+    TourGraph,
+    Views,
+    choose_camera_height,
+    find_link_ring,
+    plan_route,
+)
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
 
-FADE_SECONDS = 1.0
 DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
 _NEXT_SCENES = 3  # that are predicted before they are needed
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor
 _MIN_HOTSPOT_PIXELS = 14.0
-_LINK_METRES = (1.0, 3.0)  # distance of a link's hotspot on the floor
 
 
 class TourScenes:
@@ -289,8 +297,9 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
     for start in sorted(set(scenes.edge), key=lambda node: float(np.linalg.norm(tour.positions[node] - position))):
         for (first, node), link in tour.links.items():
             if first == start and tour.is_fade(first, node) and node not in feet:
-                way = _find_link_end(tour, first, node, scenes.camera_height, down)
-                feet[node] = (tour.positions[first] + way + below, link.text or tour.panoramas[node].label)
+                ring = find_link_ring(tour, first, node, scenes.camera_height)
+                if ring is not None:
+                    feet[node] = (tour.positions[first] + ring, link.text or tour.panoramas[node].label)
     found = []
     for node, (foot, label) in feet.items():
         angles = np.arange(24) * (2 * np.pi / 24)
@@ -304,19 +313,6 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
         hotspot = Hotspot(node, label, center, float(radius), tuple(ring), is_fade)
         found.append((float(np.linalg.norm(foot - position)), hotspot))
     return [hotspot for _, hotspot in sorted(found, key=lambda item: -item[0])]
-
-
-def _find_link_end(
-    tour: TourGraph, start: int, end: int, height: float, down: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "3"]:
-    """The level way from a camera to where a link meets the floor, 1 to 3 m away."""
-    direction = tour.find_direction(start, end)
-    assert direction is not None
-    fall = float(direction @ down)
-    flat = direction - fall * down
-    length = max(float(np.linalg.norm(flat)), 1e-6)
-    distance = height * length / fall if fall > 1e-6 else _LINK_METRES[1]
-    return min(max(distance, _LINK_METRES[0]), _LINK_METRES[1]) / length * flat
 
 
 def find_clicked(hotspots: Sequence[Hotspot], pixel: tuple[float, float]) -> int | None:

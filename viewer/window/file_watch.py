@@ -8,13 +8,14 @@ from pathlib import Path
 from pansplat.data.pairs import list_panorama_files
 
 _SECONDS = 2.0  # between looks at the files
+_FILES = 500  # that are looked at together, in about a millisecond; a tour of tiles has thousands
 
 
 class FileWatch:
     """Compares the times and sizes of files, and the names of the panoramas in folders, with those at the start.
 
     Attributes:
-        changed: whether a file was changed, removed or made at the last look.
+        changed: whether a file was changed, removed or made at the last look at all files.
     """
 
     def __init__(self) -> None:
@@ -23,17 +24,23 @@ class FileWatch:
         self._files: tuple[Path, ...] = ()
         self._stamps: list[tuple[object, ...] | None] = []
         self._last = -1e9
+        self._next, self._found = 0, False  # of the look at all files that is in progress
 
     def start(self, files: Sequence[Path]) -> None:
         """Watch these files and folders from now on."""
         self._files, self.changed = tuple(files), False
+        self._next, self._found = 0, False
         self._stamps = [_read_stamp(file) for file in self._files]
 
     def look(self, now: float) -> None:
-        """Update `changed` at time `now` (seconds), if the last look was some seconds ago."""
-        if now - self._last >= _SECONDS:
-            self._last = now
-            self.changed = [_read_stamp(file) for file in self._files] != self._stamps
+        """Look at some files at time `now` (seconds), and update `changed` after the last one; then pause."""
+        if self._next == 0 and now - self._last < _SECONDS:
+            return
+        self._last, part = now, slice(self._next, self._next + _FILES)
+        self._found |= [_read_stamp(file) for file in self._files[part]] != self._stamps[part]
+        self._next = part.stop
+        if self._next >= len(self._files):
+            self.changed, self._next, self._found = self._found, 0, False
 
 
 def _read_stamp(file: Path) -> tuple[object, ...] | None:

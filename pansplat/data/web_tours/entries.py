@@ -134,11 +134,6 @@ def plain_text(value: Any) -> str:
     return " ".join("".join(letters).split())[:_MAX_TEXT]
 
 
-def wrap(yaw: float) -> float:
-    """The same direction in [-pi, pi)."""
-    return (yaw + math.pi) % (2 * math.pi) - math.pi
-
-
 def make_panoramas(entries: Sequence[Entry], source: Path) -> list[Panorama]:
     """Panoramas with file-safe, unique names; the same picture counts once. Cube faces get files in the cache folder.
 

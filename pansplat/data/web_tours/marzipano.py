@@ -17,9 +17,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pansplat.data.cube_faces import strip_level
-from pansplat.data.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel, find_missing_file
-from pansplat.data.images import read_size
+from pansplat.data.cube_faces import find_gap, strip_level
+from pansplat.data.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
+from pansplat.data.images import read_size, require_complete
 from pansplat.data.pairs import Link
 from pansplat.data.web_tours.entries import (
     Entry,
@@ -31,10 +31,10 @@ from pansplat.data.web_tours.entries import (
     read_entries,
     read_text,
     require_tiles,
-    wrap,
 )
 from pansplat.data.web_tours.javascript import parse_literal
 from pansplat.errors import InputError, InputWarning
+from pansplat.geometry.path import wrap_angle
 
 _DATA = "data.js"
 _FILES = "app-files"  # folder in the archive of the Tool
@@ -109,7 +109,7 @@ def _read_link(spot: Mapping[str, Any]) -> Link:
 def _read_direction(content: Any) -> tuple[float, float]:
     if not isinstance(content, dict):
         raise InputError(f"needed yaw and pitch, got {str(content)[:_SHOWN]!r}")
-    return wrap(finite_number(content.get("yaw", 0), "yaw")), finite_number(content.get("pitch", 0), "pitch")
+    return wrap_angle(finite_number(content.get("yaw", 0), "yaw")), finite_number(content.get("pitch", 0), "pitch")
 
 
 def _objects(value: Any) -> list[dict[str, Any]]:
@@ -130,18 +130,19 @@ def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[Cube
     for pixels, tile in stated:
         require_tiles(min(pixels, MAX_SIZE), tile)
     attempts = [_find_complete(base, stated, first, folder) for first in (0, 1)]
-    best, missing = max(attempts, key=lambda attempt: len(attempt[0]))
+    best, gap = max(attempts, key=lambda attempt: len(attempt[0]))
     preview = f"{base}/preview.jpg"
     if not best and (folder / preview).is_file():
         width, height = read_size(folder / preview)
+        require_complete(folder / preview)
         best = [strip_level(preview, width, _PREVIEW)] if height == 6 * width else []
+    gap = gap or f"{base} is missing"
     if not best:
-        raise InputError(f"needed all tiles of a level, got no {missing or base}; copy or export the tour again")
+        raise InputError(f"needed all tiles of a level, but {gap}; copy or export the tour again")
     largest = min(max(pixels for pixels, _ in stated), MAX_SIZE) if stated else 0
     if best[-1].size < largest:
         warnings.warn(
-            f"{source}: scene {key!r} is read at {best[-1].size} instead of {largest} pixels a face: "
-            f"{missing or 'a folder of tiles'} is missing.",
+            f"{source}: scene {key!r} is read at {best[-1].size} instead of {largest} pixels a face: {gap}.",
             category=InputWarning,
             stacklevel=4,
         )
@@ -151,19 +152,19 @@ def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[Cube
 def _find_complete(
     base: str, stated: Sequence[tuple[int, int]], first: int, folder: Path
 ) -> tuple[list[CubeLevel], str | None]:
-    """The complete levels, the smallest first, and a missing tile of the others, if the levels count from `first`."""
+    """The complete levels, the smallest first, and a gap of the others, if the levels count from `first`."""
     complete: list[CubeLevel] = []
-    missing = None
+    found = None
     for place, (pixels, tile) in enumerate(stated, start=first):
         level = CubeLevel(pixels, tile, tuple(f"{base}/{place}/{face}/{ROW}/{COLUMN}.jpg" for face in _FACES))
         if pixels > MAX_SIZE or _has_more_tiles(level, folder):
             continue
-        gap = find_missing_file(level, folder)
+        gap = find_gap(level, folder)
         if gap is None:
             complete.append(level)
         elif place:
-            missing = gap
-    return sorted(complete, key=lambda level: level.size), missing
+            found = gap
+    return sorted(complete, key=lambda level: level.size), found
 
 
 def _has_more_tiles(level: CubeLevel, folder: Path) -> bool:

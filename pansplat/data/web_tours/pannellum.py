@@ -17,9 +17,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pansplat.data.cube_faces import find_layout, require_faces
-from pansplat.data.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel, find_missing_file
-from pansplat.data.images import read_size
+from pansplat.data.cube_faces import find_gap, find_layout, require_faces
+from pansplat.data.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
+from pansplat.data.images import read_size, require_complete
 from pansplat.data.pairs import Link
 from pansplat.data.web_tours.entries import (
     MAX_BYTES,
@@ -32,10 +32,10 @@ from pansplat.data.web_tours.entries import (
     read_entries,
     read_text,
     require_tiles,
-    wrap,
 )
 from pansplat.data.web_tours.javascript import parse_literal
 from pansplat.errors import InputError, InputWarning
+from pansplat.geometry.path import wrap_angle
 
 SUFFIXES = (".json", ".html", ".htm", ".js")
 _NAMES = ("tour.json", "pannellum.json", "config.json")  # looked at first
@@ -182,7 +182,7 @@ def _read_link(spot: Mapping[str, Any]) -> Link:
 
 def _read_direction(content: Mapping[str, Any]) -> tuple[float, float]:
     yaw, pitch = (math.radians(finite_number(content.get(name, 0), name)) for name in ("yaw", "pitch"))
-    return wrap(yaw), -pitch
+    return wrap_angle(yaw), -pitch
 
 
 def _base(scene: Mapping[str, Any]) -> list[Any]:
@@ -196,6 +196,7 @@ def _read_equirect(scene: Mapping[str, Any], folder: Path) -> Path | CubeImage:
         raise InputError(f"needed a picture of 360 x 180 degrees, got {spans[0]:g} x {spans[1]:g} (haov, vaov)")
     width, height = read_size(image)
     if width == 2 * height:
+        require_complete(image)
         return image
     layout = find_layout(image)
     if layout is None:
@@ -231,7 +232,7 @@ def _read_tiles(scene: Mapping[str, Any], folder: Path) -> CubeImage:
         if not 0 < pixels <= MAX_SIZE:
             continue
         level = CubeLevel(pixels, tile, faces)
-        gap = find_missing_file(level, folder)
+        gap = find_gap(level, folder)
         if gap is None:
             levels.append(level)
         else:
@@ -242,10 +243,12 @@ def _read_tiles(scene: Mapping[str, Any], folder: Path) -> CubeImage:
             pixels = require_faces([folder / face for face in faces])
             levels.append(CubeLevel(pixels, pixels, faces))
     if not levels:
-        raise InputError(f"needed all tiles of a level, got no {gaps[-1] if gaps else 'level'}; copy the tour again")
+        raise InputError(
+            f"needed all tiles of a level, but {gaps[-1] if gaps else 'there is none'}; copy the tour again"
+        )
     if gaps and levels[-1].size < min(full, MAX_SIZE):
         warnings.warn(
-            f"{folder / gaps[-1]} is missing; the panorama is read at {levels[-1].size} pixels a face, not {full}.",
+            f"{folder}/{gaps[-1]}; the panorama is read at {levels[-1].size} pixels a face, not {full}.",
             category=InputWarning,
             stacklevel=4,
         )

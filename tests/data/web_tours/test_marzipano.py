@@ -106,6 +106,18 @@ def test_an_incomplete_level_gives_way_to_the_next_complete_one(export: Export, 
     _check_picture(hall, check_colors, 32)
 
 
+def test_a_level_with_a_damaged_tile_gives_way_to_the_next_complete_one(export: Export, check_colors) -> None:
+    folder = export(_scene("0-hall"), _scene("1-attic"))
+    for tile in ("0-hall/2/u/1/0", "1-attic/1/f/0/0", "1-attic/2/f/0/0"):
+        (folder / f"tiles/{tile}.jpg").write_bytes(b"<html>404</html>")
+    with (
+        pytest.warns(UserWarning, match="'0-hall' is read at 32 instead of 64 pixels .*2/u/1/0.jpg is damaged"),
+        pytest.warns(UserWarning, match="'1-attic' is left out: needed all tiles .*1-attic/2/f/0/0.jpg is damaged"),
+    ):
+        (hall,) = read_web_tour(folder / "data.js")
+    _check_picture(hall, check_colors, 32)
+
+
 def test_without_tiles_the_preview_is_read(export: Export, color_face, check_colors) -> None:
     folder = export(_scene("0-hall"), tiles=False)
     preview = Image.new("RGB", (16, 96))

@@ -119,6 +119,19 @@ def test_an_incomplete_level_gives_way_to_the_next_complete_one(multires: Path, 
     check_colors(read_panorama(panorama.image, 40)[0])
 
 
+def test_damaged_pictures_are_left_out_and_damaged_tiles_give_way(multires: Path, write_scene, check_colors) -> None:
+    write_scene(multires / "attic.jpg")
+    for name in ("tiles/3/d2_1.jpg", "attic.jpg"):
+        (multires / name).write_bytes((multires / name).read_bytes()[:-20])
+    scenes = {"hall": {"type": "multires", "multiRes": MULTIRES}, "attic": {"panorama": "attic.jpg"}}
+    with (
+        pytest.warns(UserWarning, match=r"d2_1\.jpg is damaged; the panorama is read at 20 pixels a face, not 40"),
+        pytest.warns(UserWarning, match=r"'attic' is left out: .*attic\.jpg: needed a complete image"),
+    ):
+        (panorama,) = read_web_tour(_write(multires, {"scenes": scenes}))
+    check_colors(read_panorama(panorama.image, 40)[0])
+
+
 def test_without_tiles_the_fallback_is_read(multires: Path, check_colors) -> None:
     for level in "123":
         (multires / f"tiles/{level}/f0_0.jpg").unlink()
@@ -167,7 +180,7 @@ def test_names_are_file_safe_and_unique(tmp_path: Path, write_scene) -> None:
         ),
         ({"type": "cubemap", "cubeMap": ["a.jpg"] * 5}, 'needed six files as "cubeMap"'),
         ({"type": "cubemap", "cubeMap": ["hall.jpg"] * 5 + [None]}, "needed the path of a file, got 'None'"),
-        ({"type": "multires", "multiRes": MULTIRES}, "needed all tiles of a level, got no tiles/3/f0_0.jpg"),
+        ({"type": "multires", "multiRes": MULTIRES}, "needed all tiles of a level, but tiles/3/f0_0.jpg is missing"),
         ({"type": "multires", "multiRes": MULTIRES | {"maxLevel": 99}}, "needed a maxLevel of 1 to 20, got 99"),
         ({"type": "multires", "multiRes": MULTIRES | {"path": "/x"}}, "needed a path with %s"),
         ({"type": "multires", "multiRes": MULTIRES | {"basePath": "../.."}}, "needed a file inside"),

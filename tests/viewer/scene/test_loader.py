@@ -96,6 +96,29 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
         assert loaded.entry.views == (0,) and loaded.entry.tour is each and loaded.scene is scene
 
 
+def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(monkeypatch, parted_house, load_house):
+    networks = {name: SimpleNamespace(name=name, min_views=n) for name, n in (("pairs", 2), ("default", 1))}
+    monkeypatch.setattr("pansplat.pipeline.load_model", lambda name="default", **options: networks[name])
+    monkeypatch.setattr("pansplat.pipeline.load_pairs", lambda path, **options: pairs)
+    pairs = [parted_house.make_pair(views) for views in ((0, 1), (1, 2), (3,))]
+    pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], world=1),))
+    with pytest.warns(InputWarning, match="1 single view is predicted by default"):
+        entries = find_entries(parted_house.folder, LoadOptions(model="pairs"))
+    assert all(any("predicted by default" in note for note in entry.notes) for entry in entries)
+    assert not find_entries(parted_house.folder, LoadOptions())[0].notes
+    used = []
+
+    def predict(pair, model, **options):
+        used.append(model.name)
+        return load_house(scenes.make_entry((0, 1))).scene
+
+    monkeypatch.setattr("pansplat.pipeline.predict", predict)
+    scenes = TourScenes(parted_house)
+    for views in ((0, 1), (3,)):
+        load_entry(scenes.make_entry(views), LoadOptions(model="pairs"), ignore)
+    assert used == ["pairs", "default"]
+
+
 @pytest.mark.shared
 def test_a_folder_of_pairs_has_an_entry_for_each(shared):
     entries = find_entries(shared / "data" / "zind", LoadOptions())

@@ -8,13 +8,13 @@ import pytest
 from PIL import Image
 
 from pansplat.data.pairs import Link
-from pansplat.tours import plan_route
+from pansplat.tours import FADE_SECONDS, plan_route
 from pansplat_viewer import run
 from pansplat_viewer.capture import Film, TourFrames, write_tour
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.settings import DrawSettings
-from pansplat_viewer.scene.tour import FADE_SECONDS, CrossFade, TourScenes, find_clicked, find_hotspots, measure_bytes
+from pansplat_viewer.scene.tour import CrossFade, TourScenes, find_clicked, find_hotspots, measure_bytes
 
 
 @pytest.fixture
