@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TypeVar
@@ -74,6 +74,12 @@ def load_guided_sweep(path: Path, name: str = "default") -> GuidedSweep:
     network = _load_network(path, MODEL, RefinementConfig, DepthRefinement)
     sharpening = load_sharpening(_shipped("sharpening.safetensors"))
     return GuidedSweep(network, sharpening, _hash_files(path, _shipped("sharpening.safetensors")), name)
+
+
+@lru_cache(maxsize=1)
+def load_default_sweep() -> GuidedSweep:
+    """The guided sweep of the weights that the package ships; it is loaded once."""
+    return load_guided_sweep(default_weights())
 
 
 def load_sharpening(path: Path) -> DepthSharpening:

@@ -11,7 +11,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -150,11 +150,10 @@ def load_model(
     return load_predictor(path, compat, precision=precision, **options)
 
 
-@lru_cache(maxsize=1)
 def _load_default() -> Predictor:
-    from pansplat.guided_sweep import default_weights, load_guided_sweep
+    from pansplat.guided_sweep import load_default_sweep
 
-    return load_guided_sweep(default_weights())
+    return load_default_sweep()
 
 
 def _load_sweep(**options: Any) -> Predictor:

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+from pansplat.sweep.prior import rotate_image, upright_rotation
+
 _LEAST_DEVIATION = 0.04  # of log-depth at a right match: heights of two cameras differ, too
 _SCALE_SHARE = 1.0  # of the network's own Laplace scale
 _TAIL = 2.0  # degrees of freedom of a right match's deviation
@@ -43,8 +45,8 @@ class DepthMap:
     def sample(self, bearings: Float[Array, "n 3"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """Log-depth and its standard deviation at bearings of the camera."""
         upright = bearings @ self.rotation
-        deviation = np.hypot(_LEAST_DEVIATION, _SCALE_SHARE * _nearest(self.scale, upright))
-        return _nearest(self.log_depth, upright), deviation
+        deviation = np.hypot(_LEAST_DEVIATION, _SCALE_SHARE * sample_nearest(self.scale, upright))
+        return sample_nearest(self.log_depth, upright), deviation
 
     def mirrored(self) -> DepthMap:
         """That of the panorama that is mirrored left to right."""
@@ -52,7 +54,25 @@ class DepthMap:
         return DepthMap(self.log_depth[:, ::-1], self.scale[:, ::-1], flip @ self.rotation @ flip)
 
 
-def _nearest(values: Float[Array, "h w"], rays: Float[Array, "n 3"]) -> Float[Array, "n"]:
+def estimate_depth(image: Float[Array, "h w 3"], down: Float[Array, "3"] | None) -> DepthMap:
+    """The depth of a panorama by the default model.
+
+    Args:
+        image: RGB in [0, 1].
+        down: gravity in the camera's frame; None if it is unknown: the camera is then taken to be upright.
+    """
+    from pansplat.guided_sweep import load_default_sweep
+
+    turn = None if down is None else upright_rotation(np.eye(3), down)
+    upright = image if turn is None else rotate_image(image, turn)
+    prior = load_default_sweep().prior
+    assert prior is not None
+    observed = prior.observe([upright.astype(np.float32)])
+    return DepthMap(observed.sharpen()[0], observed.priors[0].scale, np.eye(3) if turn is None else turn)
+
+
+def sample_nearest(values: Float[Array, "h w"], rays: Float[Array, "n 3"]) -> Float[Array, "n"]:
+    """Nearest values of an equirectangular map at directions."""
     height, width = values.shape
     column = (np.arctan2(rays[:, 0], rays[:, 2]) / (2 * math.pi) + 0.5) * width
     row = (np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2])) / math.pi + 0.5) * height

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,18 +19,31 @@ from pansplat.data.images import read_height, read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.pairs import FAR, NEAR, find_mask
 from pansplat.data.views import CAMERA_HEIGHT
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.files import require_file
-from pansplat.poses.axes import RotationPrior, SceneAxes, find_axes, with_hints
-from pansplat.poses.features import DIAGONAL, FACE_ROTATIONS, Features, Matches, detect_features, match_features
-from pansplat.poses.hints import Hints, read_hints
-from pansplat.poses.tour import Pair, build_tour
-from pansplat.poses.two_view import (
-    Hypothesis,
-    RelativePose,
-    estimate_relative_pose,
-    polish_relative_pose,
+from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes, with_hints
+from pansplat.poses.dense import Surroundings
+from pansplat.poses.depth import estimate_depth
+from pansplat.poses.features import (
+    DIAGONAL,
+    FACE_ROTATIONS,
+    Features,
+    Matches,
+    detect_features,
+    drop_repeated,
+    match_features,
 )
+from pansplat.poses.hints import Hints, read_hints
+from pansplat.poses.learned import (
+    LearnedFeatures,
+    Matcher,
+    MatcherMissingError,
+    detect_learned,
+    load_matcher,
+    match_learned,
+)
+from pansplat.poses.tour import Group, Pair, build_tour
+from pansplat.poses.two_view import RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_floor, level_poses
 from pansplat.predictor import Progress
 from pansplat.threads import one_thread, worker_threads
@@ -42,9 +56,12 @@ _FEW = 6  # up to this number of panoramas, all pairs are compared with all feat
 _DARK = 8.0  # mean grey value of an image that shows nothing
 _LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
 _SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
+_ENOUGH = 100.0  # expected number of right matches by SIFT, above which the learned matcher is not asked
+_LIKELY = 0.3  # prior probability of the matches that count for it
+_LEARNED_PRIOR, _LEARNED_NOISE = 0.7, 1.6e-3  # largest prior, as matches of one pair of faces depend; radians
+_LEARNED_SIZE = 7.0  # pixels
+_DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
 _FLOOR_PAIRS = 8
-_LARGEST_SLOPE = 3.0  # of the way between two cameras of a weak pair, degrees
-_CONFIRMING_CONTRAST = 1.6  # of the floor that confirms a weak pair
 _MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
 _MIRROR_RATIO = 1.5  # of that number to the one with the picture itself; symmetric things match either way
 _MAX_BASELINE = 1e9  # metres
@@ -53,52 +70,103 @@ _MIN_FAR = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """Estimated poses, with the figures of their check.
+class PoseGroup:
+    """Panoramas whose relative poses are known.
 
     Attributes:
-        images: the files that were read.
-        poses: cam2world of the placed ones, OpenCV axes, world y down, metres if `scale_source` is not "unknown".
-        unplaced: the reason for each file without a pose.
-        relations: of the pairs that were compared, by indices into `images`.
-        near, far: depth range of the scene's points, in the poses' unit.
+        poses: cam2world, OpenCV axes, world y down, metres if `scale_source` is not "unknown".
+        near, far: depth range of the group's points, in the poses' unit.
         residual: median angle between points and bearings, degrees.
         scale_source: how the unit was found, for messages.
     """
 
-    images: tuple[Path, ...]
     poses: dict[Path, Float[Array, "4 4"]]
-    unplaced: dict[Path, str]
-    relations: dict[Pair, RelativePose]
     near: float
     far: float
     residual: float
     scale_source: str
 
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """Estimated poses, with the figures of their check.
+
+    Attributes:
+        images: the files that were read.
+        groups: of panoramas that reliable pairs connect, the largest one first; each has a world of its own.
+        unplaced: the reason for each file without a pose.
+        relations: of the pairs that were compared, by indices into `images`.
+    """
+
+    images: tuple[Path, ...]
+    groups: tuple[PoseGroup, ...]
+    unplaced: dict[Path, str]
+    relations: dict[Pair, RelativePose]
+
+    @property
+    def poses(self) -> dict[Path, Float[Array, "4 4"]]:
+        """Those of the largest group."""
+        return self.groups[0].poses
+
     @property
     def summary(self) -> str:
         """One line: how many panoramas have a pose, and the figures of the check."""
         used = [relation for relation in self.relations.values() if relation.is_reliable]
-        weakest = min((relation.places for relation in used), default=0.0)
+        probable = sum(not relation.is_certain for relation in used)
+        placed = sum(len(group.poses) for group in self.groups)
+        groups = f" in {len(self.groups)} groups" if len(self.groups) > 1 else ""
+        residual = max(group.residual for group in self.groups)
         return (
-            f"{len(self.poses)} of {len(self.images)} panoramas have a pose, by {len(used)} pairs; residual "
-            f"{self.residual:.2f} degrees, weakest pair {weakest:.0f} places in common; scale: {self.scale_source}"
+            f"{placed} of {len(self.images)} panoramas have a pose{groups}, by {len(used)} pairs"
+            + (f", of which {probable} are probable only" if probable else "")
+            + f"; residual {residual:.2f} degrees; scale: {self.groups[0].scale_source}"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What is used of a panorama: features of faces along its axes, and of faces turned against the walls."""
+    """What is used of a panorama.
+
+    Attributes:
+        features: by SIFT, of faces along the camera's axes.
+        turned: the same, of faces turned against the walls.
+        learned: by the learned matcher, if it is installed.
+        axes: gravity and walls.
+        small: grey, for the search of the floor.
+        surroundings: all that it shows, with estimated depth.
+    """
 
     features: Features
     turned: Features
+    learned: LearnedFeatures | None
     axes: SceneAxes
     small: Float[Array, "height width"]
+    surroundings: Surroundings
+
+    @functools.cached_property
+    def matched(self) -> Features:
+        """The features from which the pose of a pair is estimated."""
+        if self.learned is None:
+            return self.features
+        count = len(self.learned)
+        return self.features.joined(
+            Features(
+                self.learned.bearings,
+                np.zeros((count, self.features.descriptors.shape[1]), np.float32),
+                np.full(count, _LEARNED_SIZE),
+                np.full(count, _LEARNED_NOISE),
+            )
+        )
 
     @functools.cached_property
     def joined(self) -> Features:
         """All features."""
-        return self.features.joined(self.turned)
+        return self.matched.joined(self.turned)
+
+    @functools.cached_property
+    def mirrored(self) -> _View:
+        """The view of the panorama that is mirrored left to right; its gravity and walls are not used."""
+        return replace(self, features=self.features.mirrored(), learned=None, surroundings=self.surroundings.mirrored())
 
 
 def estimate_poses(
@@ -156,34 +224,50 @@ def estimate_poses(
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
-
-    @functools.cache
-    def floor_height(pair: Pair) -> float | None:
-        first, second = (views[view] for view in pair)
-        floor = find_floor([first.small, second.small], _pair_poses(relations[pair], first, second), [(0, 1)])
-        return floor.height if floor.is_found(_CONFIRMING_CONTRAST) else None
-
-    tour = build_tour([v.joined for v in views], relations, downs, noise, floor_height)
+    tour = build_tour([v.joined for v in views], relations, downs, noise)
+    placed = [position for group in tour.groups for position in group.placed]
     for position, (reason, other) in tour.unplaced.items():
         partner = "" if other is None else f" (best with {paths[kept[other]].name})"
-        unplaced[kept[position]] = _describe_mirrored(position, views, tour.placed, paths, kept) or reason + partner
-    if len(tour.placed) < 2:
+        unplaced[kept[position]] = _describe_mirrored(position, views, placed, paths, kept) or reason + partner
+    if not tour.groups:
         raise _no_poses(paths, unplaced)
-    poses = level_poses(tour.poses, downs[list(tour.placed)])
     report("finding the floor", 0.95)
-    files = [paths[kept[position]] for position in tour.placed]
-    scale, source = _find_scale(files, poses, [views[p].small for p in tour.placed], camera_height, baseline)
-    poses[:, :3, 3] *= scale
-    limits = depth_range(tour.depths * scale) or (NEAR, FAR)
-    renumbered = {(kept[i], kept[j]): relation for (i, j), relation in relations.items()}
+    groups = [
+        _finish_group(
+            group,
+            level_poses(group.poses, downs[list(group.placed)]),
+            [paths[kept[position]] for position in group.placed],
+            [views[position].small for position in group.placed],
+            camera_height,
+            baseline if number == 0 else None,
+        )
+        for number, group in enumerate(tour.groups)
+    ]
     return PoseEstimate(
         paths,
-        dict(zip(files, poses, strict=True)),
+        tuple(groups),
         {paths[n]: unplaced[n] for n in sorted(unplaced)},
-        renumbered,
-        min(max(limits[0], 0.1), _LARGEST_NEAR),
-        max(limits[1], _MIN_FAR),
-        float(np.degrees(np.median(tour.angles))) if len(tour.angles) else 0.0,
+        {(kept[i], kept[j]): relation for (i, j), relation in relations.items()},
+    )
+
+
+def _finish_group(
+    group: Group,
+    poses: Float[Array, "view 4 4"],
+    files: Sequence[Path],
+    images: Sequence[Array],
+    camera_height: float,
+    baseline: tuple[Path | str, Path | str, float] | None,
+) -> PoseGroup:
+    """The group in metres."""
+    scale, source = _find_scale(files, poses, images, camera_height, baseline)
+    poses[:, :3, 3] *= scale
+    near, far = depth_range(group.depths * scale) or (NEAR, FAR)
+    return PoseGroup(
+        dict(zip(files, poses, strict=True)),
+        min(max(near, 0.1), _LARGEST_NEAR),
+        max(far, _MIN_FAR),
+        float(np.degrees(np.median(group.angles))) if len(group.angles) else 0.0,
         source,
     )
 
@@ -264,13 +348,23 @@ def _describe_views(
     is_compass = len(headings) > 1  # one value for all pictures is a program's default
     static = scene_mask_of_files(tuple(paths[n] for n in kept), _HEIGHT).numpy()
 
+    matcher = _load_matcher()
+
     def describe(n: int) -> _View:
         mask = masks.get(paths[n])
         scene = static if mask is None else read_mask(mask, _HEIGHT).numpy()
-        small = cv2.resize(pixels[n], (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
-        axes = with_hints(find_axes(pixels[n]), hints[n].down, hints[n].heading if is_compass else None)
-        turned = detect_features(pixels[n], scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
-        return _View(detect_features(pixels[n], scene), turned, axes, small)
+        grey = pixels[n]
+        small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
+        axes = with_hints(find_axes(grey), hints[n].down, hints[n].heading if is_compass else None)
+        turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
+        image = read_panorama(paths[n], len(grey))[0].permute(1, 2, 0).numpy()
+        learned = None
+        if matcher is not None:
+            learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
+        image = cv2.resize(image, (2 * _DEPTH_HEIGHT, _DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
+        depth = estimate_depth(image, axes.axes[0] if axes.has_down else None)
+        surroundings = Surroundings(image.mean(axis=2), depth)
+        return _View(detect_features(grey, scene), turned, learned, axes, small, surroundings)
 
     views = []
     with worker_threads() as pool:
@@ -295,19 +389,19 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
             chosen |= set(own[:_THOROUGH])
         pairs = sorted(chosen)
 
+    matcher = _load_matcher()
+
     def relate(pair: Pair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
-        matches = match_features(first.features, second.features)
+        matches = _match(first, second, matcher)
         prior = RotationPrior(first.axes, second.axes)
-        relation = estimate_relative_pose(
-            first.features, second.features, matches, prior, lambda h: _agree_on_floor(h, first, second), seed=seed
-        )
+        relation = _estimate_pair(first, second, matches, prior, seed)
         if not relation.is_reliable:
             return relation
-        if _is_mirrored(first, second, overlap.get(pair), relation.score):
+        if _is_mirrored(first, second, overlap.get(pair), relation):
             return replace(relation, problem="one of both looks mirrored left to right")
         further = match_features(first.turned, second.turned)
-        every = matches.joined(further.shifted(len(first.features), len(second.features)))
+        every = matches.joined(further.shifted(len(first.matched), len(second.matched)))
         return polish_relative_pose(relation, first.joined, second.joined, every, prior)
 
     relations = {}
@@ -318,25 +412,34 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
     return relations
 
 
-def _pair_poses(relation: RelativePose | Hypothesis, first: _View, second: _View) -> Float[Array, "2 4 4"]:
-    """Levelled poses of two panoramas at a distance of 1."""
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, :3, :3], poses[1, :3, 3] = relation.rotation.T, -relation.rotation.T @ relation.translation
-    return level_poses(poses, np.stack((first.axes.axes[0], second.axes.axes[0])))
+def _load_matcher() -> Matcher | None:
+    """The learned matcher; None, with a warning, if its weights are not installed."""
+    try:
+        return load_matcher()
+    except MatcherMissingError as error:
+        warnings.warn(f"poses are estimated by SIFT alone: {error}.", InputWarning, stacklevel=2)
+        return None
 
 
-def _agree_on_floor(hypothesis: Hypothesis, first: _View, second: _View) -> bool:
-    """Whether the way between the cameras is level, and both panoramas show one floor.
+def _match(first: _View, second: _View, matcher: Matcher | None) -> Matches:
+    """Matches of `matched` features: by SIFT, and by the learned matcher where those hardly suffice."""
+    matches = match_features(first.features, second.features)
+    if matcher is None or first.learned is None or second.learned is None:
+        return matches
+    if matches.prior[matches.prior > _LIKELY].sum() > _ENOUGH:
+        return matches
+    found = match_learned(matcher, first.learned, second.learned)
+    learned = Matches(found.indices, np.minimum(found.probability, _LEARNED_PRIOR))
+    every = matches.joined(learned.shifted(len(first.features), len(second.features)))
+    return drop_repeated(first.matched, second.matched, every)
 
-    Repeated doors and windows give wrong poses with many matches. Such a pose is rarely level, and the floors of
-    both panoramas do not agree under it.
-    """
-    if not (first.axes.has_down and second.axes.has_down):
-        return False
-    poses = _pair_poses(hypothesis, first, second)
-    if abs(poses[1, 1, 3]) > math.sin(math.radians(_LARGEST_SLOPE)):
-        return False
-    return find_floor([first.small, second.small], poses, [(0, 1)]).is_found(_CONFIRMING_CONTRAST)
+
+def _estimate_pair(
+    first: _View, second: _View, matches: Matches, prior: RotationPrior = NO_PRIOR, seed: int = 0
+) -> RelativePose:
+    """The relative pose of two views."""
+    surroundings = first.surroundings, second.surroundings
+    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, seed=seed)
 
 
 def _describe_mirrored(
@@ -352,22 +455,24 @@ def _describe_mirrored(
     return None
 
 
-def _is_mirrored(first: _View, second: _View, overlap: float | None = None, score: float = 0.0) -> bool:
+def _is_mirrored(
+    first: _View, second: _View, overlap: float | None = None, relation: RelativePose | None = None
+) -> bool:
     """Whether the mirror image of one panorama has more in common with the other one than it has itself.
 
     Args:
         overlap: `_quick_overlap` of both, if known.
-        score: of the pose of both; that of the mirror image must be larger.
+        relation: of both; the mirror image must fit better.
     """
-    mirrored = first.features.mirrored()
-    evidence = _quick_overlap(mirrored, second.features)
+    mirrored = first.mirrored
+    evidence = _quick_overlap(mirrored.features, second.features)
     if evidence < _MIRROR_RATIO * (_quick_overlap(first.features, second.features) if overlap is None else overlap):
         return False
-    matches = match_features(mirrored, second.features)
+    matches = match_features(mirrored.features, second.features)
     if matches.prior.sum() < _MIRROR_EVIDENCE:
         return False
-    found = estimate_relative_pose(mirrored, second.features, matches)
-    return found.is_reliable and found.score > score
+    found = _estimate_pair(mirrored, second, matches)
+    return found.is_reliable and (relation is None or found.score > relation.score)
 
 
 def _quick_overlap(first: Features, second: Features) -> float:
@@ -396,8 +501,7 @@ def _find_scale(
     )
     floor = find_floor(images, poses, pairs[:_FLOOR_PAIRS])
     if not floor.is_found():
-        typical = float(np.median([np.linalg.norm(centres[i] - centres[j]) for i, j in pairs[: len(files) - 1]]))
-        return 1 / typical, "unknown (no floor was found); neighbouring cameras are taken as 1 m apart, see --baseline"
+        return camera_height, f"cameras {camera_height:g} m over the floor, by estimated depth (no floor was found)"
     source = f"cameras {camera_height:g} m over the floor"
     if floor.lower is not None:
         source += f" (uncertain: a plane {floor.lower:.1f} times as deep may be the floor, see --baseline)"

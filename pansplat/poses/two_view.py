@@ -20,8 +20,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from pansplat.poses.axes import NO_PRIOR, RotationPrior
-from pansplat.poses.dense import Comparison
-from pansplat.poses.depth import DepthMap, MatchDepths
+from pansplat.poses.dense import Surroundings, compare, compare_many
+from pansplat.poses.depth import MatchDepths
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.solvers import (
     Bearings,
@@ -66,6 +66,8 @@ _VOTERS, _VOTE_WIDTH, _VOTE_LIMITS = 800, 0.06, (0.03, 0.25)  # matches; error o
 _VOTE_YAW, _CLIMB = 0.05, 0.3  # radians; deviation of the difference of the cameras' heights, camera heights
 _PAIR_SAMPLES, _PAIRS = 20000, 1000  # of two matches; of them, those that agree
 _MODES, _KEPT_BY_DEPTH = 8, 12  # hypotheses by depth: of each rotation; that are optimised
+_KEPT_ALIKE, _FARTHEST = 8, 8.0  # hypotheses by single matches that are optimised; their largest distance
+_ALIKE = 1.5, -60.0, 7.0, 3.5, 0.0  # of the logarithm of votes, conflict, likeness, shade, overlap
 _DEPTH_FACTORS = (24, 6, 2, 1)  # of the noise, in their optimisation
 _EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
@@ -134,6 +136,7 @@ class _Evidence:
         noise: standard deviation of a right match's epipolar angle, radians.
         axes: gravity and walls of both panoramas.
         depths: estimated at the matches, if they are known.
+        surroundings: all that both panoramas show, with estimated depths.
     """
 
     a: Float[Array, "match 3"]
@@ -142,6 +145,7 @@ class _Evidence:
     noise: Float[Array, "match"]
     axes: RotationPrior
     depths: MatchDepths | None = None
+    surroundings: tuple[Surroundings, Surroundings] | None = None
 
     def strongest(self, count: int) -> _Evidence:
         """The evidence of the first `count` matches."""
@@ -372,10 +376,14 @@ def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: i
     return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
 
 
-def _sample_depths(maps: tuple[DepthMap, DepthMap] | None, a: Bearings, b: Bearings) -> MatchDepths | None:
-    if maps is None:
+def _sample_depths(
+    surroundings: tuple[Surroundings, Surroundings] | None, a: Bearings, b: Bearings
+) -> MatchDepths | None:
+    if surroundings is None:
         return None
-    (first, first_deviation), (second, second_deviation) = maps[0].sample(a), maps[1].sample(b)
+    (first, first_deviation), (second, second_deviation) = (
+        view.depth.sample(rays) for view, rays in zip(surroundings, (a, b), strict=True)
+    )
     return MatchDepths(np.stack((first, second), axis=1), np.stack((first_deviation, second_deviation), axis=1))
 
 
@@ -385,7 +393,7 @@ def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> list[Flo
     With parallel walls one match states the translation for each of four rotations. Without them, two matches of
     levelled cameras state rotation and translation.
     """
-    if evidence.depths is None:
+    if evidence.depths is None or evidence.surroundings is None:
         return []
     strongest = evidence.strongest(_VOTERS)
     assert strongest.depths is not None
@@ -394,27 +402,66 @@ def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> list[Flo
         (rays * np.exp(strongest.depths.log_depth[:, side, None])) @ levels[side].T
         for side, rays in enumerate((strongest.a, strongest.b))
     )
-    reach = _VOTE_WIDTH * np.exp(strongest.depths.log_depth).mean(axis=1)
-    found = []
+    reach = (_VOTE_WIDTH * np.exp(strongest.depths.log_depth).mean(axis=1)).clip(*_VOTE_LIMITS)
+    found, singles = [], []
     for rotation in evidence.axes.wall_rotations():
         level = levels[1] @ rotation @ levels[0].T
-        found += [(level, t, s) for t, s in _vote(y - x @ level.T, reach, strongest.prior)]
+        translations = y - x @ level.T
+        votes, weights = _count_votes(translations, reach, strongest.prior)
+        found += [(level, t, v) for t, v in _find_modes(translations, reach, votes, weights)]
+        singles.append((level, translations, votes))
     found += _vote_pairs(x, y, reach, strongest.prior, rng)
     found.sort(key=lambda item: -item[2])
+    chosen = [(rotation, t) for rotation, t, _ in found[:_KEPT_BY_DEPTH]]
+    chosen += _choose_alike(singles, levels, evidence.surroundings)
     return [
-        levels[1].T @ skew(t / max(float(np.linalg.norm(t)), 1e-9)) @ rotation @ levels[0]
-        for rotation, t, _ in found[:_KEPT_BY_DEPTH]
+        levels[1].T @ skew(t / max(float(np.linalg.norm(t)), 1e-9)) @ rotation @ levels[0] for rotation, t in chosen
     ]
 
 
-def _vote(
+def _choose_alike(
+    singles: Sequence[tuple[Float[Array, "3 3"], Float[Array, "n 3"], Float[Array, "n"]]],
+    levels: tuple[Float[Array, "3 3"], Float[Array, "3 3"]],
+    surroundings: tuple[Surroundings, Surroundings],
+) -> list[tuple[Float[Array, "3 3"], Float[Array, "3"]]]:
+    """Levelled poses of single matches under which both panoramas look most alike."""
+    if not singles:
+        return []
+    rotations = np.concatenate([np.repeat(rotation[None], len(t), axis=0) for rotation, t, _ in singles])
+    translations, votes = (np.concatenate([item[n] for item in singles]) for n in (1, 2))
+    kept = (np.abs(translations[:, 2]) < _CLIMB) & (np.linalg.norm(translations, axis=1) < _FARTHEST)
+    rotations, translations, votes = rotations[kept], translations[kept] * (1, 1, 0), votes[kept]
+    overlap, conflict, likeness, shade = compare_many(
+        *surroundings, levels[1].T @ rotations @ levels[0], translations @ levels[1]
+    ).T
+    values = np.log1p(votes), np.minimum(conflict, _LARGEST_CONFLICT), likeness, shade, overlap
+    odds = np.dot(_ALIKE, values)
+    chosen: list[int] = []
+    for n in np.argsort(-odds).tolist():
+        if len(chosen) == _KEPT_ALIKE:
+            break
+        if all(
+            np.linalg.norm(translations[n] - translations[m]) > _VOTE_LIMITS[1]
+            or np.abs(rotations[n] - rotations[m]).max() > _VOTE_YAW
+            for m in chosen
+        ):
+            chosen.append(n)
+    return [(rotations[n], translations[n]) for n in chosen]
+
+
+def _count_votes(
     translations: Float[Array, "n 3"], reach: Float[Array, "n"], prior: Float[Array, "n"]
-) -> list[tuple[Float[Array, "3"], float]]:
-    """Translations around which the matches' own ones are dense, with their votes."""
-    reach = reach.clip(*_VOTE_LIMITS)
+) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+    """How many matches state a translation near that of each match, and their weights."""
     squared = ((translations[:, None] - translations[None]) ** 2).sum(axis=-1)
     weights = np.exp(-0.5 * squared / reach[None] ** 2) * prior
-    votes = weights.sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2)
+    return weights.sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2), weights
+
+
+def _find_modes(
+    translations: Float[Array, "n 3"], reach: Array, votes: Float[Array, "n"], weights: Float[Array, "n n"]
+) -> list[tuple[Float[Array, "3"], float]]:
+    """Translations with most votes, and these."""
     found: list[tuple[Array, float]] = []
     for n in np.argsort(-votes):
         if len(found) == _MODES:
@@ -590,9 +637,8 @@ def estimate_relative_pose(
     second: Features,
     matches: Matches,
     axes: RotationPrior = NO_PRIOR,
+    surroundings: tuple[Surroundings, Surroundings] | None = None,
     *,
-    compare: Callable[[Hypothesis], Comparison | None] = lambda hypothesis: None,
-    depths: tuple[DepthMap, DepthMap] | None = None,
     seed: int = 0,
 ) -> RelativePose:
     """The most probable relative pose of two panoramas, with its check.
@@ -601,23 +647,31 @@ def estimate_relative_pose(
         first, second: features of both panoramas.
         matches: between them.
         axes: gravity and walls of both panoramas.
-        compare: all that both panoramas show under a hypothesis; None if its distance is unknown.
-        depths: estimated of both panoramas.
+        surroundings: all that both panoramas show, with estimated depths; without them only the matches count.
         seed: of the random samples.
     """
     count = min(len(matches), _MAX_MATCHES)
     indices = matches.indices[:count]
     a, b = first.bearings[indices[:, 0]], second.bearings[indices[:, 1]]
-    evidence = _Evidence(
-        a, b, matches.prior[:count], _match_noise(first, second, indices), axes, _sample_depths(depths, a, b)
-    )
+    noise, depths = _match_noise(first, second, indices), _sample_depths(surroundings, a, b)
+    evidence = _Evidence(a, b, matches.prior[:count], noise, axes, depths, surroundings)
     found = _search_hypotheses(evidence, np.random.default_rng(seed))
     if not found:
         no_match = f"only {count} features match"
         return RelativePose(
-            np.eye(3), np.array((0.0, 0, 1)), indices[:0], 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, math.nan, -math.inf, no_match
+            np.eye(3),
+            np.array((0.0, 0, 1)),
+            indices[:0],
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            (math.inf,) * 2,
+            math.nan,
+            -math.inf,
+            no_match,
         )
-    best, log_odds, margin = _choose_compared(found, evidence, compare)
+    best, log_odds, margin = _choose_compared(found, evidence)
     support = _Support(_count_all_places(best, evidence), best.score, margin)
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
@@ -647,20 +701,20 @@ def estimate_relative_pose(
     )
 
 
-def _choose_compared(
-    found: list[Hypothesis], evidence: _Evidence, compare: Callable[[Hypothesis], Comparison | None]
-) -> tuple[Hypothesis, float, float]:
+def _choose_compared(found: list[Hypothesis], evidence: _Evidence) -> tuple[Hypothesis, float, float]:
     """The hypothesis of the highest odds, their logarithm, and how much its score exceeds that of the others."""
-    odds = [_log_odds(h, evidence, compare(h)) for h in found[:_COMPARED]]
+    odds = [_log_odds(h, evidence) for h in found[:_COMPARED]]
     best = int(np.argmax(odds)) if max(odds) > -math.inf else 0
     others = [h.score for n, h in enumerate(found) if n != best]
     return found[best], odds[best], found[best].score - max(others, default=0.0)
 
 
-def _log_odds(hypothesis: Hypothesis, evidence: _Evidence, comparison: Comparison | None) -> float:
-    """Logarithm of the odds that a hypothesis is right; -inf if its panoramas cannot be compared."""
-    if comparison is None:
+def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
+    """Logarithm of the odds that a hypothesis is right; -inf if the panoramas cannot be compared."""
+    if evidence.surroundings is None or not math.isfinite(hypothesis.distance):
         return -math.inf
+    translation = hypothesis.distance * hypothesis.translation
+    comparison = compare(*evidence.surroundings, hypothesis.rotation, translation)
     slope = abs(float(hypothesis.translation @ (hypothesis.rotation @ evidence.axes.first.axes[0])))
     values = (
         1.0,
@@ -684,7 +738,9 @@ def _find_problem(support: _Support, log_odds: float) -> str | None:
     """Why a pose must not be used; None if its matches suffice, or with the comparison of both panoramas."""
     if support.suffices or log_odds >= _PROBABLE_ODDS:
         return None
-    share = f"right with a probability of {100 / (1 + math.exp(-log_odds)):.0f} %" if log_odds > -math.inf else "unclear"
+    share = (
+        f"right with a probability of {100 / (1 + math.exp(-log_odds)):.0f} %" if log_odds > -math.inf else "unclear"
+    )
     return f"too little in common: {support.places:.0f} places match, and the best pose is {share}"
 
 

@@ -71,7 +71,7 @@ class DepthPrior:
 
     def rotate(self, rotation: np.ndarray) -> DepthPrior:
         """The prior of the camera rotated by `rotation` (3, 3), its new axes in the old ones."""
-        rotated = _rotate_image(np.stack((self.log_depth, self.scale), axis=-1), rotation)
+        rotated = rotate_image(np.stack((self.log_depth, self.scale), axis=-1), rotation)
         return DepthPrior(rotated[..., 0], rotated[..., 1])
 
 
@@ -121,9 +121,9 @@ class PriorEstimator:
         config: PriorConfig,
     ) -> None:
         self._cam2world, self._down, self._config = cam2world, down, config
-        self._turns = [_upright_rotation(pose[:3, :3], down) for pose in cam2world]
+        self._turns = [upright_rotation(pose[:3, :3], down) for pose in cam2world]
         self._observed = model.observe(
-            [i if turn is None else _rotate_image(i, turn) for i, turn in zip(images, self._turns, strict=True)]
+            [i if turn is None else rotate_image(i, turn) for i, turn in zip(images, self._turns, strict=True)]
         )
         self._upright_poses = np.array(cam2world, np.float64)
         for pose, turn in zip(self._upright_poses, self._turns, strict=True):
@@ -140,7 +140,7 @@ class PriorEstimator:
         height = min(max(CAMERA_HEIGHT, 1 / limits[1]), 1 / limits[0])
         upright = [log_depth + math.log(height) for log_depth in self._observed.sharpen()]
         return [
-            log_depth if turn is None else _rotate_image(log_depth[..., None], turn.T)[..., 0]
+            log_depth if turn is None else rotate_image(log_depth[..., None], turn.T)[..., 0]
             for log_depth, turn in zip(upright, self._turns, strict=True)
         ]
 
@@ -188,7 +188,7 @@ def _scale_depth(priors: Sequence[DepthPrior], factors: Sequence[float]) -> list
     return [DepthPrior(p.log_depth + math.log(factor), p.scale) for p, factor in zip(priors, factors, strict=True)]
 
 
-def _upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | None:
+def upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | None:
     """The smallest rotation (3, 3) after which a camera's y axis is `down`, as new axes in the old ones."""
     target = rotation.T @ down
     axis = np.cross((0.0, 1.0, 0.0), target)
@@ -201,7 +201,7 @@ def _upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | No
     return cv2.Rodrigues(axis / sine * angle)[0]
 
 
-def _rotate_image(image: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def rotate_image(image: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     maps = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
     return np.ascontiguousarray(rotate_equirect(maps, torch.from_numpy(rotation)).permute(1, 2, 0).numpy())
 

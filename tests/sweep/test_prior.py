@@ -67,7 +67,7 @@ def _estimate(room, poses, model_type=TrueDepth):
     views = [View(i, np.ones(i.shape[:2], bool), d.astype(np.float32)) for i, d in zip(images, down, strict=True)]
     upright = [pose.copy() for pose in poses]
     for pose in upright:
-        turn = prior_module._upright_rotation(pose[:3, :3], _DOWN)
+        turn = prior_module.upright_rotation(pose[:3, :3], _DOWN)
         pose[:3, :3] = pose[:3, :3] if turn is None else pose[:3, :3] @ turn
     model = model_type(room, upright)
     limits = (1 / 8, 1 / 0.3)
@@ -132,10 +132,10 @@ def test_surfaces_give_one_more_prior(make_room, turn):
 
 
 def test_upside_down_camera_is_turned_by_half(turn):
-    rotation = prior_module._upright_rotation(turn("x", 180), _DOWN)
+    rotation = prior_module.upright_rotation(turn("x", 180), _DOWN)
     assert rotation is not None
     np.testing.assert_allclose((turn("x", 180) @ rotation)[:, 1], _DOWN, atol=1e-12)
-    assert prior_module._upright_rotation(turn("y", 77), _DOWN) is None
+    assert prior_module.upright_rotation(turn("y", 77), _DOWN) is None
 
 
 def test_prior_rotated_there_and_back_is_the_same(make_room, turn):
@@ -192,7 +192,7 @@ def test_sharpened_depth_of_a_tilted_camera_is_turned_back(make_room, turn):
     room = make_room()
     pose = room.pose((-0.4, 0.0, -0.2), turn("x", 12) @ turn("z", -9))
     upright = pose.copy()
-    upright[:3, :3] = pose[:3, :3] @ prior_module._upright_rotation(pose[:3, :3], _DOWN)
+    upright[:3, :3] = pose[:3, :3] @ prior_module.upright_rotation(pose[:3, :3], _DOWN)
     model = TrueDepth(room, [upright])
     estimator = PriorEstimator(model, [room.cast(pose, 64)[0]], pose[None], _DOWN, PriorConfig())
     sharp = estimator.sharpen((1 / 8, 1 / 0.3))[0]
