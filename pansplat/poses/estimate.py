@@ -43,7 +43,7 @@ from pansplat.poses.learned import (
     match_learned,
 )
 from pansplat.poses.tour import Group, Pair, build_tour
-from pansplat.poses.two_view import RelativePose, estimate_relative_pose, polish_relative_pose
+from pansplat.poses.two_view import NO_WAYS, RelativePose, Ways, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_floor, level_poses
 from pansplat.predictor import Progress
 from pansplat.threads import one_thread, worker_threads
@@ -173,6 +173,7 @@ def estimate_poses(
     images: Sequence[Path | str],
     *,
     masks: Mapping[Path, Path | None] | None = None,
+    links: Mapping[Path, Mapping[Path, float]] | None = None,
     camera_height: float = CAMERA_HEIGHT,
     baseline: tuple[Path | str, Path | str, float] | None = None,
     seed: int = 0,
@@ -183,6 +184,7 @@ def estimate_poses(
     Args:
         images: files, 2:1; one that is repeated is used once.
         masks: the mask file of each image, if it has one; by default those beside the images (docs/input.md).
+        links: for an image, the yaw at which a tour shows the way to other images, radians to the right of the centre.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images and their distance in metres, instead of the camera's height.
         seed: of the random samples.
@@ -220,7 +222,12 @@ def estimate_poses(
     with one_thread():  # panoramas and pairs are divided among threads
         files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
         views = _describe_views(paths, files, pixels, hints, kept, report)
-        relations = _relate_views(views, seed, report)
+        ways = links or {}
+        yaws = {
+            (i, j): Ways(ways.get(paths[a], {}).get(paths[b]), ways.get(paths[b], {}).get(paths[a]))
+            for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
+        }
+        relations = _relate_views(views, yaws, seed, report)
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
@@ -374,8 +381,10 @@ def _describe_views(
     return views
 
 
-def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[Pair, RelativePose]:
-    """Relative poses of the pairs that have most in common."""
+def _relate_views(
+    views: Sequence[_View], ways: Mapping[Pair, Ways], seed: int, report: Progress
+) -> dict[Pair, RelativePose]:
+    """Relative poses of the pairs that have most in common, and of those that links connect."""
     pairs = list(itertools.combinations(range(len(views)), 2))
     overlap: dict[Pair, float] = {}
     if len(views) > _FEW:
@@ -383,7 +392,7 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
         with worker_threads() as pool:
             quick = pool.map(lambda pair: _quick_overlap(views[pair[0]].features, views[pair[1]].features), pairs)
             overlap.update(zip(pairs, quick, strict=True))
-        chosen = set()
+        chosen = {pair for pair, way in ways.items() if way != NO_WAYS}
         for view in range(len(views)):
             own = sorted((pair for pair in pairs if view in pair), key=lambda pair: -overlap[pair])
             chosen |= set(own[:_THOROUGH])
@@ -395,7 +404,7 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
         first, second = views[pair[0]], views[pair[1]]
         matches = _match(first, second, matcher)
         prior = RotationPrior(first.axes, second.axes)
-        relation = _estimate_pair(first, second, matches, prior, seed)
+        relation = _estimate_pair(first, second, matches, prior, ways[pair], seed)
         if not relation.is_reliable:
             return relation
         if _is_mirrored(first, second, overlap.get(pair), relation):
@@ -435,11 +444,11 @@ def _match(first: _View, second: _View, matcher: Matcher | None) -> Matches:
 
 
 def _estimate_pair(
-    first: _View, second: _View, matches: Matches, prior: RotationPrior = NO_PRIOR, seed: int = 0
+    first: _View, second: _View, matches: Matches, prior: RotationPrior = NO_PRIOR, ways: Ways = NO_WAYS, seed: int = 0
 ) -> RelativePose:
     """The relative pose of two views."""
     surroundings = first.surroundings, second.surroundings
-    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, seed=seed)
+    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, ways, seed=seed)
 
 
 def _describe_mirrored(

@@ -23,11 +23,11 @@ from pansplat.data.poses import rigid_matrix, to_cam2world
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
-from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
+from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup, estimate_poses
 from pansplat.predictor import Progress
 from pansplat.strict_json import read_json
 
-_FORMAT = "4"  # version of the estimate and of its cached file; part of the cache's key
+_FORMAT = "5"  # version of the estimate and of its cached file; part of the cache's key
 _CONVENTION = "cam2world opencv"
 SUFFIXES = (".json", ".tum", ".kitti")
 
@@ -67,7 +67,7 @@ def _write(path: Path, text: str) -> None:
 def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
     return {
         "convention": _CONVENTION,
-        **_make_world(estimate, names),
+        **_make_world(estimate.groups[0], names),
         "estimate": {
             "summary": estimate.summary,
             "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
@@ -75,11 +75,11 @@ def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str
     }
 
 
-def _make_world(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
+def _make_world(group: PoseGroup, names: Mapping[Path, str]) -> dict[str, Any]:
     return {
-        "near": round(estimate.near, 3),
-        "far": round(estimate.far, 3),
-        "poses": {names[image]: np.round(pose, 9).tolist() for image, pose in estimate.poses.items()},
+        "near": round(group.near, 3),
+        "far": round(group.far, 3),
+        "poses": {names[image]: np.round(pose, 9).tolist() for image, pose in group.poses.items()},
     }
 
 
@@ -126,11 +126,17 @@ def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Pro
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
         masks = {panorama.image: panorama.mask for panorama in panoramas}
-        estimate = estimate_poses(list(names), masks=masks, camera_height=camera_height, progress=progress)
+        images = {panorama.name: panorama.image for panorama in panoramas}
+        links = {
+            panorama.image: {images[link.target]: link.yaw for link in panorama.links if link.target in images}
+            for panorama in panoramas
+        }
+        estimate = estimate_poses(list(names), masks=masks, links=links, camera_height=camera_height, progress=progress)
     except NoPosesError as error:
         worlds, summary, unplaced = [], "", error.reasons
     else:
-        worlds, summary, unplaced = [_make_world(estimate, names)], estimate.summary, estimate.unplaced
+        worlds = [_make_world(group, names) for group in estimate.groups]
+        summary, unplaced = estimate.summary, estimate.unplaced
     unreadable = [image for image in unplaced if not _is_readable(image)]
     if len(unreadable) == len(panoramas):
         raise NoPosesError(unplaced)
@@ -192,7 +198,8 @@ def _hash_inputs(panoramas: Sequence[Panorama], camera_height: float) -> str:
     """A hash of the names, by which the cached file states its poses, and of the pictures' and masks' states."""
     digest = hashlib.blake2b(f"{_FORMAT} {camera_height:g}".encode(), digest_size=12)
     for panorama in panoramas:
-        digest.update(os.fsencode(f"{panorama.name};"))
+        links = [(link.target, round(link.yaw, 6)) for link in panorama.links]
+        digest.update(os.fsencode(f"{panorama.name} {links};"))
         for file in (panorama.image, panorama.mask):
             digest.update(os.fsencode(f"{_stamp(file)};"))
     return digest.hexdigest()

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -69,6 +70,7 @@ _MODES, _KEPT_BY_DEPTH = 8, 12  # hypotheses by depth: of each rotation; that ar
 _KEPT_ALIKE, _FARTHEST = 8, 8.0  # hypotheses by single matches that are optimised; their largest distance
 _ALIKE = 1.5, -60.0, 7.0, 3.5, 0.0  # of the logarithm of votes, conflict, likeness, shade, overlap
 _DEPTH_FACTORS = (24, 6, 2, 1)  # of the noise, in their optimisation
+_WAY_NOISE, _WAY_SHARE = math.radians(15), 0.85  # of links, which are often on a door; their share of right ones
 _EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
 
@@ -89,12 +91,12 @@ class _Support:
 
 # Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
 _NEEDED = _Support(32, 80, 20)
-_COMPARED = 12  # best hypotheses whose panoramas are compared
+_COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds that a hypothesis is right, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # conflict, likeness, shade, overlap, slope of the way (docs/poses.md).
-_ODDS = (-10.0, 0.62, 0.37, 6.4, -56.0, 6.9, 3.6, -2.0, -16.0)
+_ODDS = (-13.1, 0.57, 1.43, 6.0, -27.0, 4.0, 2.2, -1.8, -18.6)
 _LARGEST_CONFLICT, _LARGEST_SLOPE = 0.1, 0.3
-_CERTAIN_ODDS, _PROBABLE_ODDS = 4.0, 2.0
+_CERTAIN_ODDS, _PROBABLE_ODDS = 1.2, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +114,35 @@ class Hypothesis:
     score: float
     probability: Float[Array, "match"]
     distance: float = math.nan
+
+
+class Ways(NamedTuple):
+    """Where a tour's links place the other panorama: yaw to the right of the centre column, radians; None without one.
+
+    Attributes:
+        there: from the first panorama.
+        back: from the second panorama.
+    """
+
+    there: float | None = None
+    back: float | None = None
+
+    def score(self, rotations: Float[Array, "n 3 3"], translations: Float[Array, "n 3"]) -> Float[Array, "n"]:
+        """Logarithm of the likelihood ratio of relative poses against chance."""
+        score = np.zeros(len(rotations))
+        for yaw, directions in (
+            (self.there, -np.einsum("nji,nj->ni", rotations, translations)),
+            (self.back, translations),
+        ):
+            if yaw is not None:
+                angle = np.arctan2(directions[:, 0], directions[:, 2]) - yaw
+                angle = (angle + math.pi) % (2 * math.pi) - math.pi
+                density = np.exp(-0.5 * (angle / _WAY_NOISE) ** 2) / (math.sqrt(2 * math.pi) * _WAY_NOISE)
+                score += np.log(_WAY_SHARE * density * 2 * math.pi + 1 - _WAY_SHARE)
+        return score
+
+
+NO_WAYS = Ways()
 
 
 def _match_noise(first: Features, second: Features, indices: Int[Array, "match 2"]) -> Float[Array, "match"]:
@@ -137,6 +168,7 @@ class _Evidence:
         axes: gravity and walls of both panoramas.
         depths: estimated at the matches, if they are known.
         surroundings: all that both panoramas show, with estimated depths.
+        ways: from each panorama towards the other one, as a tour's links state them.
     """
 
     a: Float[Array, "match 3"]
@@ -146,6 +178,7 @@ class _Evidence:
     axes: RotationPrior
     depths: MatchDepths | None = None
     surroundings: tuple[Surroundings, Surroundings] | None = None
+    ways: Ways = NO_WAYS
 
     def strongest(self, count: int) -> _Evidence:
         """The evidence of the first `count` matches."""
@@ -413,7 +446,7 @@ def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> list[Flo
     found += _vote_pairs(x, y, reach, strongest.prior, rng)
     found.sort(key=lambda item: -item[2])
     chosen = [(rotation, t) for rotation, t, _ in found[:_KEPT_BY_DEPTH]]
-    chosen += _choose_alike(singles, levels, evidence.surroundings)
+    chosen += _choose_alike(singles, levels, evidence.surroundings, evidence.ways)
     return [
         levels[1].T @ skew(t / max(float(np.linalg.norm(t)), 1e-9)) @ rotation @ levels[0] for rotation, t in chosen
     ]
@@ -423,6 +456,7 @@ def _choose_alike(
     singles: Sequence[tuple[Float[Array, "3 3"], Float[Array, "n 3"], Float[Array, "n"]]],
     levels: tuple[Float[Array, "3 3"], Float[Array, "3 3"]],
     surroundings: tuple[Surroundings, Surroundings],
+    ways: Ways,
 ) -> list[tuple[Float[Array, "3 3"], Float[Array, "3"]]]:
     """Levelled poses of single matches under which both panoramas look most alike."""
     if not singles:
@@ -431,11 +465,10 @@ def _choose_alike(
     translations, votes = (np.concatenate([item[n] for item in singles]) for n in (1, 2))
     kept = (np.abs(translations[:, 2]) < _CLIMB) & (np.linalg.norm(translations, axis=1) < _FARTHEST)
     rotations, translations, votes = rotations[kept], translations[kept] * (1, 1, 0), votes[kept]
-    overlap, conflict, likeness, shade = compare_many(
-        *surroundings, levels[1].T @ rotations @ levels[0], translations @ levels[1]
-    ).T
+    poses = levels[1].T @ rotations @ levels[0], translations @ levels[1]
+    overlap, conflict, likeness, shade = compare_many(*surroundings, *poses).T
     values = np.log1p(votes), np.minimum(conflict, _LARGEST_CONFLICT), likeness, shade, overlap
-    odds = np.dot(_ALIKE, values)
+    odds = np.dot(_ALIKE, values) + ways.score(*poses)
     chosen: list[int] = []
     for n in np.argsort(-odds).tolist():
         if len(chosen) == _KEPT_ALIKE:
@@ -638,6 +671,7 @@ def estimate_relative_pose(
     matches: Matches,
     axes: RotationPrior = NO_PRIOR,
     surroundings: tuple[Surroundings, Surroundings] | None = None,
+    ways: Ways = NO_WAYS,
     *,
     seed: int = 0,
 ) -> RelativePose:
@@ -648,13 +682,14 @@ def estimate_relative_pose(
         matches: between them.
         axes: gravity and walls of both panoramas.
         surroundings: all that both panoramas show, with estimated depths; without them only the matches count.
+        ways: from each panorama towards the other one.
         seed: of the random samples.
     """
     count = min(len(matches), _MAX_MATCHES)
     indices = matches.indices[:count]
     a, b = first.bearings[indices[:, 0]], second.bearings[indices[:, 1]]
     noise, depths = _match_noise(first, second, indices), _sample_depths(surroundings, a, b)
-    evidence = _Evidence(a, b, matches.prior[:count], noise, axes, depths, surroundings)
+    evidence = _Evidence(a, b, matches.prior[:count], noise, axes, depths, surroundings, ways)
     found = _search_hypotheses(evidence, np.random.default_rng(seed))
     if not found:
         no_match = f"only {count} features match"
@@ -727,7 +762,7 @@ def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
         comparison.overlap,
         min(slope, _LARGEST_SLOPE),
     )
-    return float(np.dot(_ODDS, values))
+    return float(np.dot(_ODDS, values) + evidence.ways.score(hypothesis.rotation[None], translation[None])[0])
 
 
 def _count_all_places(hypothesis: Hypothesis, evidence: _Evidence) -> float:
