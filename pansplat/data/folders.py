@@ -400,7 +400,10 @@ def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -
 
 
 def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
-    """Triplets, then pairs of a pairs.json, as indices into `names`."""
+    """Triplets, then pairs of a pairs.json, as indices into `names`.
+
+    Images without a pose are left out, and pairs that need them, with a note, if a pair remains.
+    """
     content = read_json(source)
     if not isinstance(content, dict) or not any(key in content for key in ("pairs", "triplets")):
         raise InputError(
@@ -408,6 +411,8 @@ def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
             '"triplets"; see docs/input.md.'
         )
     groups, numbers = [], {name: number for number, name in enumerate(names)}
+    unposed: dict[str, str] = {}  # image, and the first entry that names it
+    dropped = 0
     for key in ("triplets", "pairs"):
         entries = list_field(content, key, source)
         for number, entry in enumerate(entries, start=1):
@@ -424,8 +429,28 @@ def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
                 raise InputError(f'{where}: needed an image or a list of images as "target", got {target}; correct it.')
             if len(context) > MAX_CONTEXT:
                 raise too_many_panoramas(where, len(context))
-            first, second = (tuple(_find_name(name, numbers, where) for name in part) for part in (context, targets))
-            groups.append((first, second))
+            unposed |= {
+                name: where
+                for name in (*context, *targets)
+                if name not in {**numbers, **unposed} and (source.parent / name).is_file()
+            }
+            first, second = (
+                tuple(_find_name(name, numbers, where) for name in part if name not in unposed)
+                for part in (context, targets)
+            )
+            if len(first) > 1:
+                groups.append((first, second))
+            else:
+                dropped += 1
+    if unposed and not groups:
+        _find_name(*next((name, numbers, where) for name, where in unposed.items()))
+    if unposed:
+        pairs = f"; {dropped} of {dropped + len(groups)} pairs need them" if dropped else ""
+        warnings.warn(
+            f"left out of {source}, without a pose in {_POSES}: {list_names([Path(name) for name in unposed])}{pairs}.",
+            category=InputWarning,
+            stacklevel=4,
+        )
     if not groups:
         raise InputError(f"{source}: needed at least one pair, got none; add one or remove the file.")
     return tuple(groups)

@@ -22,7 +22,7 @@ _TURN_BACK_DEGREES = 120.0  # of the way at a panorama, at which the camera turn
 _TURN_IN_PLACE_DEGREES = 60.0  # between the heading and the way, at which the camera stands still
 _SMOOTHING_SECONDS = 1.2
 _SAMPLES_PER_SECOND = 60
-_LOOK_AROUND_DEGREES = 90.0  # that the camera turns in a part without a way, before the fade
+_LOOK_AROUND_DEGREES = 90.0  # that the camera turns in a part without a way
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +107,8 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
     Where the way turns back, the camera turns in place. All is smoothed over time, so that corners are rounded.
 
     Before a fade along a link the camera turns in the direction of the link, and goes 0.7 m. Before another one, at a
-    panorama alone, it turns by 90 degrees. After a fade, it looks away from the link back; without one, in the
-    direction of the panorama's start view; else its heading stays.
+    panorama alone, it turns by 90 degrees; so it does at the end, unless a start pose is given. After a fade, it looks
+    away from the link back; without one, in the direction of the panorama's start view; else its heading stays.
 
     Args:
         tour: the graph.
@@ -143,8 +143,8 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
             places = [start[:3, 3], *places]
         if first >= 0:
             yaw, pitch = _find_arrival(tour, *steps[first]) or (yaw, 0.0)
-        is_left = last < len(steps) and (first >= 0 or start is None)
-        around = math.radians(_LOOK_AROUND_DEGREES) if is_left and len(places) == 1 else 0.0
+        is_seen = start is None or 0 <= first < last < len(steps)  # of a user's flight, not the ends
+        around = math.radians(_LOOK_AROUND_DEGREES) if is_seen and len(places) == 1 and steps else 0.0
         sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch, around))
         yaw = float(sections[-1][3][-1])
     *positions, yaws, pitches, numbers = (np.concatenate(values) for values in zip(*sections, strict=True))

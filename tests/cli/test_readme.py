@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import pansplat
@@ -52,7 +54,7 @@ def test_pose_files_of_the_readme_are_read(tmp_path: Path) -> None:
     (poses,) = re.findall(r"```json\n(.+?)```", README, flags=re.DOTALL)
     (tmp_path / "poses.json").write_text(poses)
     for name in ("left.jpg", "right.jpg"):
-        (tmp_path / name).touch()  # images are read later
+        cv2.imwrite(str(tmp_path / name), np.zeros((8, 16, 3), np.uint8))
     (pair,) = pansplat.load_pairs(tmp_path)
     assert [panorama.image.name for panorama in pair.context] == ["left.jpg", "right.jpg"]
     assert (pair.near, pair.far) == (0.45, 10.0)

@@ -414,6 +414,24 @@ def test_posed_panoramas_in_no_pair_are_scenes_of_their_own(tmp_path: Path) -> N
     assert attic.context[0].cam2world.tolist() == _pose(2) and attic.context[0].world == 0
 
 
+def test_pairs_of_panoramas_without_a_pose_are_left_out_with_a_note(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "house", ("a.png", "b.png", "c.png"))
+    write_scene(folder / "d.jpg", 8)
+    contexts = [["a.png", "d.jpg"], ["a.png", "b.png", "d.jpg"], ["b.png", "c.png"]]
+    pairs = [{"context": context, "target": ["d.jpg"]} for context in contexts[:2]]
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [*pairs, {"context": contexts[2]}]}))
+    with (
+        pytest.warns(UserWarning, match=r"pairs\.json, .* pose in poses\.json: d\.jpg; 1 of 3 pairs need them"),
+        pytest.warns(UserWarning, match=r"poses\.json has no pose of d\.jpg; each is a scene of its own"),
+    ):
+        first, second, single = load_pairs(folder)
+    assert [[view.name for view in pair.context] for pair in (first, second, single)] == [["a", "b"], ["b", "c"], ["d"]]
+    assert first.targets == second.targets == ()
+    (folder / "pairs.json").write_text(json.dumps({"pairs": pairs[:1]}))
+    with pytest.warns(UserWarning), pytest.raises(InputError, match=r"pairs 1: .* a pose in poses\.json, got 'd\.jpg'"):
+        load_pairs(folder)
+
+
 def test_frames_of_360loc_without_a_pose_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
     names = _sequence(tmp_path)
     (tmp_path / "camera_pose.json").write_text(json.dumps({name: _pose(i) for i, name in enumerate(names)}))

@@ -77,7 +77,12 @@ def test_a_route_goes_along_a_link_then_jumps_and_looks_away_from_the_link_back(
     assert np.allclose(route.positions[after], home.positions[3]) and math.cos(route.yaws[after]) == pytest.approx(1)
     assert route.legs[before] == 0 and set(route.legs[after : route.jumps[1] + 1]) == {1}
     assert np.allclose(route.positions[route.jumps[1]], home.positions[3] + (0, 0, 0.7))
-    assert np.allclose(route.positions[-1], home.positions[6]) and math.cos(route.yaws[-1]) == pytest.approx(1)
+    last = route.jumps[1] + 1
+    assert np.allclose(route.positions[last:], home.positions[6]) and math.cos(route.yaws[last]) == pytest.approx(1)
+    assert math.sin(route.yaws[-1]) == pytest.approx(1, abs=1e-3), "the last panorama, which is alone, is seen, too"
+    assert len(route.yaws) - last > 3 * 60, "for more than the second of the fade"
+    way = plan_route(home, [3, 6], home.cam2world[3].numpy())
+    assert math.cos(way.yaws[-1]) == pytest.approx(1), "a way to it ends in the direction of arrival"
     steps = np.linalg.norm(np.diff(route.positions, axis=0), axis=1)
     assert steps[np.delete(np.arange(len(steps)), route.jumps)].max() < 1.05 / 60, "only the jumps are fast"
     count = 7 * len(route.yaws)
