@@ -14,7 +14,7 @@ from pansplat.cli import run
 from pansplat.data.folders import load_pairs
 from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
-from pansplat.poses.estimate import PoseEstimate
+from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.solvers import rotation_exp
 from pansplat.poses.two_view import RelativePose
 
@@ -35,8 +35,10 @@ def _estimate(panoramas: list[Panorama], turn: float) -> PoseEstimate:
         pose[:3, 3] *= 2
         found[panorama.image] = world @ pose
     found[panoramas[0].image][:3, :3] @= rotation_exp(np.array((0, turn, 0)))
-    relation = RelativePose(np.eye(3), np.eye(3)[0], np.empty((0, 2), int), 100.0, 50.0, 40.0, 0.3, (0.01, 0.01), None)
-    return PoseEstimate(tuple(found), found, {}, {(0, 1): relation}, 0.5, 10.0, 0.05, "cameras 1.5 m over the floor")
+    figures = 100.0, 50.0, 40.0, 0.3, (0.01, 0.01), 1.0, 9.0
+    relation = RelativePose(np.eye(3), np.eye(3)[0], np.empty((0, 2), int), *figures, None)
+    group = PoseGroup(found, 0.5, 10.0, 0.05, "cameras 1.5 m over the floor")
+    return PoseEstimate(tuple(found), (group,), {}, {(0, 1): relation})
 
 
 @pytest.mark.parametrize(("turn", "outcome"), [(0.0, "solved"), (0.1, "wrong")])
@@ -48,8 +50,9 @@ def test_errors_do_not_depend_on_the_world(monkeypatch: pytest.MonkeyPatch, turn
     assert row.get("scale_percent") == pytest.approx(100)
     assert row.get("position_cm") == pytest.approx(0, abs=1e-6)
     assert row.get("rotation_degrees") == pytest.approx(np.degrees(turn), abs=1e-6)
-    (summary,) = bench.summarise([Row("pair", "room", row.case, row.result), row])
+    summary, tours = bench.summarise([Row("pair", "room", row.case, row.result), row])
     assert f"1 {outcome}" in summary and ("rotation median 0.000" in summary) == (outcome == "solved")
+    assert tours.startswith("1 tours: 3 of 3 panoramas (100%)") and f"{int(turn > 0)} tours with a wrong pose" in tours
 
 
 @pytest.mark.filterwarnings("ignore:.*has no pose of attic.png")
@@ -60,7 +63,7 @@ def test_the_command_writes_a_row_for_each_pair_and_tour(monkeypatch, tmp_path: 
     monkeypatch.setattr(bench, "estimate_poses", refuse)
     room, out = write_pair(tmp_path / "room"), tmp_path / "out"
     Image.new("RGB", (32, 16)).save(room / "attic.png")  # a single view is not measured
-    assert run(["bench", "pose", str(room), "--tours", "--out", str(out), "--threads", "1"]) == 0
+    assert run(["bench", "pose", str(room), "--tours", "also", "--out", str(out), "--threads", "1"]) == 0
     pair, tour = json.loads((out / "pose.json").read_text())["rows"]
     assert (pair["suite"], tour["suite"], tour["scene"]) == ("pair", "tour", "room")
     assert pair["outcome"] == "flagged" and "too dark" in pair["note"] and pair["count"] == 2

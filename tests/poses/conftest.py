@@ -1,4 +1,4 @@
-"""Synthetic bearings of points that two cameras see, and panoramas of textured box rooms."""
+"""Synthetic bearings of points that two cameras see, and panoramas of textured box rooms with their depth."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,7 +10,10 @@ import torch
 from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.poses.dense import Surroundings
+from pansplat.poses.depth import DepthMap
 from pansplat.poses.solvers import rotation_exp
+from pansplat.sweep.prior import upright_rotation
 
 _HALF = np.array((2.6, 1.35, 2.1))  # half the size of a room, metres
 
@@ -79,13 +82,18 @@ def _make_textures(seed: int) -> Array:
     return cv2.GaussianBlur(textures.transpose(1, 2, 0), (0, 0), 0.7).transpose(2, 0, 1) + 128
 
 
+def _cast(rays: Array, centre: Array) -> tuple[Array, Array]:
+    """The distance of a room's walls, and the axis of each that is hit."""
+    with np.errstate(divide="ignore"):
+        distance = (np.sign(rays) * _HALF - centre) / rays
+    return distance.min(axis=-1), distance.argmin(axis=-1)
+
+
 def _render_room(textures: Array, rotation: Array, centre: Array, height: int = 256) -> Array:
     """The panorama (height 2*height 3) of a camera in the room, 8 bit."""
     rays = pixel_directions(height, 2 * height, dtype=torch.float64).numpy() @ rotation.T
-    with np.errstate(divide="ignore"):
-        distance = (np.sign(rays) * _HALF - centre) / rays
-    axis = distance.argmin(axis=-1)
-    points = centre + rays * distance.min(axis=-1)[..., None]
+    distance, axis = _cast(rays, centre)
+    points = centre + rays * distance[..., None]
     image = np.zeros(rays.shape[:2], np.float32)
     for wall in range(6):
         n, side = divmod(wall, 2)
@@ -106,6 +114,30 @@ def render_room() -> Callable[..., Array]:
         return _render_room(textures[room], rotation, centre)
 
     return render
+
+
+@pytest.fixture(scope="session")
+def look_around(render_room: Callable[..., Array]) -> Callable[..., Surroundings]:
+    """A function that makes the surroundings of a camera in a room, with exact depth; its down is the world's y axis.
+
+    The camera's height over the floor, 1.35 m less the y of its centre, is the unit of the depth.
+    """
+
+    def look(room: int, rotation: Array, centre: Array, deviation: float = 0.03) -> Surroundings:
+        turn = upright_rotation(rotation, np.array((0.0, 1, 0)))
+        turn = np.eye(3) if turn is None else turn
+        rays = pixel_directions(192, 384, dtype=torch.float64).numpy() @ (rotation @ turn).T
+        log_depth = np.log(_cast(rays, centre)[0] / (_HALF[1] - centre[1]))
+        grey = render_room(room, rotation, centre)[..., 0] / 255
+        return Surroundings(grey, DepthMap(log_depth, np.full((48, 96), deviation), turn))
+
+    return look
+
+
+@pytest.fixture(scope="session")
+def find_walls() -> Callable[[Array, Array], Array]:
+    """A function that gives the distances of the walls along rays from a place in a room, metres."""
+    return lambda rays, centre: _cast(rays, centre)[0]
 
 
 @pytest.fixture(scope="module")

@@ -47,7 +47,7 @@ def test_good_pictures_among_others_have_their_poses(estimate: PoseEstimate) -> 
 def test_a_given_distance_sets_the_scale(estimate: PoseEstimate) -> None:
     centres = [pose[:3, 3] for pose in estimate.poses.values()]
     assert np.linalg.norm(centres[0] - centres[1]) == pytest.approx(2.0)
-    assert estimate.scale_source == "a.png and b.png are 2 m apart"
+    assert estimate.groups[0].scale_source == "a.png and b.png are 2 m apart"
 
 
 def test_the_reason_names_the_picture(estimate: PoseEstimate) -> None:

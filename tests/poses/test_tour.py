@@ -1,65 +1,131 @@
-"""Tours of synthetic cameras: placing by shared points or by the floor, and contradictions."""
+"""Tours of synthetic cameras: placing by estimated distances or by shared points, groups, and contradictions."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pansplat.poses.features import Features
-from pansplat.poses.solvers import rotation_exp
-from pansplat.poses.tour import Pair, Tour, build_tour
+from pansplat.poses.solvers import rotation_angle, rotation_exp
+from pansplat.poses.tour import Group, Pair, Tour, build_tour
 from pansplat.poses.two_view import RelativePose
 
-CENTRES = np.array(((0.0, 0, 0), (1.0, 0, 0.2), (1.4, 0, 1.5)))
-ROTATIONS = rotation_exp(np.array(((0, 0, 0), (0, 0.5, 0), (0, -0.8, 0.0))))
-HEIGHT = 1.5
+CENTRES = np.array(((0.0, 0, 0), (1.0, 0, 0.2), (1.4, 0, 1.5), (-0.8, 0, 1.1), (0.2, 0, 2.0)))  # camera heights
+ROTATIONS = rotation_exp(np.array(((0, 0, 0), (0, 0.5, 0), (0, -0.8, 0), (0, 2.0, 0), (0, -1.4, 0))))
+COUNT = 60  # points of a pair
 
 
-def _build(shared: bool, pairs: tuple[Pair, ...] = ((0, 1), (1, 2)), turn: float = 0.0, floor: bool = True) -> Tour:
-    """The tour by the given pairs, each with own points unless all cameras share them; the last pair may be wrong."""
+def relate(pair: Pair, indices: np.ndarray) -> RelativePose:
+    """The right relation of two cameras."""
+    i, j = pair
+    way = ROTATIONS[j].T @ (CENTRES[i] - CENTRES[j])
+    distance = float(np.linalg.norm(way))
+    return RelativePose(
+        ROTATIONS[j].T @ ROTATIONS[i],
+        way / distance,
+        indices,
+        300.0,
+        99.0,
+        50.0,
+        0.5,
+        (1e-3, 1e-3),
+        distance,
+        5.0,
+        None,
+    )
+
+
+def build(*pairs: Pair, shared: bool = False, views: int = 3, **changes) -> Tour:
+    """The tour by the given pairs, each with own points unless all cameras share them.
+
+    Args:
+        changes: of the last pair's relation; `turn`, radians, and `stretch` of its rotation and its distance.
+    """
     rng = np.random.default_rng(0)
-    points = [rng.uniform(-4, 4, (60, 3)) for _ in pairs]
-    points = [points[0]] * len(pairs) if shared else points
-    world = points[0] if shared else np.concatenate(points)
+    world = rng.uniform(-4, 4, (COUNT if shared else COUNT * len(pairs), 3))
     features = []
-    for rotation, centre in zip(ROTATIONS, CENTRES, strict=True):
+    for rotation, centre in zip(ROTATIONS[:views], CENTRES[:views], strict=True):
         rays = (world - centre) @ rotation
         bearings = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        features.append(Features(bearings, np.empty((len(world), 128), np.float32), np.zeros(len(world)), 0.003))
+        rest = np.empty((len(world), 128), np.float32), np.zeros(len(world)), np.full(len(world), 1e-3)
+        features.append(Features(bearings, *rest))
     relations = {}
-    for n, (i, j) in enumerate(pairs):
-        rotation = ROTATIONS[j].T @ ROTATIONS[i]
-        translation = ROTATIONS[j].T @ (CENTRES[i] - CENTRES[j])
-        own = np.arange(60) + (0 if shared else 60 * n)
-        if n == len(pairs) - 1:
-            rotation = rotation_exp(np.array((0, turn, 0))) @ rotation
-        direction = translation / np.linalg.norm(translation)
-        relations[i, j] = RelativePose(
-            rotation, direction, np.stack((own, own), axis=1), 300.0 - n, 99.0, 50.0, 0.5, (1e-3, 1e-3), None
-        )
+    for n, pair in enumerate(pairs):
+        own = np.arange(COUNT) + (0 if shared else COUNT * n)
+        relations[pair] = replace(relate(pair, np.stack((own, own), axis=1)), score=300.0 - n)
+    turn, stretch = (changes.pop(name, default) for name, default in (("turn", 0.0), ("stretch", 1.0)))
+    last = relations[pairs[-1]]
+    rotation = rotation_exp(np.array((0, turn, 0))) @ last.rotation
+    relations[pairs[-1]] = replace(last, rotation=rotation, distance=stretch * last.distance, **changes)
+    return build_tour(features, relations, np.stack([r.T @ (0.0, 1, 0) for r in ROTATIONS[:views]]), 1e-3)
 
-    def floor_height(pair: Pair) -> float | None:
-        return HEIGHT / float(np.linalg.norm(CENTRES[pair[0]] - CENTRES[pair[1]])) if floor else None
 
-    downs = np.stack([rotation.T @ (0.0, 1, 0) for rotation in ROTATIONS])
-    return build_tour(features, relations, downs, 1e-3, floor_height)
+def sides(group: Group) -> list[float]:
+    """Distances of consecutive cameras."""
+    return np.linalg.norm(np.diff(group.poses[:, :3, 3], axis=0), axis=1).tolist()
+
+
+TRUE_SIDES = np.linalg.norm(np.diff(CENTRES[:3], axis=0), axis=1)
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_shared_points_or_the_floor_determine_distances(shared: bool) -> None:
-    tour = _build(shared, floor=not shared)
-    assert tour.placed == (0, 1, 2)
-    sides = [np.linalg.norm(x[1] - x[0]) / np.linalg.norm(x[2] - x[1]) for x in (tour.poses[:, :3, 3], CENTRES)]
-    assert sides[0] == pytest.approx(sides[1], rel=1e-2)
+def test_cameras_are_placed_in_camera_heights(shared: bool) -> None:
+    (group,) = build((0, 1), (1, 2), shared=shared).groups
+    assert group.placed == (0, 1, 2)
+    assert sides(group) == pytest.approx(TRUE_SIDES.tolist(), rel=1e-2)
+    for pose, rotation in zip(group.poses, ROTATIONS, strict=False):
+        assert rotation_angle(group.poses[0, :3, :3].T @ pose[:3, :3] @ (ROTATIONS[0].T @ rotation).T) < 1e-3
+    assert (group.depths > 0).all() and np.median(group.angles) < 1e-4
 
 
-def test_a_panorama_without_shared_points_and_floor_is_left_out() -> None:
-    tour = _build(False, floor=False)
-    assert tour.placed == (0, 1)
-    reason, other = tour.unplaced[2]
-    assert "distance cannot be determined" in reason and other == 1
+def test_a_panorama_without_shared_points_is_placed_at_its_estimated_distance() -> None:
+    (group,) = build((0, 1), (1, 2), stretch=1.4).groups
+    assert sides(group) == pytest.approx([TRUE_SIDES[0], 1.4 * TRUE_SIDES[1]], rel=1e-2)
 
 
-def test_a_pair_that_contradicts_two_better_ones_is_rejected() -> None:
-    tour = _build(True, ((0, 1), (1, 2), (0, 2)), turn=math.radians(20))
-    assert tour.rejected == ((0, 2),) and tour.placed == (0, 1, 2)
+def test_points_that_three_panoramas_see_correct_an_estimated_distance() -> None:
+    (group,) = build((0, 1), (1, 2), shared=True, stretch=1.1).groups
+    assert sides(group)[1] / sides(group)[0] == pytest.approx(TRUE_SIDES[1] / TRUE_SIDES[0], rel=1e-3)
+
+
+def test_two_panoramas_have_their_estimated_distance() -> None:
+    (group,) = build((0, 1), views=2, stretch=1.3).groups
+    assert sides(group) == pytest.approx([1.3 * TRUE_SIDES[0]])
+
+
+def test_groups_stay_apart_and_the_largest_comes_first() -> None:
+    tour = build((0, 1), (2, 3), (3, 4), views=5)
+    assert [group.placed for group in tour.groups] == [(2, 3, 4), (0, 1)]
+    assert not tour.unplaced and not tour.rejected
+    assert [len(group.poses) for group in tour.groups] == [3, 2]
+
+
+def test_an_unreliable_pair_does_not_connect_groups() -> None:
+    tour = build((0, 1), (2, 3), (1, 2), views=4, problem="too little in common", log_odds=0.2)
+    assert [group.placed for group in tour.groups] == [(0, 1), (2, 3)]
+
+
+def test_the_reason_against_a_panorama_is_that_of_its_most_probable_pair() -> None:
+    tour = build((0, 1), (1, 2), views=4, problem="too little in common", log_odds=0.2)
+    assert tour.unplaced == {
+        2: ("too little in common", 1),
+        3: ("it has nothing in common with another panorama", None),
+    }
+
+
+@pytest.mark.parametrize("changes", [{"turn": math.radians(20)}, {"stretch": 2.0}])
+def test_a_pair_that_contradicts_two_better_ones_is_rejected(changes: dict[str, float]) -> None:
+    for shared in (True, False):
+        tour = build((0, 1), (1, 2), (0, 2), shared=shared, **changes)
+        assert tour.rejected == ((0, 2),) and tour.groups[0].placed == (0, 1, 2)
+        assert sides(tour.groups[0]) == pytest.approx(TRUE_SIDES.tolist(), rel=1e-2)
+
+
+def test_a_pair_that_closes_a_triangle_is_kept() -> None:
+    assert build((0, 1), (1, 2), (0, 2), turn=math.radians(2), stretch=1.1).rejected == ()
+
+
+def test_the_less_probable_pair_of_a_contradiction_is_rejected() -> None:
+    tour = build((0, 1), (1, 2), (0, 2), stretch=2.0, log_odds=9.0)
+    assert tour.rejected == ((1, 2),)  # of the others, it has the lower score
