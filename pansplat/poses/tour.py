@@ -251,7 +251,7 @@ class _GrowingGroup:
         joint = np.bincount(problem.camera[counts[problem.point] > 2], minlength=len(placed))
         weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
         pairs = [pair for pair in self._relations if weak & set(pair)]
-        numbers = np.array([[placed.index(view) for view in pair] for pair in pairs]).reshape(-1, 2)
+        numbers = np.array([[placed.index(view) for view in pair] for pair in pairs], np.int64).reshape(-1, 2)
         return replace(problem, pairs=numbers, distances=np.array([self._relations[pair].distance for pair in pairs]))
 
     def _add(self, view: int) -> None:
