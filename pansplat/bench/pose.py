@@ -1,11 +1,13 @@
 """`pansplat bench pose`: estimated camera poses against known ones, for pairs and for whole tours.
 
-A row is a pair of panoramas, or all panoramas of a folder. A pose is wrong if its rotation differs by more than 3
-degrees or its direction by more than 10; a wrong pose that passes the check of the estimate is the error to avoid.
+A row is a pair of panoramas, or all panoramas of a folder. A pose of a pair is wrong if its rotation differs by more
+than 3 degrees or its direction by more than 10, one of a tour if a rotation differs by more than 5 degrees or a
+position by more than 0.3 m; a wrong pose that passes the check of the estimate is the error to avoid.
 
 Values of a row: `outcome` is "solved", "flagged" (no pose passed the check), or "wrong" (a wrong pose passed it);
-`rotation_degrees` and `direction_degrees` are errors of the relative pose, for a tour medians over all pairs;
-`scale_percent` that of the distances; `position_cm` the largest error of a position after similarity alignment;
+`placed` counts the panoramas of the two largest groups; `rotation_degrees` and `direction_degrees` are errors of the
+relative pose, for a tour medians over the pairs within groups, `worst_degrees` the largest rotation; `scale_percent`
+that of the distances; `position_cm` the largest error of a position after similarity alignment of each group;
 `places` match in the weakest pair; `seconds` of the estimate.
 """
 
@@ -33,7 +35,8 @@ from pansplat.poses.solvers import angle_between, rotation_angle
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_WRONG_ROTATION, _WRONG_DIRECTION = 3.0, 10.0  # degrees
+_WRONG_ROTATION, _WRONG_DIRECTION = 3.0, 10.0  # degrees, of a pair
+_WRONG_TURN, _WRONG_PLACE = 5.0, 30.0  # degrees and centimetres, of a tour
 
 
 @dataclass(frozen=True)
@@ -49,20 +52,21 @@ class PoseCase:
     baseline_m: float
 
 
-def measure_folder(path: Path, report: Report, *, camera_height: float, tours: bool) -> None:
+def measure_folder(path: Path, report: Report, *, camera_height: float, pairs: bool, tours: bool) -> None:
     """Add a row for each pair of a folder, and for all its panoramas together.
 
     Args:
         camera_height: mean height of the cameras over the floor, metres.
-        tours: also estimate all panoramas together.
+        pairs: estimate each pair by itself.
+        tours: estimate all panoramas together.
     """
-    pairs = [pair for pair in load_pairs(path) if len(pair.context) > 1]  # a single view has nothing to compare with
-    contexts = {frozenset(view.image for view in pair.context): pair for pair in pairs}
-    for pair in contexts.values():
+    loaded = [pair for pair in load_pairs(path) if len(pair.context) > 1]  # a single view has nothing to compare with
+    contexts = {frozenset(view.image for view in pair.context): pair for pair in loaded}
+    for pair in contexts.values() if pairs else ():
         report.step(pair.name)
         report.add(measure_poses(pair.name, pair.context, camera_height))
     if tours:
-        views = {view.image: view for pair in pairs for view in (*pair.context, *pair.targets)}
+        views = {view.image: view for pair in loaded for view in (*pair.context, *pair.targets)}
         report.step(f"all {len(views)} panoramas")
         report.add(measure_poses(path.resolve().name, list(views.values()), camera_height, "tour"))
 
@@ -85,23 +89,28 @@ def measure_poses(name: str, panoramas: Sequence[Panorama], camera_height: float
 
 
 def _compare(estimate: PoseEstimate, truth: Mapping[Path, Array]) -> dict[str, Any]:
-    rotations, directions, ratios = [], [], []
-    for first, second in itertools.combinations(estimate.poses, 2):
-        found, known = (np.linalg.inv(p[second]) @ p[first] for p in (estimate.poses, truth))
-        rotations.append(math.degrees(rotation_angle(found[:3, :3] @ known[:3, :3].T)))
-        directions.append(math.degrees(angle_between(found[:3, 3], known[:3, 3])))
-        ratios.append(float(np.linalg.norm(found[:3, 3]) / np.linalg.norm(known[:3, 3])))
+    rotations, directions, ratios, places = [], [], [], []
+    for group in estimate.groups:
+        for first, second in itertools.combinations(group.poses, 2):
+            found, known = (np.linalg.inv(p[second]) @ p[first] for p in (group.poses, truth))
+            rotations.append(math.degrees(rotation_angle(found[:3, :3] @ known[:3, :3].T)))
+            directions.append(math.degrees(angle_between(found[:3, 3], known[:3, 3])))
+            ratios.append(float(np.linalg.norm(found[:3, 3]) / np.linalg.norm(known[:3, 3])))
+        positions = [np.stack([poses[image][:3, 3] for image in group.poses]) for poses in (group.poses, truth)]
+        places.append(100 * float(_aligned_errors(*positions).max()))
     is_wrong = max(rotations) > _WRONG_ROTATION or max(directions) > _WRONG_DIRECTION
-    places = [relation.places for relation in estimate.relations.values() if relation.is_reliable]
-    positions = [np.stack([poses[image][:3, 3] for image in estimate.poses]) for poses in (estimate.poses, truth)]
-    known_scale = not estimate.scale_source.startswith("unknown")
+    if len(truth) > 2:
+        is_wrong = max(rotations) > _WRONG_TURN or max(places) > _WRONG_PLACE
+    matched = [relation.places for relation in estimate.relations.values() if relation.is_reliable]
     return {
         "outcome": "wrong" if is_wrong else "solved",
+        "placed": sum(len(group.poses) for group in estimate.groups[:2]),
         "rotation_degrees": float(np.median(rotations)),
+        "worst_degrees": max(rotations),
         "direction_degrees": float(np.median(directions)),
-        "scale_percent": 100 * (float(np.median(ratios)) - 1) if known_scale else None,
-        "position_cm": 100 * float(_aligned_errors(*positions).max()) if len(positions[0]) > 2 else None,
-        "places": min(places),
+        "scale_percent": 100 * (float(np.median(ratios)) - 1),
+        "position_cm": max(places) if len(truth) > 2 else None,
+        "places": min(matched),
     }
 
 
@@ -123,7 +132,16 @@ def summarise(rows: Sequence[Row]) -> list[str]:
     for name in ("rotation", "direction") if solved else ():
         median, high = np.quantile([result[f"{name}_degrees"] for result in solved], (0.5, 0.95))
         parts.append(f"{name} median {median:.3f}, 95 % {high:.3f} degrees")
-    return ["; ".join(parts)] if results else []
+    lines = ["; ".join(parts)] if results else []
+    tours = [row for row in rows if row.suite == "tour"]
+    if tours:
+        placed, count = sum(row.get("placed") or 0 for row in tours), sum(row.case.count for row in tours)
+        wrong = sum(row.get("outcome") == "wrong" for row in tours)
+        lines.append(
+            f"{len(tours)} tours: {placed} of {count} panoramas ({placed / count:.0%}) are in the two largest groups; "
+            f"{wrong} tours with a wrong pose"
+        )
+    return lines
 
 
 def plot_poses(rows: Sequence[Row], header: Header) -> Figure:
@@ -148,7 +166,9 @@ POSE = Benchmark(
         Column("panoramas", lambda row: row.scene),
         Column("baseline m", "baseline_m", "{:.2f}"),
         Column("outcome", "outcome"),
+        Column("placed", "placed", "{:.0f}"),
         Column("rotation deg", "rotation_degrees", "{:.3f}"),
+        Column("worst", "worst_degrees", "{:.2f}"),
         Column("direction deg", "direction_degrees", "{:.2f}"),
         Column("scale %", "scale_percent", "{:+.1f}"),
         Column("position cm", "position_cm", "{:.1f}"),

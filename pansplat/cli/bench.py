@@ -256,8 +256,8 @@ class BenchPose(_Options):
     """Folders of panoramas with poses; by default the sample, if it is there."""
     camera_height: Positive = 1.5
     """Mean height of the cameras over the floor, metres."""
-    tours: bool = False
-    """Also estimate all panoramas of each folder together."""
+    tours: Literal["no", "also", "only"] = "no"
+    """Whether to estimate all panoramas of each folder together: not, beside its pairs, or instead of them."""
 
     def run(self) -> int:
         """Measure, print the tables and write the files; exit status 1 if a wrong pose passed the check."""
@@ -266,7 +266,9 @@ class BenchPose(_Options):
         paths = _paths_or_sample(self.paths)
         with self._open_report(POSE) as report:
             for path in paths:
-                measure_folder(path, report, camera_height=self.camera_height, tours=self.tours)
+                measure_folder(
+                    path, report, camera_height=self.camera_height, pairs=self.tours != "only", tours=self.tours != "no"
+                )
         return int(any(row.get("outcome") == "wrong" for row in report.rows))
 
 

@@ -88,20 +88,23 @@ def _print_estimate(estimate: PoseEstimate) -> None:
     from rich.table import Table
 
     table = Table()
-    for column in ("pair", "score", "margin", "places", "parallax", "rotation +-", "direction +-", "check"):
+    for column in ("pair", "score", "places", "odds", "parallax", "rotation +-", "direction +-", "check"):
         table.add_column(column, justify="left" if column in ("pair", "check") else "right")
     for (i, j), relation in estimate.relations.items():
         if relation.is_reliable or len(estimate.relations) <= 3:
             degrees = [math.degrees(angle) for angle in (relation.parallax, *relation.uncertainty)]
             table.add_row(
                 f"{estimate.images[i].stem} - {estimate.images[j].stem}",
-                *(f"{value:.0f}" for value in (relation.score, relation.margin, relation.places)),
+                *(f"{value:.0f}" for value in (relation.score, relation.places)),
+                "matches suffice" if math.isinf(relation.log_odds) else f"{math.exp(relation.log_odds):.1f}",
                 f"{degrees[0]:.1f}",
                 *(f"{value:.2f}" for value in degrees[1:]),
-                relation.problem or "good",
+                relation.problem or ("certain" if relation.is_certain else "probable"),
             )
     make_table_console().print(table)
     print(estimate.summary)
+    for image, reason in estimate.apart.items():
+        print_message("note", f"{image.name} is not in the file of poses: {reason}")
     for image, reason in estimate.unplaced.items():
         print_message("note", f"{image.name} has no pose: {reason}")
     sys.stdout.flush()

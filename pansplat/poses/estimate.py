@@ -109,6 +109,15 @@ class PoseEstimate:
         return self.groups[0].poses
 
     @property
+    def apart(self) -> dict[Path, str]:
+        """For each file of a smaller group, with which others it has a pose."""
+        return {
+            image: f"it has a pose with {', '.join(other.name for other in group.poses if other != image)} only"
+            for group in self.groups[1:]
+            for image in group.poses
+        }
+
+    @property
     def summary(self) -> str:
         """One line: how many panoramas have a pose, and the figures of the check."""
         used = [relation for relation in self.relations.values() if relation.is_reliable]

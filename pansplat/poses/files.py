@@ -33,7 +33,7 @@ SUFFIXES = (".json", ".tum", ".kitti")
 
 
 def write_poses(estimate: PoseEstimate, path: Path) -> None:
-    """Write a poses.json, or a trajectory in the TUM or KITTI format by the suffix.
+    """Write the poses of the largest group as a poses.json, or a trajectory in the TUM or KITTI format by the suffix.
 
     Names in a poses.json are relative to its folder. A trajectory has one line for each panorama that has a pose, in
     the order of the names; the timestamps of TUM are the panoramas' numbers.
@@ -70,7 +70,7 @@ def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str
         **_make_world(estimate.groups[0], names),
         "estimate": {
             "summary": estimate.summary,
-            "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
+            "unplaced": {image.name: reason for image, reason in (estimate.unplaced | estimate.apart).items()},
         },
     }
 
