@@ -9,15 +9,29 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import pansplat
 from pansplat.cli import run
 from pansplat.data.poses import read_trajectory
 from pansplat.poses.axes import SceneAxes
-from pansplat.poses.estimate import PoseEstimate, _is_mirrored, _View, estimate_poses
-from pansplat.poses.features import detect_features
+from pansplat.poses.dense import Surroundings
+from pansplat.poses.depth import DepthMap
+from pansplat.poses.estimate import (
+    NoPosesError,
+    PoseEstimate,
+    PoseGroup,
+    _is_mirrored,
+    _match,
+    _relate_views,
+    _View,
+    estimate_poses,
+)
+from pansplat.poses.features import Features, detect_features
 from pansplat.poses.files import write_poses
+from pansplat.poses.learned import LearnedFeatures, LearnedMatches, MatcherMissingError
 from pansplat.poses.solvers import angle_between, rotation_angle
+from pansplat.poses.two_view import NO_WAYS, RelativePose, Ways
 
 SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
 
@@ -61,7 +75,8 @@ def test_written_poses_are_read_back(estimate: PoseEstimate, photographs: Path, 
     (photographs / "poses.json").unlink()
     for panorama in pair.context:
         assert np.allclose(panorama.cam2world.numpy(), estimate.poses[panorama.image], atol=1e-8)
-    assert (pair.near, pair.far) == pytest.approx((estimate.near, estimate.far), abs=1e-3)
+    (group,) = estimate.groups
+    assert (pair.near, pair.far) == pytest.approx((group.near, group.far), abs=1e-3)
     for suffix in ("tum", "kitti"):
         write_poses(estimate, tmp_path / f"poses.{suffix}")
         trajectory = read_trajectory(tmp_path / f"poses.{suffix}")
@@ -123,7 +138,90 @@ def test_a_name_that_is_not_utf8_is_refused_before_the_estimate(tmp_path: Path, 
         assert "needed a name in UTF-8, got '\\udcff.png'; rename it" in _message(capsys, command, str(tmp_path))
 
 
-def test_a_mirror_image_of_symmetric_things_is_recognised() -> None:
+def _relation(log_odds: float, problem: str | None = None) -> RelativePose:
+    figures = 90.0, 50.0, 40.0, 0.3, (0.01, 0.01), 1.0, log_odds
+    return RelativePose(np.eye(3), np.eye(3)[0], np.empty((0, 2), int), *figures, problem)
+
+
+def test_the_summary_names_groups_and_probable_pairs() -> None:
+    files = [Path(f"{name}.png") for name in "abcdef"]
+    groups = [
+        PoseGroup(dict.fromkeys(files[start:end], np.eye(4)), 0.3, 7.0, residual, "a test")
+        for start, end, residual in ((0, 3, 0.1), (3, 5, 0.2))
+    ]
+    relations = {
+        (0, 1): _relation(math.inf), (1, 2): _relation(0.8), (3, 4): _relation(3.0), (2, 3): _relation(0.1, "unclear"),
+    }  # fmt: skip
+    estimate = PoseEstimate(tuple(files), tuple(groups), {files[5]: "dark"}, relations)
+    assert estimate.summary == (
+        "5 of 6 panoramas have a pose in 2 groups, by 3 pairs, of which 1 are probable only; residual 0.20 degrees; "
+        "scale: a test"
+    )
+    assert estimate.poses == groups[0].poses
+    alone = PoseEstimate(tuple(files[:3]), tuple(groups[:1]), {}, {(0, 1): _relation(3.0)})
+    assert alone.summary == "3 of 3 panoramas have a pose, by 1 pairs; residual 0.10 degrees; scale: a test"
+
+
+def test_without_the_learned_matcher_poses_are_estimated_by_sift_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse() -> None:
+        raise MatcherMissingError("needed the learned matcher's weights, got none; run setup.sh again")
+
+    monkeypatch.setattr("pansplat.poses.estimate.load_matcher", refuse)
+    for number in range(2):
+        noise = np.tile(np.random.default_rng(number).integers(0, 255, (8, 16, 3), np.uint8), (1, 3, 1))
+        ramp = cv2.resize(noise, (384, 64), interpolation=cv2.INTER_CUBIC)[:, 128:256]
+        cv2.imwrite(str(tmp_path / f"{number}.png"), ramp)
+    with pytest.warns(UserWarning) as caught, pytest.raises(NoPosesError, match=r"too little in common|features match"):
+        estimate_poses(sorted(tmp_path.glob("*.png")))
+    (message,) = {str(warning.message) for warning in caught}
+    assert message.startswith("poses are estimated by SIFT alone: needed the learned matcher's weights, got none")
+    assert len(caught) == 1
+
+
+def _view(features: Features, small: np.ndarray, learned: LearnedFeatures | None = None) -> _View:
+    """A view with unknown walls and depth."""
+    depth = DepthMap(np.zeros((48, 96)), np.full((48, 96), 1.0), np.eye(3))
+    axes = SceneAxes(np.eye(3), False, False)
+    return _View(features, features, learned, axes, small, Surroundings(small, depth))
+
+
+def _no_features(count: int) -> Features:
+    return Features(
+        np.tile((0.0, 0, 1), (count, 1)), np.zeros((count, 128), np.float32), np.ones(count), np.ones(count)
+    )
+
+
+def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    bearings = rng.normal(size=(400, 3))
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    descriptors = rng.uniform(size=(400, 128)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    every = Features(bearings, descriptors, np.ones(400), np.full(400, 1e-3))
+    learned = LearnedFeatures(-bearings[:3], torch.zeros(3, 128), torch.zeros(3, 2), (0, 3, 3, 3, 3), 0.01)
+    found = LearnedMatches(np.array(((2, 1), (0, 2))), np.array((0.9, 0.5)), np.array((0.99, 0.4)))
+    monkeypatch.setattr("pansplat.poses.estimate.match_learned", lambda matcher, first, second: found)
+    few, many = (_view(every.strongest(count), np.zeros((64, 128), np.float32), learned) for count in (20, 400))
+    joined = _match(few, few, object())
+    assert len(joined) == 22 and (np.diff(joined.prior) <= 0).all()
+    own = joined.indices.min(axis=1) >= 20  # learned features follow those of SIFT
+    assert joined.indices[own].tolist() == [[22, 21], [20, 22]] and joined.prior[own].tolist() == [0.7, 0.4]
+    assert np.allclose(few.matched.bearings[20:], -bearings[:3]) and len(few.joined) == 43
+    assert len(_match(few, few, None)) == 20 and _match(many, many, object()).indices.max() < 400
+
+
+def test_a_linked_pair_is_compared_among_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pansplat.poses.estimate._THOROUGH", 1)
+    monkeypatch.setattr("pansplat.poses.estimate._quick_overlap", lambda first, second: 0.0)
+    views = [_view(_no_features(1), np.zeros((4, 8), np.float32)) for _ in range(8)]
+    ways = {(i, j): NO_WAYS for i in range(8) for j in range(i + 1, 8)}
+    found = [_relate_views(views, ways | linked, 0, lambda *_: None) for linked in ({}, {(4, 6): Ways(back=0.5)})]
+    assert set(found[1]) - set(found[0]) == {(4, 6)}
+
+
+def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> None:
     """Symmetric furniture gives a mirrored picture a pose with many matches."""
     views = {}
     for name in ("left", "right", "mirrored"):
@@ -131,7 +229,7 @@ def test_a_mirror_image_of_symmetric_things_is_recognised() -> None:
         image = cv2.resize(image, (768, 384), interpolation=cv2.INTER_AREA)
         image = image[:, ::-1].copy() if name == "mirrored" else image
         features = detect_features(image, count=2500)
-        views[name] = _View(features, features, SceneAxes(np.eye(3), False, False), image)
+        views[name] = _view(features, image.astype(np.float32) / 255)
     assert _is_mirrored(views["left"], views["mirrored"])
     assert not _is_mirrored(views["left"], views["right"])
     assert not _is_mirrored(views["left"], views["left"])

@@ -10,7 +10,7 @@ import torch
 
 import pansplat
 from pansplat.errors import InputError
-from pansplat.poses.estimate import NoPosesError, PoseEstimate
+from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
 
 
 def _write(folder: Path, *names: str) -> None:
@@ -20,17 +20,20 @@ def _write(folder: Path, *names: str) -> None:
         cv2.imwrite(str(folder / name), ramp)
 
 
-def _place(*names: str):
-    """An estimate that places the files of these names, in metres along x."""
+def _place(*groups: tuple[str, ...]):
+    """An estimate that places the files of these names, in metres along x; each group in its own world."""
 
     def estimate(images, **options) -> PoseEstimate:
-        poses = {image: np.eye(4) for image in images if image.name in names}
-        for number, pose in enumerate(poses.values()):
-            pose[0, 3] = number
-        unplaced = {image: f"no door in {image.stem}" for image in images if image.name not in names}
-        if not poses:
+        unplaced = {image: f"no door in {image.stem}" for image in images if image.name not in sum(groups, ())}
+        if not groups:
             raise NoPosesError(unplaced)
-        return PoseEstimate(tuple(images), poses, unplaced, {}, 0.3, 7.0, 0.0, "a test")
+        found = []
+        for number, names in enumerate(groups):
+            poses = {image: np.eye(4) for image in images if image.name in names}
+            for step, pose in enumerate(poses.values()):
+                pose[0, 3] = step
+            found.append(PoseGroup(poses, 0.3 + number / 10, 7.0 + number, 0.0, "a test"))
+        return PoseEstimate(tuple(images), tuple(found), unplaced, {})
 
     return estimate
 
@@ -42,7 +45,7 @@ def _load(folder: Path) -> list:
 def test_the_panoramas_that_are_not_placed_are_scenes_of_their_own(tmp_path: Path, monkeypatch) -> None:
     _write(tmp_path, "a.png", "b.png", "c.png", "d.png", "e.png")
     (tmp_path / "links.json").write_text(json.dumps({"b.png": {"title": "Bath", "links": [{"to": "c.png", "yaw": 1}]}}))
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "c.png", "d.png"))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place(("a.png", "c.png", "d.png")))
     for _ in range(2):
         with pytest.warns(UserWarning) as caught:
             pairs = _load(tmp_path)
@@ -57,6 +60,39 @@ def test_the_panoramas_that_are_not_placed_are_scenes_of_their_own(tmp_path: Pat
         assert "b.png (Bath) has no pose and is a scene of its own: no door in b" in messages[1]
         assert "e.png has no pose" in messages[2]
         monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)  # the second call reads the cache
+
+
+def test_groups_are_worlds_of_their_own(tmp_path: Path, monkeypatch) -> None:
+    _write(tmp_path, "a.png", "b.png", "c.png", "d.png", "e.png", "f.png")
+    place = _place(("b.png", "d.png", "f.png"), ("a.png", "e.png"))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", place)
+    for _ in range(2):
+        with pytest.warns(UserWarning) as caught:
+            pairs = _load(tmp_path)
+        assert [pair.name for pair in pairs][1:] == ["d-f", tmp_path.name, "c"]
+        assert [[view.world for view in pair.context] for pair in pairs] == [[0, 0], [0, 0], [1, 1], [2]]
+        assert [view.name for view in pairs[2].context] == ["a", "e"] and pairs[2].context[1].cam2world[0, 3] == 1
+        assert [(pair.near, pair.far) for pair in pairs[1:3]] == [(0.3, 7), (0.4, 8)]
+        assert "5 of 6 panoramas have a pose in 2 groups" in str(caught[0].message) and len(caught) == 2
+        monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)  # the second call reads the cache
+
+
+def test_links_are_given_to_the_estimate_and_a_changed_one_is_estimated_anew(tmp_path: Path, monkeypatch) -> None:
+    _write(tmp_path, "a.png", "b.png")
+    given = []
+
+    def estimate(images, *, links, **options) -> PoseEstimate:
+        given.append({image.name: {target.name: yaw for target, yaw in own.items()} for image, own in links.items()})
+        return _place(("a.png", "b.png"))(images)
+
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", estimate)
+    for yaw in (1.5, 1.5, -0.5, None):
+        links = [] if yaw is None else [{"to": "b.png", "yaw": yaw}]
+        (tmp_path / "links.json").write_text(json.dumps({"a.png": {"title": "Hall", "links": links}}))
+        with pytest.warns(UserWarning, match="2 of 2 panoramas"):
+            _load(tmp_path)
+    assert [own["b.png"] for own in given] == [{}, {}, {}]
+    assert [own["a.png"].get("b.png") for own in given] == [1.5, -0.5, None]
 
 
 def test_if_none_is_placed_all_are_scenes_of_their_own(tmp_path: Path, monkeypatch) -> None:
@@ -76,14 +112,14 @@ def test_a_changed_picture_is_estimated_anew(tmp_path: Path, monkeypatch) -> Non
     with pytest.warns(UserWarning):
         assert len(_load(tmp_path)) == 2
     _write(tmp_path, "c.png", "b.png", "a.png")
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "b.png"))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place(("a.png", "b.png")))
     with pytest.warns(UserWarning, match="2 of 3 panoramas"), pytest.warns(UserWarning, match=r"c\.png has no pose"):
         assert [pair.name for pair in _load(tmp_path)] == [tmp_path.name, "c"]
 
 
 def test_a_renamed_scene_and_a_new_mask_are_estimated_anew(tmp_path: Path, monkeypatch) -> None:
     _write(tmp_path, "a.png", "b.png")
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "b.png"))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place(("a.png", "b.png")))
     for keys in (("hall", "bath"), ("Halle", "Bad")):
         scenes = {key: {"panorama": f"{file}.png"} for key, file in zip(keys, "ab", strict=True)}
         (tmp_path / "tour.json").write_text(json.dumps({"scenes": scenes}))
@@ -91,7 +127,7 @@ def test_a_renamed_scene_and_a_new_mask_are_estimated_anew(tmp_path: Path, monke
             (pair,) = _load(tmp_path)
         assert tuple(view.name for view in pair.context) == keys
     cv2.imwrite(str(tmp_path / "mask.png"), np.full((8, 16), 255, np.uint8))
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png"))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place(("a.png",)))
     with pytest.warns(UserWarning, match="1 of 2 panoramas"), pytest.warns(UserWarning, match=r"b\.png has no pose"):
         assert len(_load(tmp_path)) == 2
 
@@ -156,7 +192,7 @@ def test_the_panoramas_of_a_web_tour_keep_titles_links_and_start_views(tmp_path:
         "bath": {"title": "Bath", "panorama": "img/c.png"},
     }
     (tmp_path / "tour.json").write_text(json.dumps({"scenes": scenes}))
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place("a.png", "c.png"))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place(("a.png", "c.png")))
     for path in (tmp_path, tmp_path / "tour.json"):
         with (
             pytest.warns(UserWarning, match=r"2 of 3 panoramas have a pose, .* a test\.$"),

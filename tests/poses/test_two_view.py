@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes
+from pansplat.poses.dense import Surroundings
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
-from pansplat.poses.two_view import RelativePose, estimate_relative_pose, polish_pose, polish_relative_pose
+from pansplat.poses.two_view import (
+    NO_WAYS,
+    RelativePose,
+    Ways,
+    estimate_relative_pose,
+    polish_pose,
+    polish_relative_pose,
+)
 
 PIXEL = 2 * math.pi / 2048
-NOISE = 0.3 * PIXEL
+NOISE, STATED_NOISE = 0.3 * PIXEL, 0.45 * PIXEL
 
 
 @pytest.fixture
@@ -23,17 +31,17 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def features(bearings, sizes: np.ndarray | float = 1.0) -> tuple[Features, Features]:
     """Features of both views with these bearings and no descriptors."""
     count = len(bearings.first)
-    rest = np.zeros((count, 128), np.float32), np.broadcast_to(sizes, count), PIXEL
+    rest = np.zeros((count, 128), np.float32), np.broadcast_to(sizes, count), np.full(count, STATED_NOISE)
     return Features(bearings.first, *rest), Features(bearings.second, *rest)
 
 
 def estimate(bearings, seed: int = 0, axes: RotationPrior = NO_PRIOR, **options) -> RelativePose:
-    """The pose of bearings whose outliers come last, with ratios that hardly reveal them."""
+    """The pose of bearings whose outliers come last, with priors that hardly reveal them."""
     rng = np.random.default_rng(seed)
-    ratio = np.sort(rng.uniform(0.6, 0.85, len(bearings.first)))
-    order = rng.permutation(len(ratio))  # outliers are spread over all ratios
+    prior = -np.sort(-rng.uniform(0.06, 0.67, len(bearings.first)))
+    order = rng.permutation(len(prior))  # outliers are spread over all priors
     return estimate_relative_pose(
-        *features(bearings), Matches(np.stack((order, order), axis=1), ratio), axes, seed=seed, **options
+        *features(bearings), Matches(np.stack((order, order), axis=1), prior), axes, seed=seed, **options
     )
 
 
@@ -93,31 +101,99 @@ def test_matches_of_one_object_are_refused(scene) -> None:
     assert not found.is_reliable
 
 
-def test_walls_and_floor_confirm_a_pose_of_few_matches(scene) -> None:
-    turn = np.array((0, math.pi / 2, 0))
-    bearings = scene(
-        10, 40, noise=NOISE, outliers=0.4, rotation=rotation_exp(turn), translation=np.array((0.8, 0.0, 0.6))
-    )
-    axes = SceneAxes(np.array(((0.0, 1, 0), (0, 0, 1), (1, 0, 0))), True, True)
-    reliable = [
-        estimate(bearings, axes=prior, agree_on_floor=lambda hypothesis, floor=floor: floor).is_reliable
-        for prior, floor in ((NO_PRIOR, False), (NO_PRIOR, True), (RotationPrior(axes, axes), True))
-    ]
-    assert reliable == [False, False, True]
+HEIGHT = 1.35  # of the cameras over the floor of the room, metres
+WALLS = SceneAxes(np.array(((0.0, 1, 0), (0, 0, 1), (1, 0, 0))), True, True)
+PARALLEL = RotationPrior(WALLS, WALLS)
+CENTRES = np.array((-0.9, 0, 0.4)), np.array((0.8, 0, -0.5))
+TURN = rotation_exp(np.array((0, math.pi / 2, 0)))
+HALF_TURN = np.diag((-1.0, 1, -1))
 
 
-def test_the_floor_prefers_a_pose_among_equal_ones(scene, quick) -> None:
-    both = [scene(seed, 60, noise=NOISE) for seed in (11, 12)]
-    mixed = type(both[0])(
-        *(np.concatenate([getattr(b, side) for b in both]) for side in ("first", "second")),
-        both[0].rotation,
-        both[0].translation,
-    )
-    for wanted in both:
-        found = estimate(
-            mixed, agree_on_floor=lambda h, wanted=wanted: bool(rotation_angle(h.rotation @ wanted.rotation.T) < 0.01)
-        )
-        assert rotation_angle(found.rotation @ wanted.rotation.T) < 0.01
+@pytest.fixture
+def see_room(scene, find_walls):
+    """A function that makes bearings of a room's walls from its first place, and from a pose in it."""
+
+    def see(seed: int, count: int, rotation: np.ndarray, centre: np.ndarray):
+        example = scene(seed, count)
+        points = CENTRES[0] + example.first * find_walls(example.first, CENTRES[0])[:, None]
+        second = (points - centre) @ rotation
+        second /= np.linalg.norm(second, axis=1, keepdims=True)
+        rng = np.random.default_rng(seed)
+        first, second = (b + NOISE * rng.normal(size=b.shape) for b in (example.first, second))
+        first, second = (b / np.linalg.norm(b, axis=1, keepdims=True) for b in (first, second))
+        return type(example)(first, second, rotation.T, rotation.T @ (CENTRES[0] - centre) / HEIGHT)
+
+    return see
+
+
+def join(*parts):
+    """All matches of several ones, with the pose of the first ones."""
+    both = (np.concatenate([getattr(part, side) for part in parts]) for side in ("first", "second"))
+    return type(parts[0])(*both, parts[0].rotation, parts[0].translation)
+
+
+def look(look_around, rotation: np.ndarray, centre: np.ndarray, room: int = 0) -> tuple[Surroundings, Surroundings]:
+    """What cameras at the first place of a room, and at a pose in a room, see."""
+    return look_around(0, np.eye(3), CENTRES[0]), look_around(room, rotation, centre)
+
+
+def test_surroundings_confirm_a_pose_of_few_matches(scene, see_room, look_around) -> None:
+    bearings = see_room(10, 20, TURN, CENTRES[1])
+    mixed = join(bearings, scene(3, 20, outliers=1.0))
+    alone = estimate(mixed, axes=PARALLEL)
+    assert not alone.is_reliable and alone.log_odds == -math.inf and math.isnan(alone.distance)
+    found = estimate(mixed, axes=PARALLEL, surroundings=look(look_around, TURN, CENTRES[1]))
+    assert found.is_certain and math.isfinite(found.log_odds), found.problem
+    assert max(errors_degrees(found, bearings)) < 0.5
+    assert found.distance == pytest.approx(np.linalg.norm(bearings.translation), rel=0.03)
+    other = estimate(mixed, axes=PARALLEL, surroundings=look(look_around, TURN, CENTRES[1], room=1))
+    assert not other.is_reliable and "right with a probability of" in str(other.problem)
+
+
+def test_many_places_suffice_without_a_comparison(scene, quick) -> None:
+    found = estimate(scene(1, 300, noise=NOISE))
+    assert found.is_certain and found.log_odds == math.inf and found.places > 32
+
+
+def test_surroundings_choose_among_poses_of_equal_matches(see_room, look_around, quick) -> None:
+    """The room has the same depth after half a turn; only what it shows differs."""
+    poses = (TURN, CENTRES[1]), (HALF_TURN @ TURN, HALF_TURN @ CENTRES[1])
+    parts = [see_room(11 + n, 40, *pose) for n, pose in enumerate(poses)]
+    for wanted, pose in zip(parts, poses, strict=True):
+        found = estimate(join(*parts), axes=PARALLEL, surroundings=look(look_around, *pose))
+        assert max(errors_degrees(found, wanted)) < 0.5
+
+
+def find_ways(bearings) -> Ways:
+    """The right ways of a pose."""
+    there, back = -bearings.rotation.T @ bearings.translation, bearings.translation
+    return Ways(*(math.atan2(direction[0], direction[2]) for direction in (there, back)))
+
+
+def test_ways_choose_among_poses_of_equal_matches(see_room, look_around, quick) -> None:
+    poses = (TURN, CENTRES[1]), (HALF_TURN @ TURN, HALF_TURN @ CENTRES[1])
+    parts = [see_room(11 + n, 40, *pose) for n, pose in enumerate(poses)]
+    blank = [Surroundings(np.full((64, 128), 0.5), view.depth) for view in look(look_around, *poses[0])]
+    both, single = find_ways(parts[0]), find_ways(parts[1])
+    for wanted, ways in ((0, both), (1, Ways(there=single.there)), (1, Ways(back=single.back))):
+        found = estimate(join(*parts), axes=PARALLEL, surroundings=tuple(blank), ways=ways)
+        assert max(errors_degrees(found, parts[wanted])) < 0.5
+
+
+def test_ways_state_the_direction_to_the_other_camera() -> None:
+    rotation, translation = TURN.T, TURN.T @ (CENTRES[0] - CENTRES[1])
+    towards = CENTRES[1] - CENTRES[0]
+    yaw = math.atan2(towards[0], towards[2])
+    for wrong, sign in ((0.0, 1), (0.2, 1), (2.0, -1), (math.pi, -1)):
+        for turn in (wrong, wrong + 2 * math.pi, wrong - 2 * math.pi):
+            assert sign * Ways(there=yaw + turn).score(rotation[None], translation[None])[0] > 1
+    assert NO_WAYS.score(rotation[None], translation[None]).tolist() == [0]
+
+
+def test_only_matches_count_without_surroundings(see_room, quick) -> None:
+    bearings = see_room(12, 60, TURN, CENTRES[1])
+    plain, linked = (estimate(bearings, ways=ways) for ways in (NO_WAYS, Ways(2.0, 2.0)))
+    assert plain.log_odds == linked.log_odds and np.array_equal(plain.translation, linked.translation)
 
 
 def test_too_few_matches_are_refused(scene) -> None:
@@ -142,18 +218,21 @@ def test_further_matches_polish_a_pose(scene, quick) -> None:
     bearings = scene(9, 900, noise=2 * NOISE, outliers=0.5)
     few = type(bearings)(bearings.first[:60], bearings.second[:60], bearings.rotation, bearings.translation)
     found, count = estimate(few), len(bearings.first)
-    every = Matches(np.tile(np.arange(count)[:, None], (1, 2)), np.full(count, 0.7))
+    every = Matches(np.tile(np.arange(count)[:, None], (1, 2)), np.full(count, 0.45))
     polished = polish_relative_pose(found, *features(bearings), every)
     assert len(polished.indices) > len(found.indices) and polished.uncertainty[0] < found.uncertainty[0]
     assert sum(errors_degrees(polished, bearings)) < sum(errors_degrees(found, bearings))
 
 
-def _polish(bearings, ratio: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
+def _polish(bearings, prior: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
     """Errors of a polished pose that was 0.5 degrees off."""
     start = rotation_exp(np.radians((0.3, -0.4, 0.0))) @ bearings.rotation
-    indices = np.tile(np.arange(len(ratio))[:, None], (1, 2))
-    relation = RelativePose(start, bearings.translation, indices[:8], 99.0, 99.0, 50.0, 0.5, (0.1, 0.1), None)
-    return errors_degrees(polish_relative_pose(relation, *features(bearings, sizes), Matches(indices, ratio)), bearings)
+    indices = np.tile(np.arange(len(prior))[:, None], (1, 2))
+    figures = 99.0, 99.0, 50.0, 0.5, (0.1, 0.1), 2.0, 9.0
+    relation = RelativePose(start, bearings.translation, indices[:8], *figures, None)
+    polished = polish_relative_pose(relation, *features(bearings, sizes), Matches(indices, prior))
+    assert (polished.distance, polished.log_odds) == (2.0, 9.0)
+    return errors_degrees(polished, bearings)
 
 
 def _displaced(bearings, others, turns: np.ndarray):
@@ -167,8 +246,8 @@ def _displaced(bearings, others, turns: np.ndarray):
 def test_wrong_matches_near_the_epipolar_curves_hardly_move_a_pose(scene) -> None:
     turns = np.radians(np.random.default_rng(0).normal((0.3, -0.4, 0), 1.2, (400, 3)))  # about the wrong start
     mixed = _displaced(scene(13, 30, noise=NOISE), scene(40, 400), rotation_exp(turns))
-    ratio = np.concatenate((np.full(30, 0.65), np.full(400, 0.93)))
-    assert max(_polish(mixed, ratio, np.ones(430))) < 0.2
+    prior = np.concatenate((np.full(30, 0.6), np.full(400, 0.015)))
+    assert max(_polish(mixed, prior, np.ones(430))) < 0.2
 
 
 def test_large_features_have_a_small_weight(scene) -> None:
@@ -177,5 +256,5 @@ def test_large_features_have_a_small_weight(scene) -> None:
     errors = []
     for size in (1.0, 40.0):
         sizes = np.concatenate((np.ones(40), np.full(120, size)))
-        errors.append(max(_polish(mixed, np.full(160, 0.6), sizes)))
+        errors.append(max(_polish(mixed, np.full(160, 0.67), sizes)))
     assert errors[1] < 0.5 * errors[0]
