@@ -407,7 +407,7 @@ def _relate_views(
             chosen |= set(own[:_THOROUGH])
         pairs = sorted(chosen)
 
-    matcher = _load_matcher()
+    matcher = None if views[0].learned is None else load_matcher()
 
     def relate(pair: Pair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
