@@ -43,7 +43,8 @@ from pansplat.poses.learned import (
     match_learned,
 )
 from pansplat.poses.tour import Group, Pair, build_tour
-from pansplat.poses.two_view import NO_WAYS, RelativePose, Ways, estimate_relative_pose, polish_relative_pose
+from pansplat.poses.two_view import RelativePose, estimate_relative_pose, polish_relative_pose
+from pansplat.poses.ways import NO_WAYS, Ways
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_floor, level_poses
 from pansplat.predictor import Progress
 from pansplat.threads import one_thread, worker_threads

@@ -14,16 +14,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from pansplat.poses.axes import NO_PRIOR, RotationPrior
-from pansplat.poses.dense import Surroundings, compare, compare_many
+from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import MatchDepths
 from pansplat.poses.features import Features, Matches
+from pansplat.poses.proposals import LARGEST_CONFLICT, LEVEL, propose_by_depth
 from pansplat.poses.solvers import (
     Bearings,
     Rotation,
@@ -40,6 +40,7 @@ from pansplat.poses.solvers import (
     upright_from_three,
     upright_from_two,
 )
+from pansplat.poses.ways import NO_WAYS, Ways
 
 _WIDE_SHARE, _WIDE = 0.3, 3.0  # of right matches with larger errors; their standard deviation in that of the others
 _MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
@@ -53,7 +54,6 @@ _POLISH_PRIORS = np.array((0.667, 0.45, 0.15, 0.06, 0.02, 0.0125))  # limits of 
 _POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # of right matches in the window, a priori
 _POLISH_WEIGHT = 4.0  # of these shares, in matches
 _CALIBRATION = 1.5, 80.0  # factor of formal standard deviations: least one; that times the number of places
-_LEVEL = [2, 0, 1]  # order of the axes in a levelled camera: x, y down, z
 _MIN_MATCHES, _MAX_MATCHES = 8, 2500
 _TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
 _SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
@@ -63,14 +63,7 @@ _PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit
 _MIN_PARALLAX = 5.0  # in the noise's standard deviation
 _MAX_UNCERTAINTY = math.radians(4)
 _FACTORS, _PARALLEL_FACTORS = (2, 1), (4, 2, 1)  # of the noise, in the optimisation of a hypothesis
-_VOTERS, _VOTE_WIDTH, _VOTE_LIMITS = 800, 0.06, (0.03, 0.25)  # matches; error of their depth; of translations
-_VOTE_YAW, _CLIMB = 0.05, 0.3  # radians; deviation of the difference of the cameras' heights, camera heights
-_PAIR_SAMPLES, _PAIRS = 20000, 1000  # of two matches; of them, those that agree
-_MODES, _KEPT_BY_DEPTH = 8, 12  # hypotheses by depth: of each rotation; that are optimised
-_KEPT_ALIKE, _FARTHEST = 8, 8.0  # hypotheses by single matches that are optimised; their largest distance
-_ALIKE = 1.5, -60.0, 7.0, 3.5, 0.0  # of the logarithm of votes, conflict, likeness, shade, overlap
 _DEPTH_FACTORS = (24, 6, 2, 1)  # of the noise, in their optimisation
-_WAY_NOISE, _WAY_SHARE = math.radians(15), 0.85  # of links, which are often on a door; their share of right ones
 _EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
 
@@ -95,7 +88,7 @@ _COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds that a hypothesis is right, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # conflict, likeness, shade, overlap, slope of the way (docs/poses.md).
 _ODDS = (-13.1, 0.57, 1.43, 6.0, -27.0, 4.0, 2.2, -1.8, -18.6)
-_LARGEST_CONFLICT, _LARGEST_SLOPE = 0.1, 0.3
+_LARGEST_SLOPE = 0.3
 _CERTAIN_ODDS, _PROBABLE_ODDS = 1.2, 0.6
 
 
@@ -114,35 +107,6 @@ class Hypothesis:
     score: float
     probability: Float[Array, "match"]
     distance: float = math.nan
-
-
-class Ways(NamedTuple):
-    """Where a tour's links place the other panorama: yaw to the right of the centre column, radians; None without one.
-
-    Attributes:
-        there: from the first panorama.
-        back: from the second panorama.
-    """
-
-    there: float | None = None
-    back: float | None = None
-
-    def score(self, rotations: Float[Array, "n 3 3"], translations: Float[Array, "n 3"]) -> Float[Array, "n"]:
-        """Logarithm of the likelihood ratio of relative poses against chance."""
-        score = np.zeros(len(rotations))
-        for yaw, directions in (
-            (self.there, -np.einsum("nji,nj->ni", rotations, translations)),
-            (self.back, translations),
-        ):
-            if yaw is not None:
-                angle = np.arctan2(directions[:, 0], directions[:, 2]) - yaw
-                angle = (angle + math.pi) % (2 * math.pi) - math.pi
-                density = np.exp(-0.5 * (angle / _WAY_NOISE) ** 2) / (math.sqrt(2 * math.pi) * _WAY_NOISE)
-                score += np.log(_WAY_SHARE * density * 2 * math.pi + 1 - _WAY_SHARE)
-        return score
-
-
-NO_WAYS = Ways()
 
 
 def _match_noise(first: Features, second: Features, indices: Int[Array, "match 2"]) -> Float[Array, "match"]:
@@ -372,7 +336,7 @@ def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> list[Hy
         return []
     free, parallel = _sample_essentials(evidence, rng)
     found = [_optimise(essential, evidence, _FACTORS) for essential in _choose_best(free, evidence, _KEPT)]
-    found += [_optimise(pose, evidence, _DEPTH_FACTORS) for pose in _propose_by_depth(evidence, rng)]
+    found += [_optimise(essential, evidence, _DEPTH_FACTORS) for essential in _propose_by_depth(evidence, rng)]
     if len(parallel):  # inexact: compared among themselves, with a larger tolerance
         chosen = _choose_best(parallel, evidence.with_noise(2), _KEPT_PARALLEL)
         found += [_optimise(essential, evidence, _PARALLEL_FACTORS) for essential in chosen]
@@ -384,7 +348,7 @@ def _sample_essentials(
 ) -> tuple[Float[Array, "n 3 3"], Float[Array, "m 3 3"]]:
     """Essential matrices of random samples: of any pose or of levelled cameras, and of cameras with parallel walls."""
     a, b, axes = evidence.a, evidence.b, evidence.axes
-    levels = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
+    levels = axes.first.axes[LEVEL], axes.second.axes[LEVEL]
     free, parallel = [], [np.empty((0, 3, 3))]
     for top in sorted({min(top, len(a)) for top in _TOP_SETS}):
         chosen = _draw(rng, top, _SAMPLES[5], 5)
@@ -409,6 +373,14 @@ def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: i
     return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
 
 
+def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> list[Float[Array, "3 3"]]:
+    """Essential matrices by the estimated depths; none without these."""
+    if evidence.depths is None or evidence.surroundings is None:
+        return []
+    matches = evidence.a, evidence.b, evidence.prior, evidence.depths
+    return propose_by_depth(*matches, evidence.axes, evidence.surroundings, evidence.ways, rng)
+
+
 def _sample_depths(
     surroundings: tuple[Surroundings, Surroundings] | None, a: Bearings, b: Bearings
 ) -> MatchDepths | None:
@@ -418,124 +390,6 @@ def _sample_depths(
         view.depth.sample(rays) for view, rays in zip(surroundings, (a, b), strict=True)
     )
     return MatchDepths(np.stack((first, second), axis=1), np.stack((first_deviation, second_deviation), axis=1))
-
-
-def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> list[Float[Array, "3 3"]]:
-    """Essential matrices on which the translations of many matches agree, by their estimated depths.
-
-    With parallel walls one match states the translation for each of four rotations. Without them, two matches of
-    levelled cameras state rotation and translation.
-    """
-    if evidence.depths is None or evidence.surroundings is None:
-        return []
-    strongest = evidence.strongest(_VOTERS)
-    assert strongest.depths is not None
-    levels = evidence.axes.first.axes[_LEVEL], evidence.axes.second.axes[_LEVEL]
-    x, y = (
-        (rays * np.exp(strongest.depths.log_depth[:, side, None])) @ levels[side].T
-        for side, rays in enumerate((strongest.a, strongest.b))
-    )
-    reach = (_VOTE_WIDTH * np.exp(strongest.depths.log_depth).mean(axis=1)).clip(*_VOTE_LIMITS)
-    found, singles = [], []
-    for rotation in evidence.axes.wall_rotations():
-        level = levels[1] @ rotation @ levels[0].T
-        translations = y - x @ level.T
-        votes, weights = _count_votes(translations, reach, strongest.prior)
-        found += [(level, t, v) for t, v in _find_modes(translations, reach, votes, weights)]
-        singles.append((level, translations, votes))
-    found += _vote_pairs(x, y, reach, strongest.prior, rng)
-    found.sort(key=lambda item: -item[2])
-    chosen = [(rotation, t) for rotation, t, _ in found[:_KEPT_BY_DEPTH]]
-    chosen += _choose_alike(singles, levels, evidence.surroundings, evidence.ways)
-    return [
-        levels[1].T @ skew(t / max(float(np.linalg.norm(t)), 1e-9)) @ rotation @ levels[0] for rotation, t in chosen
-    ]
-
-
-def _choose_alike(
-    singles: Sequence[tuple[Float[Array, "3 3"], Float[Array, "n 3"], Float[Array, "n"]]],
-    levels: tuple[Float[Array, "3 3"], Float[Array, "3 3"]],
-    surroundings: tuple[Surroundings, Surroundings],
-    ways: Ways,
-) -> list[tuple[Float[Array, "3 3"], Float[Array, "3"]]]:
-    """Levelled poses of single matches under which both panoramas look most alike."""
-    if not singles:
-        return []
-    rotations = np.concatenate([np.repeat(rotation[None], len(t), axis=0) for rotation, t, _ in singles])
-    translations, votes = (np.concatenate([item[n] for item in singles]) for n in (1, 2))
-    kept = (np.abs(translations[:, 2]) < _CLIMB) & (np.linalg.norm(translations, axis=1) < _FARTHEST)
-    rotations, translations, votes = rotations[kept], translations[kept] * (1, 1, 0), votes[kept]
-    poses = levels[1].T @ rotations @ levels[0], translations @ levels[1]
-    overlap, conflict, likeness, shade = compare_many(*surroundings, *poses).T
-    values = np.log1p(votes), np.minimum(conflict, _LARGEST_CONFLICT), likeness, shade, overlap
-    odds = np.dot(_ALIKE, values) + ways.score(*poses)
-    chosen: list[int] = []
-    for n in np.argsort(-odds).tolist():
-        if len(chosen) == _KEPT_ALIKE:
-            break
-        if all(
-            np.linalg.norm(translations[n] - translations[m]) > _VOTE_LIMITS[1]
-            or np.abs(rotations[n] - rotations[m]).max() > _VOTE_YAW
-            for m in chosen
-        ):
-            chosen.append(n)
-    return [(rotations[n], translations[n]) for n in chosen]
-
-
-def _count_votes(
-    translations: Float[Array, "n 3"], reach: Float[Array, "n"], prior: Float[Array, "n"]
-) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
-    """How many matches state a translation near that of each match, and their weights."""
-    squared = ((translations[:, None] - translations[None]) ** 2).sum(axis=-1)
-    weights = np.exp(-0.5 * squared / reach[None] ** 2) * prior
-    return weights.sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2), weights
-
-
-def _find_modes(
-    translations: Float[Array, "n 3"], reach: Array, votes: Float[Array, "n"], weights: Float[Array, "n n"]
-) -> list[tuple[Float[Array, "3"], float]]:
-    """Translations with most votes, and these."""
-    found: list[tuple[Array, float]] = []
-    for n in np.argsort(-votes):
-        if len(found) == _MODES:
-            break
-        if all(np.linalg.norm(translations[n] - t) > 2 * reach[n] for t, _ in found):
-            centre = (weights[n][:, None] * translations).sum(axis=0) / max(weights[n].sum(), 1e-9)
-            found.append((centre, float(votes[n])))
-    return found
-
-
-def _vote_pairs(
-    x: Float[Array, "n 3"], y: Float[Array, "n 3"], reach: Array, prior: Array, rng: np.random.Generator
-) -> list[tuple[Float[Array, "3 3"], Float[Array, "3"], float]]:
-    """Rotations about the third axis and translations of pairs of points, dense ones, with their votes."""
-    count = len(x)
-    weights = prior / prior.sum()
-    first, second = (rng.choice(count, _PAIR_SAMPLES, p=weights) for _ in range(2))
-    dx, dy = x[second] - x[first], y[second] - y[first]
-    lengths = np.linalg.norm(dx[:, :2], axis=1), np.linalg.norm(dy[:, :2], axis=1)
-    tolerance = reach[first] + reach[second]
-    kept = (np.abs(lengths[0] - lengths[1]) < tolerance) & (np.abs(dx[:, 2] - dy[:, 2]) < tolerance)
-    kept &= np.minimum(*lengths) > 5 * tolerance
-    first, second, dx, dy = first[kept][:_PAIRS], second[kept][:_PAIRS], dx[kept][:_PAIRS], dy[kept][:_PAIRS]
-    if not len(first):
-        return []
-    yaw = np.arctan2(dy[:, 1], dy[:, 0]) - np.arctan2(dx[:, 1], dx[:, 0])
-    cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw)), np.ones(len(yaw))
-    rotations = np.stack((cos, -sin, zero, sin, cos, zero, zero, zero, one), axis=1).reshape(-1, 3, 3)
-    middle = (x[first] + x[second]) / 2, (y[first] + y[second]) / 2
-    translations = middle[1] - np.einsum("nij,nj->ni", rotations, middle[0])
-    turns = np.stack((cos, sin), axis=1) / _VOTE_YAW
-    points = np.concatenate((translations / _VOTE_LIMITS[1], turns), axis=1)
-    squared = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
-    votes = np.exp(-0.5 * squared).sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2)
-    found: list[int] = []
-    for n in np.argsort(-votes):
-        if len(found) == _MODES:
-            break
-        if all(squared[n, other] > 4 for other in found):
-            found.append(int(n))
-    return [(rotations[n], translations[n], float(votes[n]) * count / len(first) * 0.1) for n in found]
 
 
 def _optimise(essential: Float[Array, "3 3"], evidence: _Evidence, factors: Sequence[float]) -> Hypothesis:
@@ -756,7 +610,7 @@ def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
         math.log1p(max(hypothesis.score, 0.0)),
         math.log1p(_count_all_places(hypothesis, evidence)),
         float(evidence.axes.confirms(hypothesis.rotation)),
-        min(comparison.conflict, _LARGEST_CONFLICT),
+        min(comparison.conflict, LARGEST_CONFLICT),
         comparison.likeness,
         comparison.shade,
         comparison.overlap,

@@ -31,7 +31,8 @@ from pansplat.poses.features import Features, detect_features
 from pansplat.poses.files import write_poses
 from pansplat.poses.learned import LearnedFeatures, LearnedMatches, MatcherMissingError
 from pansplat.poses.solvers import angle_between, rotation_angle
-from pansplat.poses.two_view import NO_WAYS, RelativePose, Ways
+from pansplat.poses.two_view import RelativePose
+from pansplat.poses.ways import NO_WAYS, Ways
 
 SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
 

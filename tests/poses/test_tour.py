@@ -36,23 +36,27 @@ def relate(pair: Pair, indices: np.ndarray) -> RelativePose:
     )
 
 
-def build(*pairs: Pair, shared: bool = False, views: int = 3, **changes) -> Tour:
+def build(*pairs: Pair, shared: bool = False, views: int = 3, misleading: int = 0, **changes) -> Tour:
     """The tour by the given pairs, each with own points unless all cameras share them.
 
     Args:
+        misleading: further points of all cameras, seen as if the third one were 20 % further from the second.
         changes: of the last pair's relation; `turn`, radians, and `stretch` of its rotation and its distance.
     """
     rng = np.random.default_rng(0)
-    world = rng.uniform(-4, 4, (COUNT if shared else COUNT * len(pairs), 3))
+    world = rng.uniform(-4, 4, ((COUNT if shared else COUNT * len(pairs)) + misleading, 3))
+    wrong = np.arange(len(world) - misleading, len(world))
     features = []
-    for rotation, centre in zip(ROTATIONS[:views], CENTRES[:views], strict=True):
+    for view, (rotation, centre) in enumerate(zip(ROTATIONS[:views], CENTRES[:views], strict=True)):
         rays = (world - centre) @ rotation
+        if view == 2:
+            rays[wrong] = (world[wrong] - CENTRES[1] - 1.2 * (centre - CENTRES[1])) @ rotation
         bearings = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         rest = np.empty((len(world), 128), np.float32), np.zeros(len(world)), np.full(len(world), 1e-3)
         features.append(Features(bearings, *rest))
     relations = {}
     for n, pair in enumerate(pairs):
-        own = np.arange(COUNT) + (0 if shared else COUNT * n)
+        own = np.append(np.arange(COUNT) + (0 if shared else COUNT * n), wrong)
         relations[pair] = replace(relate(pair, np.stack((own, own), axis=1)), score=300.0 - n)
     turn, stretch = (changes.pop(name, default) for name, default in (("turn", 0.0), ("stretch", 1.0)))
     last = relations[pairs[-1]]
@@ -87,6 +91,11 @@ def test_a_panorama_without_shared_points_is_placed_at_its_estimated_distance() 
 def test_points_that_three_panoramas_see_correct_an_estimated_distance() -> None:
     (group,) = build((0, 1), (1, 2), shared=True, stretch=1.1).groups
     assert sides(group)[1] / sides(group)[0] == pytest.approx(TRUE_SIDES[1] / TRUE_SIDES[0], rel=1e-3)
+
+
+def test_a_few_wrong_points_that_three_panoramas_see_do_not_change_estimated_distances() -> None:
+    (group,) = build((0, 1), (1, 2), misleading=2).groups
+    assert sides(group) == pytest.approx(TRUE_SIDES.tolist(), rel=0.01)
 
 
 def test_two_panoramas_have_their_estimated_distance() -> None:

@@ -1,0 +1,41 @@
+"""Ways from one panorama towards another, as the links of a tour state them, as evidence for relative poses."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+_WAY_NOISE, _WAY_SHARE = math.radians(15), 0.85  # of links, which are often on a door; their share of right ones
+
+
+class Ways(NamedTuple):
+    """Where a tour's links place the other panorama: yaw to the right of the centre column, radians; None without one.
+
+    Attributes:
+        there: from the first panorama.
+        back: from the second panorama.
+    """
+
+    there: float | None = None
+    back: float | None = None
+
+    def score(self, rotations: Float[Array, "n 3 3"], translations: Float[Array, "n 3"]) -> Float[Array, "n"]:
+        """Logarithm of the likelihood ratio of relative poses against chance."""
+        score = np.zeros(len(rotations))
+        for yaw, directions in (
+            (self.there, -np.einsum("nji,nj->ni", rotations, translations)),
+            (self.back, translations),
+        ):
+            if yaw is not None:
+                angle = np.arctan2(directions[:, 0], directions[:, 2]) - yaw
+                angle = (angle + math.pi) % (2 * math.pi) - math.pi
+                density = np.exp(-0.5 * (angle / _WAY_NOISE) ** 2) / (math.sqrt(2 * math.pi) * _WAY_NOISE)
+                score += np.log(_WAY_SHARE * density * 2 * math.pi + 1 - _WAY_SHARE)
+        return score
+
+
+NO_WAYS = Ways()
