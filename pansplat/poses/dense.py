@@ -72,7 +72,7 @@ class Surroundings:
 
         They are those of the upright camera; depths are in camera heights.
         """
-        rays = pixel_directions(_HEIGHT, 2 * _HEIGHT).reshape(-1, 3).double().numpy() @ self.depth.rotation.T
+        rays = _upright_rays().reshape(-1, 3).astype(np.float64) @ self.depth.rotation.T
         small = cv2.resize(self.grey.astype(np.float32), (2 * _HEIGHT, _HEIGHT), interpolation=cv2.INTER_AREA)
         small = cv2.GaussianBlur(small, (0, 0), _BLUR)
         mean = cv2.GaussianBlur(small, (0, 0), _REGION)
@@ -105,11 +105,15 @@ def _compare_all(first: Surroundings, second: Surroundings, rotations: Array, tr
     back = there[0].transpose(0, 2, 1), -np.einsum("nji,nj->ni", there[0], there[1])
     values = np.zeros((len(rotations), 4))
     for (turns, ways), source, target in ((there, first, second), (back, second, first)):
-        rays = pixel_directions(_HEIGHT, 2 * _HEIGHT).numpy().astype(np.float32)
         values += 0.5 * _compare_one_way(
-            rays, source.maps, target.maps, turns.astype(np.float32), ways.astype(np.float32), step
+            _upright_rays(), source.maps, target.maps, turns.astype(np.float32), ways.astype(np.float32), step
         )
     return values
+
+
+@functools.cache
+def _upright_rays() -> Float[Array, "h 2*h 3"]:
+    return pixel_directions(_HEIGHT, 2 * _HEIGHT).numpy().astype(np.float32)
 
 
 @nb.njit(fastmath=True, cache=True, nogil=True)

@@ -86,9 +86,7 @@ def build_tour(
         groups.append(_place_group(features, own, downs, noise))
     groups.sort(key=lambda group: (-len(group.placed), group.placed))
     placed = {view for group in groups for view in group.placed}
-    unplaced = {
-        view: _describe_failure(view, relations, rejected) for view in range(len(features)) if view not in placed
-    }
+    unplaced = {view: _describe_failure(view, relations) for view in range(len(features)) if view not in placed}
     return Tour(tuple(groups), rejected, unplaced)
 
 
@@ -122,18 +120,13 @@ def _place_group(
     return Group(tuple(int(placed[i]) for i in order), poses[order], point_depths(problem), residual_angles(problem))
 
 
-def _describe_failure(
-    view: int, relations: Mapping[Pair, RelativePose], rejected: Sequence[Pair]
-) -> tuple[str, int | None]:
+def _describe_failure(view: int, relations: Mapping[Pair, RelativePose]) -> tuple[str, int | None]:
     """Why a panorama has no pose: the problem of its best pair."""
     own = [(pair, relation) for pair, relation in relations.items() if view in pair]
     if not own:
         return "it has nothing in common with another panorama", None
     pair, best = max(own, key=lambda item: (item[1].log_odds, item[1].places))
-    other = pair[0] if pair[1] == view else pair[1]
-    if best.problem is not None:
-        return best.problem, other
-    return "its pose contradicts those of other panoramas", other
+    return best.problem or "its pose contradicts those of others", pair[0] if pair[1] == view else pair[1]
 
 
 def _find_contradictions(relations: Mapping[Pair, RelativePose]) -> tuple[Pair, ...]:
