@@ -264,7 +264,7 @@ def estimate_poses(
         paths,
         tuple(groups),
         {paths[n]: unplaced[n] for n in sorted(unplaced)},
-        {(kept[i], kept[j]): relation for (i, j), relation in relations.items()},
+        {(kept[i], kept[j]): relation for (i, j), relation in (relations | tour.confirmed).items()},
     )
 
 
@@ -415,9 +415,9 @@ def _relate_views(
         matches = _match(first, second, matcher)
         prior = RotationPrior(first.axes, second.axes)
         relation = _estimate_pair(first, second, matches, prior, ways[pair], seed)
-        if not relation.is_reliable:
+        if not (relation.is_reliable or relation.is_doubtful):
             return relation
-        if _is_mirrored(first, second, overlap.get(pair), relation):
+        if relation.is_reliable and _is_mirrored(first, second, overlap.get(pair), relation):
             return replace(relation, problem="one of both looks mirrored left to right")
         further = match_features(first.turned, second.turned)
         every = matches.joined(further.shifted(len(first.matched), len(second.matched)))

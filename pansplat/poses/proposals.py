@@ -20,8 +20,7 @@ from pansplat.poses.ways import Ways
 
 LEVEL = [2, 0, 1]
 """Order of the axes in a levelled camera: x, y down, z."""
-LARGEST_CONFLICT = 0.1
-"""Share of the sphere, above which a conflict counts no more."""
+_LARGEST_CONFLICT = 0.1  # share of the sphere, above which a conflict counts no more
 _VOTERS, _VOTE_WIDTH, _VOTE_LIMITS = 800, 0.06, (0.03, 0.25)  # matches; error of their depth; of translations
 _VOTE_YAW, _CLIMB = 0.05, 0.3  # radians; deviation of the difference of the cameras' heights, camera heights
 _PAIR_SAMPLES, _PAIRS = 20000, 1000  # of two matches; of them, those that agree
@@ -86,7 +85,7 @@ def _choose_alike(
     rotations, translations, votes = rotations[kept], translations[kept] * (1, 1, 0), votes[kept]
     poses = levels[1].T @ rotations @ levels[0], translations @ levels[1]
     overlap, conflict, likeness, shade = compare_many(*surroundings, *poses).T
-    values = np.log1p(votes), np.minimum(conflict, LARGEST_CONFLICT), likeness, shade, overlap
+    values = np.log1p(votes), np.minimum(conflict, _LARGEST_CONFLICT), likeness, shade, overlap
     odds = np.dot(_ALIKE, values) + ways.score(*poses)
     chosen: list[int] = []
     for n in np.argsort(-odds).tolist():

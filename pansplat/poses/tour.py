@@ -8,6 +8,7 @@ poses are adjusted together.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ Pair = tuple[int, int]
 
 _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
 _LARGEST_GAP = 0.15  # of the way around it, relative to its length
+_CLOSED_ODDS, _NEEDED_ODDS = 4.0, 1.2  # logarithms: added by a closed triangle; needed by its doubtful pairs
 _SAME_PLACE = 0.2  # distance of two places of a panorama that confirm each other, relative to the way to it
 _OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
 _FEW_JOINT = 40  # points with two other panoramas, below which estimated distances count in the adjustment
@@ -54,11 +56,13 @@ class Tour:
 
     Attributes:
         groups: the largest one first.
+        confirmed: doubtful pairs that close a triangle with others.
         rejected: pairs that contradict the others.
         unplaced: for each panorama without a pose the reason, and the other panorama of its best pair.
     """
 
     groups: tuple[Group, ...]
+    confirmed: dict[Pair, RelativePose]
     rejected: tuple[Pair, ...]
     unplaced: dict[int, tuple[str, int | None]]
 
@@ -77,7 +81,8 @@ def build_tour(
         downs: gravity in each camera's frame; NaN where unknown.
         noise: standard deviation of a bearing, radians.
     """
-    reliable = {pair: relation for pair, relation in relations.items() if relation.is_reliable}
+    confirmed = _confirm(relations)
+    reliable = {pair: relation for pair, relation in relations.items() if relation.is_reliable} | confirmed
     rejected = _find_contradictions(reliable)
     reliable = {pair: relation for pair, relation in reliable.items() if pair not in rejected}
     groups = []
@@ -87,7 +92,34 @@ def build_tour(
     groups.sort(key=lambda group: (-len(group.placed), group.placed))
     placed = {view for group in groups for view in group.placed}
     unplaced = {view: _describe_failure(view, relations) for view in range(len(features)) if view not in placed}
-    return Tour(tuple(groups), rejected, unplaced)
+    return Tour(tuple(groups), confirmed, rejected, unplaced)
+
+
+def _confirm(relations: Mapping[Pair, RelativePose]) -> dict[Pair, RelativePose]:
+    """The doubtful relations that close a triangle with others; wrong ones rarely do."""
+    usable = {pair: relation for pair, relation in relations.items() if relation.is_reliable or relation.is_doubtful}
+    confirmed: dict[Pair, RelativePose] = {}
+    for i, j, k in itertools.combinations(sorted({view for pair in usable for view in pair}), 3):
+        pairs = (i, j), (j, k), (i, k)
+        if not all(pair in usable for pair in pairs):
+            continue
+        doubtful = {pair: usable[pair] for pair in pairs if usable[pair].is_doubtful}
+        odds = sum(relation.log_odds for relation in doubtful.values()) + _CLOSED_ODDS
+        if odds >= _NEEDED_ODDS and _closes(usable, usable[i, k], (i, k), j):
+            confirmed |= {pair: replace(relation, problem=None) for pair, relation in doubtful.items()}
+    return confirmed
+
+
+def _closes(relations: Mapping[Pair, RelativePose], relation: RelativePose, pair: Pair, k: int) -> bool:
+    """Whether a relation agrees with the way by a third panorama; False if the way is not known."""
+    first, second = _motion_between(relations, pair[0], k), _motion_between(relations, k, pair[1])
+    if first is None or second is None:
+        return False
+    turn = float(rotation_angle(second[0] @ first[0] @ relation.rotation.T))
+    way = second[0] @ first[1] + second[1]
+    length = relation.distance + float(np.linalg.norm(first[1]) + np.linalg.norm(second[1]))
+    gap = float(np.linalg.norm(way - relation.distance * relation.translation))
+    return turn < _LARGEST_LOOP and gap < _LARGEST_GAP * length
 
 
 def _connect(count: int, relations: Mapping[Pair, RelativePose]) -> list[set[int]]:
@@ -142,14 +174,8 @@ def _find_contradictions(relations: Mapping[Pair, RelativePose]) -> tuple[Pair, 
         relation = relations[pair]
         loops = []
         for k in {view for other in kept for view in other} - {i, j}:
-            first, second = _motion_between(kept, i, k), _motion_between(kept, k, j)
-            if first is None or second is None:
-                continue
-            turn = float(rotation_angle(second[0] @ first[0] @ relation.rotation.T))
-            way = second[0] @ first[1] + second[1]
-            length = relation.distance + float(np.linalg.norm(first[1]) + np.linalg.norm(second[1]))
-            gap = float(np.linalg.norm(way - relation.distance * relation.translation))
-            loops.append(turn < _LARGEST_LOOP and gap < _LARGEST_GAP * length)
+            if _motion_between(kept, i, k) is not None and _motion_between(kept, k, j) is not None:
+                loops.append(_closes(kept, relation, pair, k))
         if loops and sum(loops) * 2 < len(loops):
             rejected.append(pair)
         else:

@@ -23,7 +23,7 @@ from pansplat.poses.axes import NO_PRIOR, RotationPrior
 from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import MatchDepths
 from pansplat.poses.features import Features, Matches
-from pansplat.poses.proposals import LARGEST_CONFLICT, LEVEL, propose_by_depth
+from pansplat.poses.proposals import LEVEL, propose_by_depth
 from pansplat.poses.solvers import (
     Bearings,
     Rotation,
@@ -86,10 +86,11 @@ class _Support:
 _NEEDED = _Support(32, 80, 20)
 _COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds that a hypothesis is right, linear in: 1, log(1 + score), log(1 + places), parallel walls,
-# conflict, likeness, shade, overlap, slope of the way (docs/poses.md).
-_ODDS = (-13.1, 0.57, 1.43, 6.0, -27.0, 4.0, 2.2, -1.8, -18.6)
+# log(0.003 + conflict), likeness, shade, overlap, log(0.01 + slope of the way) (docs/poses.md).
+_ODDS = (-28.0, 0.6, 0.78, 6.4, -1.44, 8.0, 2.1, 0.6, -1.51)
+_LEAST_CONFLICT, _LEAST_SLOPE = 0.003, 0.01
 _LARGEST_SLOPE = 0.3
-_CERTAIN_ODDS, _PROBABLE_ODDS = 1.2, 0.6
+_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 1.0, 0.2, -2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -514,6 +515,11 @@ class RelativePose:
         return self.problem is None
 
     @property
+    def is_doubtful(self) -> bool:
+        """Whether too little is known by itself, and further pairs may confirm it."""
+        return not self.is_reliable and _DOUBTFUL_ODDS <= self.log_odds < _PROBABLE_ODDS
+
+    @property
     def is_certain(self) -> bool:
         """Whether it is wrong in less than one of 300 pairs; else it is probable."""
         return self.is_reliable and self.log_odds >= _CERTAIN_ODDS
@@ -610,11 +616,11 @@ def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
         math.log1p(max(hypothesis.score, 0.0)),
         math.log1p(_count_all_places(hypothesis, evidence)),
         float(evidence.axes.confirms(hypothesis.rotation)),
-        min(comparison.conflict, LARGEST_CONFLICT),
+        math.log(_LEAST_CONFLICT + comparison.conflict),
         comparison.likeness,
         comparison.shade,
         comparison.overlap,
-        min(slope, _LARGEST_SLOPE),
+        math.log(_LEAST_SLOPE + min(slope, _LARGEST_SLOPE)),
     )
     return float(np.dot(_ODDS, values) + evidence.ways.score(hypothesis.rotation[None], translation[None])[0])
 

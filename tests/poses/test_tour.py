@@ -138,3 +138,22 @@ def test_a_pair_that_closes_a_triangle_is_kept() -> None:
 def test_the_less_probable_pair_of_a_contradiction_is_rejected() -> None:
     tour = build((0, 1), (1, 2), (0, 2), stretch=2.0, log_odds=9.0)
     assert tour.rejected == ((1, 2),)  # of the others, it has the lower score
+
+
+DOUBT = {"problem": "too little in common", "log_odds": -1.0}
+
+
+def test_a_doubtful_pair_that_closes_a_triangle_is_used() -> None:
+    tour = build((0, 1), (1, 2), (0, 2), **DOUBT)
+    assert set(tour.confirmed) == {(0, 2)} and tour.confirmed[0, 2].is_reliable
+    assert tour.groups[0].placed == (0, 1, 2)
+
+
+@pytest.mark.parametrize("changes", [{"turn": math.radians(20)}, {"stretch": 2.0}, {"log_odds": -5.0}])
+def test_a_doubtful_pair_that_fits_no_triangle_is_not_used(changes: dict[str, float]) -> None:
+    assert not build((0, 1), (1, 2), (0, 2), **(DOUBT | changes)).confirmed
+
+
+def test_a_doubtful_pair_alone_places_nothing() -> None:
+    tour = build((0, 1), (1, 2), **DOUBT)
+    assert not tour.confirmed and tour.groups[0].placed == (0, 1) and set(tour.unplaced) == {2}
