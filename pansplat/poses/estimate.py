@@ -75,8 +75,8 @@ class PoseGroup:
     """Panoramas whose relative poses are known.
 
     Attributes:
-        poses: cam2world, OpenCV axes, world y down, metres if `scale_source` is not "unknown".
-        near, far: depth range of the group's points, in the poses' unit.
+        poses: cam2world, OpenCV axes, world y down, metres.
+        near, far: depth range of the group's points, metres.
         residual: median angle between points and bearings, degrees.
         scale_source: how the unit was found, for messages.
     """

@@ -74,9 +74,9 @@ class Floor:
     contrast: float
     lower: float | None = None
 
-    def is_found(self, contrast: float = _MIN_CONTRAST) -> bool:
+    def is_found(self) -> bool:
         """Whether the plane is a floor, and not the best of many wrong ones."""
-        return self.evidence >= _MIN_EVIDENCE and self.contrast >= contrast
+        return self.evidence >= _MIN_EVIDENCE and self.contrast >= _MIN_CONTRAST
 
 
 def find_floor(
