@@ -18,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, shortest_path
 from torch import Tensor
 
-from pansplat.data.pairs import Link, Pair, Panorama
+from pansplat.data.pairs import FAR, NEAR, Link, Pair, Panorama
 from pansplat.gaussians.scene import Gains, Gaussians, Scene, Starts
 from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
 from pansplat.geometry.world import working_factor
@@ -193,7 +193,10 @@ class TourGraph:
         """
         context = tuple((self.originals or self.panoramas)[view] for view in views)
         name = "-".join(panorama.name for panorama in context)
-        return Pair(name, self.folder, context, (), self.near, self.far, self.siblings)
+        near, far = self.near, self.far
+        if len(context) == 1:  # its walls may be nearer than what the cameras of the pairs see
+            near, far = min(near, NEAR), max(far, FAR)
+        return Pair(name, self.folder, context, (), near, far, self.siblings)
 
     def place(self, scene: Scene, views: Views) -> Scene:
         """The scene of `make_pair` in the world of the tour."""

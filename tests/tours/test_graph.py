@@ -101,6 +101,8 @@ def test_the_depth_range_of_a_tour_is_that_of_the_pairs_with_several_views(home)
     together, alone = home.make_pair((0, 1)), home.make_pair((3,))
     (tour,) = find_tours([dataclasses.replace(together, near=0.8, far=4.0), alone])
     assert (tour.near, tour.far) == (0.8, 4.0) and (alone.near, alone.far) == (0.45, 10.0)
+    single = tour.make_pair((len(tour) - 1,))
+    assert len(single.context) == 1 and (single.near, single.far) == (0.45, 10.0), "its walls may be nearer"
     (tour,) = find_tours([alone, home.make_pair((6,))])
     assert (tour.near, tour.far) == (0.45, 10.0)
 
