@@ -579,6 +579,8 @@ def estimate_relative_pose(
     problem = _find_problem(support, log_odds)
     if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
         problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
+    elif problem is None and surroundings is not None and not math.isfinite(best.distance):
+        problem = "the distance of the cameras cannot be determined"
     elif problem is None and uncertainty[1] > _MAX_UNCERTAINTY:
         problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
     return RelativePose(
