@@ -79,7 +79,7 @@ def load_pairs(
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
     The poses of a folder that holds panoramas only are estimated (docs/poses.md), with a warning, and cached. A
-    panorama without a pose is a pair of a single view; `Panorama.world` tells which poses have a common world.
+    panorama without a pose is a pair of a single view; poses of equal `Panorama.world` have a common world.
 
     Args:
         path: a panorama, a pair folder, a folder of many panoramas, a web tour, or a folder of pair folders, in one of

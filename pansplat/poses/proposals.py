@@ -26,7 +26,7 @@ _VOTE_YAW, _CLIMB = 0.05, 0.3  # radians; deviation of the difference of the cam
 _PAIR_SAMPLES, _PAIRS = 20000, 1000  # of two matches; of them, those that agree
 _MODES, _KEPT_BY_DEPTH = 8, 12  # hypotheses by depth: of each rotation; that are optimised
 _KEPT_ALIKE, _FARTHEST = 8, 8.0  # hypotheses by single matches that are optimised; their largest distance
-_ALIKE = 1.5, -60.0, 7.0, 3.5, 0.0  # of the logarithm of votes, conflict, likeness, shade, overlap
+_ALIKE = 1.5, -60.0, 7.0, 3.5  # of the logarithm of votes, conflict, likeness, shade
 
 
 def propose_by_depth(
@@ -84,8 +84,8 @@ def _choose_alike(
     kept = (np.abs(translations[:, 2]) < _CLIMB) & (np.linalg.norm(translations, axis=1) < _FARTHEST)
     rotations, translations, votes = rotations[kept], translations[kept] * (1, 1, 0), votes[kept]
     poses = levels[1].T @ rotations @ levels[0], translations @ levels[1]
-    overlap, conflict, likeness, shade = compare_many(*surroundings, *poses).T
-    values = np.log1p(votes), np.minimum(conflict, _LARGEST_CONFLICT), likeness, shade, overlap
+    _, conflict, likeness, shade = compare_many(*surroundings, *poses).T
+    values = np.log1p(votes), np.minimum(conflict, _LARGEST_CONFLICT), likeness, shade
     odds = np.dot(_ALIKE, values) + ways.score(*poses)
     chosen: list[int] = []
     for n in np.argsort(-odds).tolist():

@@ -110,11 +110,11 @@ def _confirm(relations: Mapping[Pair, RelativePose]) -> dict[Pair, RelativePose]
     return confirmed
 
 
-def _closes(relations: Mapping[Pair, RelativePose], relation: RelativePose, pair: Pair, k: int) -> bool:
-    """Whether a relation agrees with the way by a third panorama; False if the way is not known."""
+def _closes(relations: Mapping[Pair, RelativePose], relation: RelativePose, pair: Pair, k: int) -> bool | None:
+    """Whether a relation agrees with the way by a third panorama; None if the way is not known."""
     first, second = _motion_between(relations, pair[0], k), _motion_between(relations, k, pair[1])
     if first is None or second is None:
-        return False
+        return None
     turn = float(rotation_angle(second[0] @ first[0] @ relation.rotation.T))
     way = second[0] @ first[1] + second[1]
     length = relation.distance + float(np.linalg.norm(first[1]) + np.linalg.norm(second[1]))
@@ -170,16 +170,13 @@ def _find_contradictions(relations: Mapping[Pair, RelativePose]) -> tuple[Pair, 
     kept: dict[Pair, RelativePose] = {}
     rejected = []
     for pair in sorted(relations, key=lambda p: (-relations[p].log_odds, -relations[p].score)):
-        i, j = pair
-        relation = relations[pair]
-        loops = []
-        for k in {view for other in kept for view in other} - {i, j}:
-            if _motion_between(kept, i, k) is not None and _motion_between(kept, k, j) is not None:
-                loops.append(_closes(kept, relation, pair, k))
+        others = {view for other in kept for view in other} - set(pair)
+        closed = [_closes(kept, relations[pair], pair, k) for k in others]
+        loops = [is_closed for is_closed in closed if is_closed is not None]
         if loops and sum(loops) * 2 < len(loops):
             rejected.append(pair)
         else:
-            kept[pair] = relation
+            kept[pair] = relations[pair]
     return tuple(rejected)
 
 
