@@ -199,12 +199,18 @@ class NetworkObservation:
         self.priors = _as_priors(estimate)
 
     @torch.no_grad()
-    def refine(self, estimates: Sequence[DepthPrior], cam2world: np.ndarray, iterations: int) -> list[DepthPrior]:
-        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of the views."""
+    def refine(
+        self,
+        estimates: Sequence[DepthPrior],
+        cam2world: np.ndarray,
+        neighbours: Sequence[Sequence[int]],
+        iterations: int,
+    ) -> list[DepthPrior]:
+        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of each view with its neighbours."""
         log_depth = torch.from_numpy(np.stack([estimate.log_depth for estimate in estimates])).float()
         log_scale = torch.from_numpy(np.stack([estimate.scale for estimate in estimates])).float().log()
-        estimate, views = DepthEstimate(log_depth, log_scale), range(len(estimates))
-        pairs = [(view, other) for view in views for other in views if other != view]
+        estimate = DepthEstimate(log_depth, log_scale)
+        pairs = [(view, other) for view, others in enumerate(neighbours) for other in others]
         for _ in range(iterations):
             estimate = self.network.refine(self._observed, estimate, torch.from_numpy(cam2world), pairs)
         return _as_priors(estimate)

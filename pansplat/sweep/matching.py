@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, fields
 from typing import NamedTuple
@@ -227,6 +228,7 @@ class _Warped(NamedTuple):
 
 
 _MATCHED, _OUT_OF_RANGE, _MASKED = 0, 1, 2  # states of a warped pixel
+_UNSEEN = np.float32(1e-3)  # weight of a view that cannot see a hypothesis; it counts only where no view can
 
 
 @nb.njit(fastmath=True, forceinline=True, error_model="numpy")
@@ -271,8 +273,11 @@ def _warp(k, view, other, hypotheses, bounds, weights, row, warped):
 
 
 @nb.njit(fastmath=True, forceinline=True, error_model="numpy")
-def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m, result, slot):
-    """Write the cost of hypothesis `k` to `result[..., slot]`; `sums` are those of `_window_sums`."""
+def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m, result, share, slot):
+    """Write the cost of hypothesis `k` to `result[..., slot]`, and its weight among the other views to `share`.
+
+    `sums` are those of `_window_sums`.
+    """
     height, width = view.mean.shape
     own_mean, own_variance, valid, down = view.mean, view.variance, view.valid, view.down
     base, step, set_penalty, side, back_facing = hypotheses
@@ -294,52 +299,59 @@ def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m,
             textured = weights.textureless_weight + (1 - weights.textureless_weight) * textured
             cost = textured * cost + (1 - textured) * weights.textureless_cost
             extra = set_penalty[side[i, j], k] + penalty[i, j]
+            seen = np.float32(1)
             if other.has_surface:
                 if ratio[i, j] > 1 + weights.tolerance:
                     extra += weights.free_space_penalty
                 elif ratio[i, j] > 1 - weights.tolerance:
                     extra -= weights.consistency_bonus
                 else:
-                    cost = weights.occluded_cost
+                    cost, seen = weights.occluded_cost, _UNSEEN
             if back_facing[side[i, j], k]:
-                cost = weights.back_facing_cost
+                cost, seen = weights.back_facing_cost, _UNSEEN
             if state[i, j] == _MASKED or not valid[i, j]:
-                cost = neutral
+                cost, seen = neutral, _UNSEEN
             below = down[i, j] / max(base[i, j] + np.float32(k) * step[i, j], bounds.low)
             if below > bounds.floor or below < bounds.ceiling:
                 extra += weights.outside_penalty
             result[i, j, slot] = impossible if state[i, j] == _OUT_OF_RANGE else cost + extra
+            share[i, j, slot] = seen
 
 
 @nb.njit(fastmath=True, nogil=True, cache=True)
-def _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, offset):
-    """Write the costs of the hypotheses from `first` to `last` to `cost` (h, w, labels); the set starts at `offset`."""
+def _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, total, offset):
+    """Add the weighted costs of the hypotheses from `first` to `last` to `cost`, the weights to `total` (h, w, labels).
+
+    The set starts at `offset`.
+    """
     height, width = view.mean.shape
     m = (view.gray.shape[0] - height) // 2
     maps, row = np.empty((6, height, width), np.float32), np.empty((5, width), np.float32)
     gray, state = np.empty((height + 2 * m, width + 2 * m), np.float32), np.empty((height, width), np.uint8)
     warped, sums = _Warped(gray, maps[0], state, maps[1], maps[2]), (maps[3], maps[4], maps[5])
     column = np.empty((3, width + 2 * m), np.float32)
-    result = np.empty((height, width, _BLOCK), np.float32)
+    result, share = np.empty((height, width, _BLOCK), np.float32), np.empty((height, width, _BLOCK), np.float32)
     for k in range(first, last):
         _warp(k, view, other, hypotheses, bounds, weights, row, warped)
         _pad_in_place(warped.gray, m)
         _window_sums(view.gray, warped.gray, m, column[0], column[1], column[2], sums[0], sums[1], sums[2])
-        _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m, result, k - first)
+        _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m, result, share, k - first)
     for i in range(height):
         for j in range(width):
             for k in range(first, last):
-                cost[i, j, offset + k] = result[i, j, k - first]
+                weight = share[i, j, k - first]
+                cost[i, j, offset + k] += weight * result[i, j, k - first]
+                total[i, j, offset + k] += weight
 
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
-def _compute_set_cost(view, other, hypotheses, bounds, weights, cost, offset):
-    """Write the costs of a set's hypotheses to `cost` (h, w, labels), from label `offset`."""
+def _compute_set_cost(view, other, hypotheses, bounds, weights, cost, total, offset):
+    """Add the weighted costs of a set's hypotheses to `cost`, the weights to `total` (h, w, labels), from `offset`."""
     count = hypotheses.penalty.shape[1]
     for block in nb.prange((count + _BLOCK - 1) // _BLOCK):
         first = block * _BLOCK
         last = min(first + _BLOCK, count)
-        _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, offset)
+        _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, total, offset)
 
 
 class DepthRange(NamedTuple):
@@ -406,19 +418,32 @@ class View:
     inverse_depth: np.ndarray | None = None
 
 
+class OtherView(NamedTuple):
+    """A view that another one is matched against.
+
+    Attributes:
+        view: the other view.
+        pose: (4, 4) from the matched view's camera to the other one's.
+        sets: the hypotheses of the matched view; those of all others differ in `back_facing` only.
+    """
+
+    view: View
+    pose: np.ndarray
+    sets: list[HypothesisSet]
+
+
 def compute_matching_cost(
     view: View,
-    other: View,
-    pose: np.ndarray,
-    sets: list[HypothesisSet],
+    others: Sequence[OtherView],
     limits: tuple[float, float],
     floor_ceiling: tuple[float, float],
     config: MatchingConfig,
 ) -> np.ndarray:
     """Matching cost (h, w, sets * count) of every hypothesis, in the unit of the config's weights.
 
+    It is the mean over the other views that can see the hypothesis; over all of them where none can.
+
     Args:
-        pose: (4, 4) from `view`'s camera to `other`'s.
         limits: smallest and largest inverse depth, 1/m.
         floor_ceiling: extent of the scene below and above (negative) `view`'s camera, metres.
     """
@@ -431,25 +456,28 @@ def compute_matching_cost(
     variance = np.ascontiguousarray(cv2.boxFilter(gray * gray, -1, window)[inside])
     variance = np.maximum(variance - mean * mean, 0)
     matched = _Matched(view.image, view.valid, view.down, ray_grid(height), gray, mean, variance)
-    has_surface = other.inverse_depth is not None
-    warped = _Other(
-        pad_sphere(other.image, 1),
-        other.valid,
-        other.inverse_depth if has_surface else np.ones((height, width), np.float32),
-        has_surface,
-        np.ascontiguousarray(pose[:3, :3], np.float32),
-        np.ascontiguousarray(pose[:3, 3], np.float32),
-    )
     bounds = _Bounds(*np.float32((*limits, *floor_ceiling)))
     weights = _Weights(*(np.float32(getattr(config, name)) for name in _Weights._fields))
-    count = sets[0].penalty.shape[1]
-    cost = np.empty((height, width, len(sets) * count), np.float32)
+    count = others[0].sets[0].penalty.shape[1]
+    cost = np.zeros((height, width, len(others[0].sets) * count), np.float32)
+    total = np.zeros_like(cost)
+    unknown = np.ones((height, width), np.float32)
     limit_numba_threads()
-    for n, own in enumerate(sets):
-        back_facing = np.zeros((2, count), bool) if own.back_facing is None else own.back_facing
-        hypotheses = _Set(own.base, own.step, own.penalty, own.side, back_facing)
-        own_weights = weights if own.sphere else weights._replace(opposed_penalty=np.float32(0))
-        _compute_set_cost(matched, warped, hypotheses, bounds, own_weights, cost, n * count)
+    for other, pose, sets in others:
+        warped = _Other(
+            pad_sphere(other.image, 1),
+            other.valid,
+            unknown if other.inverse_depth is None else other.inverse_depth,
+            other.inverse_depth is not None,
+            np.ascontiguousarray(pose[:3, :3], np.float32),
+            np.ascontiguousarray(pose[:3, 3], np.float32),
+        )
+        for n, own in enumerate(sets):
+            back_facing = np.zeros((2, count), bool) if own.back_facing is None else own.back_facing
+            hypotheses = _Set(own.base, own.step, own.penalty, own.side, back_facing)
+            own_weights = weights if own.sphere else weights._replace(opposed_penalty=np.float32(0))
+            _compute_set_cost(matched, warped, hypotheses, bounds, own_weights, cost, total, n * count)
+    cost /= total
     return cost
 
 

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.sweep.matching import DepthRange, HypothesisSet, MatchingConfig, View, compute_matching_cost
+from pansplat.sweep.matching import DepthRange, HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.surface import Surface, pad_sphere, ray_grid, world_points
 
 _MIN_GRADIENT = 0.02  # per pixel; smaller gradients are noise
@@ -268,7 +268,8 @@ def _count_votes(
         )
         for axis, (slope, side) in enumerate(zip(np.abs(rays), (rays > 0).astype(np.uint8), strict=True))
     ]  # fmt: skip
-    cost = compute_matching_cost(view, other, np.linalg.inv(there) @ here, sets, depths.limits, _UNBOUNDED, config)
+    matched = OtherView(other, np.linalg.inv(there) @ here, sets)
+    cost = compute_matching_cost(view, [matched], depths.limits, _UNBOUNDED, config)
     vote = np.exp(-cost / _SOFTNESS)
     vote *= (_vote_weights(view) / vote.sum(axis=-1))[..., None] * np.maximum(_MAX_COST - cost, 0)
     votes = np.zeros_like(planes.histogram)

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 
 from pansplat.data.views import CAMERA_HEIGHT
-from pansplat.geometry.equirect import rotate_equirect
-from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
+from pansplat.geometry.equirect import rotate_equirect, row_weights
+from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
-from pansplat.sweep.surface import Surface, resize_sphere
+from pansplat.sweep.surface import Surface, nearest_pixel, ray_grid, resize_sphere
 from pansplat.threads import limit_numba_threads
 
 _HEIGHT_CANDIDATES = 64
@@ -34,6 +34,8 @@ _MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
 _HEIGHT_PENALTY = 0.06  # matching cost of a height by a factor of e from the usual one
 _FLOOR_TOLERANCE = 0.15  # in camera heights, from the floor to the pixels that the model places on it
 _SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
+_MIN_SPREAD = 0.1  # relative deviation of an estimate, at least, when it decides what a view sees
+_MIN_OVERLAP = 0.5  # of views that are matched
 _UNBOUNDED = (math.inf, -math.inf)
 
 
@@ -88,8 +90,14 @@ class ObservedViews(Protocol):
         """Log-depth (h, w) of each panorama by itself, larger than the priors, with the edges of the photograph."""
         ...
 
-    def refine(self, estimates: Sequence[DepthPrior], cam2world: np.ndarray, iterations: int) -> list[DepthPrior]:
-        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of the views."""
+    def refine(
+        self,
+        estimates: Sequence[DepthPrior],
+        cam2world: np.ndarray,
+        neighbours: Sequence[Sequence[int]],
+        iterations: int,
+    ) -> list[DepthPrior]:
+        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of each view with its neighbours."""
         ...
 
 
@@ -144,19 +152,59 @@ class PriorEstimator:
             for log_depth, turn in zip(upright, self._turns, strict=True)
         ]
 
+    def choose_neighbours(self, limits: tuple[float, float], count: int) -> list[list[int]]:
+        """The other views of each view that see most of the same surfaces, those of the largest overlap first.
+
+        The surfaces are the estimates of each view by itself. An overlap is the smaller share of the two spheres that
+        the other camera sees, from at most twice the distance. Each view has at least one other view.
+
+        Args:
+            limits: smallest and largest inverse height of the cameras over the floor.
+            count: number of other views, at most.
+        """
+        height = min(max(CAMERA_HEIGHT, 1 / limits[1]), 1 / limits[0])
+        priors = self._turn_back(_scale_depth(self._observed.priors, [height] * len(self._turns)))
+        shares = np.array(
+            [
+                [_share_seen(here, there, poses) for there, poses in zip(priors, pairs, strict=True)]
+                for here, pairs in zip(priors, _pair_poses(self._cam2world), strict=True)
+            ]
+        )
+        overlap = np.minimum(shares, shares.T)
+        np.fill_diagonal(overlap, -1)
+        order = overlap.argsort(axis=1, kind="stable")[:, ::-1]
+        return [
+            [int(other) for n, other in enumerate(row[:count]) if n == 0 or overlap[view, other] > _MIN_OVERLAP]
+            for view, row in enumerate(order[:, :-1])
+        ]
+
     def estimate_by_matching(
-        self, views: Sequence[View], limits: tuple[float, float], matching: MatchingConfig
+        self,
+        views: Sequence[View],
+        neighbours: Sequence[Sequence[int]],
+        limits: tuple[float, float],
+        matching: MatchingConfig,
     ) -> list[list[DepthPrior]]:
         """The priors of each view, from the height by the floor and, where it differs, from that by all surfaces.
 
         Args:
             views: the views at the size at which heights are compared.
+            neighbours: the other views that each view is compared with.
             limits: smallest and largest inverse height of the cameras over the floor.
         """
+        self._neighbours = neighbours
         first = self._turn_back(self._observed.priors)
+        by_pair = {}  # by the best neighbour: the model errs by another factor in each room
+        for nodes in {tuple(sorted((view, others[0]))) for view, others in enumerate(neighbours)}:
+            pair = [[maps[n] for n in nodes] for maps in (first, views)]
+            by_pair[nodes] = [
+                _estimate_camera_heights(
+                    *pair, self._cam2world[list(nodes)], self._down, limits, matching, floor_only=floor_only
+                )
+                for floor_only in (True, False)
+            ]
         heights = [
-            _estimate_camera_heights(first, views, self._cam2world, self._down, limits, matching, floor_only=floor_only)
-            for floor_only in (True, False)
+            [by_pair[min(n, o[0]), max(n, o[0])][kind][n > o[0]] for n, o in enumerate(neighbours)] for kind in range(2)
         ]
         if np.abs(np.log(np.divide(*heights))).max() < _SAME_HEIGHT:
             heights.pop()
@@ -176,7 +224,7 @@ class PriorEstimator:
 
     def _refine(self, estimates: Sequence[DepthPrior], iterations: int) -> list[DepthPrior]:
         """Estimates of the upright panoramas, refined and turned back."""
-        return self._turn_back(self._observed.refine(estimates, self._upright_poses, iterations))
+        return self._turn_back(self._observed.refine(estimates, self._upright_poses, self._neighbours, iterations))
 
     def _turn_back(self, priors: Sequence[DepthPrior]) -> list[DepthPrior]:
         """Priors of the upright panoramas as ones of the panoramas."""
@@ -240,6 +288,24 @@ def _estimate_camera_heights(
     return [max(1 / best + float(a), 1 / limits[1]) for a in above]
 
 
+def _pair_poses(cam2world: np.ndarray) -> np.ndarray:
+    """Poses (v, v, 4, 4) from the first view's camera to the second one's."""
+    return np.linalg.inv(cam2world)[None] @ cam2world[:, None]
+
+
+def _share_seen(here: DepthPrior, there: DepthPrior, pose: np.ndarray) -> float:
+    """Share of a view's sphere whose surface another view sees; `pose` (4, 4) is from its camera to the other one's."""
+    height = len(here.log_depth)
+    depth = np.exp(here.log_depth)
+    points = (ray_grid(height) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+    distance = np.maximum(np.linalg.norm(points, axis=-1), 1e-9)
+    pixel = nearest_pixel(points, height)
+    behind = (distance / np.exp(there.log_depth[pixel]) - 1) / np.maximum(there.scale[pixel], _MIN_SPREAD)
+    seen = np.clip(2 - 0.5 * behind, 0, 1) * np.minimum(2 * depth / distance, 1)
+    areas = row_weights(height).numpy()
+    return float(seen.mean(axis=1) @ areas / areas.sum())
+
+
 def _height_weights(prior: DepthPrior, view: View, *, floor_only: bool) -> np.ndarray:
     """Weights (h, w) of a view's pixels in the search of the height: textured, and of a certain prior."""
     weight = texture_weights(view) * np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
@@ -268,8 +334,8 @@ def _match_heights(
     total = np.zeros(len(candidates))
     for n, other in enumerate(views):
         if n != index:
-            pose = np.linalg.inv(cam2world[n]) @ cam2world[index]
-            cost = compute_matching_cost(views[index], other, pose, [shape], (1e-6, 1e6), _UNBOUNDED, config)
+            matched = OtherView(other, np.linalg.inv(cam2world[n]) @ cam2world[index], [shape])
+            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), _UNBOUNDED, config)
             total += np.einsum("hw,hwk->k", weight, np.minimum(cost, _MAX_COST))
     return total
 

@@ -22,6 +22,7 @@ from pansplat.sweep.matching import (
     DepthRange,
     HypothesisSet,
     MatchingConfig,
+    OtherView,
     View,
     aggregate_costs,
     compute_matching_cost,
@@ -71,6 +72,8 @@ class SearchConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
+    max_neighbours: int = 4
+    """Other views, at most, that a view is matched against."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +97,9 @@ class PosedImages:
         images = np.stack([resize_sphere(image, height) for image in self.images])
         return dataclasses.replace(self, images=images, masks=np.stack([resize_mask(m, height) for m in self.masks]))
 
-    @property
-    def baseline(self) -> float:
-        """Largest distance between two cameras, metres."""
-        centres = self.cam2world[:, :3, 3]
+    def measure_baseline(self, views: Sequence[int]) -> float:
+        """Largest distance between two cameras of some views, metres."""
+        centres = self.cam2world[list(views), :3, 3]
         return float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
 
 
@@ -116,30 +118,41 @@ def search_surfaces(
     surfaces: list[Surface] | None = None
     low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
     depths = DepthRange(low / config.far_margin, low, high)
-    steps = (high - low) * posed.baseline / (math.pi / heights[0])  # candidates are a pixel of parallax apart
-    count = int(np.clip(math.ceil(steps), 48, config.max_candidates))
-    step, candidates = depths.step(count), depths.sample(count)
-    planes = make_empty_planes(posed.cam2world, axes, posed.near, 1 / depths.farthest)
-    detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), planes, depths.limits, config, None)
+    empty = make_empty_planes(posed.cam2world, axes, posed.near, 1 / depths.farthest)
+    detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), [empty] * len(posed.images), depths.limits, config, [], None)
     estimator = None
     if prior_model is not None:
         report("estimating depth", 0.02)
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
-    if posed.baseline < 1e-3 * posed.near:  # of one view, or of views at one place: nothing can be matched
+    if posed.measure_baseline(range(len(posed.images))) < 1e-3 * posed.near:  # of one view, or of views at one place: nothing can be matched
         return _place_unmatched(posed, finest, depths, estimator)
     priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
+    neighbours = choose_nearest(posed.cam2world, config.max_neighbours)
     if estimator is not None:
-        priors = estimator.estimate_by_matching(detection.views, (low, high), config.matching)
+        neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
+        priors = estimator.estimate_by_matching(detection.views, neighbours, (low, high), config.matching)
     report("finding planes", 0.05)
-    planes = detect_planes(
-        detection.views, detection.rays, posed.cam2world, planes, depths, MIN_FLOOR * posed.near, config.matching
-    )
+    by_pair = {
+        nodes: detect_planes(
+            *([maps[n] for n in nodes] for maps in (detection.views, detection.rays)),
+            posed.cam2world[list(nodes)],
+            empty,
+            depths,
+            MIN_FLOOR * posed.near,
+            config.matching,
+        )
+        for nodes in {tuple(sorted((view, others[0]))) for view, others in enumerate(neighbours)}
+    }
+    planes = [by_pair[min(view, others[0]), max(view, others[0])] for view, others in enumerate(neighbours)]
+    pixel = math.pi / heights[0] / (high - low)  # candidates are a pixel of parallax apart
+    baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
+    counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         if estimator is not None and surfaces is not None:
             priors = estimator.estimate_from_surfaces(surfaces)
-        level = _SearchLevel(posed, heights[0], planes, depths.limits, config, surfaces)
-        surfaces = [level.search_full_range(view, candidates, own) for view, own in enumerate(priors)]
+        level = _SearchLevel(posed, heights[0], planes, depths.limits, config, neighbours, surfaces)
+        surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
@@ -147,13 +160,21 @@ def search_surfaces(
             guided_upsample(s, resize_sphere(image, s.height), resize_sphere(image, height))
             for s, image in zip(surfaces, posed.images, strict=True)
         ]
-        step /= 2
-        level = _SearchLevel(posed, height, planes, depths.limits, config, surfaces)
+        level = _SearchLevel(posed, height, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [
-            level.refine(view, config.narrow_candidates[n], step, widen=n == 0) for view in range(len(posed.images))
+            level.refine(view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
+            for view, count in enumerate(counts)
         ]
     assert surfaces is not None
     return surfaces
+
+
+def choose_nearest(cam2world: np.ndarray, count: int) -> list[list[int]]:
+    """The other views of each view, the nearest cameras first, at most `count`."""
+    centres = cam2world[:, :3, 3]
+    distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    np.fill_diagonal(distances, -1)
+    return distances.argsort(axis=1, kind="stable")[:, 1 : count + 1].tolist()
 
 
 def _place_unmatched(
@@ -176,19 +197,29 @@ class _SearchLevel:
         self,
         posed: PosedImages,
         height: int,
-        planes: ScenePlanes,
+        planes: Sequence[ScenePlanes],
         limits: tuple[float, float],
         config: SearchConfig,
+        neighbours: Sequence[Sequence[int]],
         surfaces: list[Surface] | None,
     ) -> None:
         self.posed, self.height, self.limits, self.config, self.surfaces = posed, height, limits, config, surfaces
-        self.rays = [axis_components(planes.axes, pose[:3, :3], height) for pose in posed.cam2world]
+        self.neighbours = neighbours
+        self.rays = [
+            axis_components(own.axes, pose[:3, :3], height) for own, pose in zip(planes, posed.cam2world, strict=True)
+        ]
         self.planes = planes
         masks = [resize_mask(mask, height) for mask in posed.masks]
         self.consistent: list[np.ndarray] = []
         if surfaces is not None:
             self.consistent = [consistency_mask(surfaces, posed.cam2world, n) & mask for n, mask in enumerate(masks)]
-            self.planes = collect_planes(surfaces, self.consistent, posed.cam2world, planes)
+            groups = [[view, *others] for view, others in enumerate(neighbours)]
+            self.planes = [
+                collect_planes(
+                    *([maps[n] for n in group] for maps in (surfaces, self.consistent)), posed.cam2world[group], own
+                )
+                for group, own in zip(groups, planes, strict=True)
+            ]
         self.views = [
             View(
                 resize_sphere(image, height),
@@ -210,7 +241,7 @@ class _SearchLevel:
             penalties[0] += self.config.sphere_prior
             for axis in range(3):
                 penalties[axis + 1] = self.config.plane_prior * (
-                    1 - self.planes.support(axis, self.posed.cam2world[view], inverse)
+                    1 - self.planes[view].support(axis, self.posed.cam2world[view], inverse)
                 )
         sets = [
             HypothesisSet(low * slope, step * slope, penalty.astype(np.float32), side)
@@ -227,7 +258,7 @@ class _SearchLevel:
     ) -> list[HypothesisSet]:
         """Copies of the sets in which the planes that separate the two views are back-facing."""
         pose, there = self.posed.cam2world[[view, other]]
-        marks = [None] + [self.planes.separating(axis, pose, there, inverse) for axis in range(3)]
+        marks = [None] + [self.planes[view].separating(axis, pose, there, inverse) for axis in range(3)]
         return [dataclasses.replace(s, back_facing=m, sphere=m is None) for s, m in zip(sets, marks, strict=True)]
 
     def refine(self, view: int, count: int, step: float, *, widen: bool) -> Surface:
@@ -251,19 +282,12 @@ class _SearchLevel:
 
     def _mean_cost(self, view: int, make_sets: Callable[[int], list[HypothesisSet]]) -> np.ndarray:
         """Mean matching cost (h, w, sets * count) over the other views, of the sets that `make_sets(other)` returns."""
-        others = [n for n in range(len(self.views)) if n != view]
-        bounds = self.planes.vertical_bounds(self.posed.cam2world[view])
-        cost: np.ndarray | None = None
-        for other in others:
-            part = compute_matching_cost(
-                self.views[view], self.views[other], self.posed.relative_pose(view, other),
-                make_sets(other), self.limits, bounds, self.config.matching,
-            )  # fmt: skip
-            cost = part if cost is None else cost + part
-        assert cost is not None
-        if len(others) > 1:
-            cost /= len(others)
-        return cost
+        bounds = self.planes[view].vertical_bounds(self.posed.cam2world[view])
+        others = [
+            OtherView(self.views[other], self.posed.relative_pose(view, other), make_sets(other))
+            for other in self.neighbours[view]
+        ]
+        return compute_matching_cost(self.views[view], others, self.limits, bounds, self.config.matching)
 
     def _select_hypotheses(
         self, view: int, sets: list[HypothesisSet], cost: np.ndarray, slot_map: np.ndarray, slots: int
