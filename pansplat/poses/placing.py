@@ -36,6 +36,7 @@ _UPRIGHT = math.radians(8)  # between a world's y axis and the mean down of its 
 SNAP_RADIUS, SNAP_ANGLE = 0.35, math.radians(12)  # metres and radians, to a suggestion
 WALL_ANGLE = math.radians(6)  # to parallel walls
 _LEAST_OVERLAP = 0.01  # of a comparison that counts
+_LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind
 _NEIGHBOURS = 4  # nearest panoramas that a place is compared with
 
 
@@ -253,8 +254,9 @@ class Fit:
 
     @property
     def quality(self) -> float:
-        """0 for chance to 1 for a pose as good as those that pass the check."""
-        return min(max(2.5 * self.likeness - 4 * self.conflict, 0.0), 1.0)
+        """0 for chance to 1 for a right pose in one room."""
+        low, high = _LIKENESS
+        return min(max((self.likeness - low) / (high - low) - _CONFLICT_WEIGHT * self.conflict, 0.0), 1.0)
 
 
 def measure_fit(

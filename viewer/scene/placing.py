@@ -38,6 +38,7 @@ FINE = 0.1  # of movements and turns with Shift
 _TURN_SNAP = 0.45  # of a step: a turn by steps must leave what it snapped to
 _MAX_GHOSTS = 12
 _SAME_METRES, _SAME_ANGLE = 0.25, math.radians(6)  # of suggestions that count as one
+_PLAN_MARGIN, _LEAST_EXTENT = 0.6, 4.0  # metres, around what a plan shows, and of its sides
 _BESIDE = 2.0  # metres, of a piece without suggestions from the others
 
 Nodes = tuple[int, ...]
@@ -116,6 +117,20 @@ class Placing:
         self.is_changed = False
         self.error: str | None = None
 
+    def is_of(self, folder: Path, panoramas: Sequence[Panorama]) -> bool:
+        """Whether these are its photographs."""
+        return folder == self._folder and [view.image for view in panoramas] == [view.image for view in self._first]
+
+    def reopen(self, panoramas: Sequence[Panorama]) -> None:
+        """Go on with the same photographs, which were loaded again; changes before can still be undone."""
+        self.is_changed = False
+        if self._editor is None or not self._editor.file.exists():
+            self._first = tuple(panoramas)
+        try:
+            self._read_again()
+        except InputError as error:
+            self.error = str(error)
+
     # --- photographs ---
 
     @property
@@ -167,8 +182,7 @@ class Placing:
     def _read_again(self) -> None:
         """Take poses and placements from the poses.json, or as at first if there is none."""
         found = {panorama.image.resolve(): panorama for panorama in self._first}
-        assert self._editor is not None
-        if self._editor.file.exists():
+        if self._editor is not None and self._editor.file.exists():
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 collection = read_pose_file_folder(self._folder)
@@ -312,8 +326,8 @@ class Placing:
         if fresh or not self._measured:
             self.ghosts = self._list_ghosts()
             if not self._is_moved:
-                self._raw = self._choose_start()
-                self.shown = Snapped(self._raw)
+                self.shown = self._choose_start()
+                self.drop()
         if not known:
             return
         key = (self.shown.place, len(known), self.node, self.targets)
@@ -342,16 +356,17 @@ class Placing:
                 kept.append(ghost)
         return kept[:_MAX_GHOSTS]
 
-    def _choose_start(self) -> Place:
+    def _choose_start(self) -> Snapped:
         """Where the piece is at first: its pose if it has one here, the best suggestion, or beside the others."""
         assert self.node is not None
         if self._is_in_world(self.node):
-            return self.floor.find_place(self._get_pose(self.node), self.pieces[self._image(self.node)].upright)
+            upright = self.pieces[self._image(self.node)].upright
+            return Snapped(self.floor.find_place(self._get_pose(self.node), upright))
         if self.ghosts:
-            return self.ghosts[0].place
+            return Snapped(self.ghosts[0].place, 0)
         right = max((place.right for place in self.places.values()), default=0.0)
         forward = float(np.mean([place.forward for place in self.places.values()])) if self.places else 0.0
-        return Place(right + _BESIDE, forward, 0.0)
+        return Snapped(Place(right + _BESIDE, forward, 0.0))
 
     @property
     def wall_yaw(self) -> float | None:
@@ -362,6 +377,13 @@ class Placing:
             if own is not None:
                 yaws.append(place.yaw + own)
         return find_wall_yaw(yaws)
+
+    def list_points(self) -> Float[np.ndarray, "n 2"]:
+        """Points on the plan that a view of it should contain: outlines of the others and the piece, and ghosts."""
+        outlines = [self.outline(node) for node in (*self.targets, *(self.moved if self.node is not None else ()))]
+        points = [outline for outline in outlines if outline is not None]
+        points += [np.array([ghost.place[:2]]) for ghost in self.ghosts]
+        return np.concatenate(points) if points else np.zeros((1, 2))
 
     def move(self, right: float, forward: float, *, fine: bool = False, free: bool = False) -> None:
         """Move the piece by metres on the plan.
@@ -386,10 +408,10 @@ class Placing:
         """Turn the piece to a heading, radians; see `move`."""
         self._set(self._raw._replace(yaw=wrap_angle(yaw)), free=free)
 
-    def go_to(self, place: Place) -> None:
-        """Move the piece to a place, such as that of a ghost."""
-        self._set(place, free=True)
-        self.drop()
+    def go_to(self, number: int) -> None:
+        """Move the piece to a ghost."""
+        self._raw, self._is_moved = self.ghosts[number].place, True
+        self.shown = Snapped(self._raw, number)
 
     def drop(self) -> None:
         """End a drag: the next one starts from where the piece is shown."""
@@ -466,3 +488,41 @@ class Placing:
             poses |= {self._image(target): self._get_pose(target) for target in self.targets}
         world, unit = self._world, self.floor.unit
         return self._change(lambda editor: editor.place(poses, world, unit))
+
+
+@dataclass(frozen=True)
+class PlanView:
+    """The part of a floor plan in a rectangle of the screen; forward is up.
+
+    Attributes:
+        middle: of the rectangle, metres (right, forward).
+        pixels_per_metre: scale.
+        size: of the rectangle, pixels.
+    """
+
+    middle: tuple[float, float]
+    pixels_per_metre: float
+    size: tuple[float, float]
+
+    @staticmethod
+    def of_points(points: Float[np.ndarray, "n 2"], size: tuple[float, float]) -> PlanView:
+        """The view of points with a margin, at least 4 m wide."""
+        low, high = points.min(axis=0), points.max(axis=0)
+        extent = np.maximum(high - low + 2 * _PLAN_MARGIN, _LEAST_EXTENT)
+        right, forward = ((low + high) / 2).tolist()
+        return PlanView((right, forward), float(np.min(np.array(size) / extent)), size)
+
+    def to_pixels(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels (right, down) from the rectangle's corner."""
+        scale = self.pixels_per_metre
+        return (np.asarray(places) - self.middle) * (scale, -scale) + np.array(self.size) / 2
+
+    def to_metres(self, pixels: tuple[float, float]) -> tuple[float, float]:
+        """The place at a pixel."""
+        right, down = (np.array(pixels) - np.array(self.size) / 2) / self.pixels_per_metre
+        return self.middle[0] + float(right), self.middle[1] - float(down)
+
+    def contains(self, points: Float[np.ndarray, "n 2"]) -> bool:
+        """Whether points are inside."""
+        pixels = self.to_pixels(points)
+        return bool(((pixels >= 0) & (pixels <= self.size)).all())
