@@ -107,7 +107,9 @@ def test_the_outline_of_a_room_is_where_its_walls_are(look_around):
     corners = piece.draw_outline(Place(0.6, -0.4, 0), 1.35)
     assert np.allclose(corners.max(axis=0), (2.6, 2.1), atol=0.12)
     assert np.allclose(corners.min(axis=0), (-2.6, -2.1), atol=0.12)
-    turned = piece.draw_outline(Place(0, 0, QUARTER), 1.35) + (-0.4, -0.6)  # the same room, turned to the right
+    turned = piece.draw_outline(Place(0, 0, QUARTER), 1.35) + np.array(
+        (-0.4, -0.6)
+    )  # the same room, turned to the right
     assert np.allclose(turned.max(axis=0), (2.1, 2.6), atol=0.12)
 
 

@@ -82,16 +82,16 @@ class Placing:
     """
 
     def __init__(
-        self, folder: Path, panoramas: Sequence[Panorama], *, read: Callable[[Path], Piece] = read_piece
+        self, folder: Path, panoramas: Sequence[Panorama], *, read: Callable[[Path], Piece] | None = None
     ) -> None:
         """No photograph is being placed.
 
         Args:
             folder: of the photographs.
             panoramas: all of them, in their own worlds.
-            read: makes the piece of a photograph; called in a worker thread.
+            read: makes the piece of a photograph, by default from its estimated depth; called in a worker thread.
         """
-        self._folder, self._read, self._first = folder, read, tuple(panoramas)
+        self._folder, self._read, self._first = folder, read or read_piece, tuple(panoramas)
         self.panoramas = self._first
         self.problem: str | None = None
         self._editor: PoseEditor | None = None

@@ -283,9 +283,7 @@ class PlacingWindow:
         else:
             fit, share = placing.fit, placing.fit.quality
             color = tuple(share * good + (1 - share) * bad for good, bad in zip(_GOOD, _BAD, strict=True))
-            text = (
-                f"likeness {fit.likeness:.2f}   conflict {100 * fit.conflict:.1f} %   overlap {100 * fit.overlap:.0f} %"
-            )
+            text = f"likeness {fit.likeness:.2f}   conflict {100 * fit.conflict:.1f} %"
             imgui.text_colored((*color, 1.0), text)
             imgui.progress_bar(share, (-1, 5 * imgui.get_style().font_scale_dpi), "")
         imgui.text_disabled(HINT)
