@@ -146,7 +146,7 @@ class Viewer:
         """Whether the next frame differs without new input."""
         loading = self.loader.entry is not None or self.loader.is_searching or self._comparer.photographs.is_reading
         loading = loading or self._incoming is not None or self._preparer.progress is not None
-        loading = loading or (self._placing is not None and self._placing.is_reading)
+        loading = loading or (self._placing is not None and self._placing.is_busy)
         return self.moving or loading or self._films.future is not None
 
     @property

@@ -253,10 +253,15 @@ class Fit:
     overlap: float
 
     @property
-    def quality(self) -> float:
-        """0 for chance to 1 for a right pose in one room."""
+    def score(self) -> float:
+        """About 0 by chance, and 1 at a right pose in one room."""
         low, high = _LIKENESS
-        return min(max((self.likeness - low) / (high - low) - _CONFLICT_WEIGHT * self.conflict, 0.0), 1.0)
+        return (self.likeness - low) / (high - low) - _CONFLICT_WEIGHT * self.conflict
+
+    @property
+    def quality(self) -> float:
+        """The score within 0 to 1."""
+        return min(max(self.score, 0.0), 1.0)
 
 
 def measure_fit(

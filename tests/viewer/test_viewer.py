@@ -1289,7 +1289,9 @@ def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(plac
     assert abs(placing.shown.place.yaw - yaw - np.radians(10)) < 0.05
     assert (user.state.camera, user.state.flight) == (camera, flight), "keys and wheel turn the piece only"
 
-    (x, y), ghost = find_pixel(), placing.ghosts[0].place
+    user.click("Adjust##pose")
+    user.draw_until(lambda: not placing.is_adjusting, "end of the adjustment")
+    ghost = placing.ghosts[0].place
     at = window.view.to_pixels(np.array(ghost[:2])) + window.corner
     user.click_at(*at)  # on the ghost
     assert placing.shown.suggestion == 0

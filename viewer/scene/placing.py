@@ -34,6 +34,8 @@ from pansplat.poses.placing import (
 from pansplat_viewer.scene.background import BackgroundWorker, CancelledError, Report
 
 TURN_STEP = math.radians(5)
+_ADJUST_STEP, _LEAST_STEP = 0.16, 0.01  # metres: first and last step of an adjustment
+_ADJUST_TURN = math.radians(20)  # turn for a step of a metre
 FINE = 0.1  # of movements and turns with Shift
 _TURN_SNAP = 0.45  # of a step: a turn by steps must leave what it snapped to
 _MAX_GHOSTS = 12
@@ -114,6 +116,7 @@ class Placing:
         self.fit: Fit | None = None
         self._measured: tuple[object, ...] = ()
         self._is_moved = False
+        self._step = 0.0  # metres, of the adjustment in progress
         self.is_changed = False
         self.error: str | None = None
 
@@ -247,6 +250,7 @@ class Placing:
         poses = np.stack([self._get_pose(target) for target in self.targets])
         self.floor = Floor.of_world(poses, unit or first.camera_height)
         self.places, self.ghosts, self.fit, self._measured, self._is_moved = {}, [], None, (), False
+        self._step = 0.0
         self._start_reading()
         self.update()
 
@@ -270,6 +274,11 @@ class Placing:
     def is_reading(self) -> bool:
         """Whether pieces are still to come."""
         return self._worker.future is not None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the next `update` changes something without input."""
+        return self.is_reading or self.is_adjusting
 
     @property
     def missing(self) -> int:
@@ -330,10 +339,39 @@ class Placing:
                 self.drop()
         if not known:
             return
-        key = (self.shown.place, len(known), self.node, self.targets)
+        key = self._make_key(known)
         if key != self._measured:
             self._measured = key
-            self.fit = self._measure(known)
+            self.fit = self._measure(known, self.shown.place)
+        if self._step:
+            self._adjust(known)
+
+    def adjust(self) -> None:
+        """Move the piece to the place of the best fit nearby, in small steps with each `update`."""
+        self._step = _ADJUST_STEP if self.fit is not None else 0.0
+
+    @property
+    def is_adjusting(self) -> bool:
+        """Whether the piece moves to the best fit."""
+        return self._step > 0
+
+    def _adjust(self, known: Sequence[int]) -> None:
+        """One step of a search along the axes: the best neighbour, or half the step."""
+        place, best = self.shown.place, self.fit
+        steps = np.concatenate((np.eye(3), -np.eye(3))) * (1, 1, _ADJUST_TURN) * self._step
+        for right, forward, turn in steps.tolist():
+            near = Place(place.right + right, place.forward + forward, wrap_angle(place.yaw + turn))
+            fit = self._measure(known, near)
+            if fit is not None and (best is None or fit.score > best.score):
+                best, self.shown = fit, Snapped(near)
+        if self.shown.place == place:
+            self._step = self._step / 2 if self._step > _LEAST_STEP else 0.0
+        self.fit, self._is_moved = best, True
+        self._measured = self._make_key(known)
+        self.drop()
+
+    def _make_key(self, known: Sequence[int]) -> tuple[object, ...]:
+        return self.shown.place, len(known), self.node, self.targets
 
     def _list_ghosts(self) -> list[Ghost]:
         assert self.node is not None
@@ -410,7 +448,7 @@ class Placing:
 
     def go_to(self, number: int) -> None:
         """Move the piece to a ghost."""
-        self._raw, self._is_moved = self.ghosts[number].place, True
+        self._raw, self._is_moved, self._step = self.ghosts[number].place, True, 0.0
         self.shown = Snapped(self._raw, number)
 
     def drop(self) -> None:
@@ -420,7 +458,7 @@ class Placing:
     def _set(self, raw: Place, *, free: bool, largest_turn: float | None = None) -> None:
         if self.node is None or self._get_piece(self.node) is None:
             return
-        self._raw, self._is_moved = raw, True
+        self._raw, self._is_moved, self._step = raw, True, 0.0
         walls = None if free else self.pieces[self._image(self.node)].wall_yaw
         found = snap(raw, [] if free else [ghost.place for ghost in self.ghosts], walls, self.wall_yaw)
         if largest_turn is not None and found.place.turn_between(raw) > largest_turn:
@@ -451,13 +489,16 @@ class Placing:
         return view.placement.state != "not placed" and view.world == self._world
 
     def find_poses(self) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """The poses, cam2world, of the piece's photographs at its place.
+        """The poses, cam2world, of the piece's photographs where it is shown.
 
         A photograph that has a pose is moved along the floor and turned; it keeps its tilt, and in its own world its
         height. Another one is upright, as high as the nearest camera.
         """
+        return self._find_poses(self.shown.place)
+
+    def _find_poses(self, place: Place) -> dict[int, Float[np.ndarray, "4 4"]]:
         assert self.node is not None
-        place, upright = self.shown.place, self.pieces[self._image(self.node)].upright
+        upright = self.pieces[self._image(self.node)].upright
         pose = self.floor.make_pose(place, upright, self._find_down(place))
         if self.panoramas[self.node].placement.state == "not placed":
             return {self.node: pose}
@@ -472,11 +513,11 @@ class Placing:
         motion[:3, 3] = self.floor.level @ (place.right, down, place.forward) - motion[:3, :3] @ old[:3, 3]
         return {node: motion @ self._get_pose(node) for node in self.moved}
 
-    def _measure(self, known: Sequence[int]) -> Fit | None:
+    def _measure(self, known: Sequence[int], place: Place) -> Fit | None:
         assert self.node is not None
         others = [(self.pieces[self._image(target)], self._get_pose(target)) for target in known]
         piece = self.pieces[self._image(self.node)]
-        return measure_fit(piece, self.find_poses()[self.node], others, self.floor.unit)
+        return measure_fit(piece, self._find_poses(place)[self.node], others, self.floor.unit)
 
     def save(self) -> bool:
         """Write the pose of the piece; returns whether it was written."""

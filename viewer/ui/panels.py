@@ -99,7 +99,7 @@ class Panels:
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.items: dict[str, Rectangle] = {}
-        self.minimap, self.placing = Minimap(ctx), PlacingWindow()
+        self.minimap, self.placing = Minimap(ctx), PlacingWindow(ctx)
         self.path, self.path_file = "", "path.json"
 
     def draw(self, state: ViewerState, data: PanelData, now: float) -> Commands:
@@ -135,6 +135,7 @@ class Panels:
     def release(self) -> None:
         """Free the GL objects."""
         self.minimap.release()
+        self.placing.release()
 
     def _draw_tour(self, state: ViewerState, data: PanelData, tour: TourScenes, commands: Commands) -> None:
         """Draw the plan and the progress of the tour at the right border, below the statistics."""

@@ -8,11 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import moderngl
 import numpy as np
 from imgui_bundle import imgui
 from jaxtyping import Float
 
 from pansplat.data.placements import State
+from pansplat.poses.placing import Piece
 from pansplat_viewer.scene.placing import Nodes, Place, Placing, PlanView
 
 STATE_COLORS: dict[State, tuple[float, float, float, float]] = {
@@ -36,6 +38,7 @@ _GOOD, _BAD = (0.4, 0.9, 0.45), (0.95, 0.4, 0.35)
 _KNOB = 34.0  # pixels from the camera to the knob, at a DPI scale of 1
 _REACH = 9.0  # pixels around a ghost or the knob
 _BUTTONS = 150.0  # pixels from the list's left border to the first button, at a DPI scale of 1
+_ROWS = 0.25, 0.7  # of the photograph that are shown
 _SIZE = 520.0  # of the window, pixels at a DPI scale of 1
 
 _FLAGS = imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_scroll_with_mouse.value
@@ -96,7 +99,11 @@ class PlacingWindow:
         corner, view: of the plan in the last frame, pixels; for tests that drag.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ctx: moderngl.Context) -> None:
+        """No texture is made before the first frame."""
+        self._ctx = ctx
+        self._texture: moderngl.Texture | None = None
+        self._shown: Piece | None = None  # in the texture
         self.corner = (0.0, 0.0)
         self.view = PlanView((0.0, 0.0), 1.0, (1.0, 1.0))
         self._key: tuple[object, ...] = ()
@@ -109,11 +116,12 @@ class PlacingWindow:
         first = imgui.Cond_.first_use_ever.value
         size = min(_SIZE * scale, 0.9 * display.x, 0.75 * display.y)
         imgui.set_next_window_pos((display.x / 2, display.y / 2), first, (0.5, 0.5))
-        imgui.set_next_window_size((size, 1.2 * size), first)
+        imgui.set_next_window_size((size, min(1.4 * size, 0.95 * display.y)), first)
         shown, is_open = imgui.begin("Place by hand", True, _FLAGS)
         reload = False
         if shown:
             self._draw_choices(placing, button)
+            self._draw_photograph(placing)
             self._draw_plan(placing, scale, record)
             reload = self._draw_state(placing, button)
         imgui.end()
@@ -144,6 +152,32 @@ class PlacingWindow:
             label = "only it##group" if placing.with_group else "with its group##group"
             if button(label):
                 placing.start(node, with_group=not placing.with_group)
+
+    def release(self) -> None:
+        """Free the texture."""
+        if self._texture is not None:
+            self._texture.release()
+        self._texture = self._shown = None
+
+    def _draw_photograph(self, placing: Placing) -> None:
+        """Draw the photograph of the piece as far as it is level; its middle is the direction of the camera's mark."""
+        assert placing.node is not None
+        piece = placing.pieces.get(placing.panoramas[placing.node].image)
+        if piece is None:
+            return
+        if piece is not self._shown:
+            self.release()
+            grey = piece.surroundings.grey
+            rows = grey[round(_ROWS[0] * len(grey)) : round(_ROWS[1] * len(grey))]
+            pixels = np.repeat((255 * rows.clip(0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+            self._texture, self._shown = self._ctx.texture(pixels.shape[1::-1], 3, pixels.tobytes(), alignment=1), piece
+            self._texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        assert self._texture is not None
+        width, at = imgui.get_content_region_avail().x, imgui.get_cursor_screen_pos()
+        height = width * self._texture.height / self._texture.width
+        imgui.image(imgui.ImTextureRef(self._texture.glo), (width, height))
+        middle = at.x + width / 2
+        imgui.get_window_draw_list().add_line((middle, at.y), (middle, at.y + height), _color((*_PIECE[:3], 0.7)), 1.0)
 
     def _draw_plan(self, placing: Placing, scale: float, record: Record) -> None:
         """Draw the plan, and apply the pointer, the wheel and the keys to the piece."""
@@ -287,6 +321,11 @@ class PlacingWindow:
             imgui.text_colored((*color, 1.0), text)
             imgui.progress_bar(share, (-1, 5 * imgui.get_style().font_scale_dpi), "")
         imgui.text_disabled(HINT)
+        imgui.begin_disabled(placing.fit is None)
+        if button("Adjust##pose"):
+            placing.adjust()
+        imgui.end_disabled()
+        imgui.same_line()
         if button("Save##pose"):
             placing.save()
         imgui.same_line()

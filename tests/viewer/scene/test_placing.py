@@ -178,6 +178,23 @@ def test_the_fit_follows_the_piece(started: Placing):
     assert started.fit.quality > 0.8 and (wrong is None or wrong.quality < 0.3)
 
 
+def test_an_adjustment_finds_the_place_of_the_best_fit_nearby(started: Placing):
+    truth = _true_place(started)
+    started.turn_to(truth.yaw + 0.1, free=True)
+    place = started.shown.place
+    started.move(truth.right + 0.2 - place.right, truth.forward - 0.15 - place.forward, free=True)
+    started.update()
+    before = started.fit.score
+    started.adjust()
+    while started.is_adjusting:
+        started.update()
+    assert started.fit.score > before + 0.2
+    assert started.shown.place.distance(truth) < 0.04 and started.shown.place.turn_between(truth) < 0.02
+    started.adjust()
+    started.move(0.5, 0.0, free=True)  # a drag ends it
+    assert not started.is_adjusting
+
+
 def test_a_photograph_placed_at_its_true_pose_is_in_the_tour_after_saving_and_reloading(started: Placing, folder: Path):
     before = json.loads((folder / "poses.json").read_text())
     truth = _true_place(started)
