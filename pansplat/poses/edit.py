@@ -63,6 +63,21 @@ class PoseEditor:
                 f"links a {POSES} would hide; copy its panoramas to a folder of their own."
             )
         self._undo: list[tuple[bytes | None, bytes]] = []
+        if self.file in self._sources:
+            self._check_convention(panoramas)
+
+    def _check_convention(self, panoramas: Sequence[Panorama]) -> None:
+        """Refuse poses that were read otherwise than the file states them; what is written would be wrong."""
+        content = self.read()
+        for panorama in panoramas:
+            name = self._names[panorama.image]
+            if name in content["poses"] and not np.allclose(
+                _read_pose(content, name, self.file), panorama.cam2world.numpy(), atol=1e-6
+            ):
+                raise InputError(
+                    f"{self.file}: needed poses in the convention of the file to change them, got those of "
+                    "--convention, or the file has changed; correct its convention, and load it again."
+                )
 
     @property
     def can_undo(self) -> bool:

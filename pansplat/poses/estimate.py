@@ -18,6 +18,7 @@ from numpy import ndarray as Array
 from pansplat.data.images import read_height, read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.pairs import FAR, NEAR, find_mask
+from pansplat.data.placements import Tie, find_holds
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import require_file
@@ -127,6 +128,26 @@ class PoseEstimate:
             for group in self.groups[1:]
             for image in group.poses
         }
+
+    def list_ties(self, names: Mapping[Path, str]) -> list[Tie]:
+        """The pairs that hold the groups together, by the names of their files."""
+        ties = []
+        for (i, j), relation in self.relations.items():
+            ends = self.images[i], self.images[j]
+            is_used = relation.is_reliable and (i, j) not in self.rejected
+            if is_used and any(all(end in group.poses for end in ends) for group in self.groups):
+                ties.append(Tie(names[ends[0]], names[ends[1]], relation.is_certain))
+        return ties
+
+    @property
+    def probable(self) -> dict[Path, str]:
+        """For each file that only probable pairs connect with the core of its group, these pairs."""
+        ties = self.list_ties({image: image.name for image in self.images})
+        found = {}
+        for group in self.groups:
+            holds = find_holds([image.name for image in group.poses], ties)
+            found |= {image: holds[image.name].reason for image in group.poses if image.name in holds}
+        return found
 
     @property
     def summary(self) -> str:

@@ -178,6 +178,12 @@ def _make_pairs(
     pairs, ties = [], read_ties(content)
     for number, world in enumerate(content["worlds"]):
         placements = judge(list(world["poses"]), ties, (), source)
+        for name, placement in placements.items():
+            if placement.state == "probable":
+                view = by_name[name]
+                outcome = "is only probably placed, and can be rejected in pansplat-view"
+                message = f"{view.image}{_in_brackets(view.title)} {outcome}: {placement.reason}"
+                warnings.warn(message, InputWarning, stacklevel=4)
         placed = tuple(
             replace(
                 by_name[name],

@@ -42,14 +42,10 @@ def make_pose_file(worlds: Sequence[Mapping[str, Any]], estimate: Mapping[str, A
 
 def list_pairs(estimate: PoseEstimate, names: Mapping[Path, str]) -> list[dict[str, Any]]:
     """The pairs that hold the groups together, and how certain they are."""
-    pairs = []
-    for (i, j), relation in estimate.relations.items():
-        ends = [estimate.images[n] for n in (i, j)]
-        is_used = relation.is_reliable and (i, j) not in estimate.rejected
-        if is_used and any(all(end in group.poses for end in ends) for group in estimate.groups):
-            check = "certain" if relation.is_certain else "probable"
-            pairs.append({"between": [names[end] for end in ends], "check": check})
-    return pairs
+    return [
+        {"between": [tie.first, tie.second], "check": "certain" if tie.is_certain else "probable"}
+        for tie in estimate.list_ties(names)
+    ]
 
 
 def list_suggestions(suggestions: Suggestions, names: Mapping[Path, str]) -> list[dict[str, Any]]:

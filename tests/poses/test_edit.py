@@ -86,6 +86,16 @@ def test_states_and_reasons_are_those_of_the_estimate_also_from_its_cache_and_fr
     assert _load(folder)["f"].placement.reason == "no door"
 
 
+def test_a_note_names_what_is_only_probable(folder: Path):
+    with pytest.warns(UserWarning, match=r"d\.png is only probably placed.*by probable pairs only: c - d"):
+        pansplat.load_pairs(folder)
+    estimate = _estimate(sorted(folder.glob("*.png")))
+    assert {image.name: reason for image, reason in estimate.probable.items()} == {
+        "d.png": "by probable pairs only: c.png - d.png",
+        "e.png": "by probable pairs only: d.png - e.png",
+    }
+
+
 def test_a_rejected_leaf_has_no_pose_after_loading_and_can_be_restored(folder: Path):
     editor = _edit(folder)
     editor.reject(folder / "e.png")
@@ -172,6 +182,13 @@ def test_saving_keeps_other_entries_fields_and_the_convention(folder: Path):
     views = _load(folder)
     assert all(np.allclose(views[name].cam2world.numpy(), pose) for name in "bc")
     assert np.allclose(views["a"].cam2world.numpy(), np.eye(4))
+
+
+def test_poses_that_were_read_in_another_convention_are_not_changed(folder: Path):
+    write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    views = [view for pair in pansplat.load_pairs(folder, convention="cam2world opengl") for view in pair.context]
+    with pytest.raises(InputError, match="needed poses in the convention of the file"):
+        PoseEditor(folder, views)
 
 
 def test_a_change_of_another_program_is_kept(folder: Path):
