@@ -265,8 +265,8 @@ def merge_estimate(file: Path, estimate: PoseEstimate, names: Mapping[Path, str]
             added += 1
     fresh = make_pose_content(estimate, names)["estimate"]
     old = content.get("estimate") if isinstance(content.get("estimate"), dict) else {}
-    apart = {frozenset(tie[:2]) for record in content.get("rejected", ()) for tie in read_ties(record)}
-    kept = [tie for tie in old.get("pairs", ()) if set(tie.get("between", ())) <= known]
+    apart = {frozenset(tie[:2]) for record in content.get("rejected") or () for tie in read_ties(record)}
+    kept = [pair for pair in _list_pairs(old) if set(pair["between"]) <= known]
     pairs = [
         pair for pair in fresh["pairs"] if not set(pair["between"]) <= known and frozenset(pair["between"]) not in apart
     ]
@@ -357,9 +357,15 @@ def _put(
 def _take_pairs(content: Content, ties: Sequence[Tie]) -> list[Content]:
     """The pairs of some ties, which are removed from the estimate."""
     estimate, ends = content["estimate"], [set(tie[:2]) for tie in ties]
-    taken = [pair for pair in estimate["pairs"] if set(pair.get("between", ())) in ends]
+    taken = [pair for pair in _list_pairs(estimate) if set(pair["between"]) in ends]
     estimate["pairs"] = [pair for pair in estimate["pairs"] if pair not in taken]
     return taken
+
+
+def _list_pairs(estimate: Content) -> list[Content]:
+    """The valid pairs of an estimate, as the file has them."""
+    pairs = estimate.get("pairs")
+    return [pair for pair in pairs if read_ties({"pairs": [pair]})] if isinstance(pairs, list) else []
 
 
 def _read(file: Path) -> bytes | None:

@@ -214,7 +214,7 @@ def paint_floor_plan(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The floor plan over dark grey with the names of the panoramas, the edges between them, and a route.
 
-    Panoramas without a known place are squares.
+    Panoramas without a known place are squares, those that are only probably placed are rings.
 
     Args:
         tour, outlines: see `draw_floor_plan`.
@@ -235,6 +235,7 @@ def paint_floor_plan(
         if (node, node) in tour.overlaps:
             cv2.rectangle(image, (x - 5, y - 5), (x + 5, y + 5), (90, 204, 255), -1)
         else:
-            cv2.circle(image, (x, y), 6, (90, 204, 255), -1, cv2.LINE_AA)
+            is_probable = panorama.placement.state == "probable"
+            cv2.circle(image, (x, y), 6, (90, 204, 255), 2 if is_probable else -1, cv2.LINE_AA)
         cv2.putText(image, panorama.name, (x + 9, y + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return image

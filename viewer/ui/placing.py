@@ -230,7 +230,9 @@ class PlacingWindow:
                 points = self._to_screen(piece.draw_outline(ghost.place, placing.floor.unit))
                 _draw_line(canvas, points, (*_GHOST[:3], 0.6), scale)
                 other = placing.panoramas[ghost.other].label
-                imgui.set_tooltip(f"hypothesis beside {other}: right with {100 * ghost.probability:.0f} %")
+                percent = 100 * ghost.probability
+                share = f"{percent:.0f} %" if percent >= 1 else "less than 1 %"
+                imgui.set_tooltip(f"hypothesis beside {other}: right with {share}")
 
     def _draw_camera(
         self, canvas: imgui.ImDrawList, place: Place, color: tuple, scale: float, *, hollow: bool = False
