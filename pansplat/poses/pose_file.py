@@ -34,7 +34,7 @@ def make_pose_file(worlds: Sequence[Mapping[str, Any]], estimate: Mapping[str, A
     poses = {}
     for number, world in enumerate(worlds):
         for name, pose in world["poses"].items():
-            poses[name] = {"cam2world": pose, "world": number} if number else {"cam2world": pose}
+            poses[name] = {"cam2world": pose, "world": number} if number else pose
     ranges = [{key: world[key] for key in ("near", "far", "unit")} for world in worlds]
     first = {key: ranges[0][key] for key in ("near", "far")} if ranges else {}
     return {"convention": CONVENTION, **first, "worlds": ranges, "poses": poses, "estimate": dict(estimate)}
