@@ -112,10 +112,7 @@ class PoseEditor:
 
     def read_unit(self, world: int) -> float | None:
         """Metres that are one camera height of the estimated depths in a world, if the file states it."""
-        worlds = self.read().get("worlds")
-        entry = worlds[world] if isinstance(worlds, list) and 0 <= world < len(worlds) else None
-        unit = entry.get("unit") if isinstance(entry, dict) else None
-        return float(unit) if isinstance(unit, (int, float)) and not isinstance(unit, bool) and unit > 0 else None
+        return _find_unit(self.read(), world)
 
     def place(self, poses: Mapping[Path, Float[Array, "4 4"]], world: int | None, unit: float | None = None) -> None:
         """Place panoramas by hand.
@@ -257,9 +254,10 @@ def merge_estimate(file: Path, estimate: PoseEstimate, names: Mapping[Path, str]
             pose = group.poses[image]
             if anchors:
                 nearest = min(anchors, key=lambda a: float(np.linalg.norm(group.poses[a][:3, 3] - pose[:3, 3])))
-                anchor = _read_pose(content, own[nearest], file)
-                pose = anchor @ np.linalg.inv(group.poses[nearest]) @ pose
                 world = _world_of(poses[own[nearest]])
+                motion = np.linalg.inv(group.poses[nearest]) @ pose
+                motion[:3, 3] *= (_find_unit(content, world) or group.unit) / group.unit
+                pose = _read_pose(content, own[nearest], file) @ motion
             assert world is not None
             _put(content, own[image], pose, world, file, {})
             added += 1
@@ -315,6 +313,13 @@ def _is_by_hand(entry: Any) -> bool:
 
 def _world_of(entry: Any) -> int:
     return int(entry.get("world") or 0) if isinstance(entry, dict) else 0
+
+
+def _find_unit(content: Content, world: int) -> float | None:
+    worlds = content.get("worlds")
+    entry = worlds[world] if isinstance(worlds, list) and 0 <= world < len(worlds) else None
+    unit = entry.get("unit") if isinstance(entry, dict) else None
+    return float(unit) if isinstance(unit, (int, float)) and not isinstance(unit, bool) and unit > 0 else None
 
 
 def _find_free_world(content: Content) -> int:

@@ -260,13 +260,14 @@ def test_a_new_estimate_keeps_the_poses_by_hand_and_adds_others_beside_them(fold
     editor.place({folder / "b.png": pose}, 0)
     content = _content(folder)
     del content["poses"]["c.png"]
+    content["worlds"][0]["unit"] = 3.2  # metres, twice those of the new estimate
     (folder / "poses.json").write_text(json.dumps(content))
     with pytest.warns(UserWarning, match="placed or rejected by hand: all its poses are kept, and 1 are added"):
         write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
     views = _load(folder)
     assert np.allclose(views["b"].cam2world.numpy(), pose) and views["b"].placement.state == "by hand"
     assert "e.png" not in _content(folder)["poses"]
-    assert np.allclose(views["c"].cam2world[:3, 3], (1, 0, 3))  # 1 m beside b, the nearest one
+    assert np.allclose(views["c"].cam2world[:3, 3], (2, 0, 3))  # beside b, the nearest one
 
 
 def test_all_groups_of_an_estimate_are_written(folder: Path):
