@@ -27,8 +27,9 @@ from pansplat_viewer.draw.stereo import StereoRenderer, choose_format, get_eye_s
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.background import BackgroundWorker, Report
 from pansplat_viewer.scene.key_frames import read_path, write_path
-from pansplat_viewer.scene.loader import LoadedScene, Progress, SceneEntry, SceneLoader
+from pansplat_viewer.scene.loader import LoadedScene, Progress, SceneEntry, SceneLoader, list_panoramas
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
+from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
 from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot, keep_largest
 from pansplat_viewer.scene.state import (
@@ -46,7 +47,7 @@ from pansplat_viewer.ui.panels import PanelData, Panels
 from pansplat_viewer.ui.presenter import Presenter
 from pansplat_viewer.window.file_watch import FileWatch
 from pansplat_viewer.window.gui import Gui
-from pansplat_viewer.window.input import Commands, apply_input, read_input
+from pansplat_viewer.window.input import Commands, Input, apply_input, read_input
 from pansplat_viewer.window.preferences import read_preferences, write_preferences
 
 PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
@@ -123,6 +124,7 @@ class Viewer:
         self._films: BackgroundWorker[list[Path]] = BackgroundWorker("film-writer")
         self._tour: TourScenes | None = None
         self._waiting = False
+        self._placing: Placing | None = None
         self._last_camera = self.state.camera
 
     @property
@@ -144,6 +146,7 @@ class Viewer:
         """Whether the next frame differs without new input."""
         loading = self.loader.entry is not None or self.loader.is_searching or self._comparer.photographs.is_reading
         loading = loading or self._incoming is not None or self._preparer.progress is not None
+        loading = loading or (self._placing is not None and self._placing.is_busy)
         return self.moving or loading or self._films.future is not None
 
     @property
@@ -216,7 +219,8 @@ class Viewer:
         was_playing = self.state.playing
         panel_commands = self.panels.draw(self.state, self.panel_data, now)
         # The step is limited, so that after a slow frame the camera does not move far.
-        key_commands = apply_input(self.state, read_input(min(seconds, _MAX_STEP_SECONDS)))
+        events = self._leave_placing(read_input(min(seconds, _MAX_STEP_SECONDS)))
+        key_commands = apply_input(self.state, events)
         self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
         advance_path(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
         self._update_tour(now)
@@ -240,6 +244,8 @@ class Viewer:
         """Stop the threads and free every GL object; the context must still be current."""
         self._save_layout(changed=False)
         self._films.close()
+        if self._placing is not None:
+            self._placing.close()
         self.loader.close()
         self._preparer.close()
         self.presenter.release()
@@ -321,6 +327,7 @@ class Viewer:
         self._resolution = self._create_resolution()
         self._fade.clear()
         self._comparer.photographs.open(loaded.entry.panoramas)
+        self._open_placing(loaded.entry)
         if loaded.entry.tour is None:
             enter_scene(self.state, loaded.scene, at=self._at)
         else:
@@ -329,6 +336,36 @@ class Viewer:
         self._fade.show(0, loaded.scene, now, part)
         self._last_camera = self.state.camera
         self.state.show_message(f"{loaded.entry.name}   (H shows the keys)", now)
+
+    # --- poses by hand ---
+
+    def _open_placing(self, entry: SceneEntry) -> None:
+        """The photographs of the folder of an entry, whose poses the panel shows."""
+        source = entry.tour or entry.pair
+        panoramas = [] if source is None or entry.merged is not None else list_panoramas(self.entries, source.folder)
+        if self._placing is not None:
+            if source is not None and self._placing.is_of(source.folder, panoramas):
+                self._placing.reopen(panoramas)
+                return
+            self._placing.close()
+        self._placing = Placing(source.folder, panoramas) if source is not None and panoramas else None
+
+    def _update_placing(self) -> None:
+        placing = self._placing
+        if placing is not None:
+            placing.update()
+            if placing.error is not None:
+                self.panel_data.error, placing.error = placing.error, None
+        self.panel_data.placing = placing
+
+    def _leave_placing(self, events: Input) -> Input:
+        """The input without the keys of the window in which a photograph is placed; Escape closes it."""
+        placing = self._placing
+        if placing is None or placing.node is None or not self.state.overlay:
+            return events
+        if "escape" in events.pressed:
+            placing.stop()
+        return replace(events, pressed=events.pressed - {",", ".", "escape"})
 
     # --- tours ---
 
@@ -432,6 +469,7 @@ class Viewer:
         film = self._films.progress
         data.tour, data.film = self._tour, None if film is None else film[1]
         data.hotspots = []
+        self._update_placing()
         if self._tour is not None:
             has_arrived = self._fade.parts[self._fade.front] == self._tour.part
             if has_arrived and get_eye_size(size, self.state.settings.stereo) == size:

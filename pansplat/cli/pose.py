@@ -103,8 +103,10 @@ def _print_estimate(estimate: PoseEstimate) -> None:
             )
     make_table_console().print(table)
     print(estimate.summary)
+    for image, reason in estimate.probable.items():
+        print_message("note", f"{image.name} is only probably placed, {reason}")
     for image, reason in estimate.apart.items():
-        print_message("note", f"{image.name} is not in the file of poses: {reason}")
+        print_message("note", f"{image.name} is in a smaller group: {reason}")
     for image, reason in estimate.unplaced.items():
         print_message("note", f"{image.name} has no pose: {reason}")
     sys.stdout.flush()

@@ -44,15 +44,17 @@ from pansplat.data.photographs import (
     list_unread_panoramas,
     read_photograph,
 )
+from pansplat.data.placements import BY_HAND, Placement, judge, read_rejected, read_ties
 from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import expand_home, read_file
-from pansplat.strict_json import list_field, number_field, read_json
+from pansplat.strict_json import list_field, number_field, read_json, require_object
 
 _POSES, _PAIRS = "poses.json", "pairs.json"
 _CAMERA_POSES = "camera_pose.json"  # of 360Loc
 
+_MAX_WORLD = 9999  # of poses.json
 _MAX_DEPTH = 4  # levels of nested folders that are searched
 _MATRIX_KEYS = ("cam2world", "world2cam", "pose")
 _IMAGE_FOLDERS = ("image", "images", "panos", "frames", ".")  # of a sequence
@@ -336,12 +338,16 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     panoramas = tuple(_read_pose_entry(folder, name, entry, convention, is_stated) for name, entry in entries.items())
     if not panoramas:
         raise InputError(f"{source}: needed poses of one or more panoramas, got none; add them or remove the file.")
+    panoramas = tuple(_judge_entries(content, panoramas, source))
     folders = tuple(dict.fromkeys((folder, *(view.image.parent for view in panoramas))))
-    unposed = _list_further(source, folders, panoramas)
+    unposed = _explain_unposed(content, _list_further(source, folders, panoramas), source)
     linked = add_links([*panoramas, *unposed], folder)
     near, far = (number_field(content, key, source, needed="a number in metres") for key in ("near", "far"))
     groups = _read_groups(folder / _PAIRS, list(entries)) if (folder / _PAIRS).is_file() else None
-    count = max(len(panoramas) - 1, 1) if groups is None else len(groups)
+    if groups is not None:
+        groups = _drop_groups_of_several_worlds(folder / _PAIRS, groups, panoramas)
+    worlds = Counter(panorama.world for panorama in panoramas)
+    count = sum(max(size - 1, 1) for size in worlds.values()) if groups is None else len(groups)
     is_single = count == 1 and (len(panoramas) > 1 or not unposed)
     return Collection(
         source,
@@ -349,10 +355,70 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
         groups,
         near=NEAR if near is None else near,
         far=FAR if far is None else far,
+        ranges=_read_ranges(content, source),
         name=folder.resolve().name if is_single else None,
         unposed=tuple(linked[len(panoramas) :]),
         folders=folders,
     )
+
+
+def _judge_entries(content: dict[str, Any], panoramas: Sequence[Panorama], source: Path) -> list[Panorama]:
+    """The panoramas of poses.json with their placements."""
+    entries = content["poses"]
+    by_hand = {name for name, entry in entries.items() if isinstance(entry, dict) and entry.get("placed") == BY_HAND}
+    ties, placements = read_ties(content.get("estimate")), {}
+    for world in {panorama.world for panorama in panoramas}:
+        names = [name for name, view in zip(entries, panoramas, strict=True) if view.world == world]
+        placements |= judge(names, ties, by_hand, source)
+    rejected = {name for poses in read_rejected(content) for name in poses}
+    return [
+        dataclasses.replace(
+            panorama, placement=dataclasses.replace(placements[name], is_rejected=name in rejected - by_hand)
+        )
+        for name, panorama in zip(entries, panoramas, strict=True)
+    ]
+
+
+def _explain_unposed(content: dict[str, Any], panoramas: Sequence[Panorama], source: Path) -> list[Panorama]:
+    """The panoramas beside those of poses.json, with the reasons that it states."""
+    estimate, rejected = content.get("estimate"), read_rejected(content)
+    reasons = estimate.get("unplaced") if isinstance(estimate, dict) else None
+    reasons = reasons if isinstance(reasons, dict) else {}
+    explained = []
+    for panorama in panoramas:
+        name = panorama.image.name
+        if any(name in poses for poses in rejected):
+            placement = Placement("not placed", "rejected by hand", source, is_rejected=True)
+        else:
+            placement = Placement("not placed", str(reasons.get(name, f"{_POSES} has no pose of it")), source)
+        explained.append(dataclasses.replace(panorama, placement=placement))
+    return explained
+
+
+def _drop_groups_of_several_worlds(
+    source: Path, groups: tuple[ViewGroup, ...], panoramas: Sequence[Panorama]
+) -> tuple[ViewGroup, ...] | None:
+    """The groups whose panoramas have a common world, with a note if there are others; None if none has one."""
+    kept = tuple(group for group in groups if len({panoramas[n].world for part in group for n in part}) == 1)
+    if len(kept) < len(groups):
+        warnings.warn(
+            f"left out of {source}: {len(groups) - len(kept)} of {len(groups)} pairs, whose poses are in different "
+            f"worlds of {_POSES}.",
+            category=InputWarning,
+            stacklevel=4,
+        )
+    return kept or None
+
+
+def _read_ranges(content: dict[str, Any], source: Path) -> dict[int, tuple[float, float]]:
+    """Near and far of the worlds of poses.json that state both."""
+    ranges = {}
+    for number, entry in enumerate(list_field(content, "worlds", source)):
+        world = require_object(entry, f"{source}, worlds {number}")
+        near, far = (number_field(world, key, source, needed="a number in metres") for key in ("near", "far"))
+        if near is not None and far is not None:
+            ranges[number] = near, far
+    return ranges
 
 
 def _list_further(source: Path, folders: Sequence[Path], panoramas: Sequence[Panorama]) -> list[Panorama]:
@@ -374,7 +440,7 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
     image = folder / name
     if not image.is_file():
         raise InputError(f"{source}: needed the image {image}, got no such file; correct the name or add the file.")
-    matrix, mask, depth = entry, None, None
+    matrix, mask, depth, world = entry, None, None, 0
     if isinstance(entry, dict):
         key = next((key for key in _MATRIX_KEYS if key in entry), None)
         if key is None:
@@ -386,8 +452,10 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
             )
         matrix = entry[key]
         mask, depth = (_optional_file(folder, entry, key, source) for key in ("mask", "depth"))
+        stated = number_field(entry, "world", source, low=0, high=_MAX_WORLD, whole=True, needed="a whole number")
+        world = int(stated or 0)
     cam2world = to_cam2world(rigid_matrix(matrix, source), convention)
-    return Panorama(image.stem, image, cam2world, mask or find_mask(image, folder), depth)
+    return Panorama(image.stem, image, cam2world, mask or find_mask(image, folder), depth, world=world)
 
 
 def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -> Path | None:

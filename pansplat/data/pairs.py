@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_height, read_mask, read_panorama
 from pansplat.data.masks import lift_black_surfaces, scene_mask_of_files
+from pansplat.data.placements import PLACED, Placement
 from pansplat.data.views import CAMERA_HEIGHT, Views
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import require_depth_range, working_factor
@@ -61,6 +63,7 @@ class Panorama:
         links: to other panoramas of the tour.
         start: yaw and pitch, as of a link, of the view that a visitor sees first; None if there is none.
         camera_height: over the floor, metres; the scale of a scene of this panorama alone.
+        placement: how the pose was found, or why there is none.
     """
 
     name: str
@@ -74,6 +77,7 @@ class Panorama:
     links: tuple[Link, ...] = ()
     start: tuple[float, float] | None = None
     camera_height: float = CAMERA_HEIGHT
+    placement: Placement = PLACED
 
     @property
     def label(self) -> str:
@@ -195,6 +199,7 @@ class Collection:
         groups: given context and target views; None to pair neighbours.
         ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
         near, far: metres.
+        ranges: near and far of worlds (`Panorama.world`) that have others.
         name: name of the only pair; None to join the names of the context views.
         unposed: panoramas without a pose beside the others; each is a scene of its own.
         folders: those of which all panoramas are in the collection.
@@ -206,6 +211,7 @@ class Collection:
     ordered: bool = False
     near: float = NEAR
     far: float = FAR
+    ranges: dict[int, tuple[float, float]] = field(default_factory=dict)
     name: str | None = None
     unposed: tuple[Panorama, ...] = ()
     folders: tuple[Path, ...] = ()
@@ -224,14 +230,12 @@ class Collection:
         """
         if not self.panoramas:
             raise InputError(f"{self.source}: needed posed panoramas, got none; add them and their poses.")
-        near, far = self.near if near is None else near, self.far if far is None else far
-        require_depth_range(near, far, self.source, 'set "near" and "far" in poses.json or on the command line')
         siblings = tuple(panorama.image for panorama in self.panoramas)
         pairs, groups = [], self._select_groups()
         for indices in groups:
             context, targets = (tuple(self.panoramas[i] for i in part) for part in indices)
             name = self.name or "-".join(view.name for view in context)
-            pairs.append(Pair(name, folder, context, targets, near, far, siblings))
+            pairs.append(Pair(name, folder, context, targets, *self._range(context[0].world, near, far), siblings))
         used = {i for group in groups for part in group for i in part}
         alone = [panorama for i, panorama in enumerate(self.panoramas) if i not in used]
         if alone:
@@ -241,17 +245,25 @@ class Collection:
                 category=InputWarning,
                 stacklevel=4,
             )
-        pairs += [Pair(view.name, folder, (view,), (), near, far, siblings) for view in alone]
+        pairs += [Pair(view.name, folder, (view,), (), *self._range(view.world, near, far), siblings) for view in alone]
         first_world = 1 + max(panorama.world for panorama in self.panoramas)
         every = tuple(heapq.merge(self.panoramas, self.unposed, key=lambda panorama: panorama.name))
         return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_world=first_world)
 
+    def _range(self, world: int, near: float | None, far: float | None) -> tuple[float, float]:
+        """Near and far of a world, unless they are given."""
+        own = self.ranges.get(world, (self.near, self.far))
+        near, far = own[0] if near is None else near, own[1] if far is None else far
+        require_depth_range(near, far, self.source, 'set "near" and "far" in poses.json or on the command line')
+        return near, far
+
     def _select_groups(self) -> list[ViewGroup]:
         """The given groups without repeated contexts, those with targets first; else pairs of neighbours."""
-        if len(self.panoramas) == 1:
-            return [((0,), ())]
-        if self.groups is None:
-            return [(pair, ()) for pair in self._neighbours()]
+        if self.groups is None or len(self.panoramas) == 1:
+            worlds: dict[int, list[int]] = {}
+            for number, panorama in enumerate(self.panoramas):
+                worlds.setdefault(panorama.world, []).append(number)
+            return [(pair, ()) for members in worlds.values() for pair in self._neighbours(members)]
         with_targets = [group for group in self.groups if group[1]]
         seen = {frozenset(context) for context, _ in with_targets}
         without_targets = []
@@ -262,15 +274,20 @@ class Collection:
                 without_targets.append(group)
         return with_targets + without_targets
 
-    def _neighbours(self) -> list[tuple[int, int]]:
+    def _neighbours(self, members: Sequence[int]) -> list[tuple[int, ...]]:
         """Consecutive panoramas of a path, or the edges of the minimum spanning tree of the camera centres.
 
         The tree contains every panorama, pairs each with a near one, and has no pair twice.
+
+        Args:
+            members: the panoramas of one world; a single one is returned alone.
         """
-        count = len(self.panoramas)
+        count = len(members)
+        if count == 1:
+            return [(members[0],)]
         if self.ordered or count == 2:
-            return [(i, i + 1) for i in range(count - 1)]
-        centres = torch.stack([panorama.cam2world[:3, 3] for panorama in self.panoramas])
+            return list(itertools.pairwise(members))
+        centres = torch.stack([self.panoramas[number].cam2world[:3, 3] for number in members])
         distance = (centres - centres[0]).norm(dim=-1)  # Prim's algorithm from the first panorama
         parent = torch.zeros(count, dtype=torch.long)
         outside = torch.ones(count, dtype=torch.bool)
@@ -278,7 +295,7 @@ class Collection:
         edges = []
         while outside.any():
             new = int(torch.where(outside, distance, torch.inf).argmin())
-            edges.append(tuple(sorted((int(parent[new]), new))))
+            edges.append(tuple(sorted((members[int(parent[new])], members[new]))))
             outside[new] = False
             distance_to_new = (centres - centres[new]).norm(dim=-1)
             parent[distance_to_new < distance] = new

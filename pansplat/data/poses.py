@@ -151,6 +151,13 @@ def to_cam2world(matrix: Float[Tensor, "4 4"], convention: str) -> Float[Tensor,
     return cam2world @ _OPENGL_TO_OPENCV if axes == "opengl" else cam2world
 
 
+def from_cam2world(matrix: Float[Tensor, "4 4"], convention: str) -> Float[Tensor, "4 4"]:
+    """The inverse of `to_cam2world`."""
+    direction, axes = convention.split()
+    matrix = matrix @ _OPENGL_TO_OPENCV if axes == "opengl" else matrix
+    return invert_pose(matrix) if direction == "world2cam" else matrix
+
+
 def read_number(path: Path) -> float:
     """The one positive number in a text file, such as a scale.
 

@@ -7,7 +7,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,7 @@ from numpy import ndarray as Array
 from pansplat.data.images import read_height, read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.pairs import FAR, NEAR, find_mask
+from pansplat.data.placements import Tie, find_holds
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import require_file
@@ -42,6 +43,7 @@ from pansplat.poses.learned import (
     load_matcher,
     match_learned,
 )
+from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
 from pansplat.poses.tour import Group, Pair, build_tour
 from pansplat.poses.two_view import RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.ways import NO_WAYS, Ways
@@ -61,13 +63,16 @@ _ENOUGH = 100.0  # expected number of right matches by SIFT, above which the lea
 _LIKELY = 0.3  # prior probability of the matches that count for it
 _LEARNED_PRIOR, _LEARNED_NOISE = 0.7, 1.6e-3  # largest prior, as matches of one pair of faces depend; radians
 _LEARNED_SIZE = 7.0  # pixels
-_DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
 _FLOOR_PAIRS = 8
 _MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
 _MIRROR_RATIO = 1.5  # of that number to the one with the picture itself; symmetric things match either way
 _MAX_BASELINE = 1e9  # metres
 _LARGEST_NEAR = 0.6  # metres; the depth range is not narrower than that of rooms
 _MIN_FAR = 6.0
+
+
+Suggestions = dict[tuple[Path, Path], tuple[Suggestion, ...]]
+"""For pairs of files, places of the second panorama relative to the first one, best first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +84,7 @@ class PoseGroup:
         near, far: depth range of the group's points, metres.
         residual: median angle between points and bearings, degrees.
         scale_source: how the unit was found, for messages.
+        unit: metres that are one camera height of the estimated depths.
     """
 
     poses: dict[Path, Float[Array, "4 4"]]
@@ -86,6 +92,7 @@ class PoseGroup:
     far: float
     residual: float
     scale_source: str
+    unit: float = CAMERA_HEIGHT
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +104,16 @@ class PoseEstimate:
         groups: of panoramas that reliable pairs connect, the largest one first; each has a world of its own.
         unplaced: the reason for each file without a pose.
         relations: of the pairs that were compared, by indices into `images`.
+        rejected: pairs of them that contradict the others and are not used.
+        suggestions: for placing by hand.
     """
 
     images: tuple[Path, ...]
     groups: tuple[PoseGroup, ...]
     unplaced: dict[Path, str]
     relations: dict[Pair, RelativePose]
+    rejected: tuple[Pair, ...] = ()
+    suggestions: Suggestions = field(default_factory=dict)
 
     @property
     def poses(self) -> dict[Path, Float[Array, "4 4"]]:
@@ -117,6 +128,26 @@ class PoseEstimate:
             for group in self.groups[1:]
             for image in group.poses
         }
+
+    def list_ties(self, names: Mapping[Path, str]) -> list[Tie]:
+        """The pairs that hold the groups together, by the names of their files."""
+        ties = []
+        for (i, j), relation in self.relations.items():
+            ends = self.images[i], self.images[j]
+            is_used = relation.is_reliable and (i, j) not in self.rejected
+            if is_used and any(all(end in group.poses for end in ends) for group in self.groups):
+                ties.append(Tie(names[ends[0]], names[ends[1]], relation.is_certain))
+        return ties
+
+    @property
+    def probable(self) -> dict[Path, str]:
+        """For each file that only probable pairs connect with the core of its group, these pairs."""
+        ties = self.list_ties({image: image.name for image in self.images})
+        found = {}
+        for group in self.groups:
+            holds = find_holds([image.name for image in group.poses], ties)
+            found |= {image: holds[image.name].reason for image in group.poses if image.name in holds}
+        return found
 
     @property
     def summary(self) -> str:
@@ -246,8 +277,9 @@ def estimate_poses(
     for position, (reason, other) in tour.unplaced.items():
         partner = "" if other is None else f" (best with {paths[kept[other]].name})"
         unplaced[kept[position]] = _describe_mirrored(position, views, placed, paths, kept) or reason + partner
+    suggestions = _suggest(views, relations, [paths[n] for n in kept])
     if not tour.groups:
-        raise _no_poses(paths, unplaced)
+        raise _no_poses(paths, unplaced, suggestions)
     report("finding the floor", 0.95)
     groups = [
         _finish_group(
@@ -265,7 +297,18 @@ def estimate_poses(
         tuple(groups),
         {paths[n]: unplaced[n] for n in sorted(unplaced)},
         {(kept[i], kept[j]): relation for (i, j), relation in (relations | tour.confirmed).items()},
+        tuple((kept[i], kept[j]) for i, j in tour.rejected),
+        suggestions,
     )
+
+
+def _suggest(views: Sequence[_View], relations: Mapping[Pair, RelativePose], files: Sequence[Path]) -> Suggestions:
+    """The suggestions of all pairs that have some."""
+    found = {}
+    for (i, j), relation in relations.items():
+        upright = views[i].surroundings.depth.rotation, views[j].surroundings.depth.rotation
+        found[files[i], files[j]] = list_suggestions(relation, upright)
+    return {pair: suggestions for pair, suggestions in found.items() if suggestions}
 
 
 def _finish_group(
@@ -286,6 +329,7 @@ def _finish_group(
         max(far, _MIN_FAR),
         float(np.degrees(np.median(group.angles))) if len(group.angles) else 0.0,
         source,
+        scale,
     )
 
 
@@ -294,16 +338,19 @@ class NoPosesError(InputError):
 
     Attributes:
         reasons: for each file.
+        suggestions: for placing by hand.
     """
 
-    def __init__(self, reasons: Mapping[Path, str]) -> None:
+    def __init__(self, reasons: Mapping[Path, str], suggestions: Suggestions | None = None) -> None:
         listed = "; ".join(f"{path.name}: {reason}" for path, reason in reasons.items())
         super().__init__(f"no poses were found: {listed}.")
-        self.reasons = dict(reasons)
+        self.reasons, self.suggestions = dict(reasons), suggestions or {}
 
 
-def _no_poses(paths: Sequence[Path], reasons: Mapping[int, str]) -> NoPosesError:
-    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)})
+def _no_poses(
+    paths: Sequence[Path], reasons: Mapping[int, str], suggestions: Suggestions | None = None
+) -> NoPosesError:
+    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)}, suggestions)
 
 
 def _read_images(
@@ -378,7 +425,7 @@ def _describe_views(
         learned = None
         if matcher is not None:
             learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
-        image = cv2.resize(image, (2 * _DEPTH_HEIGHT, _DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
+        image = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
         depth = estimate_depth(image, axes.axes[0] if axes.has_down else None)
         surroundings = Surroundings(image.mean(axis=2), depth)
         return _View(detect_features(grey, scene), turned, learned, axes, small, surroundings)

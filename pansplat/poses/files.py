@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from pansplat.atomic import replacing
@@ -19,32 +18,49 @@ from pansplat.cache_folders import cache_folders, write_cache_file
 from pansplat.data.folders import make_names_unique
 from pansplat.data.images import read_thumbnail
 from pansplat.data.pairs import Collection, Pair, Panorama, single_view_pairs
+from pansplat.data.placements import Placement, judge, read_ties
 from pansplat.data.poses import rigid_matrix, to_cam2world
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
-from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup, estimate_poses
+from pansplat.poses.edit import merge_estimate
+from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
+from pansplat.poses.pose_file import (
+    CONVENTION,
+    format_pose_file,
+    list_pairs,
+    list_suggestions,
+    make_pose_content,
+    make_world,
+)
 from pansplat.predictor import Progress
 from pansplat.strict_json import read_json
 
-_FORMAT = "5"  # version of the estimate and of its cached file; part of the cache's key
-_CONVENTION = "cam2world opencv"
+_FORMAT = "6"  # version of the estimate and of its cached file; part of the cache's key
 SUFFIXES = (".json", ".tum", ".kitti")
 
 
 def write_poses(estimate: PoseEstimate, path: Path) -> None:
-    """Write the poses of the largest group as a poses.json, or a trajectory in the TUM or KITTI format by the suffix.
+    """Write the poses as a poses.json, or those of the largest group in the TUM or KITTI format by the suffix.
 
-    Names in a poses.json are relative to its folder. A trajectory has one line for each panorama that has a pose, in
-    the order of the names; the timestamps of TUM are the panoramas' numbers.
+    Names in a poses.json are relative to its folder; each group is a world. If the file exists and has changes by hand
+    (`pansplat.poses.edit`), its poses are kept. A trajectory has one line for each
+    panorama of the largest group, in the order of the names; the timestamps of TUM are the panoramas' numbers.
 
     Raises:
         InputError: another suffix, or the file cannot be written.
     """
     if path.suffix.lower() == ".json":
         folder = path.resolve().parent
-        names = {image: Path(os.path.relpath(image.resolve(), folder)).as_posix() for image in estimate.poses}
-        _write(path, json.dumps(_make_content(estimate, names), indent=1) + "\n")
+        names = {image: Path(os.path.relpath(image.resolve(), folder)).as_posix() for image in estimate.images}
+        merged = merge_estimate(path, estimate, names)
+        if merged is not None:
+            warnings.warn(
+                f"{path} has poses placed or rejected by hand: all its poses are kept, and {merged[1]} are added.",
+                InputWarning,
+                stacklevel=2,
+            )
+        _write(path, format_pose_file(make_pose_content(estimate, names) if merged is None else merged[0]))
         return
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: needed a name ending in {', '.join(SUFFIXES)}, got {path.suffix!r}; rename it.")
@@ -62,25 +78,6 @@ def write_poses(estimate: PoseEstimate, path: Path) -> None:
 def _write(path: Path, text: str) -> None:
     with replacing(path) as temporary:
         temporary.write_text(text)
-
-
-def _make_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
-    return {
-        "convention": _CONVENTION,
-        **_make_world(estimate.groups[0], names),
-        "estimate": {
-            "summary": estimate.summary,
-            "unplaced": {image.name: reason for image, reason in (estimate.unplaced | estimate.apart).items()},
-        },
-    }
-
-
-def _make_world(group: PoseGroup, names: Mapping[Path, str]) -> dict[str, Any]:
-    return {
-        "near": round(group.near, 3),
-        "far": round(group.far, 3),
-        "poses": {names[image]: np.round(pose, 9).tolist() for image, pose in group.poses.items()},
-    }
 
 
 def estimate_pairs(
@@ -133,10 +130,11 @@ def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Pro
         }
         estimate = estimate_poses(list(names), masks=masks, links=links, camera_height=camera_height, progress=progress)
     except NoPosesError as error:
-        worlds, summary, unplaced = [], "", error.reasons
+        worlds, summary, unplaced, pairs, suggestions = [], "", error.reasons, [], error.suggestions
     else:
-        worlds = [_make_world(group, names) for group in estimate.groups]
-        summary, unplaced = estimate.summary, estimate.unplaced
+        worlds = [make_world(group, names) for group in estimate.groups]
+        summary, unplaced, suggestions = estimate.summary, estimate.unplaced, estimate.suggestions
+        pairs = list_pairs(estimate, names)
     unreadable = [image for image in unplaced if not _is_readable(image)]
     if len(unreadable) == len(panoramas):
         raise NoPosesError(unplaced)
@@ -145,6 +143,8 @@ def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Pro
         "summary": summary,
         "unplaced": {names[image]: reason for image, reason in unplaced.items()},
         "unreadable": [names[image] for image in unreadable],
+        "pairs": pairs,
+        "suggestions": list_suggestions(suggestions, names),
     }
 
 
@@ -175,16 +175,32 @@ def _make_pairs(
         panorama = by_name[name]
         outcome = "cannot be read and is left out" if name in unreadable else "has no pose and is a scene of its own"
         warnings.warn(f"{panorama.image}{_in_brackets(panorama.title)} {outcome}: {reason}", InputWarning, stacklevel=4)
-    pairs = []
+    pairs, ties = [], read_ties(content)
     for number, world in enumerate(content["worlds"]):
+        placements = judge(list(world["poses"]), ties, (), source)
+        for name, placement in placements.items():
+            if placement.state == "probable":
+                view = by_name[name]
+                outcome = "is only probably placed, and can be rejected in pansplat-view"
+                message = f"{view.image}{_in_brackets(view.title)} {outcome}: {placement.reason}"
+                warnings.warn(message, InputWarning, stacklevel=4)
         placed = tuple(
-            replace(by_name[name], cam2world=to_cam2world(rigid_matrix(pose, str(source)), _CONVENTION), world=number)
+            replace(
+                by_name[name],
+                cam2world=to_cam2world(rigid_matrix(pose, str(source)), CONVENTION),
+                world=number,
+                placement=placements[name],
+            )
             for name, pose in world["poses"].items()
         )
         only = folder.resolve().name if len(placed) == 2 else None
         pairs += Collection(source, placed, near=world["near"], far=world["far"], name=only).pairs(folder, near, far)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
-    single = [panorama for panorama in readable if panorama.name in unplaced]
+    single = [
+        replace(panorama, placement=Placement("not placed", unplaced[panorama.name], source))
+        for panorama in readable
+        if panorama.name in unplaced
+    ]
     first_world = len(content["worlds"])
     pairs += single_view_pairs(single, folder, near, far, siblings=readable, first_world=first_world)
     return make_names_unique(pairs)

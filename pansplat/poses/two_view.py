@@ -85,6 +85,7 @@ class _Support:
 # Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
 _NEEDED = _Support(32, 80, 20)
 _COMPARED = 16  # best hypotheses whose panoramas are compared
+_CANDIDATES = 4  # of them, those of the highest odds are kept for placing by hand
 # Logarithm of the odds that a hypothesis is right, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # log(0.003 + conflict), likeness, shade, overlap, log(0.01 + slope of the way) (docs/poses.md).
 _ODDS = (-28.0, 0.6, 0.78, 6.4, -1.44, 8.0, 2.1, 0.6, -1.51)
@@ -480,6 +481,15 @@ def _pick_distinct(essential: Float[Array, "n 3 3"], scores: Float[Array, "n"], 
 
 
 @dataclass(frozen=True, eq=False)
+class Candidate:
+    """A hypothesis x2 = R x1 + t with t in camera heights, and the logarithm of the odds that it is right."""
+
+    rotation: Rotation
+    translation: Vector
+    log_odds: float
+
+
+@dataclass(frozen=True, eq=False)
 class RelativePose:
     """The relative pose of two panoramas, and the figures of its check.
 
@@ -495,6 +505,7 @@ class RelativePose:
         distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
         log_odds: logarithm of the odds that the pose is right, by matches and comparison; infinite if matches suffice.
         problem: why the pose must not be used; None if it passes the check.
+        candidates: the best hypotheses, with or without problems, best first.
     """
 
     rotation: Rotation
@@ -508,6 +519,7 @@ class RelativePose:
     distance: float
     log_odds: float
     problem: str | None
+    candidates: tuple[Candidate, ...] = ()
 
     @property
     def is_reliable(self) -> bool:
@@ -566,7 +578,7 @@ def estimate_relative_pose(
             -math.inf,
             no_match,
         )
-    best, log_odds, margin = _choose_compared(found, evidence)
+    best, log_odds, margin, candidates = _choose_compared(found, evidence)
     support = _Support(_count_all_places(best, evidence), best.score, margin)
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
@@ -595,15 +607,20 @@ def estimate_relative_pose(
         best.distance,
         math.inf if support.suffices else log_odds,
         problem,
+        candidates,
     )
 
 
-def _choose_compared(found: list[Hypothesis], evidence: _Evidence) -> tuple[Hypothesis, float, float]:
-    """The hypothesis of the highest odds, their logarithm, and how much its score exceeds that of the others."""
+def _choose_compared(
+    found: list[Hypothesis], evidence: _Evidence
+) -> tuple[Hypothesis, float, float, tuple[Candidate, ...]]:
+    """The hypothesis of the highest odds, their logarithm, how much its score exceeds others, and the best ones."""
     odds = [_log_odds(h, evidence) for h in found[:_COMPARED]]
     best = int(np.argmax(odds)) if max(odds) > -math.inf else 0
     others = [h.score for n, h in enumerate(found) if n != best]
-    return found[best], odds[best], found[best].score - max(others, default=0.0)
+    order = [n for n in np.argsort(-np.array(odds), kind="stable").tolist() if odds[n] > -math.inf][:_CANDIDATES]
+    candidates = tuple(Candidate(found[n].rotation, found[n].distance * found[n].translation, odds[n]) for n in order)
+    return found[best], odds[best], found[best].score - max(others, default=0.0), candidates
 
 
 def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:

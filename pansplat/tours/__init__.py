@@ -14,6 +14,7 @@ from pansplat.tours.floor import (
     find_floor_outline,
     find_floor_outlines,
     paint_floor_plan,
+    trace_floor,
     write_floor_plan,
 )
 from pansplat.tours.graph import (
@@ -56,5 +57,6 @@ __all__ = [
     "paint_floor_plan",
     "plan_route",
     "select_views",
+    "trace_floor",
     "write_floor_plan",
 ]

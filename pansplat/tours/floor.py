@@ -92,7 +92,20 @@ def find_floor_outline(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
     Args:
         scene, view, level: see `find_camera_height`.
     """
-    places = _locate_surfaces(scene, view, level)
+    found = trace_floor(_locate_surfaces(scene, view, level))
+    if found is None:
+        return None
+    corners, height = found
+    center = level[:, (0, 2)].T @ scene.cam2world[view, :3, 3].double().numpy()
+    return FloorOutline(center, center + corners, height)
+
+
+def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "azimuth 2"], float] | None:
+    """Where the floor ends around a camera (right, forward), and its height over it; None if places show no floor.
+
+    Args:
+        places: of surfaces relative to the camera (right, down, forward), in any unit.
+    """
     height = _find_floor(places)
     if height is None:
         return None
@@ -109,9 +122,7 @@ def find_floor_outline(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
     neighbours = np.stack([np.roll(reach, shift) for shift in range(-2, 3)])
     reach = np.median(neighbours, axis=0)  # without single outliers
     angles = (np.arange(_AZIMUTHS) + 0.5) * 2 * math.pi / _AZIMUTHS
-    center = level[:, (0, 2)].T @ scene.cam2world[view, :3, 3].double().numpy()
-    corners = center + reach[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1)
-    return FloorOutline(center, corners, height)
+    return reach[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1), height
 
 
 def _measure_reach(
@@ -203,7 +214,7 @@ def paint_floor_plan(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The floor plan over dark grey with the names of the panoramas, the edges between them, and a route.
 
-    Panoramas without a known place are squares.
+    Panoramas without a known place are squares, those that are only probably placed are rings.
 
     Args:
         tour, outlines: see `draw_floor_plan`.
@@ -224,6 +235,7 @@ def paint_floor_plan(
         if (node, node) in tour.overlaps:
             cv2.rectangle(image, (x - 5, y - 5), (x + 5, y + 5), (90, 204, 255), -1)
         else:
-            cv2.circle(image, (x, y), 6, (90, 204, 255), -1, cv2.LINE_AA)
+            is_probable = panorama.placement.state == "probable"
+            cv2.circle(image, (x, y), 6, (90, 204, 255), 2 if is_probable else -1, cv2.LINE_AA)
         cv2.putText(image, panorama.name, (x + 9, y + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return image

@@ -11,6 +11,7 @@ import torch
 
 import pansplat.tours as tours
 from pansplat.data.pairs import Panorama
+from pansplat.data.placements import Placement
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -87,3 +88,16 @@ def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):
         with pytest.raises(InputError, match="needed a floor below"):
             tours.write_floor_plan(scene, tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
+
+
+def test_a_panorama_that_is_probably_placed_is_a_ring(room_scene):
+    pose = room_scene.cam2world[0]
+    views = [Panorama(state, Path(state), pose, placement=Placement(state)) for state in ("placed", "probable")]
+    colors = []
+    for view in views:
+        tour = TourGraph("", Path(), (view, view), 0.45, 10.0, overlaps={(0, 1): 0.5})
+        image = tours.paint_floor_plan(tour, [find_floor_outline(room_scene, 0, pose[:3, :3].numpy())])
+        plan = draw_floor_plan(tour, [find_floor_outline(room_scene, 0, pose[:3, :3].numpy())], size=1024)
+        x, y = plan.to_pixels(np.array((0.5, 0.0))).round().astype(int)
+        colors.append((image[y, x].tolist(), image[y, x + 6].tolist()))
+    assert colors[0][0] == [90, 204, 255] != colors[1][0] and colors[1][1] == [90, 204, 255]

@@ -1,7 +1,9 @@
 """Synthetic clicks and keys, on a context without a window, change the rendered image."""
 
+import json
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from pathlib import Path
@@ -15,13 +17,18 @@ import torch
 from imgui_bundle import imgui
 from PIL import Image
 
+from pansplat.data.folders import load_pairs
 from pansplat.data.images import write_image
 from pansplat.data.pairs import Pair, Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.equirect import sample_equirect, uv_from_directions
+from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.poses.dense import Surroundings
+from pansplat.poses.depth import DepthMap
+from pansplat.poses.placing import Piece
 from pansplat.rendering.cpu.display import DisplayScene
+from pansplat.tours import find_tours
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
@@ -38,6 +45,7 @@ from pansplat_viewer.scene.loader import (
 )
 from pansplat_viewer.scene.settings import Comparison, Display, Preset
 from pansplat_viewer.scene.state import ViewerState
+from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
 from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.viewer import Viewer
@@ -1168,6 +1176,168 @@ def test_a_click_on_a_link_fades_to_a_panorama_without_a_place_and_the_list_lead
     user.press(imgui.Key.r)
     user.settle()
     assert find_node(user) == 0 and user.state.camera == user.state.home
+
+
+# --- poses by hand ---
+
+
+@pytest.fixture
+def placing_user(user, tmp_path, monkeypatch) -> User:
+    """The session in a tour of a, b, c and d: c is probably placed, d is not; a suggestion is 1 m to the right of a."""
+    for name in "abcd":
+        pixels = np.random.default_rng(ord(name)).integers(0, 255, (32, 64, 3), np.uint8)
+        Image.fromarray(pixels).resize((256, 128)).save(tmp_path / f"{name}.png")
+    poses = {f"{name}.png": np.eye(4).tolist() for name in "abc"}
+    for step, pose in enumerate(poses.values()):
+        pose[2][3] = 0.8 * step
+    estimate = {
+        "unplaced": {"d.png": "no door in d"},
+        "pairs": [
+            {"between": ["a.png", "b.png"], "check": "certain"},
+            {"between": ["b.png", "c.png"], "check": "probable"},
+        ],
+        "suggestions": [{"between": ["a.png", "d.png"], "places": [[1.0, 0.0, 0.5, -1.0]]}],
+    }
+    content = {"convention": "cam2world opencv", "worlds": [{"unit": 1.0}], "poses": poses, "estimate": estimate}
+    (tmp_path / "poses.json").write_text(json.dumps(content))
+
+    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_pairs(path))]
+
+    def read(image: Path) -> Piece:
+        depth = DepthMap(np.zeros((32, 64)), np.full((8, 16), 0.05), np.eye(3))
+        rays = pixel_directions(32, 64).numpy()
+        np.log(1 / np.abs(rays).max(axis=-1), out=depth.log_depth)  # a cube
+        return Piece(Surroundings(np.full((32, 64), 0.5), depth), 0.0)
+
+    monkeypatch.setattr(user.viewer, "_find", find)
+    monkeypatch.setattr("pansplat_viewer.scene.placing.read_piece", read)
+    user.viewer.open(tmp_path)
+    user.draw_until(lambda: user.viewer._tour is not None and not user.viewer.loader.is_searching, "tour")
+    user.settle()
+    yield user
+    user.viewer._placing.stop()
+
+
+def test_states_of_photographs_are_listed_and_drawn_on_the_floor_plan(placing_user):
+    user = placing_user
+    assert user.data.placing.panoramas[3].placement.reason == "no door in d"
+    tour = user.viewer._tour.tour
+    assert describe_panoramas(tour) == "2 placed, 1 probably, 1 not placed"
+    assert [describe_panorama(tour, node) for node in range(4)] == ["a", "b", "c (probably placed)", "d (not placed)"]
+    labels = {label for label in user.panels.items if "##" in label}
+    assert {"Place##0", "Place##1", "Place##2", "Place##3", "Reject##2"} <= labels
+    assert not {"Reject##0", "Reject##1", "Reject##3", "Restore##2"} & labels
+    pixels = np.frombuffer(user.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)[::-1].astype(int)
+    centres = [pixels[round(y), round(x)].sum() for x, y in user.panels.minimap.nodes]
+    assert centres[1] > centres[2] + 100, "the mark of the one that is probably placed is hollow"
+
+
+def test_a_probable_photograph_is_rejected_restored_and_the_rejection_undone(placing_user, tmp_path):
+    user = placing_user
+    before = (tmp_path / "poses.json").read_bytes()
+    user.click("Reject##2")
+    assert "c.png" not in json.loads((tmp_path / "poses.json").read_text())["poses"]
+    user.draw_frames(2)
+    assert "Restore##2" in user.panels.items and "Reject##2" not in user.panels.items
+    user.draw_until(lambda: user.data.changed, "note of the changed file")  # it moves the button
+    user.click("Load the changed poses")
+    user.draw_until(lambda: not user.data.placing.is_changed, "loaded poses")
+    user.settle()
+    assert describe_panoramas(user.viewer._tour.tour) == "2 placed, 2 not placed"
+    assert "Restore##2" in user.panels.items
+    user.click("Undo##poses")  # also after loading
+    assert (tmp_path / "poses.json").read_bytes() == before
+    assert user.data.placing.panoramas[2].placement.state == "probable"
+
+
+def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(placing_user, tmp_path):
+    user = placing_user
+    user.click("Place##3")
+    placing, window, io = user.data.placing, user.panels.placing, imgui.get_io()
+    user.draw_until(lambda: not placing.missing and placing.places, "pieces")
+    user.draw_frames(2)
+    assert placing.shown.suggestion == 0
+
+    def find_pixel() -> tuple[float, float]:
+        x, y = window.view.to_pixels(np.array(placing.shown.place[:2]))
+        return x + window.corner[0], y + window.corner[1]
+
+    start, (x, y) = placing.shown.place, find_pixel()
+    scale = window.view.pixels_per_metre
+    user.drag((x, y), (x + 0.6 * scale, y - 0.5 * scale))
+    assert placing.shown.place.right == pytest.approx(start.right + 0.6, abs=0.02)
+    assert placing.shown.place.forward == pytest.approx(start.forward + 0.5, abs=0.02)
+    assert placing.shown.suggestion is None and placing.fit is not None
+
+    camera, flight, yaw = user.state.camera, user.state.flight, placing.shown.place.yaw
+    user.press(imgui.Key.period)
+    assert placing.shown.place.yaw == pytest.approx(yaw + np.radians(5), abs=0.03)
+    io.add_key_event(imgui.Key.mod_shift, True)
+    yaw = placing.shown.place.yaw
+    user.press(imgui.Key.comma)
+    io.add_key_event(imgui.Key.mod_shift, False)
+    user.draw_frames(1)
+    assert placing.shown.place.yaw == pytest.approx(yaw - np.radians(0.5), abs=1e-6)
+    io.add_mouse_pos_event(*find_pixel())
+    user.draw_frames(2)
+    yaw = placing.shown.place.yaw
+    io.add_mouse_wheel_event(0.0, 2.0)
+    user.draw_frames(2)
+    assert abs(placing.shown.place.yaw - yaw - np.radians(10)) < 0.05
+    assert (user.state.camera, user.state.flight) == (camera, flight), "keys and wheel turn the piece only"
+
+    user.click("Adjust##pose")
+    user.draw_until(lambda: not placing.is_adjusting, "end of the adjustment")
+    ghost = placing.ghosts[0].place
+    at = window.view.to_pixels(np.array(ghost[:2])) + window.corner
+    user.click_at(*at)  # on the ghost
+    assert placing.shown.suggestion == 0
+    user.click("Save##pose")
+    entry = json.loads((tmp_path / "poses.json").read_text())["poses"]["d.png"]
+    assert entry["placed"] == "by hand" and entry["cam2world"][0][3] == pytest.approx(1.0)
+    user.draw_frames(2)
+    user.click("Load the changed poses##pose")
+    user.draw_until(lambda: not placing.is_changed, "loaded poses")
+    user.settle()
+    tour = user.viewer._tour.tour
+    assert describe_panorama(tour, 3) == "d (placed by hand)" and (3, 3) not in tour.overlaps
+    user.press(imgui.Key.escape)
+    assert placing.node is None and not user.state.quit
+
+
+def test_alt_disables_snapping_and_the_knob_turns_the_piece(placing_user):
+    user = placing_user
+    user.click("Place##3")
+    placing, window, io = user.data.placing, user.panels.placing, imgui.get_io()
+    user.draw_until(lambda: not placing.missing and placing.places, "pieces")
+    user.draw_frames(2)
+    scale, start = window.view.pixels_per_metre, placing.shown.place
+    io.add_key_event(imgui.Key.mod_alt, True)
+    x, y = window.view.to_pixels(np.array(start[:2])) + window.corner
+    user.drag((x, y), (x + 0.1 * scale, y))
+    assert placing.shown.suggestion is None and placing.shown.place.right == pytest.approx(start.right + 0.1, abs=0.02)
+    io.add_key_event(imgui.Key.mod_alt, False)
+    user.draw_frames(1)
+    knob = window._find_knob(placing, 1.0)
+    x, y = window.view.to_pixels(np.array(placing.shown.place[:2])) + window.corner
+    user.drag(knob, (x + 60, y + 2))  # to the right of the camera
+    assert placing.shown.has_walls and placing.shown.place.yaw == pytest.approx(np.pi / 2)
+
+
+def test_a_pose_that_cannot_be_written_is_an_error_in_the_window(placing_user, tmp_path):
+    user = placing_user
+    (tmp_path / "poses.json").write_text("{")
+    user.click("Reject##2")
+    user.draw_frames(1)
+    assert "poses.json: needed JSON" in user.data.error
+    user.click("OK")
+    assert user.data.error is None
+
+
+# --- tours ---
 
 
 def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(user, house, load_house, small_scene, monkeypatch):

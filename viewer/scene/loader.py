@@ -8,7 +8,7 @@ of the scene in the file. Imports no torch before it loads.
 import contextlib
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -150,6 +150,18 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
     entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in tours]
     entries += [SceneEntry(pair.name, pair=pair, notes=tuple(notes)) for pair in pairs]
     return entries + [SceneEntry(p.stem, file=p) for p in scenes]
+
+
+def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
+    """The photographs of a folder among all entries, in their own worlds, by name."""
+    found: dict[Path, Panorama] = {}
+    for entry in entries:
+        tour, pair = entry.tour, entry.pair
+        if tour is not None and tour.folder == folder:
+            found |= {view.image: view for view in tour.originals or tour.panoramas}
+        elif pair is not None and pair.folder == folder:
+            found |= {view.image: view for view in pair.context + pair.targets}
+    return sorted(found.values(), key=lambda view: view.name)
 
 
 @contextlib.contextmanager

@@ -1,6 +1,6 @@
 """The floor plan of a tour as a panel: floors, walls, panoramas, and the camera; a click flies to a panorama.
 
-Panoramas without a known place are squares.
+Panoramas without a known place are squares, those that are only probably placed are rings.
 """
 
 from __future__ import annotations
@@ -31,15 +31,27 @@ _COLORS = (
 
 
 def describe_panorama(tour: TourGraph, node: int) -> str:
-    """The label of a panorama, and whether its place is unknown."""
-    label = tour.panoramas[node].label
-    return f"{label} (not placed)" if (node, node) in tour.overlaps else label
+    """The label of a panorama, and how sure its place is."""
+    label, placement = tour.panoramas[node].label, tour.panoramas[node].placement
+    if (node, node) in tour.overlaps:
+        return f"{label} (not placed)"
+    notes = {"probable": " (probably placed)", "by hand": " (placed by hand)"}
+    return label + notes.get(placement.state, "")
 
 
 def describe_panoramas(tour: TourGraph) -> str:
-    """The number of panoramas with and without a known place."""
+    """The number of panoramas with a known, a probable and no known place."""
     alone = sum(a == b for a, b in tour.overlaps)
-    return f"{len(tour) - alone} placed, {alone} not placed" if alone else f"{len(tour)} panoramas"
+    probable = sum(is_probable(tour, node) for node in range(len(tour)))
+    if not alone and not probable:
+        return f"{len(tour)} panoramas"
+    counts = ((len(tour) - alone - probable, "placed"), (probable, "probably"), (alone, "not placed"))
+    return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed")
+
+
+def is_probable(tour: TourGraph, node: int) -> bool:
+    """Whether a panorama is only probably placed."""
+    return tour.panoramas[node].placement.state == "probable" and (node, node) not in tour.overlaps
 
 
 class Minimap:
@@ -73,7 +85,8 @@ class Minimap:
         nearest = int(np.argmin(distances))
         if distances[nearest] > _CLICK_PIXELS * scale:
             return None
-        imgui.set_tooltip(describe_panorama(scenes.tour, nearest))
+        reason = scenes.tour.panoramas[nearest].placement.reason
+        imgui.set_tooltip("\n".join(filter(None, (describe_panorama(scenes.tour, nearest), reason))))
         return nearest if imgui.is_mouse_clicked(0) else None
 
     def release(self) -> None:
@@ -109,6 +122,8 @@ class Minimap:
         for node, (x, y) in enumerate(self.nodes):
             if (node, node) in tour.overlaps:
                 canvas.add_rect_filled((x - half, y - half), (x + half, y + half), colors[node in loaded])
+            elif is_probable(tour, node):
+                canvas.add_circle((x, y), 4.0 * scale, colors[node in loaded], 0, 1.8 * scale)
             else:
                 canvas.add_circle_filled((x, y), 4.0 * scale, colors[node in loaded])
         place, rotation = np.asarray(camera.position) @ axes, camera.rotation

@@ -9,6 +9,7 @@ from imgui_bundle import imgui
 
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.key_frames import KeyFrame
+from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import Comparison, Display, FrameStats, Preset, Projection
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
@@ -21,7 +22,7 @@ from pansplat_viewer.scene.state import (
     toggle_play,
 )
 from pansplat_viewer.scene.tour import Hotspot, TourScenes
-from pansplat_viewer.ui.minimap import SIZE, Minimap, describe_panorama, describe_panoramas
+from pansplat_viewer.ui.minimap import SIZE, Minimap, describe_panorama, describe_panoramas, is_probable
 from pansplat_viewer.ui.overlays import (
     FIXED,
     MARGIN,
@@ -32,6 +33,7 @@ from pansplat_viewer.ui.overlays import (
     draw_points,
     draw_stats,
 )
+from pansplat_viewer.ui.placing import PlacingWindow, draw_photographs
 from pansplat_viewer.window.gui import PANEL_WIDTH
 from pansplat_viewer.window.input import HELP, Commands
 from pansplat_viewer.window.preferences import Preferences, Theme
@@ -82,6 +84,7 @@ class PanelData:
     hotspots: list[Hotspot] = field(default_factory=list)  # places of its panoramas in the image
     background: tuple[str, float] | None = None  # work of the loader on the tour, and the fraction done
     notes: tuple[str, ...] = ()  # what was not used or not placed at the path of the scene, and why
+    placing: Placing | None = None  # the photographs and their poses; None if nothing is known of these
 
 
 class Panels:
@@ -91,11 +94,12 @@ class Panels:
         items: rectangle of each widget of the last frame, by its label; for tests that click.
         path, path_file: texts of the fields of scenes and of the camera path.
         minimap: the plan of a tour.
+        placing: the window in which a photograph is placed.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.items: dict[str, Rectangle] = {}
-        self.minimap = Minimap(ctx)
+        self.minimap, self.placing = Minimap(ctx), PlacingWindow(ctx)
         self.path, self.path_file = "", "path.json"
 
     def draw(self, state: ViewerState, data: PanelData, now: float) -> Commands:
@@ -116,6 +120,8 @@ class Panels:
             if state.hotspots:
                 draw_hotspots(data.hotspots)
             self._draw_tour(state, data, data.tour, commands)
+        if state.overlay and data.placing is not None and data.placing.node is not None:
+            commands.reload |= self.placing.draw(data.placing, self._button, self._record_rectangle)
         if state.help:
             state.help = _draw_help()
         if data.loading:
@@ -129,6 +135,7 @@ class Panels:
     def release(self) -> None:
         """Free the GL objects."""
         self.minimap.release()
+        self.placing.release()
 
     def _draw_tour(self, state: ViewerState, data: PanelData, tour: TourScenes, commands: Commands) -> None:
         """Draw the plan and the progress of the tour at the right border, below the statistics."""
@@ -146,6 +153,8 @@ class Panels:
         state.hotspots = self._check("hotspots", state.hotspots)
         if state.minimap:
             commands.visit = self.minimap.draw(tour, state.camera)
+            if any(is_probable(tour.tour, node) for node in range(len(tour.tour))):
+                imgui.text_disabled("ring: probably placed")
         imgui.set_next_item_width(-1)
         if imgui.begin_combo("##visit", describe_panoramas(tour.tour)):
             for node in range(len(tour.tour)):
@@ -210,6 +219,9 @@ class Panels:
             self._section("Scene", self._draw_scene, state, data, commands)
             if data.notes:
                 self._section("Notes", _draw_notes, data.notes, opened=len(data.notes) <= _OPENED_NOTES)
+            if data.placing is not None and data.placing.is_listed:
+                opened = any(view.placement.state != "placed" for view in data.placing.panoramas)
+                self._section("Photographs", self._draw_photographs, data.placing, commands, opened=opened)
             if data.stats.total:
                 self._section("Gaussians", self._draw_gaussians, state)
             self._section("Display", self._draw_display, state)
@@ -221,6 +233,9 @@ class Panels:
             self._section("Window", self._draw_window, data, commands, opened=False)
             imgui.pop_item_width()
         imgui.end()
+
+    def _draw_photographs(self, placing: Placing, commands: Commands) -> None:
+        commands.reload |= draw_photographs(placing, self._button)
 
     def _draw_scene(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
         if data.entries:

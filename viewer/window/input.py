@@ -33,7 +33,7 @@ HELP = (
     ("1 2 ... 9", "jump to a panorama (tour: fly there)"),
     ("Space", "play the flight between them"),
     ("M", "floor plan and hotspots of a tour"),
-    (", .", "step along the flight"),
+    (", .", "step along the flight (placing: turn)"),
     ("C", "compare with the nearest photograph"),
     ("X", "pin the image, to compare others with it"),
     ("B", "before or after the refinement"),

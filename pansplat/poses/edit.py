@@ -1,0 +1,382 @@
+"""Changes of a folder's poses by hand: poses that a user places, rejects and restores, in its poses.json.
+
+The first change of a folder whose poses were estimated writes all estimated poses to a poses.json; from then on the
+file counts. Other entries and fields of the file stay as they are. Each change is written at once and can be undone.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from pansplat.atomic import replacing
+from pansplat.data.images import list_pictures
+from pansplat.data.pairs import Panorama
+from pansplat.data.placements import BY_HAND, Tie, find_holds, read_rejected, read_ties
+from pansplat.data.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
+from pansplat.data.web_tours import find_web_tour
+from pansplat.errors import InputError
+from pansplat.files import read_file
+from pansplat.poses.estimate import PoseEstimate
+from pansplat.poses.placing import Place, Suggestion
+from pansplat.poses.pose_file import format_pose_file, make_pose_content, make_pose_file
+from pansplat.strict_json import MAX_BYTES, read_json, require_object
+
+POSES = "poses.json"
+
+Content = dict[str, Any]
+
+
+class PoseEditor:
+    """The poses of a folder's panoramas, which it changes.
+
+    Attributes:
+        file: the poses.json.
+    """
+
+    def __init__(self, folder: Path, panoramas: Sequence[Panorama]) -> None:
+        """Nothing is written before the first change.
+
+        Args:
+            folder: of the tour.
+            panoramas: all of it, as they were loaded.
+
+        Raises:
+            InputError: a poses.json cannot state the poses of this folder.
+        """
+        self.file = folder / POSES
+        self._sources = {panorama.placement.source for panorama in panoramas} - {None}
+        self._names = {panorama.image: _name_in(folder, panorama) for panorama in panoramas}
+        self._by_name = {panorama.name: panorama.image for panorama in panoramas}
+        if not self._sources:
+            raise InputError(f"{folder}: needed estimated poses or a {POSES} to change poses, got another format.")
+        if not self.file.exists() and find_web_tour(folder) is not None:
+            raise InputError(
+                f"{folder}: needed photographs to place them by hand, got a tour of another program, whose titles and "
+                f"links a {POSES} would hide; copy its panoramas to a folder of their own."
+            )
+        self._undo: list[tuple[bytes | None, bytes]] = []
+        if self.file in self._sources:
+            self._check_convention(panoramas)
+
+    def _check_convention(self, panoramas: Sequence[Panorama]) -> None:
+        """Refuse poses that were read otherwise than the file states them; what is written would be wrong."""
+        content = self.read()
+        for panorama in panoramas:
+            name = self._names[panorama.image]
+            if name in content["poses"] and not np.allclose(
+                _read_pose(content, name, self.file), panorama.cam2world.numpy(), atol=1e-6
+            ):
+                raise InputError(
+                    f"{self.file}: needed poses in the convention of the file to change them, got those of "
+                    "--convention, or the file has changed; correct its convention, and load it again."
+                )
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether a change of this editor is left to undo."""
+        return bool(self._undo)
+
+    def read(self) -> Content:
+        """The content of the poses.json, or what it would be for estimated poses.
+
+        Raises:
+            InputError: the file cannot be read.
+        """
+        if self.file.exists():
+            content = require_object(read_json(self.file), self.file)
+            require_object(content.get("poses"), f"{self.file}, poses")
+            return content
+        (source,) = self._sources
+        return _convert(require_object(read_json(source), source), self._names, self._by_name)
+
+    def read_suggestions(self) -> dict[tuple[Path, Path], tuple[Suggestion, ...]]:
+        """For pairs of panoramas, places of the second one relative to the first, camera heights."""
+        images = {name: image for image, name in self._names.items()}
+        estimate, found = self.read().get("estimate"), {}
+        pairs = estimate.get("suggestions") if isinstance(estimate, dict) else None
+        for pair in pairs if isinstance(pairs, list) else []:
+            names, places = (pair.get("between"), pair.get("places")) if isinstance(pair, dict) else (None, None)
+            if not (isinstance(names, list) and len(names) == 2 and set(map(str, names)) <= set(images)):
+                continue
+            rows = [row for row in places if _is_row(row)] if isinstance(places, list) else []
+            found[images[names[0]], images[names[1]]] = tuple(Suggestion(Place(*row[:3]), row[3]) for row in rows)
+        return found
+
+    def read_unit(self, world: int) -> float | None:
+        """Metres that are one camera height of the estimated depths in a world, if the file states it."""
+        return _find_unit(self.read(), world)
+
+    def place(self, poses: Mapping[Path, Float[Array, "4 4"]], world: int | None, unit: float | None = None) -> None:
+        """Place panoramas by hand.
+
+        Args:
+            poses: cam2world of each, metres.
+            world: of the file, whose other panoramas they are placed beside; None for one of their own.
+            unit: metres that are a camera height, of a new world.
+
+        Raises:
+            InputError: the file cannot be read or written.
+        """
+        content = self.read()
+        if world is None:
+            world = _find_free_world(content)
+            if unit is not None:
+                worlds = content.setdefault("worlds", [])
+                worlds += [{} for _ in range(world + 1 - len(worlds))]
+                worlds[world] = worlds[world] | {"unit": round(unit, 4)}
+        for image, pose in poses.items():
+            _put(content, self._names[image], pose, world, self.file, {"placed": BY_HAND})
+        self._write(content)
+
+    def reject(self, image: Path) -> None:
+        """Drop the pose of a panorama that is probable or placed by hand, and what only its pairs hold.
+
+        Panoramas that leave their group together get a world of their own.
+
+        Raises:
+            InputError: the pose is certain, or the file cannot be read or written.
+        """
+        content, name = self.read(), self._names[image]
+        poses = content["poses"]
+        if name not in poses:
+            raise InputError(f"{self.file}: needed a panorama with a pose to reject it, got {name}.")
+        ties: tuple[Tie, ...] = ()
+        members: tuple[str, ...] = (name,)
+        if not _is_by_hand(poses[name]):
+            names = [other for other in poses if _world_of(poses[other]) == _world_of(poses[name])]
+            by_hand = [other for other in names if _is_by_hand(poses[other])]
+            hold = find_holds(names, read_ties(content.get("estimate")), by_hand).get(name)
+            if hold is None:
+                raise InputError(
+                    f"{self.file}: needed a pose that is probable or placed by hand, got {name}; place it."
+                )
+            ties, members = hold.ties, hold.members
+        if len(members) == len(poses):
+            raise InputError(f"{self.file}: needed another panorama with a pose, got only {name}.")
+        record: Content = {"poses": {member: copy.deepcopy(poses[member]) for member in members}}
+        if ties:
+            record["pairs"] = _take_pairs(content, ties)
+        if len(members) == 1:
+            del poses[name]
+        else:
+            record["world"] = _find_free_world(content)
+            for member in members:
+                poses[member] = _as_object(poses[member], content, self.file) | {"world": record["world"]}
+        content["rejected"] = [*(content.get("rejected") or []), record]
+        self._write(content)
+
+    def restore(self, image: Path) -> None:
+        """Take back the last rejection of a panorama, also of those that left their group with it.
+
+        A panorama that was placed otherwise since stays where it is.
+
+        Raises:
+            InputError: there is no such rejection, or the file cannot be read or written.
+        """
+        content, name = self.read(), self._names[image]
+        records = content.get("rejected") or []
+        found = [record for record in records if isinstance(record, dict) and name in (record.get("poses") or ())]
+        if not found:
+            raise InputError(f"{self.file}: needed a rejected panorama, got {name}.")
+        record, poses = found[-1], content["poses"]
+        for member, entry in record["poses"].items():
+            if member not in poses or ("world" in record and _world_of(poses[member]) == record["world"]):
+                poses[member] = entry
+        if record.get("pairs"):
+            content.setdefault("estimate", {}).setdefault("pairs", []).extend(record["pairs"])
+        content["rejected"] = [other for other in records if other is not record]
+        if not content["rejected"]:
+            del content["rejected"]
+        self._write(content)
+
+    def undo(self) -> None:
+        """Undo the last change: the file is as before, or removed if the change made it.
+
+        Raises:
+            InputError: there is none, another program has changed the file since, or it cannot be written.
+        """
+        if not self._undo:
+            raise InputError(f"{self.file}: needed a change to undo, got none.")
+        before, after = self._undo[-1]
+        if _read(self.file) != after:
+            raise InputError(f"{self.file}: needed the file as it was written, got another content; it is kept.")
+        if before is not None:
+            _replace(self.file, before)
+        else:
+            try:
+                self.file.unlink()
+            except OSError as error:
+                raise InputError(f"cannot remove {self.file}: got '{error.strerror}'; remove it by hand.") from error
+        self._undo.pop()
+
+    def _write(self, content: Content) -> None:
+        before, after = _read(self.file), format_pose_file(content).encode()
+        _replace(self.file, after)
+        self._undo.append((before, after))
+
+
+def merge_estimate(file: Path, estimate: PoseEstimate, names: Mapping[Path, str]) -> tuple[Content, int] | None:
+    """The content of a poses.json with changes by hand, and the poses that an estimate adds; also their number.
+
+    All poses of the file are kept. A panorama without one is placed where the estimate has it, relative to the nearest
+    panorama of the file in its group.
+
+    Args:
+        file: the poses.json; it need not exist.
+        estimate: of the folder.
+        names: of the files in it.
+
+    Returns:
+        None if there are no changes by hand.
+    """
+    if not file.exists():
+        return None
+    content = require_object(read_json(file), file)
+    poses = content.get("poses")
+    rejected = {name for entries in read_rejected(content) for name in entries}
+    if not isinstance(poses, dict) or not (rejected or any(map(_is_by_hand, poses.values()))):
+        return None
+    known, added = set(poses), 0
+    for group in estimate.groups:
+        own = {image: names[image] for image in group.poses}
+        new = [image for image, name in own.items() if name not in known | rejected]
+        anchors = [image for image, name in own.items() if name in known]
+        world = None if anchors else _find_free_world(content)
+        for image in new:
+            pose = group.poses[image]
+            if anchors:
+                nearest = min(anchors, key=lambda a: float(np.linalg.norm(group.poses[a][:3, 3] - pose[:3, 3])))
+                world = _world_of(poses[own[nearest]])
+                motion = np.linalg.inv(group.poses[nearest]) @ pose
+                motion[:3, 3] *= (_find_unit(content, world) or group.unit) / group.unit
+                pose = _read_pose(content, own[nearest], file) @ motion
+            assert world is not None
+            _put(content, own[image], pose, world, file, {})
+            added += 1
+    fresh = make_pose_content(estimate, names)["estimate"]
+    old = content.get("estimate") if isinstance(content.get("estimate"), dict) else {}
+    apart = {frozenset(tie[:2]) for record in content.get("rejected") or () for tie in read_ties(record)}
+    kept = [pair for pair in _list_pairs(old) if set(pair["between"]) <= known]
+    pairs = [
+        pair for pair in fresh["pairs"] if not set(pair["between"]) <= known and frozenset(pair["between"]) not in apart
+    ]
+    content["estimate"] = {**old, **fresh, "pairs": kept + pairs}
+    return content, added
+
+
+def _name_in(folder: Path, panorama: Panorama) -> str:
+    """The key of a panorama in the poses.json of a folder."""
+    image = panorama.image
+    if len(list_pictures(image)) > 1:
+        raise InputError(
+            f"{image}: needed 2:1 photographs to place them by hand, got cube faces; convert them to panoramas."
+        )
+    try:
+        return image.resolve().relative_to(folder.resolve()).as_posix()
+    except ValueError:
+        raise InputError(f"{image}: needed a photograph in {folder} to place it by hand; move it there.") from None
+
+
+def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, Path]) -> Content:
+    """A cached estimate as the content of a poses.json."""
+
+    def rename(name: str) -> str:
+        return names[by_name[name]] if name in by_name else name
+
+    worlds = [
+        world | {"poses": {rename(name): pose for name, pose in world["poses"].items()}} for world in cached["worlds"]
+    ]
+    renamed = {
+        key: [pair | {"between": [rename(name) for name in pair["between"]]} for pair in cached[key]]
+        for key in ("pairs", "suggestions")
+    }
+    unplaced = {by_name[name].name if name in by_name else name: reason for name, reason in cached["unplaced"].items()}
+    return make_pose_file(worlds, {"summary": cached["summary"], "unplaced": unplaced, **renamed})
+
+
+def _is_row(row: Any) -> bool:
+    is_list = isinstance(row, list) and len(row) == 4
+    return is_list and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in row)
+
+
+def _is_by_hand(entry: Any) -> bool:
+    return isinstance(entry, dict) and entry.get("placed") == BY_HAND
+
+
+def _world_of(entry: Any) -> int:
+    return int(entry.get("world") or 0) if isinstance(entry, dict) else 0
+
+
+def _find_unit(content: Content, world: int) -> float | None:
+    worlds = content.get("worlds")
+    entry = worlds[world] if isinstance(worlds, list) and 0 <= world < len(worlds) else None
+    unit = entry.get("unit") if isinstance(entry, dict) else None
+    return float(unit) if isinstance(unit, (int, float)) and not isinstance(unit, bool) and unit > 0 else None
+
+
+def _find_free_world(content: Content) -> int:
+    used = {_world_of(entry) for entry in content["poses"].values()}
+    return next(number for number in range(len(used) + 1) if number not in used)
+
+
+def _convention_of(content: Content, file: Path) -> str:
+    return parse_convention(content.get("convention"), file)
+
+
+def _as_object(entry: Any, content: Content, file: Path) -> Content:
+    """An entry with room for fields."""
+    return dict(entry) if isinstance(entry, dict) else {_convention_of(content, file).split()[0]: entry}
+
+
+def _read_pose(content: Content, name: str, file: Path) -> Float[Array, "4 4"]:
+    entry = content["poses"][name]
+    matrix = next((entry[key] for key in _KEYS if key in entry), None) if isinstance(entry, dict) else entry
+    return to_cam2world(rigid_matrix(matrix, f"{file}, {name!r}"), _convention_of(content, file)).numpy()
+
+
+_KEYS = ("cam2world", "world2cam", "pose")
+
+
+def _put(
+    content: Content, name: str, pose: Float[Array, "4 4"], world: int, file: Path, fields: Mapping[str, str]
+) -> None:
+    """Set the pose of an entry in the convention of the file; other fields of the entry are kept."""
+    convention = _convention_of(content, file)
+    entry = _as_object(content["poses"].get(name, {}), content, file)
+    key = next((key for key in _KEYS if key in entry), convention.split()[0])
+    matrix = from_cam2world(torch.from_numpy(np.asarray(pose, np.float64)), convention)
+    entry |= {key: np.round(matrix.numpy(), 9).tolist(), **fields}
+    if world or "world" in entry:
+        entry["world"] = world
+    content["poses"][name] = entry
+
+
+def _take_pairs(content: Content, ties: Sequence[Tie]) -> list[Content]:
+    """The pairs of some ties, which are removed from the estimate."""
+    estimate, ends = content["estimate"], [set(tie[:2]) for tie in ties]
+    taken = [pair for pair in _list_pairs(estimate) if set(pair["between"]) in ends]
+    estimate["pairs"] = [pair for pair in estimate["pairs"] if pair not in taken]
+    return taken
+
+
+def _list_pairs(estimate: Content) -> list[Content]:
+    """The valid pairs of an estimate, as the file has them."""
+    pairs = estimate.get("pairs")
+    return [pair for pair in pairs if read_ties({"pairs": [pair]})] if isinstance(pairs, list) else []
+
+
+def _read(file: Path) -> bytes | None:
+    return read_file(file, limit=MAX_BYTES) if file.exists() else None
+
+
+def _replace(file: Path, data: bytes) -> None:
+    with replacing(file) as temporary:
+        temporary.write_bytes(data)

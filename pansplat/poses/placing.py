@@ -1,0 +1,295 @@
+"""Panoramas as pieces on a floor plan: their places, what snaps, and how well a place fits the panoramas around it.
+
+A piece is a panorama with its estimated depth. Its place is a point on the plan and a heading, because gravity is known
+and cameras of a tour are equally high. Units of a plan are metres; those of a piece are camera heights.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from pansplat.data.images import read_height, read_panorama
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.path import level_pose, up_direction, wrap_angle
+from pansplat.poses.axes import find_axes, with_hints
+from pansplat.poses.dense import Comparison, Surroundings, compare
+from pansplat.poses.depth import estimate_depth
+from pansplat.poses.hints import read_hints
+from pansplat.poses.two_view import RelativePose
+from pansplat.tours.floor import trace_floor
+
+DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
+_IMAGE_HEIGHT = 1024  # largest one, in which edges are looked for
+_OUTLINE_STEP = 2  # of the pixels that an outline is traced from, rows and columns
+_UPRIGHT = math.radians(8)  # between a world's y axis and the mean down of its cameras, if y is down
+SNAP_RADIUS, SNAP_ANGLE = 0.35, math.radians(12)  # metres and radians, to a suggestion
+WALL_ANGLE = math.radians(6)  # to parallel walls
+_LEAST_OVERLAP = 0.01  # of a comparison that counts
+_LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind
+_NEIGHBOURS = 4  # nearest panoramas that a place is compared with
+
+
+class Place(NamedTuple):
+    """A place on a floor plan.
+
+    Attributes:
+        right, forward: of the camera, metres.
+        yaw: heading, radians to the right of the plan's forward axis.
+    """
+
+    right: float
+    forward: float
+    yaw: float
+
+    def add(self, other: Place, unit: float = 1.0) -> Place:
+        """A place that is known relative to this one, in a unit of metres."""
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        right, forward = unit * other.right, unit * other.forward
+        return Place(
+            self.right + cosine * right + sine * forward,
+            self.forward - sine * right + cosine * forward,
+            wrap_angle(self.yaw + other.yaw),
+        )
+
+    def inverse(self) -> Place:
+        """The place of the plan's origin relative to this one."""
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        return Place(-cosine * self.right + sine * self.forward, -sine * self.right - cosine * self.forward, -self.yaw)
+
+    def distance(self, other: Place) -> float:
+        """Between the cameras, metres."""
+        return math.hypot(self.right - other.right, self.forward - other.forward)
+
+    def turn_between(self, other: Place) -> float:
+        """Absolute difference of the headings, radians."""
+        return abs(wrap_angle(self.yaw - other.yaw))
+
+
+class Suggestion(NamedTuple):
+    """A place of one panorama relative to another one, camera heights, with the logarithm of its odds."""
+
+    place: Place
+    log_odds: float
+
+
+def list_suggestions(
+    relation: RelativePose, upright: tuple[Float[Array, "3 3"], Float[Array, "3 3"]]
+) -> tuple[Suggestion, ...]:
+    """The best hypotheses of a pair as places of the second panorama relative to the first one.
+
+    Args:
+        relation: of the pair.
+        upright: axes of both upright cameras in the cameras' frames, as columns (`DepthMap.rotation`).
+    """
+    found = []
+    for candidate in relation.candidates:
+        centre = upright[0].T @ (-candidate.rotation.T @ candidate.translation)
+        forward = upright[0].T @ candidate.rotation.T @ upright[1][:, 2]
+        place = Place(float(centre[0]), float(centre[2]), math.atan2(forward[0], forward[2]))
+        found.append(Suggestion(place, candidate.log_odds))
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """What one panorama shows, in camera heights.
+
+    Attributes:
+        surroundings: grey values and depth.
+        wall_yaw: direction of its walls, radians to the right of the upright camera's z axis, up to a quarter turn;
+            None if it shows no walls.
+    """
+
+    surroundings: Surroundings
+    wall_yaw: float | None
+
+    @property
+    def upright(self) -> Float[Array, "3 3"]:
+        """Axes of the upright camera in the camera's frame, as columns."""
+        return self.surroundings.depth.rotation
+
+    @functools.cached_property
+    def outline(self) -> Float[Array, "azimuth 2"] | None:
+        """Where its floor ends (right, forward of the upright camera); None if it shows no floor."""
+        depth = self.surroundings.depth.log_depth
+        rays = pixel_directions(*depth.shape).numpy()
+        places = (rays * np.exp(depth)[..., None])[::_OUTLINE_STEP, ::_OUTLINE_STEP].reshape(-1, 3)
+        found = trace_floor(places.astype(np.float64))
+        return None if found is None else found[0] / found[1]
+
+    def draw_outline(self, place: Place, unit: float) -> Float[Array, "azimuth 2"]:
+        """The outline on the plan, metres; a small circle if there is none."""
+        outline = self.outline
+        if outline is None:
+            angles = np.linspace(0, 2 * math.pi, 24, endpoint=False)
+            outline = 0.3 * np.stack((np.sin(angles), np.cos(angles)), axis=1)
+        cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
+        turned = outline @ np.array(((cosine, -sine), (sine, cosine)))
+        return np.array((place.right, place.forward)) + unit * turned
+
+
+def read_piece(image: Path) -> Piece:
+    """The piece of a panorama file, with its depth by the default model.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    pixels = read_panorama(image, min(read_height(image), _IMAGE_HEIGHT))[0].permute(1, 2, 0).numpy()
+    grey = cv2.cvtColor((pixels * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    axes = with_hints(find_axes(grey), read_hints(image).down, None)
+    pixels = cv2.resize(pixels, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
+    depth = estimate_depth(pixels, axes.axes[0] if axes.has_down else None)
+    wall = depth.rotation.T @ axes.axes[1]
+    return Piece(Surroundings(pixels.mean(axis=2), depth), math.atan2(wall[0], wall[2]) if axes.has_walls else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """The floor plan of a world.
+
+    Attributes:
+        level: right, down and forward of the plan in the world, as columns.
+        unit: metres that are one camera height of the pieces.
+    """
+
+    level: Float[Array, "3 3"]
+    unit: float
+
+    @staticmethod
+    def of_world(poses: Float[Array, "view 4 4"], unit: float) -> Floor:
+        """The plan of posed cameras; it looks along the first one. y is down if the cameras agree with that."""
+        matrices = torch.from_numpy(np.asarray(poses, np.float64))
+        up = up_direction(matrices)
+        if float(-up[1]) > math.cos(_UPRIGHT):
+            up = torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64)
+        return Floor(level_pose(matrices[0], up)[:3, :3].numpy(), unit)
+
+    def find_place(self, pose: Float[Array, "4 4"], upright: Float[Array, "3 3"]) -> Place:
+        """The place of a camera."""
+        right, _, forward = (self.level.T @ pose[:3, 3]).tolist()
+        ahead = self.level.T @ pose[:3, :3] @ upright[:, 2]
+        return Place(right, forward, math.atan2(ahead[0], ahead[2]))
+
+    def make_pose(self, place: Place, upright: Float[Array, "3 3"], down: float) -> Float[Array, "4 4"]:
+        """The pose, cam2world, of an upright camera at a place; `down` is its place along that axis, metres."""
+        cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
+        pose = np.eye(4)
+        turn = np.array(((cosine, 0, sine), (0, 1, 0), (-sine, 0, cosine)))
+        pose[:3, :3] = self.level @ turn @ upright.T
+        pose[:3, 3] = self.level @ (place.right, down, place.forward)
+        return pose
+
+
+class Snapped(NamedTuple):
+    """A place after snapping.
+
+    Attributes:
+        suggestion: number of the suggestion that it is at; None for none.
+        has_walls: whether only its walls snapped.
+    """
+
+    place: Place
+    suggestion: int | None = None
+    has_walls: bool = False
+
+
+def snap(
+    place: Place, suggestions: Sequence[Place], wall_yaw: float | None = None, target_yaw: float | None = None
+) -> Snapped:
+    """The nearest suggestion within reach, or else the place with its walls parallel to those of the plan.
+
+    Args:
+        place: of the piece.
+        suggestions: on the plan.
+        wall_yaw: of the piece (`Piece.wall_yaw`); None snaps no walls.
+        target_yaw: of the plan's walls, radians up to a quarter turn.
+    """
+    near = [
+        (place.distance(other) / SNAP_RADIUS + place.turn_between(other) / SNAP_ANGLE, number)
+        for number, other in enumerate(suggestions)
+        if place.distance(other) < SNAP_RADIUS and place.turn_between(other) < SNAP_ANGLE
+    ]
+    if near:
+        number = min(near)[1]
+        return Snapped(suggestions[number], number)
+    if wall_yaw is not None and target_yaw is not None:
+        error = math.remainder(place.yaw + wall_yaw - target_yaw, math.pi / 2)
+        if abs(error) < WALL_ANGLE:
+            return Snapped(place._replace(yaw=wrap_angle(place.yaw - error)), None, True)
+    return Snapped(place)
+
+
+def find_wall_yaw(yaws: Sequence[float]) -> float | None:
+    """The mean of directions up to quarter turns, radians; None if there are none or they contradict each other."""
+    if not yaws:
+        return None
+    mean = np.exp(4j * np.array(yaws)).mean()
+    return float(np.angle(mean)) / 4 if abs(mean) > 0.5 else None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a piece at a place fits the panoramas around it.
+
+    Attributes:
+        likeness: correlation of the detail of what both see; mean over the panoramas, by overlap.
+        conflict: share of the sphere whose surface is where another camera sees through; likewise.
+        overlap: largest share of the sphere that both see.
+    """
+
+    likeness: float
+    conflict: float
+    overlap: float
+
+    @property
+    def score(self) -> float:
+        """About 0 by chance, and 1 at a right pose in one room."""
+        low, high = _LIKENESS
+        return (self.likeness - low) / (high - low) - _CONFLICT_WEIGHT * self.conflict
+
+    @property
+    def quality(self) -> float:
+        """The score within 0 to 1."""
+        return min(max(self.score, 0.0), 1.0)
+
+
+def measure_fit(
+    piece: Piece,
+    pose: Float[Array, "4 4"],
+    others: Sequence[tuple[Piece, Float[Array, "4 4"]]],
+    unit: float,
+) -> Fit | None:
+    """The fit of a piece at a pose with the nearest other panoramas; None if it has nothing in common with them.
+
+    Args:
+        piece: of the panorama.
+        pose: its cam2world.
+        others: pieces and poses of panoramas of the same world.
+        unit: metres that are one camera height.
+    """
+    nearest = sorted(others, key=lambda other: float(np.linalg.norm(other[1][:3, 3] - pose[:3, 3])))[:_NEIGHBOURS]
+    found: list[Comparison] = []
+    for other, known in nearest:
+        rotation = pose[:3, :3].T @ known[:3, :3]
+        translation = pose[:3, :3].T @ (known[:3, 3] - pose[:3, 3]) / unit
+        found.append(compare(other.surroundings, piece.surroundings, rotation, translation))
+    weights = np.array([comparison.overlap for comparison in found])
+    if not len(found) or weights.max() < _LEAST_OVERLAP:
+        return None
+    likeness, conflict = (np.array([getattr(c, name) for c in found]) for name in ("likeness", "conflict"))
+    return Fit(
+        float((weights * likeness).sum() / weights.sum()),
+        float((weights * conflict).sum() / weights.sum()),
+        float(weights.max()),
+    )

@@ -1,0 +1,77 @@
+"""The content of a poses.json of estimated poses (docs/input.md)."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pansplat.poses.estimate import PoseEstimate, PoseGroup, Suggestions
+
+CONVENTION = "cam2world opencv"
+
+
+def make_pose_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
+    """The content of a poses.json: all groups, each a world, and what a user may want to know and change."""
+    worlds = [make_world(group, names) for group in estimate.groups]
+    return make_pose_file(
+        worlds,
+        {
+            "summary": estimate.summary,
+            "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
+            "pairs": list_pairs(estimate, names),
+            "suggestions": list_suggestions(estimate.suggestions, names),
+        },
+    )
+
+
+def make_pose_file(worlds: Sequence[Mapping[str, Any]], estimate: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a poses.json from worlds as the cache keeps them."""
+    poses = {}
+    for number, world in enumerate(worlds):
+        for name, pose in world["poses"].items():
+            poses[name] = {"cam2world": pose, "world": number} if number else pose
+    ranges = [{key: world[key] for key in ("near", "far", "unit")} for world in worlds]
+    first = {key: ranges[0][key] for key in ("near", "far")} if ranges else {}
+    return {"convention": CONVENTION, **first, "worlds": ranges, "poses": poses, "estimate": dict(estimate)}
+
+
+def list_pairs(estimate: PoseEstimate, names: Mapping[Path, str]) -> list[dict[str, Any]]:
+    """The pairs that hold the groups together, and how certain they are."""
+    return [
+        {"between": [tie.first, tie.second], "check": "certain" if tie.is_certain else "probable"}
+        for tie in estimate.list_ties(names)
+    ]
+
+
+def list_suggestions(suggestions: Suggestions, names: Mapping[Path, str]) -> list[dict[str, Any]]:
+    """Places of the second panorama of a pair relative to the first: right, forward (camera heights), yaw, log-odds."""
+    return [
+        {
+            "between": [names[first], names[second]],
+            "places": [[round(x, 4) for x in (*s.place, s.log_odds)] for s in own],
+        }
+        for (first, second), own in suggestions.items()
+    ]
+
+
+def format_pose_file(content: Mapping[str, Any]) -> str:
+    """The text of a poses.json; each row of a matrix is a line."""
+    return re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", _join_lines, json.dumps(content, indent=1)) + "\n"
+
+
+def _join_lines(match: re.Match[str]) -> str:
+    return "[" + " ".join(match[1].split()) + "]"
+
+
+def make_world(group: PoseGroup, names: Mapping[Path, str]) -> dict[str, Any]:
+    return {
+        "near": round(group.near, 3),
+        "far": round(group.far, 3),
+        "unit": round(group.unit, 4),
+        "poses": {names[image]: np.round(pose, 9).tolist() for image, pose in group.poses.items()},
+    }

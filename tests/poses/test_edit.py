@@ -1,0 +1,280 @@
+"""Rejecting, restoring and placing by hand change poses.json only where they must, survive loading, and are undone."""
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import pansplat
+from pansplat.data.pairs import Panorama
+from pansplat.errors import InputError
+from pansplat.poses.edit import PoseEditor
+from pansplat.poses.estimate import PoseEstimate, PoseGroup
+from pansplat.poses.files import write_poses
+from pansplat.poses.placing import Place, Suggestion
+from pansplat.poses.two_view import RelativePose
+
+NAMES = "abcdef"
+
+
+def _relation(log_odds: float) -> RelativePose:
+    none = np.zeros((0, 2), np.int64)
+    return RelativePose(np.eye(3), np.array((0.0, 0, 1)), none, 100, 100, 40, 0.3, (0.01, 0.01), 1.0, log_odds, None)
+
+
+def _estimate(images, **options) -> PoseEstimate:
+    """a, b, c (certain), d probable by c, e probable by d; f is not placed. Cameras are 1 m apart along x."""
+    images = list(images)
+    poses = {}
+    for step, image in enumerate(images[:5]):
+        poses[image] = np.eye(4)
+        poses[image][0, 3] = step
+    odds = {(0, 1): np.inf, (1, 2): 3.0, (2, 3): 0.5, (3, 4): 0.5}
+    return PoseEstimate(
+        tuple(images),
+        (PoseGroup(poses, 0.4, 8.0, 0.0, "a test", 1.6),),
+        {images[5]: "no door"} if len(images) > 5 else {},
+        {pair: _relation(value) for pair, value in odds.items()},
+        (),
+        {(images[0], images[5]): (Suggestion(Place(1.0, 2.0, 0.5), -1.5),)} if len(images) > 5 else {},
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch) -> Path:
+    for number, name in enumerate(NAMES):
+        noise = np.random.default_rng(number).integers(0, 255, (8, 16, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), cv2.resize(noise, (128, 64), interpolation=cv2.INTER_CUBIC))
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _estimate)
+    return tmp_path
+
+
+def _load(folder: Path) -> dict[str, Panorama]:
+    pairs = pansplat.load_pairs(folder)
+    return {view.name: view for pair in pairs for view in pair.context}
+
+
+def _states(folder: Path) -> dict[str, str]:
+    return {name: view.placement.state for name, view in sorted(_load(folder).items())}
+
+
+def _edit(folder: Path) -> PoseEditor:
+    return PoseEditor(folder, list(_load(folder).values()))
+
+
+def _content(folder: Path) -> dict:
+    return json.loads((folder / "poses.json").read_text())
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+ALL = {"a": "placed", "b": "placed", "c": "placed", "d": "probable", "e": "probable", "f": "not placed"}
+
+
+def test_states_and_reasons_are_those_of_the_estimate_also_from_its_cache_and_from_a_file(folder: Path, monkeypatch):
+    for _ in range(2):
+        views = _load(folder)
+        assert _states(folder) == ALL
+        assert views["d"].placement.reason == "by probable pairs only: c - d"
+        assert views["f"].placement.reason == "no door"
+        monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)
+    write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    assert _states(folder) == ALL
+    assert _load(folder)["f"].placement.reason == "no door"
+
+
+def test_a_note_names_what_is_only_probable(folder: Path):
+    with pytest.warns(UserWarning, match=r"d\.png is only probably placed.*by probable pairs only: c - d"):
+        pansplat.load_pairs(folder)
+    estimate = _estimate(sorted(folder.glob("*.png")))
+    assert {image.name: reason for image, reason in estimate.probable.items()} == {
+        "d.png": "by probable pairs only: c.png - d.png",
+        "e.png": "by probable pairs only: d.png - e.png",
+    }
+
+
+def test_a_rejected_leaf_has_no_pose_after_loading_and_can_be_restored(folder: Path):
+    editor = _edit(folder)
+    editor.reject(folder / "e.png")
+    view = _load(folder)["e"]
+    assert view.placement.state == "not placed" and view.placement.reason == "rejected by hand"
+    assert view.placement.is_rejected and view.world != _load(folder)["a"].world
+    assert _states(folder) == ALL | {"e": "not placed"}
+    again = _edit(folder)  # another session
+    again.restore(folder / "e.png")
+    assert _states(folder) == ALL
+    assert _load(folder)["e"].cam2world[0, 3] == 4 and "rejected" not in _content(folder)
+
+
+def test_what_a_rejected_pair_holds_leaves_together_and_comes_back_together(folder: Path):
+    editor = _edit(folder)
+    editor.reject(folder / "d.png")
+    views = _load(folder)
+    assert views["d"].world == views["e"].world != views["a"].world
+    assert np.allclose(views["e"].cam2world[:3, 3] - views["d"].cam2world[:3, 3], (1, 0, 0))
+    assert views["d"].placement.is_rejected
+    _edit(folder).restore(folder / "d.png")
+    assert len({view.world for name, view in _load(folder).items() if name != "f"}) == 1
+    assert _states(folder) == ALL
+
+
+def test_a_certain_pose_is_not_rejected(folder: Path):
+    with pytest.raises(InputError, match="needed a pose that is probable or placed by hand, got b"):
+        _edit(folder).reject(folder / "b.png")
+    assert not (folder / "poses.json").exists()
+
+
+def test_a_pose_placed_by_hand_is_in_the_world_of_the_others_and_undone_in_steps(folder: Path):
+    editor, pose = _edit(folder), np.eye(4)
+    pose[:3, 3] = 0.5, 0, 2
+    world = _load(folder)["a"].world
+    editor.place({folder / "f.png": pose}, world)
+    first = (folder / "poses.json").read_bytes()
+    view = _load(folder)["f"]
+    assert view.placement.state == "by hand" and view.world == world
+    assert np.allclose(view.cam2world.numpy(), pose)
+    editor.reject(folder / "e.png")
+    editor.undo()
+    assert (folder / "poses.json").read_bytes() == first
+    editor.undo()
+    assert not (folder / "poses.json").exists() and not editor.can_undo
+    with pytest.raises(InputError, match="needed a change to undo"):
+        editor.undo()
+
+
+def test_a_pose_placed_by_hand_can_be_rejected_and_restored(folder: Path):
+    _edit(folder).place({folder / "f.png": np.eye(4)}, 0)
+    _edit(folder).reject(folder / "f.png")
+    assert _states(folder) == ALL
+    _edit(folder).restore(folder / "f.png")
+    assert _states(folder) == ALL | {"f": "by hand"}
+
+
+def test_saving_keeps_other_entries_fields_and_the_convention(folder: Path):
+    opengl = np.diag((1.0, -1, -1, 1))
+    inverse = {}
+    for step, name in enumerate("ab"):
+        pose = np.eye(4)
+        pose[0, 3] = step
+        inverse[f"{name}.png"] = np.linalg.inv(pose @ opengl).tolist()
+    cv2.imwrite(str(folder / "b_depth.png"), np.zeros((8, 16), np.uint16))
+    stated = {
+        "convention": "world2cam opengl",
+        "near": 0.3,
+        "far": 7,
+        "author": {"name": "me"},
+        "poses": {"a.png": inverse["a.png"], "b.png": {"pose": inverse["b.png"], "depth": "b_depth.png", "note": 3}},
+    }
+    (folder / "poses.json").write_text(json.dumps(stated))
+    pose = np.eye(4)
+    pose[:3, 3] = 2, 0, 1
+    _edit(folder).place({folder / "c.png": pose, folder / "b.png": pose}, 0)
+    content = _content(folder)
+    assert {key: content[key] for key in ("convention", "near", "far", "author")} == {
+        key: stated[key] for key in ("convention", "near", "far", "author")
+    }
+    assert content["poses"]["a.png"] == stated["poses"]["a.png"]
+    kept = {key: content["poses"]["b.png"][key] for key in ("depth", "note", "placed")}
+    assert kept == {"depth": "b_depth.png", "note": 3, "placed": "by hand"}
+    views = _load(folder)
+    assert all(np.allclose(views[name].cam2world.numpy(), pose) for name in "bc")
+    assert np.allclose(views["a"].cam2world.numpy(), np.eye(4))
+
+
+def test_poses_that_were_read_in_another_convention_are_not_changed(folder: Path):
+    write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    views = [view for pair in pansplat.load_pairs(folder, convention="cam2world opengl") for view in pair.context]
+    with pytest.raises(InputError, match="needed poses in the convention of the file"):
+        PoseEditor(folder, views)
+
+
+def test_a_change_of_another_program_is_kept(folder: Path):
+    editor = _edit(folder)
+    editor.place({folder / "f.png": np.eye(4)}, 0)
+    content = _content(folder) | {"remark": "mine"}
+    (folder / "poses.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="needed the file as it was written"):
+        editor.undo()
+    editor.reject(folder / "e.png")
+    assert _content(folder)["remark"] == "mine"
+
+
+def test_a_failed_write_names_the_file_and_leaves_the_old_one(folder: Path, monkeypatch):
+    editor = _edit(folder)
+    editor.place({folder / "f.png": np.eye(4)}, 0)
+    before = (folder / "poses.json").read_bytes()
+
+    def refuse(*args) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(InputError, match=r"cannot write .*poses\.json: needed a writable folder.*Permission denied"):
+        editor.reject(folder / "f.png")
+    assert (folder / "poses.json").read_bytes() == before
+    assert {file.suffix for file in folder.iterdir() if file.is_file()} == {".png", ".json"}
+
+
+def test_a_damaged_file_is_named_and_kept(folder: Path):
+    editor = _edit(folder)
+    (folder / "poses.json").write_text('{"poses": ')
+    with pytest.raises(InputError, match=r"poses\.json: needed JSON"):
+        editor.place({folder / "f.png": np.eye(4)}, 0)
+    assert (folder / "poses.json").read_text() == '{"poses": '
+
+
+def test_photographs_without_any_pose_get_a_world_of_their_own(folder: Path):
+    editor, pose = _edit(folder), np.eye(4)
+    pose[0, 3] = 1.5
+    editor.reject(folder / "e.png")
+    editor.place({folder / "e.png": np.eye(4), folder / "f.png": pose}, None, 1.4)
+    views = _load(folder)
+    assert views["e"].world == views["f"].world != views["a"].world
+    assert _states(folder) == ALL | {"e": "by hand", "f": "by hand"}
+    assert editor.read_unit(views["f"].world) == 1.4 and editor.read_unit(0) == 1.6
+
+
+def test_suggestions_are_kept_from_the_cache_to_the_file(folder: Path):
+    for _ in range(2):
+        editor = _edit(folder)
+        assert editor.read_suggestions() == {
+            (folder / "a.png", folder / "f.png"): (Suggestion(Place(1.0, 2.0, 0.5), -1.5),)
+        }
+        editor.place({folder / "e.png": np.eye(4)}, 0)
+
+
+def test_a_tour_of_another_program_is_not_changed(folder: Path):
+    scenes = {name: {"panorama": f"{name}.png"} for name in NAMES}
+    (folder / "tour.json").write_text(json.dumps({"scenes": scenes}))
+    with pytest.raises(InputError, match="got a tour of another program"):
+        _edit(folder)
+
+
+def test_a_new_estimate_keeps_the_poses_by_hand_and_adds_others_beside_them(folder: Path):
+    """The new estimate has its origin elsewhere; e, whose pair was rejected, stays without a pose."""
+    editor, pose = _edit(folder), np.eye(4)
+    pose[:3, 3] = 0, 0, 3
+    editor.reject(folder / "e.png")
+    editor.place({folder / "b.png": pose}, 0)
+    content = _content(folder)
+    del content["poses"]["c.png"]
+    content["worlds"][0]["unit"] = 3.2  # metres, twice those of the new estimate
+    (folder / "poses.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match="placed or rejected by hand: all its poses are kept, and 1 are added"):
+        write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    views = _load(folder)
+    assert np.allclose(views["b"].cam2world.numpy(), pose) and views["b"].placement.state == "by hand"
+    assert "e.png" not in _content(folder)["poses"]
+    assert np.allclose(views["c"].cam2world[:3, 3], (2, 0, 3))  # beside b, the nearest one
+
+
+def test_all_groups_of_an_estimate_are_written(folder: Path):
+    images = sorted(folder.glob("*.png"))
+    poses = [{image: np.eye(4) for image in part} for part in (images[:2], images[2:4])]
+    groups = tuple(PoseGroup(own, 0.3 + n, 8.0 + n, 0.0, "a test") for n, own in enumerate(poses))
+    write_poses(PoseEstimate(tuple(images), groups, {}, {}), folder / "poses.json")
+    pairs = pansplat.load_pairs(folder)
+    assert [[view.world for view in pair.context] for pair in pairs[:2]] == [[0, 0], [1, 1]]
+    assert [(pair.near, pair.far) for pair in pairs[:2]] == [(0.3, 8), (1.3, 9)]

@@ -1,0 +1,140 @@
+"""Places on a floor plan: composition, snapping, suggestions of relative poses, outlines and the fit."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pansplat.poses.placing import (
+    SNAP_ANGLE,
+    SNAP_RADIUS,
+    WALL_ANGLE,
+    Floor,
+    Piece,
+    Place,
+    find_wall_yaw,
+    list_suggestions,
+    measure_fit,
+    snap,
+)
+from pansplat.poses.solvers import rotation_exp
+from pansplat.poses.two_view import Candidate, RelativePose
+
+QUARTER = math.pi / 2
+
+
+def _upright(yaw: float) -> np.ndarray:
+    """Cam2world rotation of a level camera, y down, that is turned to the right."""
+    return rotation_exp(np.array((0.0, yaw, 0)))
+
+
+def _assert_same(first: Place, second: Place) -> None:
+    assert first.distance(second) < 1e-9 and first.turn_between(second) < 1e-9
+
+
+def test_a_place_and_its_inverse_cancel():
+    first, second = Place(1.0, -2.0, 0.7), Place(0.4, 3.0, -2.0)
+    _assert_same(first.add(first.inverse()), Place(0, 0, 0))
+    _assert_same(first.add(second).add(second.inverse()), first)
+    _assert_same(Place(0, 0, QUARTER).add(Place(0, 1, 0)), Place(1, 0, QUARTER))  # turned right: forward is right
+    _assert_same(Place(0, 0, 0).add(Place(0, 1, 0), unit=1.5), Place(0, 1.5, 0))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.15])
+def test_a_pose_of_a_place_has_this_place_whatever_the_tilt(tilt):
+    world = np.eye(4)
+    world[:3, :3] = rotation_exp(np.array((0.4, 1.0, 0))) @ _upright(0.5)
+    floor = Floor.of_world(world[None], 1.5)
+    upright = rotation_exp(np.array((tilt, 0, -tilt)))
+    pose = floor.make_pose(Place(2.0, 1.0, 0.8), upright, -0.3)
+    _assert_same(floor.find_place(pose, upright), Place(2.0, 1.0, 0.8))
+    assert floor.level[:, 1] @ pose[:3, 3] == pytest.approx(-0.3)
+    assert np.allclose(pose[:3, :3] @ upright[:, 1], floor.level[:, 1])  # gravity
+
+
+def test_y_is_down_if_the_cameras_are_nearly_upright():
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_exp(np.array((0.05, 0, 0.02)))
+    assert np.allclose(Floor.of_world(pose[None], 1.0).level[:, 1], (0, 1, 0))
+
+
+def test_suggestions_are_where_the_second_camera_of_a_candidate_is():
+    """The second camera is 2 camera heights to the right of the first one and 1 ahead, and is turned by 0.6 radians."""
+    uprights = rotation_exp(np.array((0.1, 0, 0.05))), rotation_exp(np.array((-0.05, 0, 0.1)))
+    first = Floor(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3), uprights[0], 0.0)
+    second = Floor(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3).add(Place(2, 1, 0.6)), uprights[1], 0.0)
+    motion = np.linalg.inv(second) @ first
+    candidates = (Candidate(motion[:3, :3], motion[:3, 3], -1.0), Candidate(np.eye(3), np.zeros(3), -4.0))
+    relation = RelativePose(
+        np.eye(3), np.array((0.0, 0, 1)), np.zeros((0, 2), int), 0, 0, 0, 0, (1, 1), 1.0, -1.0, "no", candidates
+    )
+    best, other = list_suggestions(relation, uprights)
+    _assert_same(best.place, Place(2, 1, 0.6))
+    assert (best.log_odds, other.log_odds) == (-1.0, -4.0)
+
+
+def test_a_place_snaps_to_the_nearest_suggestion_within_radius_and_angle():
+    suggestions = [Place(0, 0, 0), Place(0.3, 0, 0), Place(0, 0, 1.0)]
+    assert snap(Place(0.2, 0.02, 0.05), suggestions) == (suggestions[1], 1, False)
+    for place in (Place(0, SNAP_RADIUS + 0.01, 0), Place(-0.1, 0, SNAP_ANGLE + 0.01)):
+        assert snap(place, suggestions) == (place, None, False)
+    assert snap(Place(0.05, 0, 0.97), suggestions).suggestion == 2  # of two at one point, that of the heading
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_walls_snap_to_multiples_of_a_quarter_turn(quarters):
+    target, own = 0.3, 0.1
+    exact = target - own + quarters * QUARTER
+    for error in (-0.9 * WALL_ANGLE, 0.9 * WALL_ANGLE):
+        snapped = snap(Place(1, 2, exact + error), [], own, target)
+        assert snapped.has_walls and snapped.place.turn_between(Place(0, 0, exact)) < 1e-9
+        assert snapped.place[:2] == (1, 2)
+    place = Place(1, 2, exact + 1.1 * WALL_ANGLE)
+    assert snap(place, [], own, target) == snap(place, []) == (place, None, False)
+
+
+def test_the_mean_of_wall_directions_ignores_quarter_turns():
+    yaws = [0.1 + QUARTER, 0.12, 0.08 - 2 * QUARTER]
+    assert math.remainder(find_wall_yaw(yaws) - 0.1, QUARTER) == pytest.approx(0, abs=1e-9)
+    assert find_wall_yaw([]) is None
+    assert find_wall_yaw([0.0, QUARTER / 2]) is None  # they contradict each other
+
+
+def test_the_outline_of_a_room_is_where_its_walls_are(look_around):
+    """The camera is 1.35 m over the floor of a room of 5.2 x 4.2 m, off its middle."""
+    centre = np.array((0.6, 0.0, -0.4))
+    piece = Piece(look_around(1, np.eye(3), centre), None)
+    corners = piece.draw_outline(Place(0.6, -0.4, 0), 1.35)
+    assert np.allclose(corners.max(axis=0), (2.6, 2.1), atol=0.12)
+    assert np.allclose(corners.min(axis=0), (-2.6, -2.1), atol=0.12)
+    turned = piece.draw_outline(Place(0, 0, QUARTER), 1.35) + np.array(
+        (-0.4, -0.6)
+    )  # the same room, turned to the right
+    assert np.allclose(turned.max(axis=0), (2.1, 2.6), atol=0.12)
+
+
+def test_the_fit_is_best_at_the_right_pose(look_around):
+    centres, yaws = np.array(((-0.8, 0, -0.5), (0.9, 0, 0.4), (0.2, 0, -0.9))), (0.0, 0.6, -2.0)
+    views = [Piece(look_around(2, _upright(yaw), centre), None) for yaw, centre in zip(yaws, centres, strict=True)]
+    poses = [np.eye(4) for _ in views]
+    for pose, yaw, centre in zip(poses, yaws, centres, strict=True):
+        pose[:3, :3], pose[:3, 3] = _upright(yaw), centre
+    floor = Floor.of_world(np.stack(poses[:2]), 1.35)
+    others = list(zip(views[:2], poses[:2], strict=True))
+    place = floor.find_place(poses[2], views[2].upright)
+
+    def fit(right: float, yaw: float):
+        changed = place._replace(right=place.right + right, yaw=place.yaw + yaw)
+        return measure_fit(views[2], floor.make_pose(changed, views[2].upright, 0.0), others, 1.35)
+
+    best = fit(0, 0)
+    assert best.likeness > 0.6 and best.conflict < 0.01
+    assert best.quality > fit(0.3, 0).quality > fit(0.3, 0.5).quality
+    assert fit(0, math.pi).likeness < 0.3
+
+
+def test_a_piece_that_has_nothing_in_common_with_the_others_has_no_fit(look_around):
+    view, far = Piece(look_around(3, np.eye(3), np.zeros(3)), None), np.eye(4)
+    far[0, 3] = 1000.0
+    assert measure_fit(view, far, [(view, np.eye(4))], 1.35) is None
+    assert measure_fit(view, far, [], 1.35) is None
