@@ -16,6 +16,9 @@ from pansplat.files import expand_home, require_output_folder
 from pansplat.options import Count, CountOrNone, Depth, Height, Seconds
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pansplat.data.pairs import Pair
     from pansplat.evaluation.lpips import Backbone, Lpips
     from pansplat.evaluation.protocol import Blend, Method, ProtocolName
 
@@ -71,6 +74,8 @@ class Evaluate:
     """deferred, joint, or view0, view1, ...; by default deferred, with --protocol that of the paper's table."""
     drawing: Literal["exact", "original"] = "exact"
     """exact, or original: render as the official code does, to compare with its published figures."""
+    leave_one_out: bool = False
+    """Instead of targets: each panorama of a tour against the scene that the tour without it shows there."""
     convention: str | None = None
     """Pose convention, if a folder does not state it."""
     near: Depth | None = None
@@ -97,9 +102,12 @@ class Evaluate:
         pairs = []
         for path in self.paths:
             found = pipeline.load_pairs(path, convention=self.convention, near=self.near, far=self.far)
-            with_targets = [pair for pair in found if pair.targets]
-            if not with_targets:
-                print(f"note: {path}: none of its {len(found)} pairs has a target view; skipped", file=sys.stderr)
+            if self.leave_one_out:
+                with_targets = _leave_out_each(path, found)
+            else:
+                with_targets = [pair for pair in found if pair.targets]
+                if not with_targets:
+                    print(f"note: {path}: none of its {len(found)} pairs has a target view; skipped", file=sys.stderr)
             pairs += with_targets
         predictor = self.model.load()
         with progress_bar() as progress:
@@ -173,6 +181,23 @@ class Evaluate:
         if len(set(names)) < len(names):
             raise InputError(f"--model and --models must have distinct names, got {', '.join(names)}; rename a file")
         return methods
+
+
+def _leave_out_each(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
+    """A pair for each panorama of the tours of a folder that has others in its part; the rest are named."""
+    from pansplat.tours import connect, find_tours
+
+    tours = find_tours(pairs)
+    if not tours:
+        raise InputError(f"{path}: --leave-one-out needs a tour of three or more panoramas with poses, got {len(pairs)} pairs")
+    found = []
+    for tour in map(connect, tours):
+        alone = [n for n in range(len(tour)) if not tour.neighbours(n)]
+        if alone:
+            names = ", ".join(tour.panoramas[n].name for n in alone)
+            print(f"note: {path}: not left out, because no other panorama shows the same: {names}", file=sys.stderr)
+        found += [tour.leave_out(n) for n in range(len(tour)) if n not in alone]
+    return found
 
 
 def choose_lpips(choice: LpipsChoice, height: int) -> Lpips | None:

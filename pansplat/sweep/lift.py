@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -79,8 +80,14 @@ class LiftConfig:
     """In the free space of another view whose own surface is not consistent with any view."""
 
 
-def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gaussians:
-    """The Gaussians of all views and levels, ordered by level, then view, then lattice (finest first) and point."""
+def lift(
+    posed: PosedImages, surfaces: list[Surface], neighbours: Sequence[Sequence[int]], config: LiftConfig
+) -> Gaussians:
+    """The Gaussians of all views and levels, ordered by level, then view, then lattice (finest first) and point.
+
+    Args:
+        neighbours: the other views whose surfaces confirm or contradict those of each view.
+    """
     photographs, heights = posed.images, _lattice_heights(posed.images.shape[1], config.surface_height)
     posed = posed.resize(heights[-1])
     if surfaces[0].height != heights[-1]:
@@ -89,8 +96,8 @@ def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gau
             for s, image in zip(surfaces, posed.images, strict=True)
         ]
     views = range(len(surfaces))
-    consistent = [consistency_mask(surfaces, posed.cam2world, view) for view in views]
-    scene = _PosedSurfaces(posed, surfaces, consistent, config)
+    consistent = [consistency_mask(surfaces, posed.cam2world, view, neighbours[view]) for view in views]
+    scene = _PosedSurfaces(posed, surfaces, neighbours, consistent, config)
     scene = replace(scene, surfaces=[_remove_inconsistent(scene, view) for view in views])
     fine = [_choose_fine_pixels(image, heights, config) for image in photographs]
     parts = []
@@ -121,6 +128,7 @@ class _PosedSurfaces:
 
     posed: PosedImages
     surfaces: list[Surface]
+    neighbours: Sequence[Sequence[int]]
     consistent: list[np.ndarray]
     config: LiftConfig
 
@@ -289,22 +297,27 @@ def _background_layer(
 
 
 def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> tuple[np.ndarray, np.ndarray]:
-    """Opacity (n) by consistency with the other views, and a mask of the points to keep."""
+    """Opacity (n) by consistency with the other views, and a mask of the points to keep.
+
+    A point in the consistent free space of more views than confirm it is not kept.
+    """
     config, posed = scene.config, scene.posed
-    opacity = np.full(len(points), config.single_view_opacity)
-    kept = np.ones(len(points), bool)
-    for other, surface in enumerate(scene.surfaces):
-        if other == view:
-            continue
+    confirmed, contradicted = np.zeros(len(points), np.int8), np.zeros(len(points), np.int8)
+    doubtful, kept = np.zeros(len(points), bool), np.ones(len(points), bool)
+    for other in scene.neighbours[view]:
+        surface = scene.surfaces[other]
         visibility = classify_visibility(points, surface, posed.cam2world[other], config.discontinuity)
         local = (points - posed.cam2world[other, :3, 3]) @ posed.cam2world[other, :3, :3]
         row, column = nearest_pixel(local, surface.height)
         certain = scene.consistent[other][row, column] & posed.masks[other][row, column]
-        opacity[visibility == CONSISTENT] = config.consistent_opacity
         in_free_space = visibility == FREE_SPACE
-        opacity[in_free_space & ~certain] = config.uncertain_opacity
-        kept &= ~(in_free_space & certain) & (np.linalg.norm(local, axis=-1) > _MIN_DISTANCE * posed.near)
-    return opacity, kept
+        confirmed += visibility == CONSISTENT
+        contradicted += in_free_space & certain
+        doubtful |= in_free_space & ~certain
+        kept &= np.linalg.norm(local, axis=-1) > _MIN_DISTANCE * posed.near
+    opacity = np.where(doubtful, config.uncertain_opacity, config.single_view_opacity)
+    opacity[confirmed > 0] = config.consistent_opacity
+    return opacity, kept & (contradicted <= confirmed)
 
 
 def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:

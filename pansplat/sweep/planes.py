@@ -70,6 +70,11 @@ def estimate_axes(images: Sequence[np.ndarray], rotations: Sequence[np.ndarray])
     return np.stack((down, math.cos(yaw) * a + math.sin(yaw) * b, -math.sin(yaw) * a + math.cos(yaw) * b))
 
 
+def match_axes(axes: np.ndarray, reference: np.ndarray) -> list[int]:
+    """The order in which the walls' axes of `estimate_axes` are those of a reference."""
+    return [0, 1, 2] if abs(axes[1] @ reference[1]) >= abs(axes[2] @ reference[1]) else [0, 2, 1]
+
+
 def _edge_normals(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals (n, 3) of the planes through the camera and an image edge, and their weights (n)."""
     height, width = image.shape[:2]

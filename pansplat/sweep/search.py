@@ -35,6 +35,7 @@ from pansplat.sweep.planes import (
     collect_planes,
     detect_planes,
     estimate_axes,
+    match_axes,
     make_empty_planes,
 )
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
@@ -108,8 +109,8 @@ def search_surfaces(
     config: SearchConfig,
     report: Callable[[str, float], None],
     prior_model: PriorModel | None = None,
-) -> list[Surface]:
-    """The surface of each view, at the finest level."""
+) -> tuple[list[Surface], list[list[int]]]:
+    """The surface of each view, at the finest level, and the other views that it was matched against, best first."""
     report("finding the scene's axes", 0.0)
     finest = min(posed.images.shape[1], config.finest_height)
     small = [resize_sphere(image, max(finest // 2, 32)) for image in posed.images]
@@ -124,25 +125,22 @@ def search_surfaces(
     if prior_model is not None:
         report("estimating depth", 0.02)
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
-    if posed.measure_baseline(range(len(posed.images))) < 1e-3 * posed.near:  # of one view, or of views at one place: nothing can be matched
-        return _place_unmatched(posed, finest, depths, estimator)
-    priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     neighbours = choose_nearest(posed.cam2world, config.max_neighbours)
+    if posed.measure_baseline(range(len(posed.images))) < 1e-3 * posed.near:  # of one view, or of views at one place: nothing can be matched
+        return _place_unmatched(posed, finest, depths, estimator), neighbours
+    priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
         neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
         priors = estimator.estimate_by_matching(detection.views, neighbours, (low, high), config.matching)
     report("finding planes", 0.05)
-    by_pair = {
-        nodes: detect_planes(
-            *([maps[n] for n in nodes] for maps in (detection.views, detection.rays)),
-            posed.cam2world[list(nodes)],
-            empty,
-            depths,
-            MIN_FLOOR * posed.near,
-            config.matching,
-        )
-        for nodes in {tuple(sorted((view, others[0]))) for view, others in enumerate(neighbours)}
-    }
+    by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
+    for pair in {tuple(sorted((view, others[0]))) for view, others in enumerate(neighbours)}:
+        poses = posed.cam2world[list(pair)]
+        own = estimate_axes([small[n] for n in pair], poses[:, :3, :3])
+        start = dataclasses.replace(empty, axes=own[match_axes(own, axes)])
+        rays = [axis_components(start.axes, pose[:3, :3], detection.height) for pose in poses]
+        views = [detection.views[n] for n in pair]
+        by_pair[pair] = detect_planes(views, rays, poses, start, depths, MIN_FLOOR * posed.near, config.matching)
     planes = [by_pair[min(view, others[0]), max(view, others[0])] for view, others in enumerate(neighbours)]
     pixel = math.pi / heights[0] / (high - low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
@@ -166,7 +164,7 @@ def search_surfaces(
             for view, count in enumerate(counts)
         ]
     assert surfaces is not None
-    return surfaces
+    return surfaces, neighbours
 
 
 def choose_nearest(cam2world: np.ndarray, count: int) -> list[list[int]]:
@@ -212,7 +210,9 @@ class _SearchLevel:
         masks = [resize_mask(mask, height) for mask in posed.masks]
         self.consistent: list[np.ndarray] = []
         if surfaces is not None:
-            self.consistent = [consistency_mask(surfaces, posed.cam2world, n) & mask for n, mask in enumerate(masks)]
+            self.consistent = [
+                consistency_mask(surfaces, posed.cam2world, n, neighbours[n]) & mask for n, mask in enumerate(masks)
+            ]
             groups = [[view, *others] for view, others in enumerate(neighbours)]
             self.planes = [
                 collect_planes(

@@ -106,14 +106,13 @@ def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
 
 
 def consistency_mask(
-    surfaces: Sequence[Surface], cam2world: np.ndarray, view: int, tolerance: float = 0.06
+    surfaces: Sequence[Surface], cam2world: np.ndarray, view: int, others: Sequence[int], tolerance: float = 0.06
 ) -> np.ndarray:
-    """Pixels (h, w) of a view whose surface is consistent with at least one other view's surface."""
+    """Pixels (h, w) of a view whose surface is consistent with the surface of at least one of the other views."""
     points = world_points(surfaces[view], cam2world[view])
     consistent = np.zeros(points.shape[:2], bool)
-    for other, surface in enumerate(surfaces):
-        if other != view:
-            consistent |= classify_visibility(points, surface, cam2world[other], tolerance) == CONSISTENT
+    for other in others:
+        consistent |= classify_visibility(points, surfaces[other], cam2world[other], tolerance) == CONSISTENT
     return consistent
 
 

@@ -198,6 +198,21 @@ class TourGraph:
             near, far = min(near, NEAR), max(far, FAR)
         return Pair(name, self.folder, context, (), near, far, self.siblings)
 
+    def leave_out(self, node: int) -> Pair:
+        """A pair whose target is a panorama, and whose context is what the tour without it would show at its position.
+
+        That is the scene of the nearest edge of its part.
+        """
+        overlaps = {edge: overlap for edge, overlap in self.overlaps.items() if node not in edge}
+        joined = {*itertools.chain(*overlaps), node}
+        overlaps |= {(other, other): 1.0 for other in range(len(self)) if other not in joined}
+        others = dataclasses.replace(self, overlaps=overlaps)
+        near = [edge for edge in overlaps if self.parts[edge[0]] == self.parts[node]]
+        edge = min(near, key=lambda edge: others.measure_distance(edge, self.positions[node]))
+        pair = self.make_pair(others.choose_scene_views()[edge])
+        target = (self.originals or self.panoramas)[node]
+        return dataclasses.replace(pair, name=target.name, targets=(target,))
+
     def place(self, scene: Scene, views: Views) -> Scene:
         """The scene of `make_pair` in the world of the tour."""
         if not self.originals or self.panoramas[views[0]] is self.originals[views[0]]:
