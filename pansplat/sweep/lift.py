@@ -33,6 +33,7 @@ from pansplat.sweep.surface import (
     classify_visibility,
     consistency_mask,
     guided_upsample,
+    list_others,
     nearest_pixel,
     pad_sphere,
     pixel_coordinates,
@@ -81,13 +82,18 @@ class LiftConfig:
 
 
 def lift(
-    posed: PosedImages, surfaces: list[Surface], neighbours: Sequence[Sequence[int]], config: LiftConfig
+    posed: PosedImages,
+    surfaces: list[Surface],
+    config: LiftConfig,
+    neighbours: Sequence[Sequence[int]] | None = None,
 ) -> Gaussians:
     """The Gaussians of all views and levels, ordered by level, then view, then lattice (finest first) and point.
 
     Args:
-        neighbours: the other views whose surfaces confirm or contradict those of each view.
+        neighbours: the other views whose surfaces confirm or contradict those of each view; by default all.
     """
+    if neighbours is None:
+        neighbours = list_others(len(surfaces))
     photographs, heights = posed.images, _lattice_heights(posed.images.shape[1], config.surface_height)
     posed = posed.resize(heights[-1])
     if surfaces[0].height != heights[-1]:

@@ -107,7 +107,7 @@ class Sweep:
         report = progress or (lambda what, fraction: None)
         surfaces, neighbours = search_surfaces(posed, self.config.search, lambda what, f: report(what, 0.7 * f), self.prior)
         report("placing Gaussians", 0.7)
-        gaussians = lift(posed, surfaces, neighbours, self.config.lift)
+        gaussians = lift(posed, surfaces, self.config.lift, neighbours)
         report("fitting colours", 0.8)
         # Holes of scans are fitted too: Gaussians next to a hole then do not reach into it. A single view fills them.
         visible = torch.ones_like(images[:, 0], dtype=torch.bool) if masks is None else masks

@@ -105,6 +105,11 @@ def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
     return local @ cam2world[:3, :3].T + cam2world[:3, 3]
 
 
+def list_others(count: int) -> list[list[int]]:
+    """The other views of each of some views."""
+    return [[other for other in range(count) if other != view] for view in range(count)]
+
+
 def consistency_mask(
     surfaces: Sequence[Surface], cam2world: np.ndarray, view: int, others: Sequence[int], tolerance: float = 0.06
 ) -> np.ndarray:

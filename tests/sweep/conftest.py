@@ -122,7 +122,7 @@ class Observed:
     @functools.cached_property
     def surfaces(self) -> list[Surface]:
         """The sweep's surfaces."""
-        return search_surfaces(self.posed, SearchConfig(), lambda what, fraction: None)
+        return search_surfaces(self.posed, SearchConfig(), lambda what, fraction: None)[0]
 
     @property
     def inverse_depths(self) -> np.ndarray:

@@ -16,6 +16,7 @@ from pansplat.sweep.matching import (
     _fast_atan2,
     _Penalties,
     aggregate_costs,
+    OtherView,
     compute_matching_cost,
     select_labels,
 )
@@ -45,7 +46,9 @@ def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | N
 
 def _cost(views, *sets, pose=None, limits=(0.1, 2.0), bounds=(math.inf, -math.inf), config=_PLAIN) -> np.ndarray:
     """Cost of a view against another, by default with the same pose."""
-    return compute_matching_cost(*views, np.eye(4) if pose is None else pose, list(sets), limits, bounds, config)
+    view, *others = views
+    pose = np.eye(4) if pose is None else pose
+    return compute_matching_cost(view, [OtherView(o, pose, list(sets)) for o in others], limits, bounds, config)
 
 
 @pytest.fixture(scope="module")

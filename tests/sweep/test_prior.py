@@ -7,7 +7,7 @@ from pansplat.sweep import prior as prior_module
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, apply_prior_cost
 from pansplat.sweep.search import SearchConfig, search_surfaces
-from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
+from pansplat.sweep.surface import Surface, list_others, ray_grid, resize_sphere
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
 _DOWN = np.array((0.0, 1.0, 0.0))
@@ -31,7 +31,7 @@ class TrueDepth:
     def sharpen(self):
         return [resize_sphere(prior.log_depth, 96) for prior in self.priors]
 
-    def refine(self, estimates, cam2world, iterations):
+    def refine(self, estimates, cam2world, neighbours, iterations):
         ratios = [np.median(e.log_depth - p.log_depth) for e, p in zip(estimates, self.priors, strict=True)]
         self.starts.append(np.exp(ratios))
         self.cam2world, self.iterations = cam2world, iterations
@@ -52,8 +52,8 @@ class SmallHalls(TrueDepth):
 class TrueHeights(TrueDepth):
     """The same with the true depth after the refinement, because blank rooms do not show the heights."""
 
-    def refine(self, estimates, cam2world, iterations):
-        super().refine(estimates, cam2world, iterations)
+    def refine(self, estimates, cam2world, neighbours, iterations):
+        super().refine(estimates, cam2world, neighbours, iterations)
         heights = [self.room.high[1] - pose[1, 3] for pose in self.poses]
         return [
             DepthPrior(prior.log_depth + math.log(height), prior.scale)
@@ -72,7 +72,7 @@ def _estimate(room, poses, model_type=TrueDepth):
     model = model_type(room, upright)
     limits = (1 / 8, 1 / 0.3)
     estimator = PriorEstimator(model, images, np.stack(poses), _DOWN, PriorConfig())
-    priors = estimator.estimate_by_matching(views, limits, MatchingConfig())
+    priors = estimator.estimate_by_matching(views, list_others(len(views)), limits, MatchingConfig())
     assert {len(own) for own in priors} == {len(model.starts)}
     return model, priors, estimator
 
@@ -181,7 +181,7 @@ def test_views_at_one_place_have_the_sharpened_depth_at_a_usual_height(make_room
     room = make_room()
     poses = [room.pose((-0.4, 0.0, -0.2))] * views
     observed = room.observe(64, poses)
-    surfaces = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, TrueDepth(room, poses))
+    surfaces, _ = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, TrueDepth(room, poses))
     assert len(surfaces) == views
     expected = observed.depths[0] * 1.5 / _CAMERA_HEIGHT
     for surface in surfaces:
@@ -203,7 +203,7 @@ def test_sharpened_depth_of_a_tilted_camera_is_turned_back(make_room, turn):
 def test_prior_decides_where_photographs_are_blank(make_room):
     room = make_room("blank")
     observed = room.observe(64)
-    surfaces = search_surfaces(
+    surfaces, _ = search_surfaces(
         observed.posed, SearchConfig(), lambda what, fraction: None, TrueHeights(room, room.two_poses())
     )
     for surface, depth in zip(surfaces, observed.depths, strict=True):
