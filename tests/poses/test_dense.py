@@ -75,6 +75,15 @@ def test_a_pose_beyond_a_wall_conflicts(views) -> None:
     assert found.conflict > 0.02 and found.overlap < 0.5 and found.likeness < 0.2
 
 
+def test_the_other_side_of_a_wall_is_not_common(views, look_around) -> None:
+    # The next room is a mirror image beyond the wall x = 2.6 m; its floor and ceiling continue those of this room.
+    beyond = look_around(1, TURNS[1], CENTRES[1])
+    centres = CENTRES[0], CENTRES[1] + np.array((2 * 2.6, 0, 0))
+    rotation, translation = relate(*TURNS, centres)
+    found = compare(views[0], beyond, rotation, translation)
+    assert found.conflict == 0 and found.overlap < 0.01
+
+
 def test_another_room_of_the_same_shape_is_not_alike(views, look_around) -> None:
     found = compare(views[0], look_around(1, TURNS[1], CENTRES[1]), *relate(*TURNS))
     assert found.overlap > 0.97 and abs(found.likeness) < 0.2
@@ -90,7 +99,7 @@ def test_the_order_of_the_panoramas_does_not_matter(views) -> None:
     rotation, translation = relate(turn(20), TURNS[1])
     there = compare(*views, rotation, translation)
     back = compare(*views[::-1], rotation.T, -rotation.T @ translation)
-    for name in ("overlap", "conflict", "likeness", "shade"):
+    for name in ("overlap", "conflict", "likeness", "shade", "hue"):
         assert getattr(there, name) == pytest.approx(getattr(back, name), abs=1e-3)
 
 
