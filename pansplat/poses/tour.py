@@ -27,8 +27,8 @@ Pair = tuple[int, int]
 
 _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
 _LARGEST_GAP = 0.15  # of the way around it, relative to its length
-_JOINED_ODDS = 0.2  # logarithm of the odds of a junction of two groups
-_AGREEMENT = 4.5  # logarithm: hypotheses of two pairs agree by chance in one of 90 cases
+_JOINED_ODDS = 1.0  # logarithm of the odds of a junction of two groups
+_AGREEMENT = 3.5  # logarithm: hypotheses of two pairs agree by chance in one of 30 cases
 _LEAST_ODDS = -9.0  # of a hypothesis
 _JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; of the way, camera heights, and relative
 _RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # least differences of junctions that exclude each other

@@ -89,13 +89,13 @@ _COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds of a hypothesis against none, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the way), whether it is
 # that of a comparison (docs/poses.md).
-_ODDS = (-26.8, 0.87, 0.71, 3.67, -2.0, 7.1, -2.2, 4.9, -2.8, -1.12, -0.54)
+_ODDS = (-31.11, 0.82, 1.49, 4.08, -2.25, 6.49, -0.58, 4.77, -1.47, -1.43, -1.29)
 _LEAST_CONFLICT, _LEAST_SLOPE = 0.003, 0.01
 _NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; way, camera heights, and relative
 _PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pose by matches
 _PROPOSAL_NOISE = math.radians(0.5), 0.1  # of the pose of a comparison: rotation; position, camera heights
 _LARGEST_SLOPE = 0.3
-_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 1.0, 0.2, -2.0
+_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -130,7 +130,9 @@ def look_around(render_room: Callable[..., Array]) -> Callable[..., Surroundings
         distance = _cast(rays, centre)[0]
         log_depth = np.log(distance / (_HALF[1] - centre[1]))
         seen = pixel_directions(256, 512, dtype=torch.float64).numpy() @ rotation.T
-        colour = 0.85 + 0.15 * np.sin(2 * (centre + seen * _cast(seen, centre)[0][..., None]) + room)
+        points = centre + seen * _cast(seen, centre)[0][..., None]
+        waves = np.random.default_rng(room).normal(size=(2, 3, 3))
+        colour = 0.85 + 0.15 * np.sin(2 * points @ waves[0] + 9 * waves[1, 0])
         return Surroundings(
             colour * render_room(room, rotation, centre) / 255, DepthMap(log_depth, np.full((48, 96), deviation), turn)
         )

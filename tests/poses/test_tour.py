@@ -193,13 +193,13 @@ def is_right(group: Group) -> bool:
 
 
 def test_hypotheses_of_two_pairs_that_agree_join_a_panorama_to_a_group() -> None:
-    tour = join(((0, 2), suggest((0, 2), -1.5, -1.0)), ((1, 2), suggest((1, 2), -2.0, -1.2)))
+    tour = join(((0, 2), suggest((0, 2), -1.0, -2.0)), ((1, 2), suggest((1, 2), -1.0, -2.0)))
     assert tour.groups[0].placed == (0, 1, 2) and is_right(tour.groups[0])
 
 
 def test_hypotheses_of_two_pairs_that_differ_join_nothing() -> None:
-    turned = suggest((1, 2), -2.0, -1.2, turn=math.radians(20))
-    assert join(((0, 2), suggest((0, 2), -1.5, -1.0)), ((1, 2), turned)).groups[0].placed == (0, 1)
+    turned = suggest((1, 2), -1.0, -2.0, turn=math.radians(20))
+    assert join(((0, 2), suggest((0, 2), -1.0, -2.0)), ((1, 2), turned)).groups[0].placed == (0, 1)
 
 
 def test_one_doubtful_hypothesis_joins_nothing() -> None:
