@@ -95,7 +95,7 @@ _NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; way, c
 _PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pose by matches
 _PROPOSAL_NOISE = math.radians(0.5), 0.1  # of the pose of a comparison: rotation; position, camera heights
 _LARGEST_SLOPE = 0.3
-_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0
+_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 1.5, 0.5, -2.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -193,17 +193,25 @@ def is_right(group: Group) -> bool:
 
 
 def test_hypotheses_of_two_pairs_that_agree_join_a_panorama_to_a_group() -> None:
-    tour = join(((0, 2), suggest((0, 2), -1.0, -2.0)), ((1, 2), suggest((1, 2), -1.0, -2.0)))
+    tour = join(((0, 2), suggest((0, 2), -0.3, -4.0)), ((1, 2), suggest((1, 2), -0.3, -4.0)))
     assert tour.groups[0].placed == (0, 1, 2) and is_right(tour.groups[0])
 
 
 def test_hypotheses_of_two_pairs_that_differ_join_nothing() -> None:
-    turned = suggest((1, 2), -1.0, -2.0, turn=math.radians(20))
-    assert join(((0, 2), suggest((0, 2), -1.0, -2.0)), ((1, 2), turned)).groups[0].placed == (0, 1)
+    turned = suggest((1, 2), -0.3, -4.0, turn=math.radians(20))
+    assert join(((0, 2), suggest((0, 2), -0.3, -4.0)), ((1, 2), turned)).groups[0].placed == (0, 1)
 
 
 def test_one_doubtful_hypothesis_joins_nothing() -> None:
-    assert join(((0, 2), suggest((0, 2), -1.5))).groups[0].placed == (0, 1)
+    assert join(((0, 2), suggest((0, 2), -0.3))).groups[0].placed == (0, 1)
+
+
+def test_pairs_without_a_common_panorama_are_more_evidence_than_others() -> None:
+    group = (3, 4), suggest((3, 4), 4.0, problem=None)
+    apart = join(group, ((0, 3), suggest((0, 3), -2.0)), ((1, 4), suggest((1, 4), -2.0)))
+    assert [group.placed for group in apart.groups] == [(0, 1, 3, 4)] and is_right(apart.groups[0])
+    shared = join(group, ((0, 3), suggest((0, 3), -2.0)), ((1, 3), suggest((1, 3), -2.0)))
+    assert [group.placed for group in shared.groups] == [(0, 1), (3, 4)]
 
 
 def test_a_probable_pose_without_matches_joins_a_panorama_or_two() -> None:
