@@ -28,8 +28,7 @@ Pair = tuple[int, int]
 _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
 _LARGEST_GAP = 0.15  # of the way around it, relative to its length
 _JOINED_ODDS = 0.5  # logarithm of the odds of a junction of two groups
-_AGREEMENT = 5.5  # logarithm: hypotheses of pairs without a common panorama agree by chance in one of 240 cases
-_SHARED_AGREEMENT = 1.5  # the same for pairs with a common panorama, which may look like one place of the other group
+_AGREEMENT = 1.5  # logarithm: how much rarer hypotheses of two pairs agree if they are wrong; neighbours look alike
 _LEAST_ODDS = -9.0  # of a hypothesis
 _JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; of the way, camera heights, and relative
 _RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # least differences of junctions that exclude each other
@@ -159,26 +158,18 @@ def _find_junction(
     found = np.concatenate((np.empty((0, 4, 4)), *stated))
     if not len(found):
         return -math.inf, np.eye(4)
-    sums = {view: np.zeros(len(found)) for view in (*first, *second)}  # of the evidence of each panorama's pairs
+    sums = np.zeros(len(found))
     for i, j, motions, odds in between:
         agreeing = _agree(np.linalg.inv(found @ second[j]) @ first[i], motions, _JOINED_TURN, _JOINED_GAP)
         own = np.logaddexp.reduce(np.where(agreeing, odds, -math.inf), axis=1)
-        for view in (i, j):
-            sums[view] += np.logaddexp(0, _SHARED_AGREEMENT + own)
-    evidence = np.minimum(*(_join_evidence(np.stack([sums[view] for view in part])) for part in (first, second)))
+        sums += np.logaddexp(0, _AGREEMENT + own)
+    evidence = sums + np.log(-np.expm1(-sums)) - _AGREEMENT  # log(exp(sums) - 1)
     best = int(evidence.argmax())
     middle = np.eye(4)
     middle[:3, 3] = np.mean([pose[:3, 3] for pose in second.values()], axis=0)
     same = _agree(found @ middle, found @ middle, _RIVAL_TURN, _RIVAL_GAP)
     rivals = (evidence - np.log(same.sum(axis=1)))[~same[best]]  # each motion once
     return float(evidence[best] - np.logaddexp.reduce(np.append(rivals, 0.0))), found[best]
-
-
-def _join_evidence(sums: Float[Array, "view n"]) -> Float[Array, "n"]:
-    """Logarithm of the odds of motions by the evidence of several panoramas of one part."""
-    with np.errstate(divide="ignore"):
-        own = sums + np.log(-np.expm1(-sums)) - _SHARED_AGREEMENT  # log(exp(sums) - 1)
-    return np.logaddexp(0, _AGREEMENT + own).sum(axis=0) - _AGREEMENT
 
 
 def _hypotheses(relation: RelativePose) -> tuple[Float[Array, "n 4 4"], Float[Array, "n"]]:

@@ -89,7 +89,7 @@ _COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds of a hypothesis against none, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the way), whether it is
 # that of a comparison (docs/poses.md).
-_ODDS = (-31.11, 0.82, 1.49, 4.08, -2.25, 6.49, -0.58, 4.77, -1.47, -1.43, -1.29)
+_ODDS = (-32.94, 0.73, 1.39, 3.95, -2.41, 7.65, -0.38, 4.57, -0.75, -1.73, -1.7)
 _LEAST_CONFLICT, _LEAST_SLOPE = 0.003, 0.01
 _NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; way, camera heights, and relative
 _PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pose by matches

@@ -206,14 +206,6 @@ def test_one_doubtful_hypothesis_joins_nothing() -> None:
     assert join(((0, 2), suggest((0, 2), -0.3))).groups[0].placed == (0, 1)
 
 
-def test_pairs_without_a_common_panorama_are_more_evidence_than_others() -> None:
-    group = (3, 4), suggest((3, 4), 4.0, problem=None)
-    apart = join(group, ((0, 3), suggest((0, 3), -2.0)), ((1, 4), suggest((1, 4), -2.0)))
-    assert [group.placed for group in apart.groups] == [(0, 1, 3, 4)] and is_right(apart.groups[0])
-    shared = join(group, ((0, 3), suggest((0, 3), -2.0)), ((1, 3), suggest((1, 3), -2.0)))
-    assert [group.placed for group in shared.groups] == [(0, 1), (3, 4)]
-
-
 def test_a_probable_pose_without_matches_joins_a_panorama_or_two() -> None:
     tour = join(((1, 2), suggest((1, 2), 2.0, problem=None)), ((3, 4), suggest((3, 4), 2.0, problem=None)))
     assert [group.placed for group in tour.groups] == [(0, 1, 2), (3, 4)]
