@@ -27,7 +27,7 @@ Pair = tuple[int, int]
 
 _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
 _LARGEST_GAP = 0.15  # of the way around it, relative to its length
-_JOINED_ODDS = 0.5  # logarithm of the odds of a junction of two groups
+_JOINED_ODDS = 1.0  # logarithm of the odds of a junction of two groups
 _AGREEMENT = 1.5  # logarithm: how much rarer hypotheses of two pairs agree if they are wrong; neighbours look alike
 _LEAST_ODDS = -9.0  # of a hypothesis
 _JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; of the way, camera heights, and relative

@@ -95,7 +95,7 @@ _NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; way, c
 _PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pose by matches
 _PROPOSAL_NOISE = math.radians(0.5), 0.1  # of the pose of a comparison: rotation; position, camera heights
 _LARGEST_SLOPE = 0.3
-_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 1.5, 0.5, -2.0
+_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -558,7 +558,7 @@ class RelativePose:
 
     @property
     def is_certain(self) -> bool:
-        """Whether it is wrong in less than one of 300 pairs; else it is probable."""
+        """Whether its odds are above 7 to 1, or its matches suffice; else it is probable."""
         return self.is_reliable and self.log_odds >= _CERTAIN_ODDS
 
 
