@@ -130,7 +130,7 @@ def test_the_fit_is_best_at_the_right_pose(look_around):
 
     best = fit(0, 0)
     assert best.likeness > 0.6 and best.conflict < 0.01
-    assert best.quality > fit(0.3, 0).quality > fit(0.3, 0.5).quality
+    assert best.score > fit(0.3, 0).score > fit(0.3, 0.5).score
     assert fit(0, math.pi).likeness < 0.3
 
 
