@@ -23,14 +23,17 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.poses.depth import DepthMap, sample_nearest
 
 _HEIGHT = 96  # rows of the maps that are compared
-_COARSE = 4  # of many poses, every fourth row and column are compared
+_COARSE, _FINE = 4, 2  # of many poses, every fourth or second row and column are compared
 _BLUR, _REGION = 0.5, 6.0  # standard deviations of the compared detail and of its surroundings, pixels
-_LEAST_CONTRAST = 0.03  # grey values of 1
+_LEAST_CONTRAST, _DARK = 0.03, 0.02  # grey values of 1
+_LEAST_HUE = 0.06  # deviation of the logarithm of a ratio of colours that noise hides
 _TOLERANCE = 0.12  # of log-depth, beside the deviations of both estimates
 _CONFLICT = 0.25  # least log-depth that a surface in front of another one has against it
 _CERTAIN = 0.3  # largest sum of the deviations at a conflict
 _NEAREST = 0.25  # camera heights
 _LEAST_COMMON = 0.002  # of the sphere
+_FULL_OVERLAP = 0.1  # of the sphere, above which likeness and shade have their full weight
+_LEAST_FACING = 0.3  # cosine of the angle between both estimated normals of one surface
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,19 @@ class Comparison:
         conflict: share of the sphere whose surface is where the other panorama sees through.
         likeness: correlation of the detail of what both see, against its surroundings.
         shade: correlation of the logarithm of its grey values.
+        hue: correlation of the logarithms of red and of blue over green.
     """
 
     overlap: float
     conflict: float
     likeness: float
     shade: float
+    hue: float
+
+    @property
+    def weight(self) -> float:
+        """That of likeness, shade and hue: few directions correlate by chance."""
+        return float(overlap_weight(np.array(self.overlap)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,31 +65,40 @@ class Surroundings:
     """What is compared of a panorama.
 
     Attributes:
-        grey: in [0, 1], as the camera took it.
+        image: RGB in [0, 1], as the camera took it.
         depth: of the same panorama.
     """
 
-    grey: Float[Array, "h 2*h"]
+    image: Float[Array, "h 2*h 3"]
     depth: DepthMap
 
     def mirrored(self) -> Surroundings:
         """Those of the panorama that is mirrored left to right."""
-        return Surroundings(self.grey[:, ::-1], self.depth.mirrored())
+        return Surroundings(self.image[:, ::-1], self.depth.mirrored())
 
     @functools.cached_property
-    def maps(self) -> Float[Array, "h 2*h 4"]:
-        """Log-depth, its deviation, detail against its surroundings, and the logarithm of the grey value.
+    def maps(self) -> Float[Array, "h 2*h 9"]:
+        """Log-depth, its deviation, normal (3), detail against its surroundings, logarithm of grey value, hue (2).
 
         They are those of the upright camera; depths are in camera heights.
         """
         rays = _upright_rays().reshape(-1, 3).astype(np.float64) @ self.depth.rotation.T
-        small = cv2.resize(self.grey.astype(np.float32), (2 * _HEIGHT, _HEIGHT), interpolation=cv2.INTER_AREA)
-        small = cv2.GaussianBlur(small, (0, 0), _BLUR)
-        mean = cv2.GaussianBlur(small, (0, 0), _REGION)
-        variance = cv2.GaussianBlur(small * small, (0, 0), _REGION) - mean * mean
-        detail = (small - mean) / (np.sqrt(np.maximum(variance, 0)) + _LEAST_CONTRAST)
-        values = *self.depth.sample(rays), sample_nearest(detail, rays), sample_nearest(np.log(small + 0.02), rays)
-        return np.stack(values, axis=-1).reshape(_HEIGHT, 2 * _HEIGHT, 4).astype(np.float32)
+        image = cv2.resize(self.image.astype(np.float32), (2 * _HEIGHT, _HEIGHT), interpolation=cv2.INTER_AREA)
+        grey = cv2.GaussianBlur(image.mean(axis=2), (0, 0), _BLUR)
+        mean = cv2.GaussianBlur(grey, (0, 0), _REGION)
+        variance = cv2.GaussianBlur(grey * grey, (0, 0), _REGION) - mean * mean
+        detail = (grey - mean) / (np.sqrt(np.maximum(variance, 0)) + _LEAST_CONTRAST)
+        red, green, blue = np.moveaxis(np.log(cv2.GaussianBlur(image, (0, 0), _BLUR) + _DARK), 2, 0)
+        pictures = detail, np.log(grey + _DARK), red - green, blue - green
+        log_depth, deviation = (values.reshape(_HEIGHT, -1) for values in self.depth.sample(rays))
+        sampled = [sample_nearest(picture, rays).reshape(_HEIGHT, -1) for picture in pictures]
+        maps = np.dstack((log_depth, deviation, _find_normals(log_depth), *sampled))
+        return np.ascontiguousarray(maps, np.float32)
+
+
+def overlap_weight(overlap: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Weight of the likeness and the shade of directions with this share of the sphere."""
+    return np.minimum(np.sqrt(overlap / _FULL_OVERLAP), 1.0)
 
 
 def compare(
@@ -94,21 +113,32 @@ def compare_many(
     second: Surroundings,
     rotations: Float[Array, "pose 3 3"],
     translations: Float[Array, "pose 3"],
-) -> Float[Array, "pose 4"]:
-    """The values of `Comparison` for many poses, by a sixteenth of the directions."""
-    return _compare_all(first, second, rotations, translations, _COARSE)
+    *,
+    coarse: bool = True,
+) -> Float[Array, "pose 5"]:
+    """The values of `Comparison` for many poses, by a sixteenth or a quarter of the directions."""
+    return _compare_all(first, second, rotations, translations, _COARSE if coarse else _FINE)
 
 
 def _compare_all(first: Surroundings, second: Surroundings, rotations: Array, translations: Array, step: int) -> Array:
     a, b = first.depth.rotation, second.depth.rotation  # of the upright cameras
     there = b.T @ rotations @ a, translations @ b
     back = there[0].transpose(0, 2, 1), -np.einsum("nji,nj->ni", there[0], there[1])
-    values = np.zeros((len(rotations), 4))
+    values = np.zeros((len(rotations), 5))
     for (turns, ways), source, target in ((there, first, second), (back, second, first)):
         values += 0.5 * _compare_one_way(
             _upright_rays(), source.maps, target.maps, turns.astype(np.float32), ways.astype(np.float32), step
         )
     return values
+
+
+def _find_normals(log_depth: Float[Array, "h 2*h"]) -> Float[Array, "h 2*h 3"]:
+    """Unit normals of the surfaces, towards the camera."""
+    points = _upright_rays() * np.exp(log_depth)[:, :, None]
+    across = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
+    normals = np.cross(across, np.gradient(points, axis=0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    return normals * np.where((normals * points).sum(axis=-1, keepdims=True) > 0, -1, 1)
 
 
 @functools.cache
@@ -120,11 +150,11 @@ def _upright_rays() -> Float[Array, "h 2*h 3"]:
 def _compare_one_way(rays, source, target, rotations, translations, step):
     height, width = target.shape[:2]
     count = len(rotations)
-    result = np.zeros((count, 4))
+    result = np.zeros((count, 5))
     for n in range(count):
         r, t = rotations[n], translations[n]
         total = common = conflict = 0.0
-        sums = np.zeros((2, 5))  # of a, b, a a, b b, a b
+        sums = np.zeros((4, 5))  # of a, b, a a, b b, a b: for detail, grey, and both of hue
         for i in range(step // 2, height, step):
             weight = math.cos(((i + 0.5) / height - 0.5) * math.pi)
             for j in range(step // 2, width, step):
@@ -143,9 +173,15 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
                 uncertain = deviation + target[row, column, 1]
                 error = math.log(distance) - target[row, column, 0]
                 if abs(error) < _TOLERANCE + uncertain:
+                    facing = 0.0
+                    for k in range(3):
+                        turned = r[k, 0] * source[i, j, 2] + r[k, 1] * source[i, j, 3] + r[k, 2] * source[i, j, 4]
+                        facing += turned * target[row, column, 2 + k]
+                    if facing < _LEAST_FACING:  # the other side of a wall
+                        continue
                     common += weight
-                    for k in range(2):
-                        a, b = source[i, j, 2 + k], target[row, column, 2 + k]
+                    for k in range(4):
+                        a, b = source[i, j, 5 + k], target[row, column, 5 + k]
                         sums[k, 0] += weight * a
                         sums[k, 1] += weight * b
                         sums[k, 2] += weight * a * a
@@ -155,8 +191,14 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
                     conflict += weight
         result[n, 0], result[n, 1] = common / total, conflict / total
         if common > _LEAST_COMMON * total:
-            for k in range(2):
+            hue = np.zeros(3)  # of a a, b b, a b
+            for k in range(4):
                 a, b = sums[k, 0] / common, sums[k, 1] / common
-                norm = (sums[k, 2] / common - a * a) * (sums[k, 3] / common - b * b)
-                result[n, 2 + k] = (sums[k, 4] / common - a * b) / math.sqrt(max(norm, 1e-12))
+                squares = sums[k, 2] / common - a * a, sums[k, 3] / common - b * b, sums[k, 4] / common - a * b
+                if k < 2:
+                    result[n, 2 + k] = squares[2] / math.sqrt(max(squares[0] * squares[1], 1e-12))
+                else:
+                    for m in range(3):
+                        hue[m] += squares[m]
+            result[n, 4] = hue[2] / (math.sqrt(max(hue[0] * hue[1], 0.0)) + _LEAST_HUE**2)
     return result

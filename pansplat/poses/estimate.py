@@ -45,7 +45,7 @@ from pansplat.poses.learned import (
 )
 from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
 from pansplat.poses.tour import Group, Pair, build_tour
-from pansplat.poses.two_view import RelativePose, estimate_relative_pose, polish_relative_pose
+from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.ways import NO_WAYS, Ways
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_floor, level_poses
 from pansplat.predictor import Progress
@@ -427,7 +427,7 @@ def _describe_views(
             learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
         image = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
         depth = estimate_depth(image, axes.axes[0] if axes.has_down else None)
-        surroundings = Surroundings(image.mean(axis=2), depth)
+        surroundings = Surroundings(image, depth)
         return _View(detect_features(grey, scene), turned, learned, axes, small, surroundings)
 
     views = []
@@ -465,7 +465,9 @@ def _relate_views(
         if not (relation.is_reliable or relation.is_doubtful):
             return relation
         if relation.is_reliable and _is_mirrored(first, second, overlap.get(pair), relation):
-            return replace(relation, problem="one of both looks mirrored left to right")
+            return replace(relation, problem="one of both looks mirrored left to right", hypotheses=Hypotheses())
+        if not relation.is_matched:
+            return relation
         further = match_features(first.turned, second.turned)
         every = matches.joined(further.shifted(len(first.matched), len(second.matched)))
         return polish_relative_pose(relation, first.joined, second.joined, every, prior)

@@ -13,20 +13,23 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.poses.axes import RotationPrior
-from pansplat.poses.dense import Surroundings, compare_many
+from pansplat.poses.dense import Surroundings, compare_many, overlap_weight
 from pansplat.poses.depth import MatchDepths
-from pansplat.poses.solvers import Bearings, skew
+from pansplat.poses.solvers import Bearings
 from pansplat.poses.ways import Ways
 
-LEVEL = [2, 0, 1]
-"""Order of the axes in a levelled camera: x, y down, z."""
+Pose = tuple[Float[Array, "3 3"], Float[Array, "3"]]
+"""R and t of x2 = R x1 + t, camera heights."""
+_LEVEL = [1, 2, 0]  # order of the axes in a levelled camera: both walls' normals, down
 _LARGEST_CONFLICT = 0.1  # share of the sphere, above which a conflict counts no more
 _VOTERS, _VOTE_WIDTH, _VOTE_LIMITS = 800, 0.06, (0.03, 0.25)  # matches; error of their depth; of translations
 _VOTE_YAW, _CLIMB = 0.05, 0.3  # radians; deviation of the difference of the cameras' heights, camera heights
 _PAIR_SAMPLES, _PAIRS = 20000, 1000  # of two matches; of them, those that agree
 _MODES, _KEPT_BY_DEPTH = 8, 12  # hypotheses by depth: of each rotation; that are optimised
 _KEPT_ALIKE, _FARTHEST = 8, 8.0  # hypotheses by single matches that are optimised; their largest distance
-_ALIKE = 1.5, -60.0, 7.0, 3.5  # of the logarithm of votes, conflict, likeness, shade
+_ALIKE = 1.5, -60.0, 10.0, 2.0, 5.0  # of the logarithm of votes, conflict, likeness, shade, hue
+_STEPS, _ROUNDS = (0.08, 0.04, 0.02), 3  # of the search of the translation, camera heights; of each step
+_AROUND = np.array([(x, y, 0.0) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y])
 
 
 def propose_by_depth(
@@ -38,8 +41,8 @@ def propose_by_depth(
     surroundings: tuple[Surroundings, Surroundings],
     ways: Ways,
     rng: np.random.Generator,
-) -> list[Float[Array, "3 3"]]:
-    """Essential matrices on which the translations of many matches agree, by their estimated depths.
+) -> tuple[list[Pose], list[Pose]]:
+    """Poses on which the translations of many matches agree, and those under which both panoramas look most alike.
 
     Args:
         a, b: bearings of the matches in the first and in the second panorama, the most probable first.
@@ -51,7 +54,7 @@ def propose_by_depth(
         rng: supplies the samples of pairs of matches.
     """
     a, b, prior, depths = a[:_VOTERS], b[:_VOTERS], prior[:_VOTERS], depths.select(slice(_VOTERS))
-    levels = axes.first.axes[LEVEL], axes.second.axes[LEVEL]
+    levels = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
     x, y = ((rays * np.exp(depths.log_depth[:, side, None])) @ levels[side].T for side, rays in enumerate((a, b)))
     reach = (_VOTE_WIDTH * np.exp(depths.log_depth).mean(axis=1)).clip(*_VOTE_LIMITS)
     found, singles = [], []
@@ -63,11 +66,8 @@ def propose_by_depth(
         singles.append((level, translations, votes))
     found += _vote_pairs(x, y, reach, prior, rng)
     found.sort(key=lambda item: -item[2])
-    chosen = [(rotation, t) for rotation, t, _ in found[:_KEPT_BY_DEPTH]]
-    chosen += _choose_alike(singles, levels, surroundings, ways)
-    return [
-        levels[1].T @ skew(t / max(float(np.linalg.norm(t)), 1e-9)) @ rotation @ levels[0] for rotation, t in chosen
-    ]
+    agreed = [(levels[1].T @ rotation @ levels[0], t @ levels[1]) for rotation, t, _ in found[:_KEPT_BY_DEPTH]]
+    return agreed, _choose_alike(singles, levels, surroundings, ways)
 
 
 def _choose_alike(
@@ -75,8 +75,8 @@ def _choose_alike(
     levels: tuple[Float[Array, "3 3"], Float[Array, "3 3"]],
     surroundings: tuple[Surroundings, Surroundings],
     ways: Ways,
-) -> list[tuple[Float[Array, "3 3"], Float[Array, "3"]]]:
-    """Levelled poses of single matches under which both panoramas look most alike."""
+) -> list[Pose]:
+    """Levelled poses near those of single matches under which both panoramas look most alike."""
     if not singles:
         return []
     rotations = np.concatenate([np.repeat(rotation[None], len(t), axis=0) for rotation, t, _ in singles])
@@ -84,9 +84,7 @@ def _choose_alike(
     kept = (np.abs(translations[:, 2]) < _CLIMB) & (np.linalg.norm(translations, axis=1) < _FARTHEST)
     rotations, translations, votes = rotations[kept], translations[kept] * (1, 1, 0), votes[kept]
     poses = levels[1].T @ rotations @ levels[0], translations @ levels[1]
-    _, conflict, likeness, shade = compare_many(*surroundings, *poses).T
-    values = np.log1p(votes), np.minimum(conflict, _LARGEST_CONFLICT), likeness, shade
-    odds = np.dot(_ALIKE, values) + ways.score(*poses)
+    odds = _ALIKE[0] * np.log1p(votes) + _compare_alike(surroundings, *poses, coarse=True) + ways.score(*poses)
     chosen: list[int] = []
     for n in np.argsort(-odds).tolist():
         if len(chosen) == _KEPT_ALIKE:
@@ -97,7 +95,40 @@ def _choose_alike(
             for m in chosen
         ):
             chosen.append(n)
-    return [(rotations[n], translations[n]) for n in chosen]
+    around = _AROUND @ levels[1]
+    return [(poses[0][n], _move_alike(surroundings, poses[0][n], poses[1][n], around)) for n in chosen]
+
+
+def _move_alike(
+    surroundings: tuple[Surroundings, Surroundings],
+    rotation: Float[Array, "3 3"],
+    translation: Float[Array, "3"],
+    around: Float[Array, "n 3"],
+) -> Float[Array, "3"]:
+    """The translation near one at which both panoramas look most alike, by smaller and smaller steps."""
+    best = float(_compare_alike(surroundings, rotation[None], translation[None])[0])
+    for step in _STEPS:
+        for _ in range(_ROUNDS):
+            moved = translation + step * around
+            odds = _compare_alike(surroundings, np.repeat(rotation[None], len(moved), axis=0), moved)
+            if odds.max() <= best:
+                break
+            best, translation = float(odds.max()), moved[odds.argmax()]
+    return translation
+
+
+def _compare_alike(
+    surroundings: tuple[Surroundings, Surroundings],
+    rotations: Float[Array, "n 3 3"],
+    translations: Float[Array, "n 3"],
+    *,
+    coarse: bool = False,
+) -> Float[Array, "n"]:
+    """How well both panoramas fit; a logarithm of odds without its constant."""
+    overlap, conflict, likeness, shade, hue = compare_many(*surroundings, rotations, translations, coarse=coarse).T
+    return _ALIKE[1] * np.minimum(conflict, _LARGEST_CONFLICT) + (
+        _ALIKE[2] * likeness + _ALIKE[3] * shade + _ALIKE[4] * hue
+    ) * overlap_weight(overlap)
 
 
 def _count_votes(

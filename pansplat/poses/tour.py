@@ -3,7 +3,8 @@
 Each relation states a rotation, a direction and, by the estimated depths, a distance in camera heights. Relations that
 contradict the others around triangles are left out. The others connect the panoramas in groups. A group grows from its
 best pair: the panorama with the strongest relations to the placed ones is added where most of them place it, and all
-poses are adjusted together.
+poses are adjusted together. Groups and single panoramas are then joined where the hypotheses of several pairs between
+them agree, or one is probable enough by itself.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from pansplat.poses.bundle import Problem, adjust, point_depths, residual_angles, triangulate
@@ -26,7 +27,11 @@ Pair = tuple[int, int]
 
 _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
 _LARGEST_GAP = 0.15  # of the way around it, relative to its length
-_CLOSED_ODDS, _NEEDED_ODDS = 4.0, 1.2  # logarithms: added by a closed triangle; needed by its doubtful pairs
+_JOINED_ODDS = 1.0  # logarithm of the odds of a junction of two groups
+_AGREEMENT = 1.5  # logarithm: how much rarer hypotheses of two pairs agree if they are wrong; neighbours look alike
+_LEAST_ODDS = -9.0  # of a hypothesis
+_JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; of the way, camera heights, and relative
+_RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # least differences of junctions that exclude each other
 _SAME_PLACE = 0.2  # distance of two places of a panorama that confirm each other, relative to the way to it
 _OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
 _FEW_JOINT = 40  # points with two other panoramas, below which estimated distances count in the adjustment
@@ -56,7 +61,7 @@ class Tour:
 
     Attributes:
         groups: the largest one first.
-        confirmed: doubtful pairs that close a triangle with others.
+        confirmed: doubtful pairs that agree with the others of their group.
         rejected: pairs that contradict the others.
         unplaced: for each panorama without a pose the reason, and the other panorama of its best pair.
     """
@@ -81,33 +86,136 @@ def build_tour(
         downs: gravity in each camera's frame; NaN where unknown.
         noise: standard deviation of a bearing, radians.
     """
-    confirmed = _confirm(relations)
-    reliable = {pair: relation for pair, relation in relations.items() if relation.is_reliable} | confirmed
+    reliable = {pair: relation for pair, relation in relations.items() if relation.is_reliable and relation.is_matched}
     rejected = _find_contradictions(reliable)
     reliable = {pair: relation for pair, relation in reliable.items() if pair not in rejected}
-    groups = []
-    for members in _connect(len(features), reliable):
-        own = {pair: relation for pair, relation in reliable.items() if pair[0] in members}
-        groups.append(_place_group(features, own, downs, noise))
+    groups = _place_groups(features, reliable, downs, noise)
+    parts = _join_parts(groups, relations, len(features))
+    confirmed = _confirm(parts, relations)
+    if confirmed:
+        groups = _place_groups(features, reliable | confirmed, downs, noise)
+    groups = [_assemble(part, groups) for part in parts if len(part) > 1]
     groups.sort(key=lambda group: (-len(group.placed), group.placed))
     placed = {view for group in groups for view in group.placed}
     unplaced = {view: _describe_failure(view, relations) for view in range(len(features)) if view not in placed}
     return Tour(tuple(groups), confirmed, rejected, unplaced)
 
 
-def _confirm(relations: Mapping[Pair, RelativePose]) -> dict[Pair, RelativePose]:
-    """The doubtful relations that close a triangle with others; wrong ones rarely do."""
-    usable = {pair: relation for pair, relation in relations.items() if relation.is_reliable or relation.is_doubtful}
-    confirmed: dict[Pair, RelativePose] = {}
-    for i, j, k in itertools.combinations(sorted({view for pair in usable for view in pair}), 3):
-        pairs = (i, j), (j, k), (i, k)
-        if not all(pair in usable for pair in pairs):
-            continue
-        doubtful = {pair: usable[pair] for pair in pairs if usable[pair].is_doubtful}
-        odds = sum(relation.log_odds for relation in doubtful.values()) + _CLOSED_ODDS
-        if odds >= _NEEDED_ODDS and _closes(usable, usable[i, k], (i, k), j):
-            confirmed |= {pair: replace(relation, problem=None) for pair, relation in doubtful.items()}
+def _place_groups(
+    features: Sequence[Features], relations: Mapping[Pair, RelativePose], downs: Array, noise: float
+) -> list[Group]:
+    """The groups of panoramas that relations connect."""
+    groups = []
+    for members in _connect(len(features), relations):
+        own = {pair: relation for pair, relation in relations.items() if pair[0] in members}
+        groups.append(_place_group(features, own, downs, noise))
+    return groups
+
+
+_Part = dict[int, Float[Array, "4 4"]]
+"""Poses of panoramas, cam2world, in a world of their own; its unit is the cameras' height."""
+
+
+def _join_parts(groups: Sequence[Group], relations: Mapping[Pair, RelativePose], count: int) -> list[_Part]:
+    """The groups and single panoramas, joined where that is probable, the most probable junction first."""
+    parts: list[_Part] = [dict(zip(group.placed, group.poses, strict=True)) for group in groups]
+    placed = {view for part in parts for view in part}
+    parts += [{view: np.eye(4)} for view in range(count) if view not in placed]
+    junctions = {pair: _find_junction(parts[pair[0]], parts[pair[1]], relations) for pair in _pairs_of(len(parts))}
+    while junctions:
+        i, j = max(junctions, key=lambda pair: junctions[pair][0])
+        odds, motion = junctions[i, j]
+        if odds < _JOINED_ODDS:
+            break
+        parts[i] |= {view: motion @ pose for view, pose in parts[j].items()}
+        parts[j] = {}
+        for pair in junctions:
+            if {i, j} & set(pair):
+                junctions[pair] = _find_junction(parts[pair[0]], parts[pair[1]], relations)
+    return [part for part in parts if part]
+
+
+def _pairs_of(count: int) -> list[Pair]:
+    return list(itertools.combinations(range(count), 2))
+
+
+def _find_junction(
+    first: _Part, second: _Part, relations: Mapping[Pair, RelativePose]
+) -> tuple[float, Float[Array, "4 4"]]:
+    """The most probable motion from the world of the second part to that of the first, and the logarithm of its odds.
+
+    Each hypothesis of a pair between them states a motion. The hypotheses of other pairs that agree are evidence for
+    it; motions that exclude it, and that no hypothesis is right, are evidence against it.
+    """
+    between = []
+    for (i, j), relation in relations.items():
+        motions, odds = _hypotheses(relation)
+        if i in first and j in second:
+            between.append((i, j, motions, odds))
+        elif j in first and i in second:
+            between.append((j, i, np.linalg.inv(motions), odds))
+    stated = [first[i] @ np.linalg.inv(motions) @ np.linalg.inv(second[j]) for i, j, motions, _ in between]
+    found = np.concatenate((np.empty((0, 4, 4)), *stated))
+    if not len(found):
+        return -math.inf, np.eye(4)
+    sums = np.zeros(len(found))
+    for i, j, motions, odds in between:
+        agreeing = _agree(np.linalg.inv(found @ second[j]) @ first[i], motions, _JOINED_TURN, _JOINED_GAP)
+        own = np.logaddexp.reduce(np.where(agreeing, odds, -math.inf), axis=1)
+        sums += np.logaddexp(0, _AGREEMENT + own)
+    evidence = sums + np.log(-np.expm1(-sums)) - _AGREEMENT  # log(exp(sums) - 1)
+    best = int(evidence.argmax())
+    middle = np.eye(4)
+    middle[:3, 3] = np.mean([pose[:3, 3] for pose in second.values()], axis=0)
+    same = _agree(found @ middle, found @ middle, _RIVAL_TURN, _RIVAL_GAP)
+    rivals = (evidence - np.log(same.sum(axis=1)))[~same[best]]  # each motion once
+    return float(evidence[best] - np.logaddexp.reduce(np.append(rivals, 0.0))), found[best]
+
+
+def _hypotheses(relation: RelativePose) -> tuple[Float[Array, "n 4 4"], Float[Array, "n"]]:
+    """Motions from the first camera's frame to the second one's, and the logarithms of their odds."""
+    likely = relation.hypotheses.log_odds > _LEAST_ODDS
+    motions = np.tile(np.eye(4), (int(likely.sum()), 1, 1))
+    motions[:, :3, :3], motions[:, :3, 3] = relation.hypotheses.rotations[likely], relation.hypotheses.ways[likely]
+    return motions, relation.hypotheses.log_odds[likely]
+
+
+def _agree(
+    first: Float[Array, "n 4 4"], second: Float[Array, "m 4 4"], turn: float, gap: tuple[float, float]
+) -> Bool[Array, "n m"]:
+    """Whether motions differ by less than a turn and a gap of the way, in camera heights or relative."""
+    cosine = (np.einsum("nij,mij->nm", first[:, :3, :3], second[:, :3, :3]) - 1) / 2
+    ways = first[:, None, :3, 3], second[None, :, :3, 3]
+    length = np.linalg.norm(ways[0], axis=-1) + np.linalg.norm(ways[1], axis=-1)
+    distance = np.linalg.norm(ways[0] - ways[1], axis=-1)
+    return (cosine > math.cos(turn)) & (distance < np.maximum(gap[0], gap[1] * length))
+
+
+def _confirm(parts: Sequence[_Part], relations: Mapping[Pair, RelativePose]) -> dict[Pair, RelativePose]:
+    """The doubtful relations by matches that agree with the poses of their part."""
+    confirmed = {}
+    for part in parts:
+        for (i, j), relation in relations.items():
+            if i in part and j in part and relation.is_doubtful and relation.is_matched:
+                motion = np.linalg.inv(part[j]) @ part[i]
+                own = np.eye(4)
+                own[:3, :3], own[:3, 3] = relation.rotation, relation.distance * relation.translation
+                if _agree(motion[None], own[None], _JOINED_TURN, _JOINED_GAP)[0, 0]:
+                    confirmed[i, j] = replace(relation, problem=None)
     return confirmed
+
+
+def _assemble(part: _Part, groups: Sequence[Group]) -> Group:
+    """The group of a part: adjusted groups at their places in it, and panoramas without matches."""
+    poses, depths, angles = dict(part), [np.empty(0)], [np.empty(0)]
+    for group in groups:
+        if group.placed[0] in part:
+            motion = part[group.placed[0]] @ np.linalg.inv(group.poses[0])
+            poses |= dict(zip(group.placed, motion @ group.poses, strict=True))
+            depths.append(group.depths)
+            angles.append(group.angles)
+    placed = tuple(sorted(poses))
+    return Group(placed, np.stack([poses[view] for view in placed]), np.concatenate(depths), np.concatenate(angles))
 
 
 def _closes(relations: Mapping[Pair, RelativePose], relation: RelativePose, pair: Pair, k: int) -> bool | None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,7 +23,7 @@ from pansplat.poses.axes import NO_PRIOR, RotationPrior
 from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import MatchDepths
 from pansplat.poses.features import Features, Matches
-from pansplat.poses.proposals import LEVEL, propose_by_depth
+from pansplat.poses.proposals import Pose, propose_by_depth
 from pansplat.poses.solvers import (
     Bearings,
     Rotation,
@@ -58,6 +58,7 @@ _MIN_MATCHES, _MAX_MATCHES = 8, 2500
 _TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
 _SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
 _QUICK, _RESCORED = 500, 3000  # best matches that rank all hypotheses; hypotheses that all matches rank
+_LEVEL = [2, 0, 1]  # order of the axes in a levelled camera: x, y down, z
 _KEPT, _KEPT_PARALLEL = 10, 6  # hypotheses that are optimised: of all kinds, and of those with parallel walls
 _PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit vectors
 _MIN_PARALLAX = 5.0  # in the noise's standard deviation
@@ -85,13 +86,17 @@ class _Support:
 # Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
 _NEEDED = _Support(32, 80, 20)
 _COMPARED = 16  # best hypotheses whose panoramas are compared
-_CANDIDATES = 4  # of them, those of the highest odds are kept for placing by hand
-# Logarithm of the odds that a hypothesis is right, linear in: 1, log(1 + score), log(1 + places), parallel walls,
-# log(0.003 + conflict), likeness, shade, overlap, log(0.01 + slope of the way) (docs/poses.md).
-_ODDS = (-28.0, 0.6, 0.78, 6.4, -1.44, 8.0, 2.1, 0.6, -1.51)
+_CANDIDATES = 4  # hypotheses of the highest odds that are kept for placing by hand
+# Logarithm of the odds of a hypothesis against none, linear in: 1, log(1 + score), log(1 + places), parallel walls,
+# log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the way), whether it is
+# that of a comparison (docs/poses.md).
+_ODDS = (-32.94, 0.73, 1.39, 3.95, -2.41, 7.65, -0.38, 4.57, -0.75, -1.73, -1.7)
 _LEAST_CONFLICT, _LEAST_SLOPE = 0.003, 0.01
+_NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; way, camera heights, and relative
+_PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pose by matches
+_PROPOSAL_NOISE = math.radians(0.5), 0.1  # of the pose of a comparison: rotation; position, camera heights
 _LARGEST_SLOPE = 0.3
-_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 1.0, 0.2, -2.0
+_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +107,7 @@ class Hypothesis:
         score: natural logarithm of the likelihood ratio against chance.
         probability: of each match to be right.
         distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
+        is_proposed: whether it is the pose of a comparison of both panoramas, not optimised over matches.
     """
 
     rotation: Rotation
@@ -109,6 +115,7 @@ class Hypothesis:
     score: float
     probability: Float[Array, "match"]
     distance: float = math.nan
+    is_proposed: bool = False
 
 
 def _match_noise(first: Features, second: Features, indices: Int[Array, "match 2"]) -> Float[Array, "match"]:
@@ -158,8 +165,10 @@ class _Evidence:
         """The evidence with another noise, in units of this one."""
         return replace(self, noise=factor * self.noise)
 
-    def evaluate(self, rotation: Rotation, translation: Vector) -> Hypothesis:
+    def evaluate(self, rotation: Rotation, translation: Vector, distance: float | None = None) -> Hypothesis:
         """The evidence for a relative pose. Matches whose rays meet behind a camera are counted as wrong.
+
+        The distance of the cameras is that of the matches' depths, unless it is given, as that of a proposal.
 
         A right match by chance also has its point in front of both cameras in about half of all cases, so that a point
         in front has twice the likelihood ratio against chance (uniform on the sphere).
@@ -169,15 +178,16 @@ class _Evidence:
         points = two_view_depths(self.a, self.b, rotation, translation)
         parallax = angle_between(self.a @ rotation.T, self.b)
         behind = (points < 0).any(axis=1) & (parallax > 3 * self.noise)
-        ratio, distance = np.where(behind, 0.0, 2 * likelihood), math.nan
+        ratio, is_proposed = np.where(behind, 0.0, 2 * likelihood), distance is not None
         if self.depths is not None:
             weight = np.where((points > 0).all(axis=1), self.prior * ratio / (1 - self.prior + self.prior * ratio), 0.0)
-            distance = self.depths.find_distance(points, weight)
+            distance = self.depths.find_distance(points, weight) if distance is None else distance
             if math.isfinite(distance):
                 ratio = ratio * self.depths.likelihood_ratio(points, distance, parallax, self.noise)
         total = 1 - self.prior + self.prior * ratio
         score = float(np.log(total).sum()) + self.axes.score(rotation)
-        return Hypothesis(rotation, translation, score, self.prior * ratio / total, distance)
+        found = self.prior * ratio / total
+        return Hypothesis(rotation, translation, score, found, math.nan if distance is None else distance, is_proposed)
 
     def refine(self, start: Hypothesis, steps: int) -> Hypothesis:
         """The pose of the smallest weighted epipolar angles near a hypothesis, by Gauss-Newton with a robust loss."""
@@ -332,17 +342,23 @@ def _calibrate(deviations: tuple[float, float], places: float) -> tuple[float, f
     return factor * deviations[0], factor * deviations[1]
 
 
-def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> list[Hypothesis]:
-    """Distinct optimised hypotheses, best first."""
+def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> tuple[list[Hypothesis], list[Hypothesis]]:
+    """Distinct hypotheses that are optimised over the matches, best first, and those of a comparison as proposed."""
     if len(evidence.a) < _MIN_MATCHES:
-        return []
+        return [], []
     free, parallel = _sample_essentials(evidence, rng)
     found = [_optimise(essential, evidence, _FACTORS) for essential in _choose_best(free, evidence, _KEPT)]
-    found += [_optimise(essential, evidence, _DEPTH_FACTORS) for essential in _propose_by_depth(evidence, rng)]
+    agreed, alike = _propose_by_depth(evidence, rng)
+    ways = [(rotation, t / max(float(np.linalg.norm(t)), 1e-9)) for rotation, t in (*agreed, *alike)]
+    found += [_optimise(skew(way) @ rotation, evidence, _DEPTH_FACTORS) for rotation, way in ways]
     if len(parallel):  # inexact: compared among themselves, with a larger tolerance
         chosen = _choose_best(parallel, evidence.with_noise(2), _KEPT_PARALLEL)
         found += [_optimise(essential, evidence, _PARALLEL_FACTORS) for essential in chosen]
-    return _merge_same(found, evidence.axes)
+    proposed = [
+        evidence.evaluate(rotation, way, float(np.linalg.norm(t)))
+        for (rotation, t), (_, way) in zip(alike, ways[len(agreed) :], strict=True)
+    ]
+    return _merge_same(found, evidence.axes), proposed
 
 
 def _sample_essentials(
@@ -350,7 +366,7 @@ def _sample_essentials(
 ) -> tuple[Float[Array, "n 3 3"], Float[Array, "m 3 3"]]:
     """Essential matrices of random samples: of any pose or of levelled cameras, and of cameras with parallel walls."""
     a, b, axes = evidence.a, evidence.b, evidence.axes
-    levels = axes.first.axes[LEVEL], axes.second.axes[LEVEL]
+    levels = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
     free, parallel = [], [np.empty((0, 3, 3))]
     for top in sorted({min(top, len(a)) for top in _TOP_SETS}):
         chosen = _draw(rng, top, _SAMPLES[5], 5)
@@ -375,10 +391,10 @@ def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: i
     return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
 
 
-def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> list[Float[Array, "3 3"]]:
-    """Essential matrices by the estimated depths; none without these."""
+def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> tuple[list[Pose], list[Pose]]:
+    """Poses by the estimated depths: of many matches, and of a comparison; none without depths."""
     if evidence.depths is None or evidence.surroundings is None:
-        return []
+        return [], []
     matches = evidence.a, evidence.b, evidence.prior, evidence.depths
     return propose_by_depth(*matches, evidence.axes, evidence.surroundings, evidence.ways, rng)
 
@@ -490,12 +506,26 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Relative poses of two panoramas, of which at most one is right.
+
+    Attributes:
+        rotations, ways: x2 = R x1 + t, camera heights.
+        log_odds: logarithm of the odds of each against none.
+    """
+
+    rotations: Float[Array, "n 3 3"] = field(default_factory=lambda: np.empty((0, 3, 3)))
+    ways: Float[Array, "n 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    log_odds: Float[Array, "n"] = field(default_factory=lambda: np.empty(0))
+
+
+@dataclass(frozen=True, eq=False)
 class RelativePose:
     """The relative pose of two panoramas, and the figures of its check.
 
     Attributes:
         rotation, translation: x2 = R x1 + t; |t| = 1.
-        indices: features of the matches that agree with it.
+        indices: features of the matches that agree with it; none if it is that of a comparison.
         score: natural logarithm of the likelihood ratio against chance.
         margin: how much the score exceeds that of the best different pose.
         places: number of different places (12 degrees) with right matches, in the panorama that has fewer.
@@ -505,7 +535,7 @@ class RelativePose:
         distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
         log_odds: logarithm of the odds that the pose is right, by matches and comparison; infinite if matches suffice.
         problem: why the pose must not be used; None if it passes the check.
-        candidates: the best hypotheses, with or without problems, best first.
+        hypotheses: all that were compared, this pose among them.
     """
 
     rotation: Rotation
@@ -519,7 +549,23 @@ class RelativePose:
     distance: float
     log_odds: float
     problem: str | None
-    candidates: tuple[Candidate, ...] = ()
+    hypotheses: Hypotheses = Hypotheses()
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """The hypotheses of the highest odds, with or without problems, best first."""
+        best = np.argsort(-self.hypotheses.log_odds, kind="stable")[:_CANDIDATES].tolist()
+        poses = self.hypotheses
+        return tuple(
+            Candidate(poses.rotations[n], poses.ways[n], float(poses.log_odds[n]))
+            for n in best
+            if poses.log_odds[n] > -math.inf
+        )
+
+    @property
+    def is_matched(self) -> bool:
+        """Whether matches determine the pose."""
+        return len(self.indices) > 0
 
     @property
     def is_reliable(self) -> bool:
@@ -533,7 +579,7 @@ class RelativePose:
 
     @property
     def is_certain(self) -> bool:
-        """Whether it is wrong in less than one of 300 pairs; else it is probable."""
+        """Whether its odds are above 7 to 1, or its matches suffice; else it is probable."""
         return self.is_reliable and self.log_odds >= _CERTAIN_ODDS
 
 
@@ -562,7 +608,7 @@ def estimate_relative_pose(
     a, b = first.bearings[indices[:, 0]], second.bearings[indices[:, 1]]
     noise, depths = _match_noise(first, second, indices), _sample_depths(surroundings, a, b)
     evidence = _Evidence(a, b, matches.prior[:count], noise, axes, depths, surroundings, ways)
-    found = _search_hypotheses(evidence, np.random.default_rng(seed))
+    found, proposed = _search_hypotheses(evidence, np.random.default_rng(seed))
     if not found:
         no_match = f"only {count} features match"
         return RelativePose(
@@ -578,7 +624,15 @@ def estimate_relative_pose(
             -math.inf,
             no_match,
         )
-    best, log_odds, margin, candidates = _choose_compared(found, evidence)
+    compared = [*found[:_COMPARED], *proposed]
+    odds = np.array([_log_odds(h, evidence) for h in compared])
+    best, log_odds = _choose_compared(compared, odds)
+    hypotheses = Hypotheses(
+        np.stack([h.rotation for h in compared]), np.stack([h.distance * h.translation for h in compared]), odds
+    )
+    if best.is_proposed:
+        return _as_proposed(best, log_odds, hypotheses, evidence)
+    margin = best.score - max((h.score for h in found if h is not best), default=0.0)
     support = _Support(_count_all_places(best, evidence), best.score, margin)
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
@@ -590,7 +644,10 @@ def estimate_relative_pose(
     uncertainty = _calibrate(deviations, support.places)
     problem = _find_problem(support, log_odds)
     if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
-        problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
+        problem, hypotheses = (
+            f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees",
+            Hypotheses(),
+        )
     elif problem is None and surroundings is not None and not math.isfinite(best.distance):
         problem = "the distance of the cameras cannot be determined"
     elif problem is None and uncertainty[1] > _MAX_UNCERTAINTY:
@@ -607,24 +664,51 @@ def estimate_relative_pose(
         best.distance,
         math.inf if support.suffices else log_odds,
         problem,
-        candidates,
+        hypotheses,
     )
 
 
-def _choose_compared(
-    found: list[Hypothesis], evidence: _Evidence
-) -> tuple[Hypothesis, float, float, tuple[Candidate, ...]]:
-    """The hypothesis of the highest odds, their logarithm, how much its score exceeds others, and the best ones."""
-    odds = [_log_odds(h, evidence) for h in found[:_COMPARED]]
-    best = int(np.argmax(odds)) if max(odds) > -math.inf else 0
-    others = [h.score for n, h in enumerate(found) if n != best]
-    order = [n for n in np.argsort(-np.array(odds), kind="stable").tolist() if odds[n] > -math.inf][:_CANDIDATES]
-    candidates = tuple(Candidate(found[n].rotation, found[n].distance * found[n].translation, odds[n]) for n in order)
-    return found[best], odds[best], found[best].score - max(others, default=0.0), candidates
+def _as_proposed(best: Hypothesis, log_odds: float, hypotheses: Hypotheses, evidence: _Evidence) -> RelativePose:
+    """The relative pose of a comparison, which has no matches."""
+    support = _Support(_count_all_places(best, evidence), best.score, 0.0)
+    uncertainty = _PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)
+    return RelativePose(
+        best.rotation,
+        best.translation,
+        np.empty((0, 2), np.int64),
+        best.score,
+        0.0,
+        support.places,
+        0.0,
+        uncertainty,
+        best.distance,
+        log_odds,
+        _find_problem(support, log_odds),
+        hypotheses,
+    )
+
+
+def _choose_compared(compared: Sequence[Hypothesis], odds: Float[Array, "n"]) -> tuple[Hypothesis, float]:
+    """The most probable hypothesis and the logarithm of its odds: at most one of different hypotheses is right."""
+    best = compared[int(odds.argmax())]
+    same = np.array([_are_near(best, other) for other in compared])
+    log_odds = float(np.logaddexp.reduce(odds[same]) - np.logaddexp.reduce(np.append(odds[~same], 0.0)))
+    likely = np.flatnonzero(same & (odds > odds.max() - _PREFERENCE))
+    matched = [n for n in likely if not compared[n].is_proposed]
+    return compared[max(matched, key=lambda n: odds[n])] if matched else best, log_odds
+
+
+def _are_near(first: Hypothesis, second: Hypothesis) -> bool:
+    """Whether two hypotheses state one pose, by the distance of the cameras, too."""
+    ways = [h.distance * h.translation for h in (first, second)]
+    gap = float(np.linalg.norm(ways[0] - ways[1]))
+    longest = max(first.distance, second.distance)
+    turned = rotation_angle(first.rotation @ second.rotation.T)
+    return first is second or bool(turned < _NEAR[0] and gap < max(_NEAR[1], _NEAR[2] * longest))
 
 
 def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
-    """Logarithm of the odds that a hypothesis is right; -inf if the panoramas cannot be compared."""
+    """Logarithm of the odds of a hypothesis against none; -inf if the panoramas cannot be compared."""
     if evidence.surroundings is None or not math.isfinite(hypothesis.distance):
         return -math.inf
     translation = hypothesis.distance * hypothesis.translation
@@ -636,10 +720,12 @@ def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
         math.log1p(_count_all_places(hypothesis, evidence)),
         float(evidence.axes.confirms(hypothesis.rotation)),
         math.log(_LEAST_CONFLICT + comparison.conflict),
-        comparison.likeness,
-        comparison.shade,
+        comparison.likeness * comparison.weight,
+        comparison.shade * comparison.weight,
+        comparison.hue * comparison.weight,
         comparison.overlap,
         math.log(_LEAST_SLOPE + min(slope, _LARGEST_SLOPE)),
+        float(hypothesis.is_proposed),
     )
     return float(np.dot(_ODDS, values) + evidence.ways.score(hypothesis.rotation[None], translation[None])[0])
 

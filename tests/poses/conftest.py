@@ -127,9 +127,15 @@ def look_around(render_room: Callable[..., Array]) -> Callable[..., Surroundings
         turn = upright_rotation(rotation, np.array((0.0, 1, 0)))
         turn = np.eye(3) if turn is None else turn
         rays = pixel_directions(192, 384, dtype=torch.float64).numpy() @ (rotation @ turn).T
-        log_depth = np.log(_cast(rays, centre)[0] / (_HALF[1] - centre[1]))
-        grey = render_room(room, rotation, centre)[..., 0] / 255
-        return Surroundings(grey, DepthMap(log_depth, np.full((48, 96), deviation), turn))
+        distance = _cast(rays, centre)[0]
+        log_depth = np.log(distance / (_HALF[1] - centre[1]))
+        seen = pixel_directions(256, 512, dtype=torch.float64).numpy() @ rotation.T
+        points = centre + seen * _cast(seen, centre)[0][..., None]
+        waves = np.random.default_rng(room).normal(size=(2, 3, 3))
+        colour = 0.85 + 0.15 * np.sin(2 * points @ waves[0] + 9 * waves[1, 0])
+        return Surroundings(
+            colour * render_room(room, rotation, centre) / 255, DepthMap(log_depth, np.full((48, 96), deviation), turn)
+        )
 
     return look
 

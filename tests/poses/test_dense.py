@@ -75,6 +75,15 @@ def test_a_pose_beyond_a_wall_conflicts(views) -> None:
     assert found.conflict > 0.02 and found.overlap < 0.5 and found.likeness < 0.2
 
 
+def test_the_other_side_of_a_wall_is_not_common(views, look_around) -> None:
+    # The next room is a mirror image beyond the wall x = 2.6 m; its floor and ceiling continue those of this room.
+    beyond = look_around(1, TURNS[1], CENTRES[1])
+    centres = CENTRES[0], CENTRES[1] + np.array((2 * 2.6, 0, 0))
+    rotation, translation = relate(*TURNS, centres)
+    found = compare(views[0], beyond, rotation, translation)
+    assert found.conflict == 0 and found.overlap < 0.01
+
+
 def test_another_room_of_the_same_shape_is_not_alike(views, look_around) -> None:
     found = compare(views[0], look_around(1, TURNS[1], CENTRES[1]), *relate(*TURNS))
     assert found.overlap > 0.97 and abs(found.likeness) < 0.2
@@ -90,7 +99,7 @@ def test_the_order_of_the_panoramas_does_not_matter(views) -> None:
     rotation, translation = relate(turn(20), TURNS[1])
     there = compare(*views, rotation, translation)
     back = compare(*views[::-1], rotation.T, -rotation.T @ translation)
-    for name in ("overlap", "conflict", "likeness", "shade"):
+    for name in ("overlap", "conflict", "likeness", "shade", "hue"):
         assert getattr(there, name) == pytest.approx(getattr(back, name), abs=1e-3)
 
 
@@ -109,7 +118,7 @@ def test_a_sixteenth_of_the_directions_gives_nearly_the_same(views) -> None:
     for values, rotation, translation in zip(quick, rotations, translations, strict=True):
         found = compare(*views, rotation, translation)
         assert np.abs(values[:2] - (found.overlap, found.conflict)).max() < 0.02
-        assert np.abs(values[2:] - (found.likeness, found.shade)).max() < 0.12
+        assert np.abs(values[2:] - (found.likeness, found.shade, found.hue)).max() < 0.15
     assert quick[:, 2].argmax() == 0
 
 
@@ -126,17 +135,16 @@ def compare_one_way(source: Array, target: Array, rotation: Array, translation: 
     uncertain = source[..., 1] + seen[..., 1]
     error = np.log(distance) - seen[..., 0]
     usable = distance > 0.25
-    same = usable & (np.abs(error) < 0.12 + uncertain)
-    conflict = usable & ~same & (uncertain < 0.3) & (error < -np.maximum(0.24 + 2 * uncertain, 0.25))
+    close = usable & (np.abs(error) < 0.12 + uncertain)
+    same = close & (((source[..., 2:5] @ rotation.T) * seen[..., 2:5]).sum(axis=-1) > 0.3)
+    conflict = usable & ~close & (uncertain < 0.3) & (error < -np.maximum(0.24 + 2 * uncertain, 0.25))
     values = [weight[same].sum() / weight.sum(), weight[conflict].sum() / weight.sum()]
-    for k in (2, 3):
-        if values[0] > 0.002:
-            a, b = source[same][:, k], seen[same][:, k]
-            covariance = np.cov(a, b, aweights=weight[same])
-            values.append(covariance[0, 1] / math.sqrt(covariance[0, 0] * covariance[1, 1]))
-        else:
-            values.append(0.0)
-    return np.array(values)
+    if values[0] < 0.002:
+        return np.array([*values, 0, 0, 0])
+    covariances = [np.cov(source[same][:, k], seen[same][:, k], aweights=weight[same], ddof=0) for k in range(5, 9)]
+    values += [c[0, 1] / math.sqrt(c[0, 0] * c[1, 1]) for c in covariances[:2]]
+    hue = covariances[2] + covariances[3]
+    return np.array([*values, hue[0, 1] / (math.sqrt(hue[0, 0] * hue[1, 1]) + 0.06**2)])
 
 
 def test_the_kernel_equals_plain_numpy_in_float64(views, look_around) -> None:
@@ -147,9 +155,9 @@ def test_the_kernel_equals_plain_numpy_in_float64(views, look_around) -> None:
         there = compare_one_way(*maps, *upright)
         back = compare_one_way(*maps[::-1], upright[0].T, -upright[0].T @ upright[1])
         found = compare(views[0], second, rotation, translation)
-        values = found.overlap, found.conflict, found.likeness, found.shade
+        values = found.overlap, found.conflict, found.likeness, found.shade, found.hue
         assert np.abs((there + back) / 2 - values).max() < 3e-3  # pixels at borders of others may be others
 
 
 def test_panoramas_with_nothing_in_common_are_not_alike(views) -> None:
-    assert compare(*views, np.eye(3), np.array((0.0, 0, 500))) == Comparison(0, 0, 0, 0)
+    assert compare(*views, np.eye(3), np.array((0.0, 0, 500))) == Comparison(0, 0, 0, 0, 0)

@@ -185,7 +185,7 @@ def _view(features: Features, small: np.ndarray, learned: LearnedFeatures | None
     """A view with unknown walls and depth."""
     depth = DepthMap(np.zeros((48, 96)), np.full((48, 96), 1.0), np.eye(3))
     axes = SceneAxes(np.eye(3), False, False)
-    return _View(features, features, learned, axes, small, Surroundings(small, depth))
+    return _View(features, features, learned, axes, small, Surroundings(np.dstack((small,) * 3), depth))
 
 
 def _no_features(count: int) -> Features:

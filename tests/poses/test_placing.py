@@ -18,7 +18,7 @@ from pansplat.poses.placing import (
     snap,
 )
 from pansplat.poses.solvers import rotation_exp
-from pansplat.poses.two_view import Candidate, RelativePose
+from pansplat.poses.two_view import Hypotheses, RelativePose
 
 QUARTER = math.pi / 2
 
@@ -64,9 +64,10 @@ def test_suggestions_are_where_the_second_camera_of_a_candidate_is():
     first = Floor(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3), uprights[0], 0.0)
     second = Floor(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3).add(Place(2, 1, 0.6)), uprights[1], 0.0)
     motion = np.linalg.inv(second) @ first
-    candidates = (Candidate(motion[:3, :3], motion[:3, 3], -1.0), Candidate(np.eye(3), np.zeros(3), -4.0))
+    rotations, ways = np.stack((motion[:3, :3], np.eye(3))), np.stack((motion[:3, 3], np.zeros(3)))
+    hypotheses = Hypotheses(rotations, ways, np.array((-1.0, -4.0)))
     relation = RelativePose(
-        np.eye(3), np.array((0.0, 0, 1)), np.zeros((0, 2), int), 0, 0, 0, 0, (1, 1), 1.0, -1.0, "no", candidates
+        np.eye(3), np.array((0.0, 0, 1)), np.zeros((0, 2), int), 0, 0, 0, 0, (1, 1), 1.0, -1.0, "no", hypotheses
     )
     best, other = list_suggestions(relation, uprights)
     _assert_same(best.place, Place(2, 1, 0.6))
@@ -129,7 +130,7 @@ def test_the_fit_is_best_at_the_right_pose(look_around):
 
     best = fit(0, 0)
     assert best.likeness > 0.6 and best.conflict < 0.01
-    assert best.quality > fit(0.3, 0).quality > fit(0.3, 0.5).quality
+    assert best.score > fit(0.3, 0).score > fit(0.3, 0.5).score
     assert fit(0, math.pi).likeness < 0.3
 
 

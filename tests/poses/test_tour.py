@@ -9,7 +9,7 @@ import pytest
 from pansplat.poses.features import Features
 from pansplat.poses.solvers import rotation_angle, rotation_exp
 from pansplat.poses.tour import Group, Pair, Tour, build_tour
-from pansplat.poses.two_view import RelativePose
+from pansplat.poses.two_view import Hypotheses, RelativePose
 
 CENTRES = np.array(((0.0, 0, 0), (1.0, 0, 0.2), (1.4, 0, 1.5), (-0.8, 0, 1.1), (0.2, 0, 2.0)))  # camera heights
 ROTATIONS = rotation_exp(np.array(((0, 0, 0), (0, 0.5, 0), (0, -0.8, 0), (0, 2.0, 0), (0, -1.4, 0))))
@@ -157,3 +157,61 @@ def test_a_doubtful_pair_that_fits_no_triangle_is_not_used(changes: dict[str, fl
 def test_a_doubtful_pair_alone_places_nothing() -> None:
     tour = build((0, 1), (1, 2), **DOUBT)
     assert not tour.confirmed and tour.groups[0].placed == (0, 1) and set(tour.unplaced) == {2}
+
+
+def suggest(pair: Pair, *log_odds: float, turn: float = 0.0, problem: str | None = "too little in common"):
+    """A relation without matches; the first of its hypotheses is the right pose, turned by an angle, radians."""
+    right = relate(pair, np.empty((0, 2), np.int64))
+    rotation = rotation_exp(np.array((0, turn, 0))) @ right.rotation
+    count = len(log_odds)
+    wrong = [rotation_exp(np.array((0, 1.0 + n + 0.5 * pair[0], 0))) @ right.rotation for n in range(count - 1)]
+    ways = np.stack([right.distance * right.translation] + [right.translation * (2 + n) for n in range(count - 1)])
+    hypotheses = Hypotheses(np.stack([rotation, *wrong]), ways, np.array(log_odds))
+    return replace(right, rotation=rotation, log_odds=max(log_odds), problem=problem, hypotheses=hypotheses)
+
+
+def join(*suggested: tuple[Pair, RelativePose]) -> Tour:
+    """The tour of two cameras with matches, and of others without."""
+    rng = np.random.default_rng(0)
+    world = rng.uniform(-4, 4, (COUNT, 3))
+    features = []
+    for rotation, centre in zip(ROTATIONS, CENTRES, strict=True):
+        rays = (world - centre) @ rotation
+        rest = np.empty((COUNT, 128), np.float32), np.zeros(COUNT), np.full(COUNT, 1e-3)
+        features.append(Features(rays / np.linalg.norm(rays, axis=1, keepdims=True), *rest))
+    own = np.arange(COUNT)
+    relations = {(0, 1): relate((0, 1), np.stack((own, own), axis=1))} | dict(suggested)
+    return build_tour(features, relations, np.stack([r.T @ (0.0, 1, 0) for r in ROTATIONS]), 1e-3)
+
+
+def is_right(group: Group) -> bool:
+    """Whether all cameras are at their places, relative to the first one."""
+    first = group.placed[0]
+    centres = (CENTRES[list(group.placed)] - CENTRES[first]) @ ROTATIONS[first]
+    found = (group.poses[:, :3, 3] - group.poses[0, :3, 3]) @ group.poses[0, :3, :3]
+    return bool(np.abs(found - centres).max() < 0.02)
+
+
+def test_hypotheses_of_two_pairs_that_agree_join_a_panorama_to_a_group() -> None:
+    tour = join(((0, 2), suggest((0, 2), -0.3, -4.0)), ((1, 2), suggest((1, 2), -0.3, -4.0)))
+    assert tour.groups[0].placed == (0, 1, 2) and is_right(tour.groups[0])
+
+
+def test_hypotheses_of_two_pairs_that_differ_join_nothing() -> None:
+    turned = suggest((1, 2), -0.3, -4.0, turn=math.radians(20))
+    assert join(((0, 2), suggest((0, 2), -0.3, -4.0)), ((1, 2), turned)).groups[0].placed == (0, 1)
+
+
+def test_one_doubtful_hypothesis_joins_nothing() -> None:
+    assert join(((0, 2), suggest((0, 2), -0.3))).groups[0].placed == (0, 1)
+
+
+def test_a_probable_pose_without_matches_joins_a_panorama_or_two() -> None:
+    tour = join(((1, 2), suggest((1, 2), 2.0, problem=None)), ((3, 4), suggest((3, 4), 2.0, problem=None)))
+    assert [group.placed for group in tour.groups] == [(0, 1, 2), (3, 4)]
+    assert all(is_right(group) for group in tour.groups)
+    assert not len(tour.groups[1].depths)
+
+
+def test_two_different_hypotheses_that_are_equally_probable_join_nothing() -> None:
+    assert join(((1, 2), suggest((1, 2), 2.0, 2.0))).groups[0].placed == (0, 1)

@@ -182,7 +182,7 @@ def find_ways(bearings) -> Ways:
 def test_ways_choose_among_poses_of_equal_matches(see_room, look_around, quick) -> None:
     poses = (TURN, CENTRES[1]), (HALF_TURN @ TURN, HALF_TURN @ CENTRES[1])
     parts = [see_room(11 + n, 40, *pose) for n, pose in enumerate(poses)]
-    blank = [Surroundings(np.full((64, 128), 0.5), view.depth) for view in look(look_around, *poses[0])]
+    blank = [Surroundings(np.full((64, 128, 3), 0.5), view.depth) for view in look(look_around, *poses[0])]
     both, single = find_ways(parts[0]), find_ways(parts[1])
     for wanted, ways in ((0, both), (1, Ways(there=single.there)), (1, Ways(back=single.back))):
         found = estimate(join(*parts), axes=PARALLEL, surroundings=tuple(blank), ways=ways)
