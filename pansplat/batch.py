@@ -86,7 +86,7 @@ class BatchOptions:
         model, compat, precision: see `pansplat.load_model`.
         height: see `pansplat.predict`.
         camera_height: see `pansplat.load_pairs`.
-        refine_seconds: time limit of the refinement.
+        refine_seconds: time limit of the refinement of a pair, or of three panoramas of a tour.
         suffix: of the exported files; one of `EXPORT_SUFFIXES`.
         gaussians: largest number in a web page; None for the default.
     """
@@ -264,7 +264,8 @@ def _list_units(item: Item, options: BatchOptions, folder: Path) -> list[_Unit]:
     for tour in find_tours(pairs):
         images |= {panorama.image for panorama in tour.panoramas}
         graph, *file = _connect(tour, folder)
-        pairs_of_scenes = tuple(graph.make_pair(views) for views in graph.choose_sources())
+        sources = graph.choose_sources(_find_max_views(options))
+        pairs_of_scenes = tuple(graph.make_pair(views) for views in sources)
         units.append(_Unit(graph.name, pairs_of_scenes, graph, (tuple(file),)))
     return units + [_Unit(pair.name, (pair,)) for pair in pairs if pair.context[0].image not in images]
 
@@ -286,6 +287,10 @@ def _connect(tour: TourGraph, folder: Path) -> tuple[TourGraph, Path, bool]:
 @lru_cache(maxsize=2)  # that of the batch, and that of single views
 def _load_model(model: str, compat: pipeline.CompatChoice, precision: pipeline.Precision) -> Predictor:
     return pipeline.load_model(model, compat=compat, precision=precision)
+
+
+def _find_max_views(options: BatchOptions) -> int:
+    return pipeline.find_max_views(_load_model(options.model, options.compat, options.precision))
 
 
 def read_fingerprint(options: BatchOptions) -> str:
@@ -321,8 +326,9 @@ def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: 
         if unit.tour is None:
             scene = made[0].read()
         else:
-            of_views = dict(zip(unit.tour.choose_sources(), made, strict=True))
-            scene = merge_scenes(unit.tour, lambda views: of_views[views].read())
+            max_views = _find_max_views(options)
+            of_views = dict(zip(unit.tour.choose_sources(max_views), made, strict=True))
+            scene = merge_scenes(unit.tour, lambda views: of_views[views].read(), max_views)
         _export(scene, path, unit, options)
     yield path, is_new
 
@@ -365,6 +371,7 @@ class _PairSteps:
         if part is not None:
             self._height, self._gaussians = pipeline.choose_tour_size(pair, part, options.height)
         self._file: Path | None = None
+        self._refine_seconds = pipeline.scale_seconds(options.refine_seconds, pair)
         self.key = _hash_pair(pair)
 
     def run(self) -> Iterator[tuple[Path, bool]]:
@@ -377,7 +384,7 @@ class _PairSteps:
             yield self._write("predict", self._predict_to)
         if is_refined:
             self.key = _join_hash(
-                self.key, "refine", [refinement_fingerprint(), options.refine_seconds, self._gaussians]
+                self.key, "refine", [refinement_fingerprint(), self._refine_seconds, self._gaussians]
             )
             yield self._write("refine", self._refine_to)
 
@@ -410,7 +417,7 @@ class _PairSteps:
         scene = self.read()
         views = self._pair.load_context(scene.height)
         config = RefineConfig(gaussians=self._gaussians)
-        pipeline.refine_to_file(scene, views, path, seconds=self._options.refine_seconds, config=config)
+        pipeline.refine_to_file(scene, views, path, seconds=self._refine_seconds, config=config)
 
     def _load_predictor(self) -> Predictor:
         predictor = _load_model(self._options.model, self._options.compat, self._options.precision)

@@ -40,7 +40,7 @@ from pansplat.refinement import RefineConfig, Refinement, RefineReport, refineme
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
-from pansplat.tours import TourGraph, list_starts, make_graph, merge_scenes
+from pansplat.tours import MAX_SCENE_VIEWS, TourGraph, list_starts, make_graph, merge_scenes
 
 __all__ = [
     "estimate_poses",
@@ -180,6 +180,16 @@ def warn_of_single_views(tour: TourGraph, predictor: Predictor) -> None:
             InputWarning,
             stacklevel=3,
         )
+
+
+def find_max_views(predictor: Predictor) -> int:
+    """The number of views, at most, that a predictor is given of a tour at once."""
+    return getattr(predictor, "max_views", MAX_SCENE_VIEWS)
+
+
+def scale_seconds(seconds: float, pair: Pair) -> float:
+    """The time limit of a refinement of many views, from that of a scene of an edge."""
+    return seconds * max(len(pair.context) / MAX_SCENE_VIEWS, 1.0)
 
 
 def _find_min_views(predictor: Predictor) -> int:
@@ -403,14 +413,14 @@ def predict_tour(
     cache: bool = True,
     progress: Progress | None = None,
 ) -> Scene:
-    """Predict one scene of all panoramas of a tour: several scenes of two or three panoramas, merged.
+    """Predict one scene of all panoramas of a tour: the scenes of its parts, merged.
 
-    Single views are predicted by `default`, with a warning, if the model needs two or more views. Without `gaussians`,
-    the scenes and their cache are those of the viewer.
+    `default` and `sweep` predict a part at once; networks predict scenes of two or three panoramas. Single views are
+    predicted by `default`, with a warning, if the model needs two or more views.
 
     Args:
         tour: of `pansplat.tours.connect`.
-        model, compat, precision, refine_seconds, cache, progress: see `predict`; the time limit is that of each scene.
+        model, compat, precision, refine_seconds, cache, progress: see `predict`; the time limit is that of three panoramas.
         height: panoramas are resized to (height, 2 height); by default `choose_tour_height`.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.
@@ -421,7 +431,8 @@ def predict_tour(
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     warn_of_single_views(tour, predictor)
     report: Progress = progress or (lambda what, fraction: None)
-    total = len(tour.choose_sources())
+    max_views = find_max_views(predictor)
+    total = len(tour.choose_sources(max_views))
     part = math.inf if gaussians is None else gaussians / len(tour)  # of a panorama
     counter = itertools.count()
 
@@ -432,13 +443,13 @@ def predict_tour(
             pair,
             choose_predictor(pair, predictor),
             height=rows,
-            refine_seconds=refine_seconds,
+            refine_seconds=scale_seconds(refine_seconds, pair),
             gaussians=count,
             cache=cache,
             progress=lambda what, done: report(f"scene {number + 1} of {total}: {what}", (number + done) / total),
         )
 
-    return merge_scenes(tour, predict_scene)
+    return merge_scenes(tour, predict_scene, max_views)
 
 
 def predict_to_file(

@@ -351,6 +351,9 @@ def test_the_scene_of_a_tour_holds_each_panorama_once(
     assert [edge[:2] for edge in scene.overlaps] == list(tour.overlaps)
     distances = (scene.gaussians.means - scene.cam2world[scene.gaussians.views, :3, 3].float()).norm(dim=1)
     torch.testing.assert_close(distances, torch.full_like(distances, 2.0))
+    predictor.calls, predictor.max_views = 0, 4
+    at_once = predict_tour(tour, predictor, cache=False)
+    assert predictor.calls == 1 and at_once.gaussians.means.equal(scene.gaussians.means)
 
 
 class PairsOnly:

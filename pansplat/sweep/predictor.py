@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.data.masks import mask_holes
+from pansplat.data.pairs import MAX_CONTEXT
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
@@ -43,6 +44,8 @@ class Sweep:
     """
 
     name = "sweep"
+    max_views = MAX_CONTEXT
+    """Of one prediction; each view is matched against a few others, so that time grows linearly with their number."""
     default_height = 1024
     """Largest height that is chosen for a pair without a given height."""
 

@@ -19,6 +19,7 @@ from pansplat.tours.floor import (
 )
 from pansplat.tours.graph import (
     EDGE_HYSTERESIS,
+    MAX_SCENE_VIEWS,
     Edge,
     TourGraph,
     Views,
@@ -35,6 +36,7 @@ from pansplat.tours.route import FADE_SECONDS, Route, find_angles, plan_route
 __all__ = [
     "EDGE_HYSTERESIS",
     "FADE_SECONDS",
+    "MAX_SCENE_VIEWS",
     "Edge",
     "FloorOutline",
     "FloorPlan",

@@ -31,6 +31,7 @@ Views = tuple[int, ...]
 """The panoramas of a scene, by their number in the tour."""
 
 EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
+MAX_SCENE_VIEWS = 3  # of a scene of an edge
 _MIN_PANORAMAS = 3  # of a tour of one part
 _MIN_BASELINE = 0.03  # of a scene of two views, as a fraction of far; depth is inaccurate below it
 _MAX_STARTS = 10_000  # of a walk, divided by the number of nodes
@@ -145,11 +146,19 @@ class TourGraph:
                 scenes[edge] = self._add_baseline(edge)
         return scenes
 
-    def choose_sources(self) -> dict[Views, tuple[int, ...]]:
+    def choose_sources(self, max_views: int = MAX_SCENE_VIEWS) -> dict[Views, tuple[int, ...]]:
         """The scenes that one scene of all panoramas is made of, and the panoramas whose Gaussians each provides.
 
-        They are scenes of `choose_scene_views`, those of the largest overlaps first, until all panoramas are provided.
+        They are the parts, if the predictor takes as many views. Else they are scenes of `choose_scene_views`, those of
+        the largest overlaps first, until all panoramas are provided.
+
+        Args:
+            max_views: of the predictor.
         """
+        numbers = np.array(self.parts)
+        parts = [tuple(np.flatnonzero(numbers == part).tolist()) for part in range(max(self.parts) + 1)]
+        if MAX_SCENE_VIEWS < max_views >= max(map(len, parts)):
+            return {part: part for part in parts}
         scenes = sorted(
             set(self.choose_scene_views().values()), key=lambda nodes: (-self._weakest_overlap(nodes), nodes)
         )
@@ -429,18 +438,19 @@ def _list_images(pair: Pair) -> set[Path]:
     return {panorama.image for panorama in pair.context}
 
 
-def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
+def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene], max_views: int = MAX_SCENE_VIEWS) -> Scene:
     """One scene of all panoramas. The Gaussians of each panorama are those of one scene (`TourGraph.choose_sources`).
 
     Args:
         tour: the graph.
         load: returns the scene of some panoramas (`make_pair`); called once for each scene that is needed.
+        max_views: of the predictor (`TourGraph.choose_sources`).
     """
     parts: dict[int, Gaussians] = {}
     names: dict[int, str] = {}
     gains: dict[Views, Gains] = {}
     scene = None
-    for views, provided in tour.choose_sources().items():
+    for views, provided in tour.choose_sources(max_views).items():
         scene = tour.place(load(views), views)
         gains[views] = scene.gains
         for node in provided:

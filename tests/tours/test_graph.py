@@ -182,11 +182,21 @@ def test_panoramas_too_close_for_depth_get_a_third(make_tour):
     assert tour.choose_scene_views()[0, 1] == (0, 1, 2)
 
 
+def test_a_panorama_is_left_out_of_the_scene_that_the_others_show_at_its_position(make_tour):
+    tour = make_tour(((0, 0), (0, 1), (0, 2), (9, 0), (9, 1)), ((0, 1), (1, 2), (0, 2), (3, 4)))
+    left_out = tour.leave_out(1)
+    assert [view.name for view in left_out.context] == [tour.panoramas[k].name for k in (0, 2)]
+    assert left_out.targets == (tour.panoramas[1],) and left_out.name == tour.panoramas[1].name
+    alone = tour.leave_out(3)
+    assert [view.name for view in alone.context] == [tour.panoramas[4].name], "the other one of its part"
+
+
 def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_overlap(make_tour):
     tour = make_tour(((0, 0), (0, 1), (1, 0), (3, 0)), ())
     overlaps = {(0, 1): 0.3, (0, 2): 0.2, (1, 2): 0.25, (2, 3): 0.5}
     tour = dataclasses.replace(tour, overlaps=overlaps)
     assert tour.choose_sources() == {(2, 3): (2, 3), (0, 1, 2): (0, 1)}
+    assert tour.choose_sources(4) == {(0, 1, 2, 3): (0, 1, 2, 3)}, "a predictor of four views is given the part"
     loaded = []
 
     def load(views: tuple[int, ...]) -> Scene:
