@@ -383,9 +383,7 @@ class _PairSteps:
         if "predict" in options.steps or ("refine" in options.steps and not is_refined):
             yield self._write("predict", self._predict_to)
         if is_refined:
-            self.key = _join_hash(
-                self.key, "refine", [refinement_fingerprint(), self._refine_seconds, self._gaussians]
-            )
+            self.key = _join_hash(self.key, "refine", [refinement_fingerprint(), self._refine_seconds, self._gaussians])
             yield self._write("refine", self._refine_to)
 
     def read(self) -> Scene:

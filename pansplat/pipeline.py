@@ -420,7 +420,8 @@ def predict_tour(
 
     Args:
         tour: of `pansplat.tours.connect`.
-        model, compat, precision, refine_seconds, cache, progress: see `predict`; the time limit is that of three panoramas.
+        model, compat, precision, refine_seconds, cache, progress: see `predict`; the time limit is that of three
+            panoramas.
         height: panoramas are resized to (height, 2 height); by default `choose_tour_height`.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.

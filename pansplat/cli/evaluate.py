@@ -189,7 +189,10 @@ def _leave_out_each(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
 
     tours = find_tours(pairs)
     if not tours:
-        raise InputError(f"{path}: --leave-one-out needs a tour of three or more panoramas with poses, got {len(pairs)} pairs")
+        raise InputError(
+            f"{path}: --leave-one-out needed a tour of three or more panoramas with poses, got "
+            f"{len({view.image for pair in pairs for view in pair.context})} panoramas; add some"
+        )
     found = []
     for tour in map(connect, tours):
         alone = [n for n in range(len(tour)) if not tour.neighbours(n)]

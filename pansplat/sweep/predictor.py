@@ -108,7 +108,9 @@ class Sweep:
             far=high,
         )
         report = progress or (lambda what, fraction: None)
-        surfaces, neighbours = search_surfaces(posed, self.config.search, lambda what, f: report(what, 0.7 * f), self.prior)
+        surfaces, neighbours = search_surfaces(
+            posed, self.config.search, lambda what, f: report(what, 0.7 * f), self.prior
+        )
         report("placing Gaussians", 0.7)
         gaussians = lift(posed, surfaces, self.config.lift, neighbours)
         report("fitting colours", 0.8)

@@ -24,7 +24,7 @@ from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.geometry.equirect import rotate_equirect, row_weights
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
-from pansplat.sweep.surface import Surface, nearest_pixel, ray_grid, resize_sphere
+from pansplat.sweep.surface import Surface, measure_distances, nearest_pixel, ray_grid, resize_sphere
 from pansplat.threads import limit_numba_threads
 
 _HEIGHT_CANDIDATES = 64
@@ -155,6 +155,8 @@ class PriorEstimator:
     def choose_neighbours(self, limits: tuple[float, float], count: int) -> list[list[int]]:
         """The other views of each view that see most of the same surfaces, those of the largest overlap first.
 
+        Cameras that are too near for parallax come later.
+
         The surfaces are the estimates of each view by itself. An overlap is the smaller share of the two spheres that
         the other camera sees, from at most twice the distance. Each view has at least one other view.
 
@@ -171,8 +173,8 @@ class PriorEstimator:
             ]
         )
         overlap = np.minimum(shares, shares.T)
-        np.fill_diagonal(overlap, -1)
-        order = overlap.argsort(axis=1, kind="stable")[:, ::-1]
+        parallax = np.minimum(measure_distances(self._cam2world) * limits[1], 1)
+        order = (overlap * parallax - np.eye(len(overlap))).argsort(axis=1, kind="stable")[:, ::-1]
         return [
             [int(other) for n, other in enumerate(row[:count]) if n == 0 or overlap[view, other] > _MIN_OVERLAP]
             for view, row in enumerate(order[:, :-1])

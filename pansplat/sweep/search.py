@@ -35,14 +35,15 @@ from pansplat.sweep.planes import (
     collect_planes,
     detect_planes,
     estimate_axes,
-    match_axes,
     make_empty_planes,
+    match_axes,
 )
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
 from pansplat.sweep.surface import (
     Surface,
     consistency_mask,
     guided_upsample,
+    measure_distances,
     resize_mask,
     resize_nearest,
     resize_sphere,
@@ -73,7 +74,7 @@ class SearchConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
-    max_neighbours: int = 4
+    max_neighbours: int = 3
     """Other views, at most, that a view is matched against."""
 
 
@@ -100,8 +101,7 @@ class PosedImages:
 
     def measure_baseline(self, views: Sequence[int]) -> float:
         """Largest distance between two cameras of some views, metres."""
-        centres = self.cam2world[list(views), :3, 3]
-        return float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
+        return float(measure_distances(self.cam2world[list(views)]).max())
 
 
 def search_surfaces(
@@ -120,13 +120,15 @@ def search_surfaces(
     low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
     depths = DepthRange(low / config.far_margin, low, high)
     empty = make_empty_planes(posed.cam2world, axes, posed.near, 1 / depths.farthest)
-    detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), [empty] * len(posed.images), depths.limits, config, [], None)
+    height, everywhere = min(finest, _DETECTION_HEIGHT), [empty] * len(posed.images)
+    detection = _SearchLevel(posed, height, everywhere, depths.limits, config, [], None)
     estimator = None
     if prior_model is not None:
         report("estimating depth", 0.02)
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
-    neighbours = choose_nearest(posed.cam2world, config.max_neighbours)
-    if posed.measure_baseline(range(len(posed.images))) < 1e-3 * posed.near:  # of one view, or of views at one place: nothing can be matched
+    neighbours = choose_nearest(posed.cam2world, config.max_neighbours, 1 / high)
+    # One view, or views at one place: nothing can be matched.
+    if posed.measure_baseline(range(len(posed.images))) < 1e-3 * posed.near:
         return _place_unmatched(posed, finest, depths, estimator), neighbours
     priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
@@ -167,10 +169,10 @@ def search_surfaces(
     return surfaces, neighbours
 
 
-def choose_nearest(cam2world: np.ndarray, count: int) -> list[list[int]]:
-    """The other views of each view, the nearest cameras first, at most `count`."""
-    centres = cam2world[:, :3, 3]
-    distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+def choose_nearest(cam2world: np.ndarray, count: int, least: float) -> list[list[int]]:
+    """The other views of each view, the nearest cameras first, at most `count`; those within `least` metres last."""
+    distances = measure_distances(cam2world)
+    distances[distances < least] += distances.max()
     np.fill_diagonal(distances, -1)
     return distances.argsort(axis=1, kind="stable")[:, 1 : count + 1].tolist()
 

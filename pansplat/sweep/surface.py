@@ -105,6 +105,12 @@ def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
     return local @ cam2world[:3, :3].T + cam2world[:3, 3]
 
 
+def measure_distances(cam2world: np.ndarray) -> np.ndarray:
+    """Distances (v, v) between the cameras of poses (v, 4, 4)."""
+    centres = cam2world[:, :3, 3]
+    return np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+
+
 def list_others(count: int) -> list[list[int]]:
     """The other views of each of some views."""
     return [[other for other in range(count) if other != view] for view in range(count)]

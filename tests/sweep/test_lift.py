@@ -12,7 +12,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
 from pansplat.rendering import blend, blend_weights, rasterize
-from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, lift
+from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces, lift
 from pansplat.sweep.search import PosedImages
 from pansplat.sweep.surface import Surface
 
@@ -165,6 +165,19 @@ def test_points_in_the_consistent_free_space_of_another_view_are_dropped(make_ro
     for level in (0, 1):
         chosen = (gaussians.views == 0) & (gaussians.levels == level)
         assert (room.wall_distances(gaussians.means[chosen].numpy()).min(axis=1) < 0.15).mean() > 0.97
+
+
+@pytest.mark.parametrize(("others", "is_kept"), (([1], False), ([2], True), ([1, 2], True), ([1, 2, 3], False)))
+def test_points_in_the_free_space_of_more_views_than_confirm_them_are_not_kept(others, is_kept):
+    """Of four cameras at one place, two see a sphere of 3 m and two one of 6 m."""
+    posed, (near, _) = _sphere_around(np.ones((16, 32, 3), np.float32))
+    far = Surface(near.inverse_depth / 2, near.orientation)
+    posed = PosedImages(posed.images[[0] * 4], posed.cam2world[[0] * 4], posed.masks[[0] * 4], posed.near, posed.far)
+    certain = [np.ones((16, 32), bool)] * 4
+    scene = _PosedSurfaces(posed, [near, far, near, far], [others], certain, LiftConfig())
+    opacity, kept = _estimate_opacity(np.array(((0.0, 0, 3), (0, 3, 0))), scene, 0)
+    assert (kept == is_kept).all()
+    assert (opacity == (LiftConfig().consistent_opacity if 2 in others else LiftConfig().single_view_opacity)).all()
 
 
 def test_panoramas_larger_than_the_search_are_lifted_at_their_own_height(small_furnished_room):

@@ -11,12 +11,12 @@ from pansplat.sweep.matching import (
     AggregationConfig,
     HypothesisSet,
     MatchingConfig,
+    OtherView,
     View,
     _aggregate_columns,
     _fast_atan2,
     _Penalties,
     aggregate_costs,
-    OtherView,
     compute_matching_cost,
     select_labels,
 )
@@ -136,6 +136,17 @@ def test_the_other_views_surface_changes_the_cost_as_configured(twice):
     expected = (config.occluded_cost, -config.consistency_bonus, config.free_space_penalty, config.free_space_penalty)
     assert np.allclose(cost, expected, atol=0.02)
     assert _cost((twice[0], _view(image)), spheres).max() < 0.02  # nothing is known before the first pass
+
+
+def test_only_views_that_can_see_a_hypothesis_count(twice):
+    """The second other view sees all of the hypotheses, the first one what is not behind its surface."""
+    image, spheres = twice[0].image, _spheres((0.25, 0.5, 0.75, 1.0))
+    near, far = _view(image, inverse=0.6), _view(image, inverse=0.1)
+    first, second = _cost((twice[0], near), spheres), _cost((twice[0], far), spheres)
+    both = _cost((twice[0], near, far), spheres)
+    assert np.allclose(both[..., :2], second[..., :2], atol=0.02), "occluded in the first one"
+    assert np.allclose(both[..., 2:], (first + second)[..., 2:] / 2, atol=1e-4)
+    assert np.allclose(_cost((twice[0], near, near), spheres), first, atol=1e-4), "nobody sees the farthest ones"
 
 
 def test_hypotheses_below_the_floor_or_above_the_ceiling_are_penalised(twice):

@@ -85,6 +85,26 @@ def test_camera_heights_are_found_by_matching(make_room):
         np.testing.assert_allclose(heights, (_CAMERA_HEIGHT, _CAMERA_HEIGHT - 0.2), rtol=0.02)
 
 
+class Spheres(TrueDepth):
+    """A model that sees a sphere of 1.4 camera heights around each camera."""
+
+    def observe(self, images):
+        self.priors = [DepthPrior(np.full((64, 128), math.log(1.4)), np.full((64, 128), 0.05)) for _ in images]
+        return self
+
+
+def test_neighbours_are_the_views_that_see_the_same_surfaces_best_first(make_room):
+    """Three cameras along a line of a metre, and one 9 m away: it has a neighbour, but is none."""
+    room = make_room()
+    poses = [room.pose((x, 0.0, 0.0)) for x in (0.0, 1.0, 0.4, 9.0)]
+    estimator = PriorEstimator(
+        Spheres(room, poses), [np.ones((64, 128, 3), np.float32)] * 4, np.stack(poses), _DOWN, PriorConfig()
+    )
+    *near, far = estimator.choose_neighbours((1 / 8, 1 / 0.3), 3)
+    assert near == [[2, 1], [2, 0], [0, 1]] and len(far) == 1
+    assert estimator.choose_neighbours((1 / 8, 1 / 0.3), 1)[:3] == [[2], [2], [0]]
+
+
 def test_hall_has_a_prior_by_its_floor_and_one_by_all_surfaces(make_room):
     room = make_room(low=(-5.0, -4.0, -4.0), high=(5.0, 1.2, 4.5))
     poses = [room.pose((-0.6, 0.0, -0.2)), room.pose((0.5, 0.0, 0.1))]
