@@ -151,7 +151,7 @@ def read_piece(image: Path) -> Piece:
     pixels = cv2.resize(pixels, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
     depth = estimate_depth(pixels, axes.axes[0] if axes.has_down else None)
     wall = depth.rotation.T @ axes.axes[1]
-    return Piece(Surroundings(pixels.mean(axis=2), depth), math.atan2(wall[0], wall[2]) if axes.has_walls else None)
+    return Piece(Surroundings(pixels, depth), math.atan2(wall[0], wall[2]) if axes.has_walls else None)
 
 
 @dataclass(frozen=True, eq=False)

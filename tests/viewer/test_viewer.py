@@ -1210,7 +1210,7 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
         depth = DepthMap(np.zeros((32, 64)), np.full((8, 16), 0.05), np.eye(3))
         rays = pixel_directions(32, 64).numpy()
         np.log(1 / np.abs(rays).max(axis=-1), out=depth.log_depth)  # a cube
-        return Piece(Surroundings(np.full((32, 64), 0.5), depth), 0.0)
+        return Piece(Surroundings(np.full((32, 64, 3), 0.5), depth), 0.0)
 
     monkeypatch.setattr(user.viewer, "_find", find)
     monkeypatch.setattr("pansplat_viewer.scene.placing.read_piece", read)

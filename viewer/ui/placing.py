@@ -167,9 +167,9 @@ class PlacingWindow:
             return
         if piece is not self._shown:
             self.release()
-            grey = piece.surroundings.grey
-            rows = grey[round(_ROWS[0] * len(grey)) : round(_ROWS[1] * len(grey))]
-            pixels = np.repeat((255 * rows.clip(0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+            image = piece.surroundings.image
+            rows = image[round(_ROWS[0] * len(image)) : round(_ROWS[1] * len(image))]
+            pixels = (255 * rows.clip(0, 1)).astype(np.uint8)
             self._texture, self._shown = self._ctx.texture(pixels.shape[1::-1], 3, pixels.tobytes(), alignment=1), piece
             self._texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
         assert self._texture is not None

@@ -54,7 +54,7 @@ def _read(image: Path) -> Piece:
     waves = np.random.default_rng(0).normal(size=(3, 8)) * 4
     grey = 0.5 + 0.05 * np.sin(points @ waves + np.arange(8)).sum(axis=-1)
     depth = DepthMap(np.log(distance / HALF[1]), np.full((24, 48), 0.03), np.eye(3))
-    return Piece(Surroundings(grey, depth), -TRUTH[image.stem][2])
+    return Piece(Surroundings(np.dstack((grey,) * 3), depth), -TRUTH[image.stem][2])
 
 
 @pytest.fixture
