@@ -322,7 +322,7 @@ def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m,
 def _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, total, offset):
     """Add the weighted costs of the hypotheses from `first` to `last` to `cost`, the weights to `total` (h, w, labels).
 
-    The set starts at `offset`.
+    Without `total`, there is one other view: its costs are written. The set starts at `offset`.
     """
     height, width = view.mean.shape
     m = (view.gray.shape[0] - height) // 2
@@ -339,9 +339,12 @@ def _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, c
     for i in range(height):
         for j in range(width):
             for k in range(first, last):
-                weight = share[i, j, k - first]
-                cost[i, j, offset + k] += weight * result[i, j, k - first]
-                total[i, j, offset + k] += weight
+                if total.size:
+                    weight = share[i, j, k - first]
+                    cost[i, j, offset + k] += weight * result[i, j, k - first]
+                    total[i, j, offset + k] += weight
+                else:
+                    cost[i, j, offset + k] = result[i, j, k - first]
 
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
@@ -459,8 +462,10 @@ def compute_matching_cost(
     bounds = _Bounds(*np.float32((*limits, *floor_ceiling)))
     weights = _Weights(*(np.float32(getattr(config, name)) for name in _Weights._fields))
     count = others[0].sets[0].penalty.shape[1]
-    cost = np.zeros((height, width, len(others[0].sets) * count), np.float32)
-    total = np.zeros_like(cost)
+    shape = height, width, len(others[0].sets) * count
+    several = len(others) > 1
+    cost = np.zeros(shape, np.float32) if several else np.empty(shape, np.float32)
+    total = np.zeros(shape if several else (0, 0, 0), np.float32)
     unknown = np.ones((height, width), np.float32)
     limit_numba_threads()
     for other, pose, sets in others:
@@ -477,7 +482,8 @@ def compute_matching_cost(
             hypotheses = _Set(own.base, own.step, own.penalty, own.side, back_facing)
             own_weights = weights if own.sphere else weights._replace(opposed_penalty=np.float32(0))
             _compute_set_cost(matched, warped, hypotheses, bounds, own_weights, cost, total, n * count)
-    cost /= total
+    if several:
+        cost /= total
     return cost
 
 

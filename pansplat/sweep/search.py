@@ -138,8 +138,10 @@ def search_surfaces(
     by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
     for pair in {tuple(sorted((view, others[0]))) for view, others in enumerate(neighbours)}:
         poses = posed.cam2world[list(pair)]
-        own = estimate_axes([small[n] for n in pair], poses[:, :3, :3])
-        start = dataclasses.replace(empty, axes=own[match_axes(own, axes)])
+        start = empty
+        if len(posed.images) > len(pair):
+            own = estimate_axes([small[n] for n in pair], poses[:, :3, :3])
+            start = dataclasses.replace(empty, axes=own[match_axes(own, axes)])
         rays = [axis_components(start.axes, pose[:3, :3], detection.height) for pose in poses]
         views = [detection.views[n] for n in pair]
         by_pair[pair] = detect_planes(views, rays, poses, start, depths, MIN_FLOOR * posed.near, config.matching)
@@ -250,7 +252,7 @@ class _SearchLevel:
             for slope, penalty, side in zip(slopes, penalties, sides, strict=True)
         ]
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
-        cost = self._mean_cost(view, lambda other: self._mark_separating_planes(view, other, sets, inverse))
+        cost = self._compute_cost(view, lambda other: self._mark_separating_planes(view, other, sets, inverse))
         if priors:
             apply_prior_cost(cost, [prior.resize(self.height) for prior in priors], sets, self.config.prior)
         return self._select_hypotheses(view, sets, cost, slot_map.astype(np.float32), count)
@@ -278,12 +280,12 @@ class _SearchLevel:
         slots = 2 * count
         starts = np.stack([np.clip((c - known) / step, -4 * slots, 4 * slots) + count / 2 for c in centres], axis=2)
         slot_map = np.stack((np.ones_like(starts), starts), axis=-1).astype(np.float32)
-        cost = self._mean_cost(view, lambda other: sets)
+        cost = self._compute_cost(view, lambda other: sets)
         surface = self._select_hypotheses(view, sets, cost, slot_map, slots)
         return Surface(surface.inverse_depth, self.surfaces[view].orientation)
 
-    def _mean_cost(self, view: int, make_sets: Callable[[int], list[HypothesisSet]]) -> np.ndarray:
-        """Mean matching cost (h, w, sets * count) over the other views, of the sets that `make_sets(other)` returns."""
+    def _compute_cost(self, view: int, make_sets: Callable[[int], list[HypothesisSet]]) -> np.ndarray:
+        """Matching cost (h, w, sets * count) by the neighbours, of the sets that `make_sets(other)` returns."""
         bounds = self.planes[view].vertical_bounds(self.posed.cam2world[view])
         others = [
             OtherView(self.views[other], self.posed.relative_pose(view, other), make_sets(other))
