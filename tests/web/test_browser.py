@@ -461,7 +461,8 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
     with opened(chromium, folder / "flat.html", script=FRAMES) as page:
         keyboard, start = page.page.keyboard, page.camera
         assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
-        assert page.page.inner_text("#name") == "room 0" and page.page.inner_text("#kind") == ""
+        page.wait("document.getElementById('name').innerText === 'room 0'")  # of the first frame
+        assert page.page.inner_text("#kind") == ""
         # Titles are text. The keyboard opens the list and chooses from it.
         shown = "Array.from(document.querySelectorAll('#spots button:not([hidden])'), (button) => button.title)"
         page.run("pansplat.camera.yaw = 1.5; pansplat.camera.pitch = -0.6; dispatchEvent(new Event('resize'))")
