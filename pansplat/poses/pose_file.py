@@ -16,7 +16,7 @@ CONVENTION = "cam2world opencv"
 
 
 def make_pose_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
-    """The content of a poses.json: all groups, each a world, and what a user may want to know and change."""
+    """The content of a poses.json: the poses of all groups (a world each), their pairs, and suggestions."""
     worlds = [make_world(group, names) for group in estimate.groups]
     return make_pose_file(
         worlds,

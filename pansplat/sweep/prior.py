@@ -24,7 +24,7 @@ from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.geometry.equirect import rotate_equirect, row_weights
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
-from pansplat.sweep.surface import Surface, measure_distances, nearest_pixel, ray_grid, resize_sphere
+from pansplat.sweep.surface import Surface, list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
 from pansplat.threads import limit_numba_threads
 
 _HEIGHT_CANDIDATES = 64
@@ -197,7 +197,8 @@ class PriorEstimator:
         self._neighbours = neighbours
         first = self._turn_back(self._observed.priors)
         by_pair = {}  # by the best neighbour: the model errs by another factor in each room
-        for nodes in {tuple(sorted((view, others[0]))) for view, others in enumerate(neighbours)}:
+        pairs = list_best_pairs(neighbours)
+        for nodes in set(pairs):
             pair = [[maps[n] for n in nodes] for maps in (first, views)]
             by_pair[nodes] = [
                 _estimate_camera_heights(
@@ -205,9 +206,7 @@ class PriorEstimator:
                 )
                 for floor_only in (True, False)
             ]
-        heights = [
-            [by_pair[min(n, o[0]), max(n, o[0])][kind][n > o[0]] for n, o in enumerate(neighbours)] for kind in range(2)
-        ]
+        heights = [[by_pair[nodes][kind][nodes.index(view)] for view, nodes in enumerate(pairs)] for kind in range(2)]
         if np.abs(np.log(np.divide(*heights))).max() < _SAME_HEIGHT:
             heights.pop()
         refined = [self._refine(_scale_depth(self._observed.priors, h), self._config.iterations) for h in heights]

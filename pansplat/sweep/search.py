@@ -43,6 +43,7 @@ from pansplat.sweep.surface import (
     Surface,
     consistency_mask,
     guided_upsample,
+    list_best_pairs,
     measure_distances,
     resize_mask,
     resize_nearest,
@@ -136,7 +137,8 @@ def search_surfaces(
         priors = estimator.estimate_by_matching(detection.views, neighbours, (low, high), config.matching)
     report("finding planes", 0.05)
     by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
-    for pair in {tuple(sorted((view, others[0]))) for view, others in enumerate(neighbours)}:
+    pairs = list_best_pairs(neighbours)
+    for pair in set(pairs):
         poses = posed.cam2world[list(pair)]
         start = empty
         if len(posed.images) > len(pair):
@@ -145,7 +147,7 @@ def search_surfaces(
         rays = [axis_components(start.axes, pose[:3, :3], detection.height) for pose in poses]
         views = [detection.views[n] for n in pair]
         by_pair[pair] = detect_planes(views, rays, poses, start, depths, MIN_FLOOR * posed.near, config.matching)
-    planes = [by_pair[min(view, others[0]), max(view, others[0])] for view, others in enumerate(neighbours)]
+    planes = [by_pair[pair] for pair in pairs]
     pixel = math.pi / heights[0] / (high - low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
     counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]

@@ -116,6 +116,11 @@ def list_others(count: int) -> list[list[int]]:
     return [[other for other in range(count) if other != view] for view in range(count)]
 
 
+def list_best_pairs(neighbours: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+    """Each view and its best neighbour, the smaller number first."""
+    return [(min(view, others[0]), max(view, others[0])) for view, others in enumerate(neighbours)]
+
+
 def consistency_mask(
     surfaces: Sequence[Surface], cam2world: np.ndarray, view: int, others: Sequence[int], tolerance: float = 0.06
 ) -> np.ndarray:

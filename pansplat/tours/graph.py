@@ -157,7 +157,7 @@ class TourGraph:
         """
         numbers = np.array(self.parts)
         parts = [tuple(np.flatnonzero(numbers == part).tolist()) for part in range(max(self.parts) + 1)]
-        if MAX_SCENE_VIEWS < max_views >= max(map(len, parts)):
+        if max_views > MAX_SCENE_VIEWS and max(map(len, parts)) <= max_views:
             return {part: part for part in parts}
         scenes = sorted(
             set(self.choose_scene_views().values()), key=lambda nodes: (-self._weakest_overlap(nodes), nodes)

@@ -341,8 +341,7 @@ class PlacingWindow:
         if not placing.is_changed:
             return False
         imgui.same_line()
-        reload = button("Load the changed poses##pose")
-        return reload
+        return button("Load the changed poses##pose")
 
 
 def _list_names(names: list[str], nodes: Nodes) -> str:
