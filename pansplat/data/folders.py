@@ -44,7 +44,7 @@ from pansplat.data.photographs import (
     list_unread_panoramas,
     read_photograph,
 )
-from pansplat.data.placements import BY_HAND, Placement, judge, read_rejected, read_ties
+from pansplat.data.placements import Placement, is_by_hand, judge, read_rejected, read_ties
 from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.errors import InputError, InputWarning
@@ -365,7 +365,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
 def _judge_entries(content: dict[str, Any], panoramas: Sequence[Panorama], source: Path) -> list[Panorama]:
     """The panoramas of poses.json with their placements."""
     entries = content["poses"]
-    by_hand = {name for name, entry in entries.items() if isinstance(entry, dict) and entry.get("placed") == BY_HAND}
+    by_hand = {name for name, entry in entries.items() if is_by_hand(entry)}
     ties, placements = read_ties(content.get("estimate")), {}
     for world in {panorama.world for panorama in panoramas}:
         names = [name for name, view in zip(entries, panoramas, strict=True) if view.world == world]

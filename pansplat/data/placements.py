@@ -77,6 +77,11 @@ def read_ties(estimate: Any) -> list[Tie]:
     return ties
 
 
+def is_by_hand(entry: Any) -> bool:
+    """Whether an entry of poses.json was placed by hand."""
+    return isinstance(entry, dict) and entry.get("placed") == BY_HAND
+
+
 def read_rejected(content: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The entries by name of each rejection that poses.json records; invalid ones are ignored."""
     records = content.get("rejected")

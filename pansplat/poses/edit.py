@@ -19,7 +19,7 @@ from numpy import ndarray as Array
 from pansplat.atomic import replacing
 from pansplat.data.images import list_pictures
 from pansplat.data.pairs import Panorama
-from pansplat.data.placements import BY_HAND, Tie, find_holds, read_rejected, read_ties
+from pansplat.data.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties
 from pansplat.data.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
 from pansplat.data.web_tours import find_web_tour
 from pansplat.errors import InputError
@@ -150,9 +150,9 @@ class PoseEditor:
             raise InputError(f"{self.file}: needed a panorama with a pose to reject it, got {name}.")
         ties: tuple[Tie, ...] = ()
         members: tuple[str, ...] = (name,)
-        if not _is_by_hand(poses[name]):
+        if not is_by_hand(poses[name]):
             names = [other for other in poses if _world_of(poses[other]) == _world_of(poses[name])]
-            by_hand = [other for other in names if _is_by_hand(poses[other])]
+            by_hand = [other for other in names if is_by_hand(poses[other])]
             hold = find_holds(names, read_ties(content.get("estimate")), by_hand).get(name)
             if hold is None:
                 raise InputError(
@@ -242,7 +242,7 @@ def merge_estimate(file: Path, estimate: PoseEstimate, names: Mapping[Path, str]
     content = require_object(read_json(file), file)
     poses = content.get("poses")
     rejected = {name for entries in read_rejected(content) for name in entries}
-    if not isinstance(poses, dict) or not (rejected or any(map(_is_by_hand, poses.values()))):
+    if not isinstance(poses, dict) or not (rejected or any(map(is_by_hand, poses.values()))):
         return None
     known, added = set(poses), 0
     for group in estimate.groups:
@@ -305,10 +305,6 @@ def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, P
 def _is_row(row: Any) -> bool:
     is_list = isinstance(row, list) and len(row) == 4
     return is_list and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in row)
-
-
-def _is_by_hand(entry: Any) -> bool:
-    return isinstance(entry, dict) and entry.get("placed") == BY_HAND
 
 
 def _world_of(entry: Any) -> int:
