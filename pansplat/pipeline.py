@@ -541,7 +541,7 @@ def render(
     Raises:
         InputError: `blend` names no view of the scene, or `drawing` does not fit the other arguments.
     """
-    pose = torch.as_tensor(cam2world, dtype=torch.float64)
+    pose = torch.as_tensor(cam2world, dtype=torch.float64, device=scene.gaussians.means.device)
     if eye_distance is not None:
         if raster.get("eye_offset") or not 0 < eye_distance < math.inf:
             raise InputError(f"`eye_distance` must be above 0, without `eye_offset`, got {eye_distance}")
@@ -572,7 +572,7 @@ def render(
     if blend not in ("deferred", "joint"):
         raise InputError(f"`blend` must be deferred, joint or the number of a view, got {blend!r}")
     tour = make_graph(scene) if scene.overlaps else None
-    edge = None if tour is None else tour.find_nearest_edge(pose[:3, 3].detach().numpy())[0]
+    edge = None if tour is None else tour.find_nearest_edge(pose[:3, 3].detach().cpu().numpy())[0]
     shown = list(range(num_views))
     if tour is not None and edge is not None:
         shown = [view for view in shown if not tour.is_fade(view, edge[0])]
@@ -582,8 +582,8 @@ def render(
             gaussians = gaussians.select(torch.isin(gaussians.views, torch.tensor(shown).to(gaussians.views)))
         return rasterize_gaussians(gaussians, pose)
     group = shown if tour is None or edge is None else list(tour.choose_scene_views()[edge])
-    weights = torch.zeros(num_views, dtype=torch.float64)
-    weights[group] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].double())
+    weights = torch.zeros(num_views, dtype=torch.float64, device=pose.device)
+    weights[group] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].to(pose))
     views = [scene.gaussians.select(scene.gaussians.views == view) for view in shown]
     renderings = [rasterize_gaussians(view, pose) for view in views]
     return blend_renderings(renderings, weights[shown])

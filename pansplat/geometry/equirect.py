@@ -48,10 +48,10 @@ def pixel_directions(
     height: int, width: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "height width 3"]:
     """Unit directions of all pixel centres of a panorama."""
-    v = (torch.arange(height, dtype=torch.float64) + 0.5) / height
-    u = (torch.arange(width, dtype=torch.float64) + 0.5) / width
+    v = (torch.arange(height, dtype=torch.float64, device=device) + 0.5) / height
+    u = (torch.arange(width, dtype=torch.float64, device=device) + 0.5) / width
     uv = torch.stack((u.expand(height, width), v[:, None].expand(height, width)), dim=-1)
-    return directions_from_uv(uv).to(device=device, dtype=dtype)
+    return directions_from_uv(uv).to(dtype)
 
 
 def row_weights(height: int, *, dtype: torch.dtype = torch.float64) -> Float[Tensor, "height"]:

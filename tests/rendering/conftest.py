@@ -170,8 +170,10 @@ def yaw() -> Callable[[float], Tensor]:
 
 
 @pytest.fixture(scope="session")
-def triton_interpreter() -> None:
-    """Triton's interpreter, on the CPU, for the rest of the session."""
+def triton_device() -> str:
+    """The device of Triton's kernels: "cuda", or without one "cpu" under Triton's interpreter."""
+    if torch.cuda.is_available():
+        return "cuda"
     os.environ["TRITON_INTERPRET"] = "1"
     import triton.language as tl
     from triton.runtime import interpreter
@@ -182,3 +184,4 @@ def triton_interpreter() -> None:
     # It patches its language at every call of a device function; once is enough, and six times faster.
     interpreter._patch_lang(tl.sum.fn)
     interpreter.InterpretedFunction.__call__ = lambda self, *args, **kwargs: self.rewrite()(*args, **kwargs)
+    return "cpu"

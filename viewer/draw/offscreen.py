@@ -11,6 +11,9 @@ import moderngl
 
 from pansplat.errors import InputError
 
+CONTEXT_VERSIONS = (4, 3), (3, 3)
+"""Versions of OpenGL to ask for, best first: NVIDIA's drivers return exactly the version, Mesa's the highest."""
+
 _EGL_PACKAGES = "libegl1 libgl1-mesa-dri libgl1"
 _OSMESA_PACKAGE = "libosmesa6"
 
@@ -30,14 +33,14 @@ def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> modern
     Raises:
         InputError: OpenGL 3.3 is not available; the message has the reasons and the Debian packages.
     """
-    arguments = {"egl": lambda: {"backend": "egl"}, "osmesa": lambda: {"context": _OsMesa()}}
-    if backend != "auto" and backend not in arguments:
+    makers = {"egl": _create_egl, "osmesa": lambda: moderngl.create_context(require=330, context=_OsMesa())}
+    if backend != "auto" and backend not in makers:
         raise InputError(f"`backend` must be auto, egl or osmesa, got {backend!r}")
     load_llvm_before_mesa()
     failures = []
-    for name in arguments if backend == "auto" else (backend,):
+    for name in makers if backend == "auto" else (backend,):
         try:
-            return moderngl.create_context(require=330, standalone=True, **arguments[name]())
+            return makers[name]()
         except Exception as error:  # the libraries raise OSError, ValueError, moderngl.Error or plain Exception
             failures.append(f"{name}: {error}")
     raise InputError(
@@ -45,6 +48,14 @@ def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> modern
         f"({'; '.join(failures)}); on Debian or Ubuntu install `apt-get install {_EGL_PACKAGES}`, "
         f"or for software rendering without EGL `{_OSMESA_PACKAGE}`"
     )
+
+
+def _create_egl() -> moderngl.Context:
+    best, oldest = (100 * major + 10 * minor for major, minor in CONTEXT_VERSIONS)
+    try:
+        return moderngl.create_context(require=best, standalone=True, backend="egl")
+    except Exception:  # see `create_context`
+        return moderngl.create_context(require=oldest, standalone=True, backend="egl")
 
 
 def load_llvm_before_mesa() -> None:

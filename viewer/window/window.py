@@ -16,7 +16,7 @@ import moderngl
 from imgui_bundle import imgui
 
 from pansplat.errors import InputError
-from pansplat_viewer.draw.offscreen import load_llvm_before_mesa
+from pansplat_viewer.draw.offscreen import CONTEXT_VERSIONS, load_llvm_before_mesa
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
@@ -78,14 +78,16 @@ class Window:
             warnings.simplefilter("always")
             if not glfw.init():
                 raise NoWindowError(f"the display cannot be used ({_describe_last(caught)})")
-            glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 3)
-            glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, 3)
             glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
             glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
             glfw.window_hint(glfw.SCALE_TO_MONITOR, True)
             glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
-            handle = glfw.create_window(*size, title, None, None)
-            if not handle:
+            for major, minor in CONTEXT_VERSIONS:
+                glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
+                glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
+                if handle := glfw.create_window(*size, title, None, None):
+                    break
+            else:
                 glfw.terminate()
                 raise NoWindowError(f"the display has no OpenGL 3.3 ({_describe_last(caught)}); {_DEBIAN}")
         glfw.make_context_current(handle)

@@ -133,10 +133,10 @@ def _compute_instances(
     fixed = ProjectedGaussians(*(field.detach() for field in projected))
     boxes, keys, bases, parts, total = [], [], [], [], 0
     for plane in planes:
-        key, seen = fixed.radius, None
-        z = (fixed.direction @ plane.rotation[:, 2]) * fixed.radius
-        if options.order == "z" and not plane.is_panorama:
-            key = z
+        key, z = fixed.radius, fixed.radius
+        if not plane.is_panorama:
+            z = (fixed.direction * plane.rotation[:, 2]).sum(dim=1) * fixed.radius
+            key = z if options.order == "z" else key
         if options.kernel == "ewa":
             ahead = torch.nonzero(z > EWA_NEAR_FACTOR * options.near)[:, 0]
             box = _compute_boxes(ProjectedGaussians(*(field[ahead] for field in fixed)), plane, options)

@@ -7,6 +7,7 @@ motions.
 """
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
 
+import math
 from typing import no_type_check
 
 import torch
@@ -15,7 +16,7 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.gaussians.harmonics import evaluate_harmonics
+from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.rendering.cuda.projection import (
     MIN_RATIO,
     bilinear,
@@ -337,12 +338,15 @@ def _backpropagate_colours(
 ) -> tuple[Float[Tensor, "n k channel"], Float[Tensor, "n 3"]]:
     """Gradients of the harmonics, and of the directions in world axes."""
     grad_harmonics, grad_world_directions = torch.empty_like(harmonics), torch.empty_like(means)
+    degree = math.isqrt(harmonics.shape[1]) - 1
     for low in range(0, len(means), _CHUNK_SIZE):
         chunk = slice(low, low + _CHUNK_SIZE)
         world = torch.nn.functional.normalize(means[chunk].double() - cam2world[:3, 3], dim=1).to(means.dtype)
         leaves = harmonics[chunk].detach().requires_grad_(), world.requires_grad_()
         with torch.enable_grad():
-            colours = evaluate_harmonics(*leaves)
+            # As `evaluate_harmonics`, whose matrix product is slow on CUDA.
+            basis = harmonics_basis(leaves[1], degree)
+            colours = torch.relu((basis[:, :, None] * leaves[0]).sum(dim=1) + 0.5)
         grad_harmonics[chunk], grad_world_directions[chunk] = torch.autograd.grad(
             colours, leaves, grad_colours[chunk], materialize_grads=True
         )

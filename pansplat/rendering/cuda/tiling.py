@@ -86,12 +86,11 @@ def sort_instances(
     for plane, (box, key, base) in enumerate(zip(boxes, keys, bases, strict=True)):
         if order is None or key is not last:  # sorted by distance, all planes share one order
             order, last = torch.argsort(key, stable=True), key
-        touched = tile_ranges(box[order], size, wraps, TILE_SIZE)
-        seen = torch.nonzero((touched[:, 1] > 0) & (touched[:, 3] > 0))[:, 0]
-        touched = touched[seen]
+        touched = tile_ranges(box, size, wraps, TILE_SIZE).int()
         touched[:, 2] += plane * rows
-        records.append((order[seen] + base).int())
-        ranges.append(touched.int())
+        seen = order[((touched[:, 1] > 0) & (touched[:, 3] > 0))[order]]
+        records.append((seen + base).int())
+        ranges.append(touched[seen])
         counts.append(len(seen))
     return Instances(torch.cat(records), torch.cat(ranges), counts, (len(boxes) * rows, columns))
 
@@ -100,20 +99,20 @@ def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> It
     """List the intersections of all tiles, in bands of tile rows with at most `limit` intersections (or one row)."""
     rows, columns = instances.grid
     num_columns, first_row, num_rows = instances.ranges.long()[:, 1:].unbind(1)
-    # Count the intersections in each row of tiles, from differences at the instances' ends.
-    change = torch.zeros(rows + 1, dtype=torch.int64, device=first_row.device)
-    change.index_add_(0, first_row, num_columns)
-    change.index_add_(0, first_row + num_rows, -num_columns)
-    per_row = change.cumsum(0)[:rows].tolist()
     most = max(1, _MAX_TILES // columns)  # rows in a band
-    bands = (
-        (row, min(row + most, end)) for first, end in split_rows(per_row, limit) for row in range(first, end, most)
-    )
+    total = int((num_columns * num_rows).sum())
+    bands = [(0, rows)]
+    if total > limit or rows > most:
+        per_row = _count_in_rows(num_columns, first_row, num_rows, rows)
+        bands = [
+            (row, min(row + most, end)) for first, end in split_rows(per_row, limit) for row in range(first, end, most)
+        ]
     for low, high in bands:
         top = first_row.clamp_min(low)
         count = ((first_row + num_rows).clamp_max(high) - top).clamp_min(0) * num_columns
         ends = count.cumsum(0)
-        total = sum(per_row[low:high])
+        if len(bands) > 1:
+            total = sum(per_row[low:high])
         tiles = torch.empty(total, dtype=torch.int16, device=ends.device)
         record_ids = torch.empty(total, dtype=torch.int32, device=ends.device)
         if total:
@@ -126,6 +125,16 @@ def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> It
         numbers = torch.arange((high - low) * columns, dtype=torch.int32, device=ends.device)
         starts = torch.nn.functional.pad(torch.searchsorted(tiles.int(), numbers), (0, 1), value=total)
         yield TileIntersections((low, high), record_ids[slots], starts.int(), slots.int(), ends)
+
+
+def _count_in_rows(
+    num_columns: Int[Tensor, "m"], first_row: Int[Tensor, "m"], num_rows: Int[Tensor, "m"], rows: int
+) -> list[int]:
+    """Count the intersections in each row of tiles, from differences at the instances' ends."""
+    change = torch.zeros(rows + 1, dtype=torch.int64, device=first_row.device)
+    change.index_add_(0, first_row, num_columns)
+    change.index_add_(0, first_row + num_rows, -num_columns)
+    return change.cumsum(0)[:rows].tolist()  # type: ignore[no-any-return]
 
 
 @triton.jit(do_not_specialize=["num", "total", "low", "columns", "steps"])

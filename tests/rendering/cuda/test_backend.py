@@ -1,4 +1,4 @@
-"""The Triton kernels, interpreted, against the torch reference in float64, forward and backward."""
+"""The Triton kernels, on a GPU or interpreted, against the torch reference in float64, forward and backward."""
 
 import dataclasses
 import functools
@@ -30,18 +30,22 @@ _CASES = [
 
 def _gradients(scene: Gaussians, camera: Tensor, dtype: torch.dtype, covariances: Tensor | None, **options):
     """An image and the gradients of a random loss of all of it, by name; `pose` along rigid motions."""
-    leaves = {name: getattr(scene, name).detach().to(dtype).clone().requires_grad_() for name in _FIELDS}
+    device = "cuda" if torch.cuda.is_available() and options["backend"] == "triton" else "cpu"
+
+    def make_leaf(value: Tensor, dtype: torch.dtype = dtype) -> Tensor:
+        return value.detach().to(device, dtype, copy=True).requires_grad_()
+
+    leaves = {name: make_leaf(getattr(scene, name)) for name in _FIELDS}
     if covariances is not None:
-        leaves["covariances"] = covariances.to(dtype).clone().requires_grad_()
-        options["covariances"] = leaves["covariances"]
-    leaves["pose"] = camera.clone().requires_grad_()
-    leaves["background"] = torch.linspace(0.2, 0.9, scene.harmonics.shape[2], dtype=dtype).requires_grad_()
-    changed = dataclasses.replace(scene, **{name: leaves[name] for name in _FIELDS})
+        options["covariances"] = leaves["covariances"] = make_leaf(covariances)
+    leaves["pose"] = make_leaf(camera, camera.dtype)
+    leaves["background"] = make_leaf(torch.linspace(0.2, 0.9, scene.harmonics.shape[2]))
+    changed = dataclasses.replace(scene.to(device=device), **{name: leaves[name] for name in _FIELDS})
     got = rasterize(changed, leaves["pose"], background=leaves["background"], **options)
-    everything = torch.cat((got.color, got.alpha[None], (got.depth * got.alpha)[None]))
+    everything = torch.cat((got.color, got.alpha[None], (got.depth * got.alpha)[None])).cpu()
     target = torch.rand(everything.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     (everything.double() * target).sum().backward()
-    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    gradients = {name: leaf.grad.cpu() for name, leaf in leaves.items() if leaf.grad is not None}
     turn = camera[:3, :3].T @ gradients["pose"][:3, :3]
     gradients["pose"] = torch.cat((turn - turn.T, gradients["pose"][:3, 3:]), dim=1)
     return everything.detach(), gradients, got.info
@@ -148,7 +152,7 @@ def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
 
 
 def test_gaussians_on_the_cpu_are_refused_unless_interpreted(make_scene, pose, monkeypatch):
-    monkeypatch.delenv("TRITON_INTERPRET")
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     with pytest.raises(InputError, match="needs Gaussians on a CUDA device, got them on 'cpu'"):
         rasterize(make_scene(1), pose, size=(4, 8), backend="triton")
 

@@ -1,4 +1,4 @@
-"""The projection kernels, interpreted, against the torch reference, forward and backward."""
+"""The projection kernels, on a GPU or interpreted, against the torch reference, forward and backward."""
 
 import dataclasses
 
@@ -25,16 +25,19 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
         (False, False, True, 0),
     ],
 )
-def test_projected_gaussians_equal_the_reference(exact, compensate, by_covariance, degree, make_scene, pose):
+def test_projected_gaussians_equal_the_reference(
+    exact, compensate, by_covariance, degree, make_scene, pose, triton_device
+):
     scene = _make_degenerate(make_scene(150, seed=degree, degree=degree))  # more than one program
     covariances = _rounded(scene.covariances) if by_covariance else None
     options = dict(filter_variance=3e-4, compensate=compensate, exact=exact)
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
         same = None if covariances is None else covariances.to(dtype)
         expected = reference(scene.to(dtype=dtype), same, pose, **options)
-        got = project_gaussians(scene.to(dtype=dtype), same, pose, **options)
+        same = None if same is None else same.to(triton_device)
+        got = project_gaussians(scene.to(dtype=dtype, device=triton_device), same, pose.to(triton_device), **options)
         for name, value in expected._asdict().items():
-            found = getattr(got, name)
+            found = getattr(got, name).cpu()
             assert found.dtype == value.dtype and found.shape == value.shape, name
             if value.numel():
                 assert float((found - value).abs().max() / value.abs().max().clamp_min(1)) < tolerance, name
@@ -42,24 +45,26 @@ def test_projected_gaussians_equal_the_reference(exact, compensate, by_covarianc
 
 @pytest.mark.parametrize("by_covariance", [True, False])
 @pytest.mark.parametrize("exact", [True, False])
-def test_gradients_equal_those_of_the_reference(exact, by_covariance, make_scene, pose, monkeypatch):
+def test_gradients_equal_those_of_the_reference(exact, by_covariance, make_scene, pose, monkeypatch, triton_device):
     from pansplat.rendering.cuda import projection_backward
 
     monkeypatch.setattr(projection_backward, "_CHUNK_SIZE", 50)
     scene = _make_degenerate(make_scene(70))  # more than one program
     generator = torch.Generator().manual_seed(0)
     found = []
-    for function in (reference, project_gaussians):
-        leaves = {name: getattr(scene, name).clone().requires_grad_() for name in _FIELDS}
-        covariances = scene.covariances.clone().requires_grad_() if by_covariance else None
-        camera = pose.clone().requires_grad_()
-        changed, options = dataclasses.replace(scene, **leaves), dict(compensate=True, exact=exact)
+    for function, device in ((reference, "cpu"), (project_gaussians, triton_device)):
+        leaves = {name: getattr(scene, name).to(device, copy=True).requires_grad_() for name in _FIELDS}
+        covariances = scene.covariances.to(device, copy=True).requires_grad_() if by_covariance else None
+        camera = pose.to(device, copy=True).requires_grad_()
+        changed, options = dataclasses.replace(scene.to(device=device), **leaves), dict(compensate=True, exact=exact)
         seen = function(changed, covariances, camera, filter_variance=3e-4, **options)
+        seen = ProjectedGaussians(*(field.cpu() for field in seen))
         _any_loss(seen, generator.manual_seed(0)).backward()
-        turn = pose[:3, :3].T @ camera.grad[:3, :3]
+        motion = camera.grad.cpu()
+        turn = pose[:3, :3].T @ motion[:3, :3]
         leaves |= {} if covariances is None else {"covariances": covariances}
-        gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-        gradients["pose"] = torch.cat((turn - turn.T, camera.grad[:3, 3:]), dim=1)
+        gradients = {name: leaf.grad.cpu() for name, leaf in leaves.items() if leaf.grad is not None}
+        gradients["pose"] = torch.cat((turn - turn.T, motion[:3, 3:]), dim=1)
         found.append(gradients)
     assert found[0].keys() == found[1].keys() and len(found[0]) == (5 if by_covariance else 6)
     for name, expected in found[0].items():

@@ -25,12 +25,13 @@ def _boxes(count: int, size: tuple[int, int], seed: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("wraps", [True, False])
 @pytest.mark.parametrize("limit", [1, 30, 1 << 20])
-def test_tile_intersections_equal_brute_force_in_bands_of_any_size(wraps, limit):
+def test_tile_intersections_equal_brute_force_in_bands_of_any_size(wraps, limit, triton_device):
     size, num = (50, 70), 3
     boxes = [_boxes(40, size, seed) for seed in range(num)]
     keys = [torch.randint(0, 9, (40,), generator=torch.Generator().manual_seed(seed)).double() for seed in range(num)]
     bases = [0, 40, 80]
-    instances = sort_instances(boxes, keys, bases, size, wraps=wraps)
+    on_device = [[table.to(triton_device) for table in tables] for tables in (boxes, keys)]
+    instances = sort_instances(*on_device, bases, size, wraps=wraps)
     rows, columns = instances.grid
     assert (rows, columns) == (4 * num, 5)
     expected = [[] for _ in range(rows * columns)]
@@ -49,9 +50,10 @@ def test_tile_intersections_equal_brute_force_in_bands_of_any_size(wraps, limit)
     assert bands == {1: 4 * num, 1 << 20: 1}.get(limit, bands)
 
 
-def test_slots_are_the_positions_before_the_sort_by_tile():
+def test_slots_are_the_positions_before_the_sort_by_tile(triton_device):
     size = (50, 70)
     box, key = _boxes(40, size, 0), torch.rand(40, generator=torch.Generator().manual_seed(1))
+    box, key = box.to(triton_device), key.to(triton_device)
     instances = sort_instances([box], [key], [0], size, wraps=False)
     (band,) = intersect_tiles(instances)
     together = torch.empty_like(band.record_ids)
@@ -61,12 +63,13 @@ def test_slots_are_the_positions_before_the_sort_by_tile():
     assert int(counts.max()) > 4 and band.ends.dtype == torch.int64
 
 
-def test_tiles_are_split_into_bands_of_16_bit_indices(monkeypatch):
+def test_tiles_are_split_into_bands_of_16_bit_indices(monkeypatch, triton_device):
     from pansplat.rendering.cuda import tiling
 
     monkeypatch.setattr(tiling, "_MAX_TILES", 10)
     size = (50, 70)
-    instances = sort_instances([_boxes(40, size, 0)], [torch.arange(40.0)], [0], size, wraps=False)
+    box, key = _boxes(40, size, 0).to(triton_device), torch.arange(40.0, device=triton_device)
+    instances = sort_instances([box], [key], [0], size, wraps=False)
     found = [band.rows for band in intersect_tiles(instances)]
     assert found == [(0, 2), (2, 4)]
 

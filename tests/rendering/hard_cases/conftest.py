@@ -1,8 +1,8 @@
 """All backends, and their comparison with the dense float64 renderer, forward and backward.
 
 A test runs with torch in float64, and in float32 with the backend of "auto" on a CPU: numba, and torch for the
-EWA kernel. Tests marked `torch_float32` also run with torch in float32 and the exact kernel. Triton's interpreter, a
-thousand times slower, runs in `pytest -m exhaustive`.
+EWA kernel. Tests marked `torch_float32` also run with torch in float32 and the exact kernel. Triton runs in
+`pytest -m exhaustive`, on a GPU or under its interpreter, which is a thousand times slower.
 """
 
 import dataclasses
@@ -17,7 +17,8 @@ from torch import Tensor
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import Rendering, rasterize
 
-os.environ["TRITON_INTERPRET"] = "1"  # before the kernels are imported
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # before the kernels are imported
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
@@ -41,7 +42,7 @@ class Renderer:
     @property
     def interpreted(self) -> bool:
         """Whether it runs under Triton's interpreter, a thousand times slower."""
-        return self.name == "triton"
+        return self.name == "triton" and not torch.cuda.is_available()
 
     @property
     def size(self) -> tuple[int, int]:
@@ -55,7 +56,9 @@ class Renderer:
     def __call__(self, scene: Gaussians, pose: Tensor | None = None, **options) -> Rendering:
         pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
         options = {"size": self.size, **options}
-        return rasterize(scene.to(dtype=self.dtype), pose, backend=self.name, **options)
+        device = "cuda" if self.name == "triton" and torch.cuda.is_available() else "cpu"
+        got = rasterize(scene.to(dtype=self.dtype, device=device), pose, backend=self.name, **options)
+        return dataclasses.replace(got, color=got.color.cpu(), alpha=got.alpha.cpu(), depth=got.depth.cpu())
 
 
 _RENDERERS = {

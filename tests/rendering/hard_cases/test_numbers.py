@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.rendering import rasterize
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
@@ -141,7 +140,7 @@ def test_half_precision_is_rendered_in_float32(dtype, unit, render, make_scene, 
     camera = pose.clone()
     camera[:3, 3] *= unit
     half, single = leaves(scene), leaves(scene.to(dtype=torch.float32))
-    got = rasterize(half, camera, size=render.size, backend=render.name)
+    got = dataclasses.replace(render, dtype=dtype)(half, camera)
     expected = render(single, camera)
     assert got.color.dtype == torch.float32 and torch.equal(got.color, expected.color)
     loss_of(got).backward()
