@@ -15,8 +15,10 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
+import numba as nb
 import numpy as np
 import torch
 
@@ -24,23 +26,24 @@ from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
-from pansplat.geometry.pose import quats_from_rotations
 from pansplat.sweep.search import PosedImages
 from pansplat.sweep.surface import (
     CONSISTENT,
     FREE_SPACE,
     Surface,
-    classify_visibility,
+    classify_point,
     consistency_mask,
     guided_upsample,
     list_others,
+    locate,
+    locate_pixel,
     nearest_pixel,
     pad_sphere,
-    pixel_coordinates,
     resize_mask,
     resize_sphere,
     world_points,
 )
+from pansplat.threads import limit_numba_threads
 
 NUM_LEVELS = 4
 _MAX_LENGTH = 0.2  # largest standard deviation of a disc, relative to its distance
@@ -214,45 +217,56 @@ def _lift_lattice(
     scene: _PosedSurfaces, view: int, level: int, image: np.ndarray, inverse: np.ndarray, needed: np.ndarray
 ) -> Gaussians:
     """The points of a lattice with the spacing of the image's pixels, where they are needed."""
-    config, pose = scene.config, scene.posed.cam2world[view]
+    config, pose = scene.config, np.ascontiguousarray(scene.posed.cam2world[view], np.float64)
     count = lattice_size(2 * len(image))
-    rays = fibonacci_directions(count).numpy()
-    row, column = nearest_pixel(rays, len(needed))
-    rays = rays[needed[row, column]]
-    row, column = nearest_pixel(rays, len(inverse))
-    inverse_depth = np.maximum(inverse[row, column].astype(np.float64), 1e-6)
+    rays, pixel = _locate_lattice(count, len(needed))
+    rays = rays[needed[pixel]]
+    inverse_depth = np.maximum(inverse[nearest_pixel(rays, len(inverse))].astype(np.float64), 1e-6)
     points = (rays / inverse_depth[:, None]) @ pose[:3, :3].T + pose[:3, 3]
     opacity, kept = _estimate_opacity(points, scene, view)
     spacing = math.sqrt(4 * math.pi / count)
     rays, inverse_depth, points, opacity = rays[kept], inverse_depth[kept], points[kept], opacity[kept]
     sloped = inverse if level else scene.surfaces[view].inverse_depth
-    row, column = nearest_pixel(rays, len(sloped))
-    gradient = _differentiate_log(sloped, config.discontinuity if level < 2 else math.inf)[row, column]
+    gradient = _differentiate_log(sloped, config.discontinuity if level < 2 else math.inf)
     is_fine = len(image) > scene.surfaces[view].height
     size = spacing * (config.fine_footprint if is_fine else config.footprint)
-    axes, scales = _shape_discs(rays, inverse_depth, gradient, size, level, config)
-    color = _sample_bilinear(image, rays)
-    quats = quats_from_rotations(torch.from_numpy(pose[:3, :3] @ axes))
+    # A disc that is nearly parallel to its ray must end well before the camera.
+    steepest = min(config.max_stretch[level], _MAX_LENGTH / size)
+    limit_numba_threads()
+    quats, scales = _shape_discs(rays, inverse_depth, gradient, size, steepest, config.thickness, pose)
+    color = _sample_bilinear(pad_sphere(image, 1), rays)
     return Gaussians(
         means=torch.from_numpy(points).float(),
-        scales=torch.from_numpy(scales).float(),
-        quats=quats.float(),
-        opacities=torch.from_numpy(opacity).float(),
+        scales=torch.from_numpy(scales),
+        quats=torch.from_numpy(quats),
+        opacities=torch.from_numpy(opacity),
         harmonics=torch.from_numpy((color - 0.5) / SH_0).float()[:, None, :],
         levels=torch.full((len(points),), level, dtype=torch.uint8),
         views=torch.full((len(points),), view, dtype=torch.uint8),
     )
 
 
-def _sample_bilinear(image: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Bilinear samples (n, c) of a panorama along rays (n, 3)."""
-    height, width = image.shape[:2]
-    x, y = (c + 0.5 for c in pixel_coordinates(rays, height))  # of the padded image
-    x0, y0 = np.clip(x.astype(np.int64), 0, width), np.clip(y.astype(np.int64), 0, height)
-    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-    padded = pad_sphere(image, 1)
-    top = padded[y0, x0] * (1 - fx) + padded[y0, x0 + 1] * fx
-    return top * (1 - fy) + (padded[y0 + 1, x0] * (1 - fx) + padded[y0 + 1, x0 + 1] * fx) * fy
+@lru_cache(maxsize=1)
+def _locate_lattice(count: int, height: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Rays (n, 3) of a lattice, the same for all views, and the pixels (rows, columns) that hold them."""
+    rays = fibonacci_directions(count).numpy()
+    return rays, nearest_pixel(rays, height)
+
+
+@nb.njit(parallel=True, cache=True)
+def _sample_bilinear(padded, rays):
+    """Bilinear samples (n, c) of a panorama, which is padded by one pixel, along rays (n, 3)."""
+    height = len(padded) - 2
+    samples = np.empty((len(rays), padded.shape[2]), np.float32)
+    for n in nb.prange(len(rays)):
+        x, y = locate(rays[n, 0], rays[n, 1], rays[n, 2], height)
+        column, row = min(int(x + 0.5), 2 * height), min(int(y + 0.5), height)  # of the padded image
+        right, lower = x + 0.5 - column, y + 0.5 - row
+        for c in range(samples.shape[1]):
+            above = padded[row, column, c] * (1 - right) + padded[row, column + 1, c] * right
+            below = padded[row + 1, column, c] * (1 - right) + padded[row + 1, column + 1, c] * right
+            samples[n, c] = above * (1 - lower) + below * lower
+    return samples
 
 
 def _window_extremum(values: np.ndarray, radius: int, *, largest: bool) -> np.ndarray:
@@ -308,22 +322,31 @@ def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> t
     A point in the consistent free space of more views than confirm it is not kept.
     """
     config, posed = scene.config, scene.posed
-    confirmed, contradicted = np.zeros(len(points), np.int8), np.zeros(len(points), np.int8)
-    doubtful, kept = np.zeros(len(points), bool), np.ones(len(points), bool)
+    limit_numba_threads()
+    # Rows of `counts`: views that confirm the point, that contradict it, that may, and that are too near to it.
+    counts = np.zeros((4, len(points)), np.int16)
     for other in scene.neighbours[view]:
-        surface = scene.surfaces[other]
-        visibility = classify_visibility(points, surface, posed.cam2world[other], config.discontinuity)
-        local = (points - posed.cam2world[other, :3, 3]) @ posed.cam2world[other, :3, :3]
-        row, column = nearest_pixel(local, surface.height)
-        certain = scene.consistent[other][row, column] & posed.masks[other][row, column]
-        in_free_space = visibility == FREE_SPACE
-        confirmed += visibility == CONSISTENT
-        contradicted += in_free_space & certain
-        doubtful |= in_free_space & ~certain
-        kept &= np.linalg.norm(local, axis=-1) > _MIN_DISTANCE * posed.near
-    opacity = np.where(doubtful, config.uncertain_opacity, config.single_view_opacity)
+        certain = scene.consistent[other] & posed.masks[other]
+        pose = np.ascontiguousarray(posed.cam2world[other], np.float64)
+        inverse = scene.surfaces[other].inverse_depth
+        _count_judgements(points, inverse, certain, pose, config.discontinuity, _MIN_DISTANCE * posed.near, counts)
+    confirmed, contradicted, doubtful, near = counts
+    opacity = np.where(doubtful > 0, np.float32(config.uncertain_opacity), np.float32(config.single_view_opacity))
     opacity[confirmed > 0] = config.consistent_opacity
-    return opacity, kept & (contradicted <= confirmed)
+    return opacity, (near == 0) & (contradicted <= confirmed)
+
+
+@nb.njit(parallel=True, cache=True)
+def _count_judgements(points, inverse_depth, certain, cam2world, tolerance, nearest, counts):
+    """Add what a view says about each point to `counts`; see `_estimate_opacity`."""
+    for n in nb.prange(len(points)):
+        kind, distance, row, column = classify_point(points[n], inverse_depth, cam2world, tolerance)
+        if kind == CONSISTENT:
+            counts[0, n] += 1
+        elif kind == FREE_SPACE:
+            counts[1 if certain[row, column] else 2, n] += 1
+        if distance <= nearest:
+            counts[3, n] += 1
 
 
 def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
@@ -340,28 +363,70 @@ def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
     return np.stack((east / (pixel * shrink), south / pixel), axis=-1)
 
 
-def _shape_discs(
-    rays: np.ndarray, inverse_depth: np.ndarray, gradient: np.ndarray, size: float, level: int, config: LiftConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (n, 3, 3) in the camera frame, as columns, and standard deviations (n, 3) of discs on the surface.
+@nb.njit(parallel=True, cache=True)
+def _shape_discs(rays, inverse_depth, gradient, size, steepest, thickness, cam2world):
+    """Quaternions (n, 4, wxyz) in the world, and standard deviations (n, 3), float32, of discs on the surface.
 
-    `size` is the standard deviation of a disc across its ray, radians.
+    Args:
+        rays: (n, 3) float64, camera axes.
+        gradient: (h, w, 2) see `_differentiate_log`.
+        size: standard deviation of a disc across its ray, radians.
+        steepest: largest gradient that a disc follows.
+        thickness: standard deviation across the surface, relative to the disc's.
     """
-    longitude = np.arctan2(rays[:, 0], rays[:, 2])  # 0 at the poles
-    east = np.stack((np.cos(longitude), np.zeros(len(rays)), -np.sin(longitude)), axis=-1)
-    south = np.cross(rays, east)
-    # X = ray / inverse_depth, so dX = (direction - ray * dlog(inverse_depth)) / inverse_depth per radian.
-    steepness = np.linalg.norm(gradient, axis=-1)
-    # A disc that is nearly parallel to its ray must end well before the camera.
-    limit = min(config.max_stretch[level], _MAX_LENGTH / size)
-    gradient = gradient * np.minimum(1, limit / np.maximum(steepness, 1e-9))[:, None]
-    steepness = np.minimum(steepness, limit)
-    ascent = np.where(steepness[:, None] > 1e-6, gradient / np.maximum(steepness, 1e-6)[:, None], (1.0, 0.0))
-    along = ascent[:, :1] * east + ascent[:, 1:] * south
-    across = -ascent[:, 1:] * east + ascent[:, :1] * south
-    long = along - steepness[:, None] * rays
-    stretch = np.linalg.norm(long, axis=-1)
-    long = long / stretch[:, None]
-    axes = np.stack((long, across, np.cross(long, across)), axis=-1)
-    sigma = size / inverse_depth
-    return axes, np.stack((sigma * stretch, sigma, sigma * config.thickness), axis=-1)
+    quats, scales = np.empty((len(rays), 4), np.float32), np.empty((len(rays), 3), np.float32)
+    for n in nb.prange(len(rays)):
+        x, y, z = rays[n]
+        flat = math.sqrt(x * x + z * z)
+        east_x, east_z = (z / flat, -x / flat) if flat > 0 else (1.0, 0.0)
+        south_x, south_y, south_z = y * east_z, z * east_x - x * east_z, -y * east_x
+        row, column = locate_pixel(x, y, z, len(gradient))
+        to_east, to_south = np.float64(gradient[row, column, 0]), np.float64(gradient[row, column, 1])
+        steepness = math.sqrt(to_east * to_east + to_south * to_south)
+        if steepness > 1e-6:
+            to_east, to_south = to_east / steepness, to_south / steepness
+        else:
+            to_east, to_south = 1.0, 0.0
+        steepness = min(steepness, steepest)
+        # X = ray / inverse_depth, so dX = (direction - ray * dlog(inverse_depth)) / inverse_depth per radian.
+        stretch = math.sqrt(1 + steepness * steepness)
+        long_x = (to_east * east_x + to_south * south_x - steepness * x) / stretch
+        long_y = (to_south * south_y - steepness * y) / stretch
+        long_z = (to_east * east_z + to_south * south_z - steepness * z) / stretch
+        across_x, across_y = to_east * south_x - to_south * east_x, to_east * south_y
+        across_z = to_east * south_z - to_south * east_z
+        axes = np.empty((3, 3))
+        for i in range(3):
+            a, b, c = cam2world[i, 0], cam2world[i, 1], cam2world[i, 2]
+            axes[i, 0] = a * long_x + b * long_y + c * long_z
+            axes[i, 1] = a * across_x + b * across_y + c * across_z
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            axes[i, 2] = axes[j, 0] * axes[k, 1] - axes[k, 0] * axes[j, 1]
+        _write_quat(axes, quats[n])
+        sigma = size / inverse_depth[n]
+        scales[n, 0], scales[n, 1], scales[n, 2] = sigma * stretch, sigma, sigma * thickness
+    return quats, scales
+
+
+@nb.njit(inline="always")
+def _write_quat(m, quat):
+    """As `pansplat.geometry.pose.quats_from_rotations`, for one rotation (3, 3)."""
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    best, largest = 0, trace  # the largest component: w, x, y or z
+    for i in range(3):
+        if 2 * m[i, i] - trace > largest:
+            best, largest = i + 1, 2 * m[i, i] - trace
+    turned_x, turned_y, turned_z = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    if best == 0:
+        w, x, y, z = 1 + largest, turned_x, turned_y, turned_z
+    elif best == 1:
+        w, x, y, z = turned_x, 1 + largest, xy, xz
+    elif best == 2:
+        w, x, y, z = turned_y, xy, 1 + largest, yz
+    else:
+        w, x, y, z = turned_z, xz, yz, 1 + largest
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    norm = -norm if w < 0 else norm
+    quat[0], quat[1], quat[2], quat[3] = w / norm, x / norm, y / norm, z / norm

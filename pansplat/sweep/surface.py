@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,27 +10,48 @@ from dataclasses import dataclass
 import cv2
 import numba as nb
 import numpy as np
-import torch
 
-from pansplat.geometry.equirect import pixel_directions, uv_from_directions
+from pansplat.geometry.equirect import pixel_directions
 from pansplat.threads import limit_numba_threads
 
 
+@functools.lru_cache(maxsize=4)
 def ray_grid(height: int) -> np.ndarray:
-    """Unit rays (height, 2 height, 3), float32, of a panorama's pixels."""
-    return pixel_directions(height, 2 * height).numpy()
+    """Unit rays (height, 2 height, 3), float32, of a panorama's pixels; read-only."""
+    rays = pixel_directions(height, 2 * height).numpy()
+    rays.flags.writeable = False
+    return rays
 
 
-def pixel_coordinates(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Continuous x and y of directions (..., 3) of any length in a panorama; pixel centres at half-integers."""
-    uv = uv_from_directions(torch.from_numpy(np.ascontiguousarray(directions))).numpy()
-    return uv[..., 0] * 2 * height, uv[..., 1] * height
+@nb.njit(inline="always")
+def locate(x, y, z, height):
+    """Continuous x and y of a direction of any length in a panorama; pixel centres at half-integers."""
+    column = (math.atan2(x, z) / (2 * math.pi) + 0.5) * 2 * height
+    return column, (math.atan2(y, math.sqrt(x * x + z * z)) / math.pi + 0.5) * height
+
+
+@nb.njit(inline="always")
+def locate_pixel(x, y, z, height):
+    """Row and column of the pixel that holds a direction."""
+    column, row = locate(x, y, z, height)
+    return min(int(row), height - 1), int(column) % (2 * height)
 
 
 def nearest_pixel(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the pixel that holds each direction (..., 3)."""
-    x, y = pixel_coordinates(directions, height)
-    return np.clip(y.astype(np.int64), 0, height - 1), x.astype(np.int64) % (2 * height)
+    limit_numba_threads()
+    pixels = _locate_pixels(np.ascontiguousarray(directions).reshape(-1, 3), height)
+    row, column = pixels.reshape(2, *directions.shape[:-1])
+    return row, column
+
+
+@nb.njit(parallel=True, cache=True)
+def _locate_pixels(directions, height):
+    pixels = np.empty((2, len(directions)), np.int32)
+    for n in nb.prange(len(directions)):
+        x, y, z = np.float64(directions[n, 0]), np.float64(directions[n, 1]), np.float64(directions[n, 2])
+        pixels[0, n], pixels[1, n] = locate_pixel(x, y, z, height)
+    return pixels
 
 
 def pad_sphere(image: np.ndarray, margin: int) -> np.ndarray:
@@ -89,14 +111,32 @@ class Surface:
 
 def classify_visibility(points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float) -> np.ndarray:
     """Class (uint8) of world points (..., 3): CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE."""
-    local = (points - cam2world[:3, 3]) @ cam2world[:3, :3]
-    distance = np.maximum(np.linalg.norm(local, axis=-1), 1e-9)
-    row, column = nearest_pixel(local, surface.height)
-    ratio = 1 / (distance * surface.inverse_depth[row, column])
-    result = np.full(ratio.shape, OCCLUDED, np.uint8)
-    result[ratio > 1 - tolerance] = CONSISTENT
-    result[ratio > 1 + tolerance] = FREE_SPACE
-    return result
+    limit_numba_threads()
+    flat = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
+    classes = _classify_points(flat, surface.inverse_depth, np.ascontiguousarray(cam2world), tolerance)
+    return classes.reshape(points.shape[:-1])
+
+
+@nb.njit(inline="always")
+def classify_point(point, inverse_depth, cam2world, tolerance):
+    """Class of a world point for one view, its distance from the camera, and the row and column of its pixel."""
+    x, y, z = point[0] - cam2world[0, 3], point[1] - cam2world[1, 3], point[2] - cam2world[2, 3]
+    right = x * cam2world[0, 0] + y * cam2world[1, 0] + z * cam2world[2, 0]
+    down = x * cam2world[0, 1] + y * cam2world[1, 1] + z * cam2world[2, 1]
+    ahead = x * cam2world[0, 2] + y * cam2world[1, 2] + z * cam2world[2, 2]
+    distance = max(math.sqrt(x * x + y * y + z * z), 1e-9)
+    row, column = locate_pixel(right, down, ahead, len(inverse_depth))
+    ratio = 1 / (distance * inverse_depth[row, column])
+    kind = CONSISTENT if ratio > 1 - tolerance else OCCLUDED
+    return FREE_SPACE if ratio > 1 + tolerance else kind, distance, row, column
+
+
+@nb.njit(parallel=True, cache=True)
+def _classify_points(points, inverse_depth, cam2world, tolerance):
+    classes = np.empty(len(points), np.uint8)
+    for n in nb.prange(len(points)):
+        classes[n] = classify_point(points[n], inverse_depth, cam2world, tolerance)[0]
+    return classes
 
 
 def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
@@ -147,11 +187,16 @@ def guided_upsample(
     if needed is None:
         needed = np.ones(fine.shape[:2], bool)
     limit_numba_threads()
-    return Surface(*_upsample(surface.inverse_depth, surface.orientation, coarse, fine, needed))
+    inverse, window = surface.inverse_depth, np.ones((5, 5), np.uint8)
+    # Columns wrap; the rows beyond a pole, where the filters have no values, do not count.
+    wrapped = np.concatenate((inverse[:, -2:], inverse, inverse[:, :2]), axis=1)
+    lowest, highest = cv2.erode(wrapped, window)[:, 2:-2], cv2.dilate(wrapped, window)[:, 2:-2]
+    smooth = highest < (1 + _SMOOTH) * lowest
+    return Surface(*_upsample(inverse, surface.orientation, smooth, coarse, fine, needed))
 
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
-def _upsample(inverse, orientation, coarse, fine, needed):
+def _upsample(inverse, orientation, is_smooth, coarse, fine, needed):
     h, w = inverse.shape
     height, width = fine.shape[:2]
     result = np.zeros((height, width), np.float32)
@@ -165,19 +210,15 @@ def _upsample(inverse, orientation, coarse, fine, needed):
                 continue
             x = (j + 0.5) * w / width - 0.5
             cy, cx = int(math.floor(y + 0.5)), int(math.floor(x + 0.5))
-            lowest, highest = np.inf, 0.0
-            for di in range(-2, 3):
-                for dj in range(-2, 3):
-                    value = inverse[min(max(cy + di, 0), h - 1), (cx + dj) % w]
-                    lowest, highest = min(lowest, value), max(highest, value)
             y0, x0 = int(math.floor(y)), int(math.floor(x))
             fy, fx = y - y0, x - x0
             r0, r1 = min(max(y0, 0), h - 1), min(max(y0 + 1, 0), h - 1)
             c0, c1 = x0 % w, (x0 + 1) % w
             smooth = (inverse[r0, c0] * (1 - fx) + inverse[r0, c1] * fx) * (1 - fy)
             smooth += (inverse[r1, c0] * (1 - fx) + inverse[r1, c1] * fx) * fy
-            if highest < (1 + _SMOOTH) * lowest:  # the median is close to the smooth value
-                result[i, j], orientations[i, j] = smooth, orientation[min(max(cy, 0), h - 1), cx % w]
+            r, c = min(max(cy, 0), h - 1), cx % w
+            if is_smooth[r, c]:  # the median is close to the smooth value
+                result[i, j], orientations[i, j] = smooth, orientation[r, c]
                 continue
             n = 0
             total = 0.0
@@ -189,18 +230,18 @@ def _upsample(inverse, orientation, coarse, fine, needed):
                     for q in range(3):
                         d += abs(fine[i, j, q] - coarse[r, c, q])
                     near = (cy + di - y) ** 2 + (cx + dj - x) ** 2
-                    values[n], kinds[n] = inverse[r, c], orientation[r, c]
-                    weights[n] = math.exp(-d / 0.1 - near / 2.0) + 1e-12
-                    total += weights[n]
+                    value, weight = inverse[r, c], math.exp(-d / 0.1 - near / 2.0) + 1e-12
+                    total += weight
+                    at = n
+                    while at > 0 and values[at - 1] > value:
+                        values[at], kinds[at], weights[at] = values[at - 1], kinds[at - 1], weights[at - 1]
+                        at -= 1
+                    values[at], kinds[at], weights[at] = value, orientation[r, c], weight
                     n += 1
-            order = np.argsort(values)
-            below = 0.0
-            median = order[24]
-            for m in range(25):
-                below += weights[order[m]]
-                if below >= 0.5 * total:
-                    median = order[m]
-                    break
+            below, median = weights[0], 0
+            while below < 0.5 * total and median < 24:
+                median += 1
+                below += weights[median]
             close = abs(smooth / values[median] - 1) < _SMOOTH
             result[i, j] = smooth if close else values[median]
             orientations[i, j] = kinds[median]
