@@ -47,7 +47,7 @@ from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
 from pansplat.poses.tour import Group, Pair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.ways import NO_WAYS, Ways
-from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_floor, level_poses
+from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
 from pansplat.predictor import Progress
 from pansplat.threads import one_thread, worker_threads
 
@@ -63,7 +63,6 @@ _ENOUGH = 100.0  # expected number of right matches by SIFT, above which the lea
 _LIKELY = 0.3  # prior probability of the matches that count for it
 _LEARNED_PRIOR, _LEARNED_NOISE = 0.7, 1.6e-3  # largest prior, as matches of one pair of faces depend; radians
 _LEARNED_SIZE = 7.0  # pixels
-_FLOOR_PAIRS = 8
 _MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
 _MIRROR_RATIO = 1.5  # of that number to the one with the picture itself; symmetric things match either way
 _MAX_BASELINE = 1e9  # metres
@@ -564,16 +563,14 @@ def _find_scale(
         if distance == 0:
             raise InputError(f"`baseline` must be two images with a distance, got two from the same place: {baseline}")
         return baseline[2] / distance, f"{files[ends[0]].name} and {files[ends[1]].name} are {baseline[2]:g} m apart"
-    pairs = sorted(
-        itertools.combinations(range(len(files)), 2), key=lambda p: float(np.linalg.norm(centres[p[0]] - centres[p[1]]))
-    )
-    floor = find_floor(images, poses, pairs[:_FLOOR_PAIRS])
-    if not floor.is_found():
+    found = find_common_height(find_floors(images, poses, camera_height))
+    if found is None:
         return camera_height, f"cameras {camera_height:g} m over the floor, by estimated depth (no floor was found)"
+    height, doubt = found
     source = f"cameras {camera_height:g} m over the floor"
-    if floor.lower is not None:
-        source += f" (uncertain: a plane {floor.lower:.1f} times as deep may be the floor, see --baseline)"
-    return camera_height / floor.height, source
+    if doubt is not None:
+        source += f" (uncertain: {doubt}, see --baseline)"
+    return camera_height / height, source
 
 
 def _find_file(name: Path | str, files: Sequence[Path]) -> int:

@@ -36,7 +36,7 @@ from pansplat.poses.pose_file import (
 from pansplat.predictor import Progress
 from pansplat.strict_json import read_json
 
-_FORMAT = "7"  # version of the estimate and of its cached file; part of the cache's key
+_FORMAT = "8"  # version of the estimate and of its cached file; part of the cache's key
 SUFFIXES = (".json", ".tum", ".kitti")
 
 

@@ -627,13 +627,14 @@ def estimate_relative_pose(
     compared = [*found[:_COMPARED], *proposed]
     odds = np.array([_log_odds(h, evidence) for h in compared])
     best, log_odds = _choose_compared(compared, odds)
+    if _find_support(found[0], found, evidence).suffices:  # depths of a camera on stairs are wrong
+        best = found[0]
     hypotheses = Hypotheses(
         np.stack([h.rotation for h in compared]), np.stack([h.distance * h.translation for h in compared]), odds
     )
     if best.is_proposed:
         return _as_proposed(best, log_odds, hypotheses, evidence)
-    margin = best.score - max((h.score for h in found if h is not best), default=0.0)
-    support = _Support(_count_all_places(best, evidence), best.score, margin)
+    support = _find_support(best, found, evidence)
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
@@ -732,6 +733,12 @@ def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
 
 def _count_all_places(hypothesis: Hypothesis, evidence: _Evidence) -> float:
     return min(_count_places(rays, hypothesis.probability) for rays in (evidence.a, evidence.b))
+
+
+def _find_support(best: Hypothesis, found: Sequence[Hypothesis], evidence: _Evidence) -> _Support:
+    """How much the matches support one of the hypotheses."""
+    margin = best.score - max((h.score for h in found if h is not best), default=0.0)
+    return _Support(_count_all_places(best, evidence), best.score, margin)
 
 
 def _find_problem(support: _Support, log_odds: float) -> str | None:

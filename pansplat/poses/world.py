@@ -6,9 +6,10 @@ horizontal plane and projected into another panorama; where the plane is the flo
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.threads import worker_threads
+from pansplat.tours.floor import find_storeys
 
 FLOOR_HEIGHT = 256  # pixels of the panoramas in which the floor is searched
 _STEPS = 0.03  # relative difference of neighbouring candidates
@@ -31,6 +33,8 @@ _LOWER_SHARE, _LOWER_CONTRAST = 0.5, 2.0  # of a lower plane that is the floor: 
 _DOUBTFUL_SHARE, _DOUBTFUL_CONTRAST = 0.25, 1.45  # of a lower plane that may be the floor
 _RING = 0.12, 0.36  # relative heights with which a plane is compared
 _LOWER = 1.2, 2.6  # height of the cameras over a lower plane, in that over the best one
+_SAME_HEIGHT = 0.1  # largest logarithm of the ratio of the heights over the floors of two storeys
+_FLOOR_PAIRS = 8  # nearest pairs of a storey that are compared
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.02, 0.98  # of the distances of the points
 _NEAR_FACTOR, _FAR_FACTOR = 0.7, 1.4
 
@@ -77,6 +81,53 @@ class Floor:
     def is_found(self) -> bool:
         """Whether the plane is a floor, and not the best of many wrong ones."""
         return self.evidence >= _MIN_EVIDENCE and self.contrast >= _MIN_CONTRAST
+
+
+def find_floors(
+    images: Sequence[Float[Array, "height width"]], poses: Float[Array, "view 4 4"], unit: float
+) -> list[Floor]:
+    """The floor of each storey that two panoramas or more show, by the nearest pairs within the storey.
+
+    A panorama on the stairs is in no storey: its height over a floor is not that of a tripod. If each panorama has a
+    level of its own, the floor is that below the lowest one, on which the others may look down.
+
+    Args:
+        images: grey panoramas in [0, 1], of `FLOOR_HEIGHT`.
+        poses: levelled, y down.
+        unit: about the metres that are one unit of the poses.
+    """
+    places = poses[:, :3, 3]
+
+    def compare(views: Sequence[int], pairs: Sequence[tuple[int, int]]) -> Floor:
+        nearest = sorted(pairs, key=lambda p: float(np.linalg.norm(places[views[p[0]]] - places[views[p[1]]])))
+        return find_floor([images[view] for view in views], poses[list(views)], nearest[:_FLOOR_PAIRS])
+
+    storeys = [views for views in find_storeys(-unit * places[:, 1]) if len(views) > 1]
+    if storeys:
+        return [compare(views, list(itertools.combinations(range(len(views)), 2))) for views in storeys]
+    lowest = int(places[:, 1].argmax())
+    floor = compare(range(len(poses)), [(lowest, view) for view in range(len(poses)) if view != lowest])
+    return [replace(floor, height=floor.height - float(places[lowest, 1] - places[:, 1].mean()))]
+
+
+def find_common_height(floors: Sequence[Floor]) -> tuple[float, str | None] | None:
+    """The height of the cameras over the floors on which most evidence agrees, and why it is uncertain.
+
+    The same tripod is used in all storeys. None if no floor is found.
+    """
+    found = [floor for floor in floors if floor.is_found() and floor.height > 0]
+    if not found:
+        return None
+    agreeing = [
+        [other for other in found if abs(math.log(other.height / floor.height)) < _SAME_HEIGHT] for floor in found
+    ]
+    best = max(agreeing, key=lambda group: sum(floor.evidence for floor in group))
+    doubt = None
+    if len(best) < len(found):
+        doubt = "the floors of the storeys differ"
+    elif len(best) == 1 and best[0].lower is not None:
+        doubt = f"a plane {best[0].lower:.1f} times as deep may be the floor"
+    return float(np.mean([floor.height for floor in best])), doubt
 
 
 def find_floor(

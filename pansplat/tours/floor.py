@@ -21,6 +21,7 @@ from pansplat.tours.route import Route
 _PLAN_SIZE = 1024  # of the longer side of a floor plan as a file, pixels
 _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
 _AZIMUTHS = 180  # of a floor outline
+_STOREY_GAP, _STOREY_REACH = 1.2, 0.4  # metres: least distance of the cameras of two storeys; from a storey's level
 _PLAN_MARGIN = 0.5  # around the panoramas and outlines of a floor plan, metres
 
 
@@ -141,6 +142,31 @@ def _measure_reach(
     return reach
 
 
+def find_storeys(heights: Float[np.ndarray, "n"]) -> list[list[int]]:
+    """The cameras of each storey, by number, the storey with most of them first.
+
+    A storey is a level with most of the remaining cameras within 0.4 m, if it is 1.2 m from those before. Cameras near
+    no level, and one alone between two levels, stand on stairs and are in none. If no two cameras are at one level, but
+    all within 1.2 m, they are in one storey.
+
+    Args:
+        heights: of the cameras over any common level, metres.
+    """
+    near = np.abs(heights[:, None] - heights) < _STOREY_REACH
+    counts = near.sum(axis=1)
+    if len(heights) and counts.max() == 1 and np.ptp(heights) < _STOREY_GAP:
+        return [list(range(len(heights)))]
+    ends = heights.min(initial=np.inf), heights.max(initial=-np.inf)
+    order = counts + 0.5 * (heights == ends[0])  # the lowest one of cameras that are alone
+    free = np.ones(len(heights), bool)
+    storeys: list[list[int]] = []
+    while free.any():
+        members = near[int(np.where(free, order, 0).argmax())]
+        storeys.append(np.flatnonzero(members).tolist())
+        free &= np.abs(heights - np.median(heights[members])) >= _STOREY_GAP
+    return [storey for storey in storeys if len(storey) > 1 or heights[storey[0]] in ends]
+
+
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
     """An image of the floor from above, and its place.
@@ -160,26 +186,42 @@ class FloorPlan:
         return (places - self.origin) * (self.pixels_per_metre, -self.pixels_per_metre)
 
 
-def draw_floor_plan(tour: TourGraph, outlines: Sequence[FloorOutline], *, size: int = 256) -> FloorPlan:
+def find_other_storeys(tour: TourGraph, position: Float[np.ndarray, "3"]) -> frozenset[int]:
+    """The panoramas of the world around a position that are in another storey, each in the one of the nearest level."""
+    nearest = int(np.linalg.norm(tour.positions - position, axis=1).argmin())
+    world = [n for n, panorama in enumerate(tour.panoramas) if panorama.world == tour.panoramas[nearest].world]
+    up = -tour.level_axes[:, 1]
+    heights = tour.positions[world] @ up
+    levels = np.array([np.median(heights[storey]) for storey in find_storeys(heights)])
+    storeys = np.abs(np.append(heights, position @ up)[:, None] - levels).argmin(axis=1)
+    return frozenset(np.array(world)[storeys[:-1] != storeys[-1]].tolist())
+
+
+def draw_floor_plan(
+    tour: TourGraph, outlines: Sequence[FloorOutline], *, faint: Sequence[FloorOutline] = (), size: int = 256
+) -> FloorPlan:
     """The floors that the outlines enclose, with walls where they end.
 
     Args:
         tour: all its panoramas fit into the image.
         outlines: of any of the panoramas.
+        faint: of other storeys, drawn below.
         size: longer side of the image, pixels.
     """
-    places = np.concatenate([tour.positions @ tour.level_axes[:, (0, 2)], *(outline.corners for outline in outlines)])
+    corners = [outline.corners for outline in (*outlines, *faint)]
+    places = np.concatenate([tour.positions @ tour.level_axes[:, (0, 2)], *corners])
     low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
     scale = size / float((high - low).max())
     width, height = np.maximum(np.ceil((high - low) * scale).astype(int), 1)
     plan = FloorPlan(np.zeros((height, width, 4), np.uint8), np.array((low[0], high[1])), scale)
-    floor = np.zeros((height, width), np.uint8)
-    for outline in outlines:
-        cv2.fillPoly(floor, [plan.to_pixels(outline.corners).round().astype(np.int32)], 255)
-    # A wall is the border of all floors together, so that an outline that ends in another view's floor draws no wall.
-    wall = cv2.morphologyEx(floor, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
-    plan.image[floor > 0] = (96, 104, 116, 255)
-    plan.image[wall > 0] = (228, 230, 235, 255)
+    for shown, alpha in ((faint, 90), (outlines, 255)):
+        floor = np.zeros((height, width), np.uint8)
+        for outline in shown:
+            cv2.fillPoly(floor, [plan.to_pixels(outline.corners).round().astype(np.int32)], 255)
+        # A wall is the border of all floors together: an outline that ends in another view's floor draws no wall.
+        wall = cv2.morphologyEx(floor, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+        plan.image[floor > 0] = (96, 104, 116, alpha)
+        plan.image[wall > 0] = (228, 230, 235, alpha)
     return plan
 
 

@@ -173,6 +173,24 @@ def test_surroundings_choose_among_poses_of_equal_matches(see_room, look_around,
         assert max(errors_degrees(found, wanted)) < 0.5
 
 
+@pytest.mark.parametrize("rise", [0.5, 1.45, 2.9])
+def test_cameras_of_stairs_have_a_pose_by_matches(scene, rise, quick) -> None:
+    translation = TURN.T @ np.array((1.6, rise, -0.9))
+    bearings = scene(20, 150, noise=NOISE, outliers=0.5, rotation=TURN.T, translation=translation)
+    found = estimate(bearings, axes=PARALLEL)
+    assert found.is_certain and max(errors_degrees(found, bearings)) < 0.3, found.problem
+
+
+@pytest.mark.parametrize("rise", [0.5, 0.9, -0.5])
+def test_depths_in_other_units_do_not_outweigh_matches_that_suffice(scene, see_room, look_around, rise, quick) -> None:
+    """Each camera's depth is in its own height over the floor, so that no surface agrees if these differ."""
+    centre = CENTRES[1] - (0, rise, 0)
+    bearings = see_room(10, 120, TURN, centre)
+    mixed = join(bearings, scene(3, 120, outliers=1.0))
+    found = estimate(mixed, axes=PARALLEL, surroundings=look(look_around, TURN, centre))
+    assert found.is_certain and max(errors_degrees(found, bearings)) < 0.3, found.problem
+
+
 def find_ways(bearings) -> Ways:
     """The right ways of a pose."""
     there, back = -bearings.rotation.T @ bearings.translation, bearings.translation

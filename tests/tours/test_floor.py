@@ -101,3 +101,42 @@ def test_a_panorama_that_is_probably_placed_is_a_ring(room_scene):
         x, y = plan.to_pixels(np.array((0.5, 0.0))).round().astype(int)
         colors.append((image[y, x].tolist(), image[y, x + 6].tolist()))
     assert colors[0][0] == [90, 204, 255] != colors[1][0] and colors[1][1] == [90, 204, 255]
+
+
+def test_storeys_are_levels_of_cameras_and_stairs_are_in_none():
+    assert tours.find_storeys(np.empty(0)) == []
+    assert tours.find_storeys(np.array((1.5, 1.2, 1.52, 1.15))) == [[0, 1, 2, 3]], "two steps of a room"
+    assert tours.find_storeys(np.array((1.5, 1.5, 2.5))) == [[0, 1]], "one on the stairs"
+    assert tours.find_storeys(np.array((1.5, 2.5))) == [[0, 1]], "nothing states which one is on stairs"
+    assert tours.find_storeys(np.array((2.9, 0.0, 0.3, 1.0, 3.0, 2.0, 0.1))) == [[1, 2, 6], [0, 4]]
+    assert tours.find_storeys(np.array((0.0, 1.4, 0.05, 2.9))) == [[0, 2], [3]], "one alone between two levels"
+    assert tours.find_storeys(np.array((1.0, 2.0, 0.0))) == [[2], [1]]
+    assert tours.find_storeys(np.array((0.0, 0.5, 1.0, 1.1, 6.0, 6.0))) == [[2, 3], [4, 5]]
+
+
+def _make_two_storeys(room_scene: Scene) -> TourGraph:
+    """Two panoramas of a lower storey and two of an upper one, one on the stairs, and one of another world."""
+    panoramas = []
+    for number, (rise, world) in enumerate(((0, 0), (0.1, 0), (1.6, 0), (2.9, 0), (2.8, 0), (1.4, 1))):
+        pose = room_scene.cam2world[0].clone()
+        pose[2, 3] += rise  # z is up
+        pose[0, 3] += 0.2 * number
+        panoramas.append(Panorama(str(number), Path(str(number)), pose, world=world))
+    return TourGraph("", Path(), tuple(panoramas), 0.45, 10.0)
+
+
+def test_other_storeys_are_those_of_the_same_world_at_another_level(room_scene):
+    tour = _make_two_storeys(room_scene)
+    assert tours.find_other_storeys(tour, tour.positions[0] + (0, 0, 0.3)) == {2, 3, 4}
+    assert tours.find_other_storeys(tour, tour.positions[4]) == {0, 1}, "the stairs are nearer to the upper storey"
+    assert tours.find_other_storeys(tour, tour.positions[2]) == {0, 1}
+    assert tours.find_other_storeys(tour, tour.positions[5]) == frozenset(), "levels of two worlds cannot be compared"
+
+
+def test_the_floor_of_another_storey_is_faint_below_the_others(room_scene):
+    tour = _make_two_storeys(room_scene)
+    outline = find_floor_outline(room_scene, 0, tour.level_axes)
+    part = dataclasses.replace(outline, corners=outline.center + 0.5 * (outline.corners - outline.center))
+    plan = draw_floor_plan(tour, [part], faint=[outline], size=200)
+    column, row = plan.to_pixels(np.array(((0.5, 0.0), (2.8, 3.8)))).round().astype(int).T
+    assert plan.image[row, column, 3].tolist() == [255, 90]

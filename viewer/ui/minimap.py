@@ -1,6 +1,7 @@
 """The floor plan of a tour as a panel: floors, walls, panoramas, and the camera; a click flies to a panorama.
 
-Panoramas without a known place are squares, those that are only probably placed are rings.
+Panoramas without a known place are squares, those that are only probably placed are rings. Other storeys than that of
+the camera are faint.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import moderngl
 import numpy as np
 from imgui_bundle import imgui
 
-from pansplat.tours import FloorPlan, TourGraph, draw_floor_plan
+from pansplat.tours import FloorPlan, TourGraph, draw_floor_plan, find_other_storeys
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.tour import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR
@@ -20,13 +21,15 @@ SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1
 _CLICK_PIXELS = 12.0
 _VIEW_LENGTH = 1.0  # metres, of the camera's field of view
 
-# Colours of panoramas, of those whose scene is loaded, of edges, of the camera, and of links to other parts.
+# Colours of panoramas, of those whose scene is loaded, of edges, of the camera, of links to other parts, and of
+# panoramas of other storeys.
 _COLORS = (
     (0.75, 0.78, 0.82, 1.0),
     (0.35, 0.8, 1.0, 1.0),
     (0.6, 0.65, 0.7, 0.35),
     (1.0, 0.8, 0.2, 1.0),
     (*FADE_COLOR, 0.35),
+    (0.75, 0.78, 0.82, 0.3),
 )
 
 
@@ -72,19 +75,21 @@ class Minimap:
     def draw(self, scenes: TourScenes, camera: Camera) -> int | None:
         """Draw the plan into the current imgui window; returns the panorama that was clicked."""
         scale = imgui.get_style().font_scale_dpi
-        plan = self._update(scenes, round(SIZE * scale))
+        others = find_other_storeys(scenes.tour, np.asarray(camera.position))
+        plan = self._update(scenes, others, round(SIZE * scale))
         assert self._texture is not None
         corner = imgui.get_cursor_screen_pos()
         imgui.image(imgui.ImTextureRef(self._texture.glo), self._texture.size)
         hovered = imgui.is_item_hovered()
-        self._draw_marks(scenes, camera, plan, (corner.x, corner.y), scale)
+        self._draw_marks(scenes, others, camera, plan, (corner.x, corner.y), scale)
         if not hovered:
             return None
         mouse = imgui.get_mouse_pos()
         distances = [math.hypot(x - mouse.x, y - mouse.y) for x, y in self.nodes]
-        nearest = int(np.argmin(distances))
-        if distances[nearest] > _CLICK_PIXELS * scale:
+        near = [node for node, distance in enumerate(distances) if distance <= _CLICK_PIXELS * scale]
+        if not near:
             return None
+        nearest = min(near, key=lambda node: (node in others, distances[node]))
         reason = scenes.tour.panoramas[nearest].placement.reason
         imgui.set_tooltip("\n".join(filter(None, (describe_panorama(scenes.tour, nearest), reason))))
         return nearest if imgui.is_mouse_clicked(0) else None
@@ -95,19 +100,29 @@ class Minimap:
             self._texture.release()
         self._texture, self._key = None, ()
 
-    def _update(self, scenes: TourScenes, size: int) -> FloorPlan:
-        """The plan; its texture is written again after a scene was loaded."""
-        key = (scenes.tour, size, *map(id, scenes.outlines.values()))
+    def _update(self, scenes: TourScenes, others: frozenset[int], size: int) -> FloorPlan:
+        """The plan; its texture is written again after a scene was loaded, and in another storey."""
+        key = (scenes.tour, others, size, *map(id, scenes.outlines.values()))
         if self._plan is None or key != self._key:
             self.release()
-            self._plan = draw_floor_plan(scenes.tour, list(scenes.outlines.values()), size=size)
+            here, faint = (
+                [outline for node, outline in scenes.outlines.items() if (node in others) == is_other]
+                for is_other in (False, True)
+            )
+            self._plan = draw_floor_plan(scenes.tour, here, faint=faint, size=size)
             height, width = self._plan.image.shape[:2]
             self._texture = self._ctx.texture((width, height), 4, self._plan.image.tobytes())
             self._key = key
         return self._plan
 
     def _draw_marks(
-        self, scenes: TourScenes, camera: Camera, plan: FloorPlan, corner: tuple[float, float], scale: float
+        self,
+        scenes: TourScenes,
+        others: frozenset[int],
+        camera: Camera,
+        plan: FloorPlan,
+        corner: tuple[float, float],
+        scale: float,
     ) -> None:
         tour, canvas = scenes.tour, imgui.get_window_draw_list()
         axes = tour.level_axes[:, (0, 2)]
@@ -120,12 +135,13 @@ class Minimap:
                 canvas.add_line(self.nodes[a], self.nodes[b], colors[4], scale)
         loaded, half = {node for views in scenes.loaded for node in views}, 3.5 * scale
         for node, (x, y) in enumerate(self.nodes):
+            color = colors[5 if node in others else node in loaded]
             if (node, node) in tour.overlaps:
-                canvas.add_rect_filled((x - half, y - half), (x + half, y + half), colors[node in loaded])
+                canvas.add_rect_filled((x - half, y - half), (x + half, y + half), color)
             elif is_probable(tour, node):
-                canvas.add_circle((x, y), 4.0 * scale, colors[node in loaded], 0, 1.8 * scale)
+                canvas.add_circle((x, y), 4.0 * scale, color, 0, 1.8 * scale)
             else:
-                canvas.add_circle_filled((x, y), 4.0 * scale, colors[node in loaded])
+                canvas.add_circle_filled((x, y), 4.0 * scale, color)
         place, rotation = np.asarray(camera.position) @ axes, camera.rotation
         heading = rotation[:, 2] @ axes
         heading = heading / max(float(np.linalg.norm(heading)), 1e-6)
