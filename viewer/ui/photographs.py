@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import moderngl
 import numpy as np
@@ -95,6 +95,13 @@ class Photographs:
         texture.repeat_x, texture.repeat_y = True, False
         self._textures[index] = texture
         return texture
+
+    def wait(self, index: int) -> None:
+        """Wait until a photograph has been read, or cannot be."""
+        if index not in self._textures and index not in self._failed:
+            if index not in self._reading:
+                self._reading[index] = self._reader.submit(_read_pixels, self._panoramas[index])
+            wait([self._reading[index]])
 
     def release(self) -> None:
         """Stop the reader and free the textures."""

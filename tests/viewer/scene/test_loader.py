@@ -62,12 +62,13 @@ def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
 def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_file):
     (entry,) = find_entries(house_file, LoadOptions())
     first = load_entry(entry, LoadOptions(), ignore)
-    tour, scenes = first.entry.tour, TourScenes(first.entry.tour, merged=first.entry.merged)
+    tour, scenes = first.entry.tour, TourScenes.start(first)
     assert tour.name == "home" and tour.overlaps == house.overlaps and first.is_final
     assert np.allclose(tour.positions, house.positions) and first.entry.views == (0, 1)
     assert first.entry.panoramas == () and first.entry.files == (house_file,)
-    other = load_entry(scenes.make_entry((2, 3)), LoadOptions(), ignore)
-    assert other.entry.views == (2, 3) and other.entry.panoramas == ()
+    assert set(first.outlines) <= {0, 1, 2, 3} and scenes.edge == (0, 1) and not scenes.list_next(None, 0.0)[1:]
+    other = scenes.get((2, 3))
+    assert other.entry.views == (2, 3) and scenes.loaded == [(0, 1), (1, 2), (2, 3)]
     assert other.scene.gaussians.views.unique().tolist() == [0, 1]
     assert np.allclose(other.scene.cam2world, house.cam2world[2:])
 
