@@ -105,6 +105,8 @@ class Viewer:
         self.gui = Gui(dpi_scale, theme=values.theme, layout=values.layout)
         self._choice, self._memory = renderer, memory
         self._fade = CrossFade()
+        self._scene_slot: int = 0  # that of the scene that was shown last, and its panoramas in a tour
+        self._scene_views: tuple[int, ...] = ()
         self._slots = [SceneSlot(StereoRenderer(create_renderer(ctx, renderer), ctx))]
         self._preparer = ScenePreparer(self.renderer.prepare)
         self._incoming: LoadedScene | None = None  # shown when it is prepared
@@ -124,7 +126,6 @@ class Viewer:
         self._films: BackgroundWorker[list[Path]] = BackgroundWorker("film-writer")
         self._tour: TourScenes | None = None
         self._layers = [PhotographLayer(self.presenter), PhotographLayer(self.presenter)]  # of the fade's photographs
-        self._scene_slot, self._scene_views = 0, ()  # of the scene that was shown last
         self._placing: Placing | None = None
         self._last_camera = self.state.camera
 
@@ -506,6 +507,7 @@ class Viewer:
         data.photograph_distance = comparer.measure_distance(self.state)
         if comparer.error is not None:
             data.error, comparer.error = comparer.error, None
+        data.panoramas = self._name_panoramas()
         film = self._films.progress
         data.tour, data.film = self._tour, None if film is None else film[1]
         data.hotspots = []
@@ -517,6 +519,11 @@ class Viewer:
             data.background = None
             if self._loaded is not None and not self._is_other_requested():
                 data.background, data.loading, data.refinement = self._describe_loading(), None, None
+
+    def _name_panoramas(self) -> list[str]:
+        """The names of the input cameras of the scene, or their numbers."""
+        names = self._slot.scene.names if self._slot.scene is not None else ()
+        return [names[k] if k < len(names) else str(k + 1) for k in range(len(self.state.context))]
 
     def _describe_loading(self) -> tuple[str, float] | None:
         """The work of the loader on a tour, and the fraction done."""

@@ -47,7 +47,7 @@ class Photographs:
     @property
     def is_reading(self) -> bool:
         """Whether a photograph is being read."""
-        return bool(self._reading)
+        return any(not reading.done() for reading in self._reading.values())
 
     def open(self, panoramas: Sequence[Panorama]) -> None:
         """Replace the photographs; the same objects are kept, those of a folder that is read again are not."""
