@@ -345,9 +345,10 @@ class Viewer:
             self._enter_tour(loaded, remaining)
         tour, part = self._tour, 0 if self._tour is None else self._tour.part
         self._scene_slot, self._scene_views = 0, loaded.entry.views
+        is_here = tour is None or self._find_nearest(tour) in self._scene_views
         if isinstance(photograph, int):
-            self._fade.show(1, photograph, now, part)
-        if tour is None or not isinstance(photograph, int) or self._find_nearest(tour) in self._scene_views:
+            self._fade.show(1 if is_here else 0, photograph, now, part)
+        if is_here or photograph is None:
             self._fade.show(0, loaded.scene, now, part)
         self._last_camera = self.state.camera
         self.state.show_message(f"{loaded.entry.name}   (H shows the keys)", now)
@@ -392,6 +393,7 @@ class Viewer:
             self._slots.append(SceneSlot(StereoRenderer(create_renderer(self.ctx, self._choice), self.ctx)))
         self._tour = TourScenes.start(loaded, self._memory)
         enter_tour(state, tour, loaded.scene, plan_route(tour, tour.plan_walk(loaded.entry.start)), at=self._at)
+        self._tour.move(np.asarray(state.camera.position))
         if remaining:
             state.route, state.playing = self._tour.plan_route(state.camera.cam2world, remaining), True
 

@@ -97,6 +97,31 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
         assert loaded.entry.views == (0,) and loaded.entry.tour is each and loaded.scene is scene
 
 
+def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_follows(monkeypatch, house, load_house):
+    # The walk of the graph that is not connected starts at 0; that of the connected one at 3.
+    connected = replace(house, overlaps={(0, 1): 0.13, (1, 2): 0.4, (2, 3): 0.4, (0, 2): 0.4})
+    monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: connected)
+    asked = []
+
+    def predict(pair, refine_seconds, on_predicted, **options):
+        views = tuple(int(view.name[-1]) for view in pair.context)
+        asked.append((views, refine_seconds, on_predicted is not None))
+        return load_house(TourScenes(house).make_entry(views)).scene
+
+    monkeypatch.setattr("pansplat.pipeline.predict", predict)
+    first = load_entry(SceneEntry("house", tour=house), LoadOptions(), ignore, lambda loaded: None)
+    assert first.entry.start == 0 and 0 in first.entry.views and first.entry.tour is connected
+    scenes = TourScenes.start(first)
+    request = scenes.choose_request(scenes.list_next(None, 0.0), SceneEntry("house", tour=house))
+    assert request.views == (0, 1, 2, 3)
+    part = load_entry(request, LoadOptions(), ignore, lambda loaded: None)
+    assert asked[0] == ((0, 1, 2), 0.0, False), "the first scene is not refined"
+    assert asked[1] == ((0, 1, 2, 3), pytest.approx(10.0 * 4 / 3), True)
+    assert part.entry.views == request.views and set(part.outlines) <= set(request.views)
+    film = load_entry(SceneEntry("house", tour=house), LoadOptions(), ignore)
+    assert film.entry.views == (0, 1, 2, 3), "a film needs all, so that nothing is predicted twice"
+
+
 def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(monkeypatch, parted_house, load_house):
     networks = {name: SimpleNamespace(name=name, min_views=n) for name, n in (("pairs", 2), ("default", 1))}
     monkeypatch.setattr("pansplat.pipeline.load_model", lambda name="default", **options: networks[name])
