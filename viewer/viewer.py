@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
-from pansplat.tours import plan_route
+from pansplat.geometry.path import find_direction
+from pansplat.tours import list_starts, plan_route
 from pansplat_viewer.capture import (
     find_free_name,
     open_frames,
@@ -44,6 +45,7 @@ from pansplat_viewer.scene.state import (
 from pansplat_viewer.scene.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_clicked, find_hotspots
 from pansplat_viewer.ui.compare import Comparer
 from pansplat_viewer.ui.panels import PanelData, Panels
+from pansplat_viewer.ui.photographs import find_open_view
 from pansplat_viewer.ui.presenter import PhotographLayer, Presenter
 from pansplat_viewer.window.file_watch import FileWatch
 from pansplat_viewer.window.gui import Gui
@@ -545,16 +547,29 @@ class Viewer:
         if source is not None:
             panoramas = entry.panoramas if entry.pair is None else entry.pair.context
             poses = torch.stack([panorama.cam2world for panorama in panoramas])
-            scene = Scene(empty_gaussians(), poses, source.near, source.far)
+            scene = Scene(empty_gaussians(), poses, source.near, source.far, starts=list_starts(panoramas))
             if entry.tour is None:
                 enter_scene(self.state, scene, at=self._at)
             else:
                 enter_tour(self.state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
                 self._tour = TourScenes(entry.tour)
-            self._last_camera = self.state.camera
             nearest = self._comparer.choose_photograph(self.state)
             if nearest is not None:
                 self._comparer.photographs.wait(nearest)  # else the first frames are black
+                self._face_open_view(entry, nearest)
+            self._last_camera = self.state.camera
+
+    def _face_open_view(self, entry: SceneEntry, index: int) -> None:
+        """Turn the start to a wide view, if the panorama has neither a neighbour to look at nor a start view."""
+        panorama = self._comparer.photographs.panoramas[index]
+        is_alone = len(entry.panoramas) == 1 if entry.tour is None else not entry.tour.neighbours(index)
+        if is_alone and panorama.start is None and self.state.camera == self.state.home:
+            try:
+                forward = find_direction(panorama.cam2world, find_open_view(panorama), 0.0).numpy()
+            except InputError:  # it is shown when the photograph is
+                return
+            camera = self.state.camera
+            self.state.camera = self.state.home = cameras.focus_on_point(camera, camera.position + forward)
 
     def _draw_photograph(self, target: moderngl.Framebuffer) -> None:
         """Draw the nearest photograph, at an infinite distance around its camera, or the background."""

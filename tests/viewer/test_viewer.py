@@ -620,6 +620,20 @@ def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, sm
     assert np.abs(user.read_image() - turned).mean() < 1, "it was the photograph"
 
 
+def test_a_panorama_alone_is_entered_in_a_wide_view(user, tmp_path, monkeypatch):
+    image = np.full((64, 128, 3), 0.6, np.float32)
+    image[20:44, 90:106:2] = 0.1  # 0.37 to 0.41 of a turn right of the left border, at 1.67 radians
+    write_image(tmp_path / "alone.png", image)
+    panorama = Panorama("alone", tmp_path / "alone.png", torch.eye(4, dtype=torch.float64))
+    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: pytest.fail("not shown"))
+    for start, yaw in ((None, 2 * np.pi * (98 / 128 - 0.5)), ((0.5, 0.0), 0.5)):
+        user.viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
+        pair = Pair("alone", tmp_path, (replace(panorama, start=start),), (), 0.45, 10.0)
+        user.viewer._preview(SceneEntry("alone", pair=pair))
+        assert user.state.camera == user.state.home
+        assert user.state.camera.yaw_radians == pytest.approx(yaw, abs=0.1)
+
+
 def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_path, axis_photos):
     photographs = Photographs(ctx)
     (first, *_) = pair.context

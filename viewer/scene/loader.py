@@ -253,10 +253,10 @@ def _load_tour_scene(
         connected, max_views = connect(tour, progress), pipeline.find_max_views(predictor)
         # A window shows photographs before: they begin where the graph that is not connected yet does.
         first, views = _choose_first_scene(connected, connected if show is None else tour)
-        tour, group = connected, connected.choose_groups(max_views).get(first, views)
+        tour, part = connected, connected.choose_predictions(max_views).get(first, views)
         if show is None:
-            views = group
-        elif views != group:
+            views = part
+        elif views != part:
             seconds = 0.0
         entry = replace(entry, tour=tour, views=views, start=first, max_views=max_views)
     pair = entry.pair or tour.make_pair(views)

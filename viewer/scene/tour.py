@@ -41,8 +41,8 @@ _MIN_HOTSPOT_PIXELS = 14.0
 class TourScenes:
     """The scenes of one tour: chooses, requests and keeps them. It loads nothing itself.
 
-    A scene is that of an edge. Its Gaussians are selected from predictions of whole parts (`TourGraph.choose_groups`);
-    of a network it is a prediction of its own.
+    A scene is that of an edge. Its Gaussians are selected from predictions of whole parts
+    (`TourGraph.choose_predictions`); of a network it is a prediction of its own.
 
     Attributes:
         tour: the graph.
@@ -64,7 +64,7 @@ class TourScenes:
             tour: the graph.
             memory: limit of the loaded scenes, GiB; two predictions are kept in any case.
             merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
-            max_views: of the predictor (`TourGraph.choose_groups`).
+            max_views: of the predictor (`TourGraph.choose_predictions`).
         """
         self.tour, self._merged, self._max_views = tour, merged, max_views
         self.edge: Edge = next(iter(tour.overlaps))
@@ -73,9 +73,11 @@ class TourScenes:
         self._views = tour.choose_scene_views()
         everything = tuple(range(len(tour)))
         # The prediction that has the Gaussians of a panorama; none if each scene is a prediction.
-        self._groups = tour.choose_groups(max_views) if merged is None else dict.fromkeys(everything, everything)
+        self._providers = (
+            tour.choose_predictions(max_views) if merged is None else dict.fromkeys(everything, everything)
+        )
         self._sources = {
-            views: tuple(dict.fromkeys(self._groups.get(node, views) for node in views))
+            views: tuple(dict.fromkeys(self._providers.get(node, views) for node in views))
             for views in self._views.values()
         }
         self._predictions = {source for sources in self._sources.values() for source in sources}
@@ -192,7 +194,7 @@ class TourScenes:
         """The scene of these panoramas, from the predictions that have their Gaussians."""
         parts: list[Gaussians] = []
         for source in self._sources[views]:
-            nodes = [node for node in views if self._groups[node] == source]
+            nodes = [node for node in views if self._providers[node] == source]
             scene = select_views(self._loaded[source].scene, tuple(source.index(node) for node in nodes))
             labels = torch.tensor([views.index(node) for node in nodes])
             parts.append(replace(scene.gaussians, views=labels[scene.gaussians.views.long()]))

@@ -88,11 +88,11 @@ def test_scenes_of_edges_are_selected_from_one_prediction_of_their_part(house, l
 
 
 def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_house, monkeypatch):
-    monkeypatch.setattr("pansplat.tours.graph._MAX_GROUP", 2)
+    monkeypatch.setattr("pansplat.tours.graph._MAX_PREDICTED", 2)
     scenes = TourScenes(house, max_views=64)
-    groups = scenes.list_next(None, 0.0)
-    assert set(groups) == {(0, 1), (1, 2, 3)}, "with the best neighbour of panorama 2"
-    for views in groups:
+    predictions = scenes.list_next(None, 0.0)
+    assert set(predictions) == {(0, 1), (1, 2, 3)}, "with the best neighbour of panorama 2"
+    for views in predictions:
         scenes.add(load_house(scenes.make_entry(views)))
     scene = scenes.get((1, 2)).scene
     for view, views in enumerate(((0, 1), (1, 2, 3))):
