@@ -347,7 +347,7 @@ class Viewer:
             self._enter_tour(loaded, remaining)
         tour, part = self._tour, 0 if self._tour is None else self._tour.part
         self._scene_slot, self._scene_views = 0, loaded.entry.views
-        is_here = tour is None or self._find_nearest(tour) in self._scene_views
+        is_here = tour is None or tour.is_inside(np.asarray(self.state.camera.position), self._scene_views)
         if isinstance(photograph, int):
             self._fade.show(1 if is_here else 0, photograph, now, part)
         if is_here or photograph is None:
@@ -404,9 +404,6 @@ class Viewer:
         route, state = self.state.route, self.state
         return route.walk[route.leg(state.flight) + 1 :] if route is not None and state.playing else ()
 
-    def _find_nearest(self, tour: TourScenes) -> int:
-        return tour.find_nearest(np.asarray(self.state.camera.position))
-
     def _update_tour(self, now: float) -> None:
         """Show the scene of the camera's place, and load those that are next."""
         tour, state = self._tour, self.state
@@ -425,17 +422,17 @@ class Viewer:
     def _show_place(self, tour: TourScenes, now: float) -> None:
         """Start to fade to the scene of the camera's place; without it, to the nearest photograph.
 
-        Until then a scene of the nearest panorama stays.
+        Until then another scene stays within its panoramas.
         """
         self._fade.compute_weight(now)
-        front, node, loaded = self._fade.front, self._find_nearest(tour), tour.get(tour.views)
+        front, loaded, position = self._fade.front, tour.get(tour.views), np.asarray(self.state.camera.position)
         if loaded is not None and self._show_tour_scene(loaded, now, tour.part):
             return
-        is_here = not self._shows_photograph and node in self._scene_views and self._fade.parts[front] == tour.part
-        if self._loaded is None or not is_here:
+        shows_scene = not self._shows_photograph and self._fade.parts[front] == tour.part
+        if self._loaded is None or not (shows_scene and tour.is_inside(position, self._scene_views)):
             for end in tour.edge:  # that of the other end is read before it is needed
                 self._comparer.get_photograph(self.state, end)
-            self._show_photograph(node, now, tour.part)
+            self._show_photograph(tour.find_nearest(position), now, tour.part)
 
     def _show_tour_scene(self, loaded: LoadedScene, now: float, part: int) -> bool:
         """Start to fade to a scene; returns False if it is not prepared."""

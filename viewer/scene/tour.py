@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours import (
+    EDGE_HYSTERESIS,
     FADE_SECONDS,
     MAX_SCENE_VIEWS,
     Edge,
@@ -213,6 +214,12 @@ class TourScenes:
     def find_nearest(self, position: Float[np.ndarray, "3"]) -> int:
         """The end of the edge that is nearer to a position: another panorama may be behind a wall."""
         return min(self.edge, key=lambda node: float(np.linalg.norm(self.tour.positions[node] - position)))
+
+    def is_inside(self, position: Float[np.ndarray, "3"], views: Views) -> bool:
+        """Whether the scene of some panoramas is good at a position: they are of its edge, or one of them is there."""
+        node = self.find_nearest(position)
+        is_there = bool(np.linalg.norm(self.tour.positions[node] - position) <= EDGE_HYSTERESIS)
+        return set(self.edge) <= set(views) or (node in views and is_there)
 
     def list_next(self, route: Route | None, fraction: float) -> list[Views]:
         """All predictions, the most urgent first: those that the camera needs, then those that are next.

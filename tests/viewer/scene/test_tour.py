@@ -101,6 +101,12 @@ def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_h
         assert scene.gaussians.harmonics[scene.gaussians.views == view].equal(expected), "panorama 1 of the first"
 
 
+def test_a_scene_is_good_along_its_edges_and_near_its_panoramas(scenes):
+    for z, inside in ((0.4, True), (1.0, True), (1.15, False), (1.6, False)):
+        scenes.edge = (0, 1) if z < 0.8 else (1, 2)
+        assert scenes.is_inside(np.array((0.0, 0.0, z)), (0, 1)) == inside, z
+
+
 def test_predictions_go_on_to_the_last_scene_and_what_was_dropped_is_read_when_it_is_needed(house, load_house):
     panoramas = [replace(house.panoramas[0], cam2world=torch.eye(4, dtype=torch.float64)) for _ in range(8)]
     for k, panorama in enumerate(panoramas):
