@@ -288,9 +288,7 @@ def _write_film(
             bars.update(draw, description="film" if task in ("film", "done") else f"film: {task}", completed=done)
 
         tour, settings = loaded.entry.tour, fit_settings(options.settings, loaded.scene)
-        scenes = None if tour is None else TourScenes(tour, memory=options.memory, merged=loaded.entry.merged)
-        if scenes is not None:
-            scenes.add(loaded)
+        scenes = None if tour is None else TourScenes.start(loaded, options.memory)
         format_, create = options.image_format, lambda: create_renderer(ctx, choice, color_bits=32)
         try:
             with open_frames(create, loaded.scene, scenes, load, pixels, settings, format_) as frames:

@@ -220,19 +220,21 @@ class TourFrames:
         scenes, fade = self._scenes, self._fade
         loaded = scenes.get(scenes.views)
         if loaded is None:
-            loaded = self._load(scenes.make_entry(scenes.views))
-            scenes.add(loaded)
+            for views in scenes.missing:
+                scenes.add(self._load(scenes.make_entry(views)))
+            loaded = scenes.get(scenes.views)
+        assert loaded is not None
         fade.compute_weight(now)
         slot = fade.choose_slot(loaded.scene)
         if slot is not None:
-            if fade.scenes[slot] is not loaded.scene:
+            if fade.contents[slot] is not loaded.scene:
                 self._renderers[slot].upload(loaded.scene)
             fade.show(slot, loaded.scene, now, scenes.part)
         fade.move(pose, scenes.part)
         weight, color, depth = fade.compute_weight(now), 0.0, None
         for slot, part in ((1 - fade.front, 1 - weight), (fade.front, weight)):
-            scene, renderer = fade.scenes[slot], self._renderers[slot]
-            if scene is not None and (part > 0 or (with_depth and slot == fade.front)):
+            scene, renderer = fade.contents[slot], self._renderers[slot]
+            if isinstance(scene, Scene) and (part > 0 or (with_depth and slot == fade.front)):
                 settings = replace(fit_settings(self._settings, scene), vertical_fov_degrees=vertical_fov_degrees)
                 view = fade.poses[slot]
                 assert view is not None

@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
-from pansplat.tours import plan_route
+from pansplat.geometry.path import find_direction
+from pansplat.tours import list_starts, plan_route
 from pansplat_viewer.capture import (
     find_free_name,
     open_frames,
@@ -44,7 +45,8 @@ from pansplat_viewer.scene.state import (
 from pansplat_viewer.scene.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_clicked, find_hotspots
 from pansplat_viewer.ui.compare import Comparer
 from pansplat_viewer.ui.panels import PanelData, Panels
-from pansplat_viewer.ui.presenter import Presenter
+from pansplat_viewer.ui.photographs import find_open_view
+from pansplat_viewer.ui.presenter import PhotographLayer, Presenter
 from pansplat_viewer.window.file_watch import FileWatch
 from pansplat_viewer.window.gui import Gui
 from pansplat_viewer.window.input import Commands, Input, apply_input, read_input
@@ -105,6 +107,8 @@ class Viewer:
         self.gui = Gui(dpi_scale, theme=values.theme, layout=values.layout)
         self._choice, self._memory = renderer, memory
         self._fade = CrossFade()
+        self._scene_slot: int = 0  # that of the scene that was shown last, and its panoramas in a tour
+        self._scene_views: tuple[int, ...] = ()
         self._slots = [SceneSlot(StereoRenderer(create_renderer(ctx, renderer), ctx))]
         self._preparer = ScenePreparer(self.renderer.prepare)
         self._incoming: LoadedScene | None = None  # shown when it is prepared
@@ -123,13 +127,13 @@ class Viewer:
         self._refined: Scene | None = None
         self._films: BackgroundWorker[list[Path]] = BackgroundWorker("film-writer")
         self._tour: TourScenes | None = None
-        self._waiting = False
+        self._layers = [PhotographLayer(self.presenter), PhotographLayer(self.presenter)]  # of the fade's photographs
         self._placing: Placing | None = None
         self._last_camera = self.state.camera
 
     @property
     def renderer(self) -> StereoRenderer:
-        """The renderer of the scene that is shown."""
+        """The renderer of the scene that is shown, or that was shown before a photograph."""
         return self._slot.renderer
 
     def _create_resolution(self) -> AdaptiveResolution:
@@ -139,7 +143,12 @@ class Viewer:
 
     @property
     def _slot(self) -> SceneSlot:
-        return self._slots[self._fade.front]
+        return self._slots[self._scene_slot]
+
+    @property
+    def _shows_photograph(self) -> bool:
+        """Whether a photograph is shown, because there is no scene of the camera's place yet."""
+        return isinstance(self._fade.contents[self._fade.front], int)
 
     @property
     def busy(self) -> bool:
@@ -165,12 +174,13 @@ class Viewer:
 
     @property
     def _shown_slots(self) -> list[SceneSlot]:
-        return [self._slot] if self._comparer.pinned is None else [self._slot, self._comparer.pinned.slot]
+        slots = [] if self._shows_photograph else [self._slot]
+        return slots if self._comparer.pinned is None else [*slots, self._comparer.pinned.slot]
 
     @property
     def _is_animated(self) -> bool:
         fading = self._fade.compute_weight(self._clock()) < 1
-        return fading or self.state.path_playing or (self.state.playing and not self._waiting)
+        return fading or self.state.path_playing or self.state.playing
 
     def open(self, path: Path, name: str | None = None) -> None:
         """Look for the scenes at a path and show one; for an invalid path, show an error and keep the scene.
@@ -224,14 +234,13 @@ class Viewer:
         self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
         advance_path(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
         self._update_tour(now)
-        if self._loaded is None:
-            self._draw_preview(target, now)
-        else:
-            if key_commands.focus:
-                self._focus_center()
-            if key_commands.pick is not None:
-                self._pick(key_commands.pick, size, now)
-            self._try_to_draw(size, target, now)
+        if self._loaded is None and self._tour is None:
+            self._show_photograph(self._comparer.choose_photograph(self.state), now)
+        if key_commands.focus:
+            self._focus_center()
+        if key_commands.pick is not None:
+            self._pick(key_commands.pick, size, now)
+        self._try_to_draw(size, target, now)
         self.gui.end(self.ctx, target)
         self._save_layout()
         for commands in (panel_commands, key_commands):
@@ -248,6 +257,8 @@ class Viewer:
             self._placing.close()
         self.loader.close()
         self._preparer.close()
+        for layer in self._layers:
+            layer.release()
         self.presenter.release()
         self._comparer.release()
         self.panels.release()
@@ -268,7 +279,7 @@ class Viewer:
             self.show(result, names.index(wanted) if wanted in names else 0, path)
         elif isinstance(result, LoadedScene):
             loaded = self._loaded
-            if self._tour is not None and result.entry.tour is self._tour.tour:
+            if loaded is not None and self._tour is not None and result.entry.tour is self._tour.tour:
                 self._tour.add(result)
             elif loaded is not None and loaded.entry is result.entry and result.is_final and not loaded.is_final:
                 self._refined = result.scene
@@ -322,6 +333,8 @@ class Viewer:
             self._refined = None
 
     def _enter(self, loaded: LoadedScene, now: float) -> None:
+        photograph = self._fade.contents[self._fade.front] if self._loaded is None else None
+        remaining = self._list_remaining() if self._loaded is None else ()
         self._loaded, self._refined, self._tour = loaded, None, None
         self._shown = self.entries, self.panel_data.current, self.path
         self._resolution = self._create_resolution()
@@ -331,9 +344,14 @@ class Viewer:
         if loaded.entry.tour is None:
             enter_scene(self.state, loaded.scene, at=self._at)
         else:
-            self._enter_tour(loaded)
-        part = 0 if loaded.entry.tour is None else loaded.entry.tour.parts[loaded.entry.views[0]]
-        self._fade.show(0, loaded.scene, now, part)
+            self._enter_tour(loaded, remaining)
+        tour, part = self._tour, 0 if self._tour is None else self._tour.part
+        self._scene_slot, self._scene_views = 0, loaded.entry.views
+        is_here = tour is None or tour.is_inside(np.asarray(self.state.camera.position), self._scene_views)
+        if isinstance(photograph, int):
+            self._fade.show(1 if is_here else 0, photograph, now, part)
+        if is_here or photograph is None:
+            self._fade.show(0, loaded.scene, now, part)
         self._last_camera = self.state.camera
         self.state.show_message(f"{loaded.entry.name}   (H shows the keys)", now)
 
@@ -369,15 +387,22 @@ class Viewer:
 
     # --- tours ---
 
-    def _enter_tour(self, loaded: LoadedScene) -> None:
-        tour = loaded.entry.tour
+    def _enter_tour(self, loaded: LoadedScene, remaining: tuple[int, ...]) -> None:
+        """Enter a tour; a flight over its photographs goes on through the remaining panoramas."""
+        tour, state = loaded.entry.tour, self.state
         assert tour is not None
         if len(self._slots) == 1:
             self._slots.append(SceneSlot(StereoRenderer(create_renderer(self.ctx, self._choice), self.ctx)))
-        self._tour = TourScenes(tour, memory=self._memory, merged=loaded.entry.merged)
-        self._tour.add(loaded)
-        enter_tour(self.state, tour, loaded.scene, plan_route(tour, tour.plan_walk()), at=self._at)
-        self._tour.move(np.asarray(self.state.camera.position), self.state.route, self.state.flight)
+        self._tour = TourScenes.start(loaded, self._memory)
+        enter_tour(state, tour, loaded.scene, plan_route(tour, tour.plan_walk(loaded.entry.start)), at=self._at)
+        self._tour.move(np.asarray(state.camera.position))
+        if remaining:
+            state.route, state.playing = self._tour.plan_route(state.camera.cam2world, remaining), True
+
+    def _list_remaining(self) -> tuple[int, ...]:
+        """The panoramas that a flight through a tour still visits; none if there is no flight."""
+        route, state = self.state.route, self.state
+        return route.walk[route.leg(state.flight) + 1 :] if route is not None and state.playing else ()
 
     def _update_tour(self, now: float) -> None:
         """Show the scene of the camera's place, and load those that are next."""
@@ -386,28 +411,50 @@ class Viewer:
             return
         route = state.route if state.playing else None
         tour.move(np.asarray(state.camera.position), route, state.flight)
-        self._show_tour_scene(tour, now)
+        self._show_place(tour, now)
         self._fade.move(state.camera.cam2world, tour.part)
-        if self._is_other_requested():
+        if self._loaded is None or self._is_other_requested():
             return
         request = tour.choose_request(tour.list_next(route, state.flight), self.loader.entry)
         if request is not None:
             self.loader.request(request)
 
-    def _show_tour_scene(self, tour: TourScenes, now: float) -> None:
-        """Start to fade to the scene of the camera's place, if it is loaded and not shown."""
+    def _show_place(self, tour: TourScenes, now: float) -> None:
+        """Start to fade to the scene of the camera's place; without it, to the nearest photograph.
+
+        Until then another scene stays within its panoramas.
+        """
         self._fade.compute_weight(now)
-        loaded = tour.get(tour.views)
-        slot = None if loaded is None else self._fade.choose_slot(loaded.scene)
-        if loaded is None or slot is None:
+        front, loaded, position = self._fade.front, tour.get(tour.views), np.asarray(self.state.camera.position)
+        if loaded is not None and self._show_tour_scene(loaded, now, tour.part):
             return
+        shows_scene = not self._shows_photograph and self._fade.parts[front] == tour.part
+        if self._loaded is None or not (shows_scene and tour.is_inside(position, self._scene_views)):
+            for end in tour.edge:  # that of the other end is read before it is needed
+                self._comparer.get_photograph(self.state, end)
+            self._show_photograph(tour.find_nearest(position), now, tour.part)
+
+    def _show_tour_scene(self, loaded: LoadedScene, now: float, part: int) -> bool:
+        """Start to fade to a scene; returns False if it is not prepared."""
+        slot = self._fade.choose_slot(loaded.scene)
+        if slot is None:  # it is shown, or a fade goes on
+            return True
         if self._slots[slot].scene is not loaded.scene:
             ready = self._incoming is None and self._preparer.is_ready(loaded.scene)
             if not ready or not self._upload(self._slots[slot], loaded.scene, loaded.entry):
-                return
-        self._fade.show(slot, loaded.scene, now, tour.part)
+                return False
+        self._fade.show(slot, loaded.scene, now, part)
+        self._scene_slot, self._scene_views = slot, loaded.entry.views
         adapt_settings(self.state, loaded.scene)
         self.state.points = []
+        return True
+
+    def _show_photograph(self, index: int | None, now: float, part: int = 0) -> None:
+        """Start to fade to a photograph; what is shown stays while it is read."""
+        self._fade.compute_weight(now)
+        slot = None if index is None else self._fade.choose_slot(index)
+        if index is not None and slot is not None and self._comparer.get_photograph(self.state, index) is not None:
+            self._fade.show(slot, index, now, part)
 
     def _is_other_requested(self) -> bool:
         """Whether a scene that is not of this tour, which the user has chosen, is loaded or prepared."""
@@ -417,8 +464,8 @@ class Viewer:
         return self._tour is None or entry.tour is not self._tour.tour
 
     def _fly_tour(self, seconds: float, was_playing: bool) -> None:
-        """Advance the flight; in a tour only as far as scenes are loaded, and from wherever the camera is."""
-        state, tour, limit = self.state, self._tour, 1.0
+        """Advance the flight; in a tour from wherever the camera is."""
+        state, tour = self.state, self._tour
         if tour is not None and state.route is not None:
             pose = state.camera.cam2world
             if state.target is not None:
@@ -430,12 +477,7 @@ class Viewer:
                     state.route = tour.plan_route(pose, state.route.walk[state.route.leg(state.flight) + 1 :])
                     state.flight = 0.0
             state.target = None
-            limit = tour.find_limit(state.route, state.flight) if state.playing else 1.0
-        before = state.flight
-        advance_flight(state, seconds, limit)
-        self._waiting = state.playing and state.flight == before and limit < 1
-        if self._waiting and tour is not None and state.route is not None and tour.is_blocked(state.route, limit):
-            self._waiting = state.playing = False
+        advance_flight(state, seconds)
 
     def _visit(self, place: tuple[float, float], size: tuple[int, int]) -> bool:
         """Fly to the panorama whose hotspot is at a place of the window; returns whether there is one."""
@@ -466,6 +508,7 @@ class Viewer:
         data.photograph_distance = comparer.measure_distance(self.state)
         if comparer.error is not None:
             data.error, comparer.error = comparer.error, None
+        data.panoramas = self._name_panoramas()
         film = self._films.progress
         data.tour, data.film = self._tour, None if film is None else film[1]
         data.hotspots = []
@@ -475,8 +518,13 @@ class Viewer:
             if has_arrived and get_eye_size(size, self.state.settings.stereo) == size:
                 data.hotspots = find_hotspots(self._tour, self.state.camera, size)
             data.background = None
-            if not self._is_other_requested():
+            if self._loaded is not None and not self._is_other_requested():
                 data.background, data.loading, data.refinement = self._describe_loading(), None, None
+
+    def _name_panoramas(self) -> list[str]:
+        """The names of the input cameras of the scene, or their numbers."""
+        names = self._slot.scene.names if self._slot.scene is not None else ()
+        return [names[k] if k < len(names) else str(k + 1) for k in range(len(self.state.context))]
 
     def _describe_loading(self) -> tuple[str, float] | None:
         """The work of the loader on a tour, and the fraction done."""
@@ -484,27 +532,41 @@ class Viewer:
         if entry is None:
             return None
         if progress is not None:
-            return f"{'waiting for' if self._waiting else 'next'}: {entry.name}", progress[2]
+            return f"next: {entry.name}", progress[2]
         return f"refining: {entry.name}", refinement or 0.0
 
     def _preview(self, entry: SceneEntry) -> None:
         """Show the photographs of an entry until its scene is there; the camera can turn and fly."""
         self._comparer.photographs.open(entry.panoramas)
+        self._fade.clear()
+        self._tour = None
         source = entry.tour or entry.pair
         if source is not None:
             panoramas = entry.panoramas if entry.pair is None else entry.pair.context
             poses = torch.stack([panorama.cam2world for panorama in panoramas])
-            scene = Scene(empty_gaussians(), poses, source.near, source.far)
+            scene = Scene(empty_gaussians(), poses, source.near, source.far, starts=list_starts(panoramas))
             if entry.tour is None:
                 enter_scene(self.state, scene, at=self._at)
             else:
                 enter_tour(self.state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
+                self._tour = TourScenes(entry.tour)
+            nearest = self._comparer.choose_photograph(self.state)
+            if nearest is not None:
+                self._comparer.photographs.wait(nearest)  # else the first frames are black
+                self._face_open_view(entry, nearest)
             self._last_camera = self.state.camera
 
-    def _draw_preview(self, target: moderngl.Framebuffer, now: float) -> None:
-        """Draw what is shown before the first scene."""
-        self._plan_resolution(target.viewport[2:], now)
-        self._draw_photograph(target)
+    def _face_open_view(self, entry: SceneEntry, index: int) -> None:
+        """Turn the start to a wide view, if the panorama has neither a neighbour to look at nor a start view."""
+        panorama = self._comparer.photographs.panoramas[index]
+        is_alone = len(entry.panoramas) == 1 if entry.tour is None else not entry.tour.neighbours(index)
+        if is_alone and panorama.start is None and self.state.camera == self.state.home:
+            try:
+                forward = find_direction(panorama.cam2world, find_open_view(panorama), 0.0).numpy()
+            except InputError:  # it is shown when the photograph is
+                return
+            camera = self.state.camera
+            self.state.camera = self.state.home = cameras.focus_on_point(camera, camera.position + forward)
 
     def _draw_photograph(self, target: moderngl.Framebuffer) -> None:
         """Draw the nearest photograph, at an infinite distance around its camera, or the background."""
@@ -513,7 +575,7 @@ class Viewer:
             target.use()
             self.ctx.clear(*self.state.settings.background)
         else:
-            self.presenter.draw(photograph.texture, target, self.state.camera, right=photograph)
+            self.presenter.draw_photograph(photograph, target, self.state.camera)
 
     def _plan_resolution(self, size: tuple[int, int], now: float) -> ResolutionPlan:
         """The plan of the frame, from the movement since the last one."""
@@ -540,27 +602,21 @@ class Viewer:
 
     def _draw_image(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
         camera, plan = self.state.camera, self._plan_resolution(size, now)
-        weight, fading, pose = self._fade.compute_weight(now), None, camera.cam2world
-        settings, poses = self.state.draw_settings, [pose, pose]
-        if self._tour is not None:
-            poses = [pose if each is None else each for each in self._fade.poses]
-        front, back = self._slot, self._slots[self._fade.front - 1]
-        milliseconds = self._render(front, poses[self._fade.front], size, settings, plan)
+        weight, front = self._fade.compute_weight(now), self._fade.front
+        image, milliseconds = self._draw_content(front, size, plan)
+        fading = None
         if weight < 1:
-            assert back.scene is not None  # it may have fewer views
-            milliseconds += self._render(
-                back, poses[self._fade.front - 1], size, fit_settings(settings, back.scene), plan
-            )
-            fading = back.image
+            fading, more = self._draw_content(1 - front, size, plan)
+            milliseconds += more
         if milliseconds > 0:  # else the image is not new, or not finished
             self._resolution.record(plan, milliseconds)
-        image = self._slot.image
         if image is None:  # the first one of a large scene is not finished
             image, fading = fading, None
         if image is None:
             self._draw_photograph(target)
             return
-        self.panel_data.size = self.renderer.stats.size
+        self.panel_data.size = size if self._shows_photograph else self.renderer.stats.size
+        settings, pose = self.state.draw_settings, camera.cam2world
 
         def draw_pinned(slot: SceneSlot, settings: DrawSettings) -> moderngl.Texture | None:
             self._render(slot, pose, size, settings, plan)
@@ -569,6 +625,25 @@ class Viewer:
         mono = settings.stereo == "mono"
         right = self._comparer.get_right_side(self.state, draw_pinned) if mono else None
         self.presenter.draw(image, target, camera, right=right, fading=fading, weight=weight)
+
+    def _draw_content(
+        self, slot: int, size: tuple[int, int], plan: ResolutionPlan
+    ) -> tuple[moderngl.Texture | None, float]:
+        """The image of a slot of the fade, None if there is none yet, and the milliseconds of drawing a new one."""
+        content, camera, pose = self._fade.contents[slot], self.state.camera, self._fade.poses[slot]
+        if pose is None or self._tour is None:
+            pose = camera.cam2world
+        if isinstance(content, int):
+            photograph = self._comparer.get_photograph(self.state, content)
+            if photograph is None:
+                return None, 0.0
+            return self._layers[slot].draw(photograph, cameras.move_to_pose(camera, pose), size), 0.0
+        scene_slot = self._slots[slot]
+        if content is None or scene_slot.scene is None:
+            return None, 0.0
+        settings = fit_settings(self.state.draw_settings, scene_slot.scene)  # that which fades may have fewer views
+        milliseconds = self._render(scene_slot, pose, size, settings, plan)
+        return scene_slot.image, milliseconds
 
     def _render(
         self,
@@ -591,7 +666,7 @@ class Viewer:
 
     def _focus_center(self) -> None:
         """Orbit the point in the centre of the last image."""
-        if self._slot.image is None:
+        if self._slot.image is None or self._shows_photograph:
             return
         distance = measure_center_depth(self.renderer.read_eye_depth())
         self._slot.image = None  # `read_depth` may have replaced the texture
@@ -603,9 +678,8 @@ class Viewer:
 
     def _pick(self, place: tuple[float, float], size: tuple[int, int], now: float) -> None:
         """Show the point of the scene at a place of the window, as fractions of width and height."""
-        if self._visit(place, size):
+        if self._visit(place, size) or self._slot.scene is None or self._shows_photograph:
             return
-        assert self._slot.scene is not None
         eye_size = get_eye_size(size, self.state.settings.stereo)
         pixel = place[0] * size[0] % eye_size[0], place[1] * size[1] % eye_size[1]
         origin, direction = compute_pixel_ray(self.state.camera, pixel, eye_size)
@@ -653,6 +727,9 @@ class Viewer:
         if self._loaded is None:
             return
         self._execute_path(commands, size, now)
+        if self._shows_photograph and (commands.pin or commands.png or commands.exr or commands.panorama):
+            self.state.show_message("there is no scene of this place yet", now)
+            return
         if commands.pin:
             self._pin(now)
         if commands.go_to_photograph:
@@ -710,7 +787,7 @@ class Viewer:
         state, tour, loaded = self.state, self._tour, self._loaded
         assert loaded is not None
         scene, settings, fps = self._slot.scene, state.draw_settings, state.film_fps
-        path, level, memory = state.path, state.camera, self._memory
+        path, level, scenes = state.path, state.camera, None if tour is None else tour.copy()
         image_format = choose_format(state.film_projection, settings)
         if state.film_projection != "perspective":
             size = image_format.default_size
@@ -724,7 +801,6 @@ class Viewer:
             def load(entry: SceneEntry) -> LoadedScene:  # a film that is cancelled does not wait for a prediction
                 return self.loader.load(entry, lambda task, done: progress())
 
-            scenes = None if tour is None else TourScenes(tour.tour, memory=memory, merged=loaded.entry.merged)
             with open_frames(lambda: CpuRenderer(None), scene, scenes, load, size, settings, image_format) as frames:
                 return write_path_film(frames, path, level, file, fps, progress)
 

@@ -32,6 +32,7 @@ Views = tuple[int, ...]
 
 EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
 MAX_SCENE_VIEWS = 3  # of a scene of an edge
+_MAX_PREDICTED = 16  # panoramas that a window predicts at once; bounds its memory and the time until they are shown
 _MIN_PANORAMAS = 3  # of a tour of one part
 _MIN_BASELINE = 0.03  # of a scene of two views, as a fraction of far; depth is inaccurate below it
 _MAX_STARTS = 10_000  # of a walk, divided by the number of nodes
@@ -170,6 +171,27 @@ class TourGraph:
                 sources[views] = provided
                 missing -= set(provided)
         return sources
+
+    def choose_predictions(self, max_views: int) -> dict[int, Views]:
+        """The panoramas that each panorama is predicted with, so that scenes of edges are parts of few predictions.
+
+        They are its part. A part of more than 16 panoramas is cut into pieces of its walk; the best neighbour of each
+        panorama of a piece is predicted with it. There are none for a predictor of scenes of edges.
+
+        Args:
+            max_views: of the predictor.
+        """
+        if max_views <= MAX_SCENE_VIEWS:
+            return {}
+        predictions: dict[int, Views] = {}
+        walk = dict.fromkeys(self.plan_walk())
+        for part in range(max(self.parts) + 1):
+            nodes = [node for node in walk if self.parts[node] == part]
+            for piece in np.array_split(nodes, math.ceil(len(nodes) / min(max_views, _MAX_PREDICTED))):
+                members = piece.tolist()
+                neighbours = {end for node in members for end in self.find_edge(node)}
+                predictions |= dict.fromkeys(members, tuple(sorted({*members, *neighbours})))
+        return predictions
 
     def _weakest_overlap(self, nodes: Views) -> float:
         """The smallest overlap of the edges between the panoramas of a scene."""

@@ -74,6 +74,20 @@ def test_the_scene_of_an_edge_holds_both_ends_and_shares_a_third(make_tour):
     assert make_tour(places, ((0, 1), (2, 3))).choose_scene_views()[2, 3] == (2, 3)
 
 
+def test_panoramas_are_predicted_with_their_part_or_with_a_piece_of_a_large_one(make_tour, home):
+    assert home.choose_predictions(3) == {}, "a network has scenes of edges"
+    predictions = home.choose_predictions(64)
+    assert predictions == {0: (0, 1, 2), 1: (0, 1, 2), 2: (0, 1, 2), 3: (3,), 4: (4, 5), 5: (4, 5), 6: (6,)}
+    assert set(predictions.values()) == set(home.choose_sources(64)), "those of one scene of all panoramas"
+    row = make_tour([(0, k) for k in range(40)], [(k, k + 1) for k in range(39)])
+    predictions = row.choose_predictions(64)
+    assert set(predictions) == set(range(40)) and len(set(predictions.values())) == 3
+    for node, views in predictions.items():
+        assert {node, *row.find_edge(node)} <= set(views) and len(views) <= 16
+    members = [sum(node in views for views in set(predictions.values())) for node in range(40)]
+    assert max(members) <= 2 and sum(members) <= 44, "nothing is predicted more than twice"
+
+
 def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
     assert list(home.overlaps.items()) == [((0, 1), 0), ((1, 2), 0), ((4, 5), 0), ((3, 3), 1), ((6, 6), 1)]
     assert home.parts == (0, 0, 0, 1, 2, 2, 3) and home.name == "home tour"

@@ -620,6 +620,20 @@ def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, sm
     assert np.abs(user.read_image() - turned).mean() < 1, "it was the photograph"
 
 
+def test_a_panorama_alone_is_entered_in_a_wide_view(user, tmp_path, monkeypatch):
+    image = np.full((64, 128, 3), 0.6, np.float32)
+    image[20:44, 90:106:2] = 0.1  # 0.37 to 0.41 of a turn right of the left border, at 1.67 radians
+    write_image(tmp_path / "alone.png", image)
+    panorama = Panorama("alone", tmp_path / "alone.png", torch.eye(4, dtype=torch.float64))
+    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: pytest.fail("not shown"))
+    for start, yaw in ((None, 2 * np.pi * (98 / 128 - 0.5)), ((0.5, 0.0), 0.5)):
+        user.viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
+        pair = Pair("alone", tmp_path, (replace(panorama, start=start),), (), 0.45, 10.0)
+        user.viewer._preview(SceneEntry("alone", pair=pair))
+        assert user.state.camera == user.state.home
+        assert user.state.camera.yaw_radians == pytest.approx(yaw, abs=0.1)
+
+
 def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_path, axis_photos):
     photographs = Photographs(ctx)
     (first, *_) = pair.context
@@ -1075,29 +1089,84 @@ def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     assert max(steps) < 0.5 * exchanged, "no jump: a fade changes 30 % in 0.2 s at most"
 
 
-@pytest.mark.slow
-def test_a_flight_waits_for_a_scene_that_is_not_loaded(user, house, load_house, monkeypatch):
-    go = threading.Event()
+def match_photograph(user: User, node: int) -> float:
+    """The mean difference of the screen from a photograph in the direction of the camera."""
+    user.draw_frames(3, SETTLE_AFTER)
+    shown = user.read_screen()
+    user.state.comparison, user.state.split, user.state.photograph = "photograph", 0.0, node
+    user.draw_frames(3)
+    difference = np.abs(user.read_screen() - shown).mean()
+    user.state.comparison, user.state.photograph = "off", None
+    return float(difference)
+
+
+def test_a_flight_fades_between_photographs_where_no_scene_is_ready(user, house, load_house, monkeypatch):
+    go, viewer = threading.Event(), user.viewer
 
     def load(entry, progress, show):
         if entry.views and entry.views != (0, 1):
-            progress("predicting", 0.5)
-            assert go.wait(60)
+            while not go.wait(0.005):
+                progress("predicting", 0.5)
         return load_house(entry)
 
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
-    user.viewer.show([SceneEntry(house.name, tour=house)], 0)
-    user.draw_until(lambda: user.viewer._tour is not None, "tour")
-    user.press(imgui.Key._3)
-    user.viewer._resolution.budget_ms = 1e-3
-    user.draw_until(lambda: user.viewer._waiting, "flight that waits", 1 / 8)
-    user.draw_frames(1, 1)
-    assert find_node(user) == 1 and user.state.playing and not user.viewer.moving
-    assert user.data.background == ("waiting for: room1-room2", 0.5)
-    assert (user.read_screen().max(-1) < 8).mean() < 0.01, "the last scene is shown"
+    monkeypatch.setattr(viewer.loader, "_load", load)
+    viewer.show([SceneEntry(house.name, tour=house)], 0)
+    user.draw_until(lambda: viewer._tour is not None and not viewer.loader.is_searching, "tour")
+    first = viewer._slot.scene
+    user.press(imgui.Key._4)
+    shown = [user.read_screen()]
+    viewer._resolution.budget_ms = 1e-3
+    contents = []
+
+    def has_ended() -> bool:
+        shown.append(user.read_screen())
+        contents.append(viewer._fade.contents[viewer._fade.front])
+        return not (user.state.playing or viewer._is_animated)
+
+    user.draw_until(has_ended, "end of the flight", 1 / 10)
+    assert find_node(user) == 3, "it does not wait"
+    order = [content for content, before in zip(contents, [None, *contents], strict=False) if content is not before]
+    assert order[:2] == [first, 1] and order[-1] == 3, "the scene ends near its last panorama"
+    assert min(frame.max(-1).mean() for frame in shown) > 40, "no black"
+    steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3))
+    assert steps.max() < 20, "no jump: a fade changes 15 % in 0.1 s at most"
+    assert match_photograph(user, 3) < 1
+    user.press(imgui.Key.p)
+    assert "no scene" in user.state.message
     go.set()
-    fly(user)
-    assert find_node(user) == 2
+    user.draw_until(lambda: not viewer._shows_photograph, "scene")
+    user.settle()
+    assert viewer._slot.scene is viewer._tour.get((2, 3)).scene
+
+
+def test_a_tour_shows_its_photographs_before_the_first_scene(user, house, load_house, monkeypatch):
+    go, viewer = threading.Event(), user.viewer
+
+    def load(entry, progress, show):
+        if not entry.views:
+            while not go.wait(0.005):
+                progress("predicting", 0.5)
+        return load_house(entry)
+
+    monkeypatch.setattr(viewer.loader, "_load", load)
+    viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
+    viewer.show([SceneEntry(house.name, tour=house)], 0)
+    user.draw_frames(1)
+    assert (user.read_screen().max(-1) > 8).all(), "the first frame is a photograph"
+    assert user.state.camera.yaw_radians == 0 and house.plan_walk()[:2] == [0, 1], "towards its neighbour"
+    assert "visit" in user.panels.items and match_photograph(user, 0) < 1
+    user.press(imgui.Key._3)
+    user.draw_until(lambda: not (user.state.playing or viewer._is_animated), "end of the flight", 1 / 10)
+    assert find_node(user) == 2 and match_photograph(user, 2) < 1
+    user.press(imgui.Key.space)
+    user.draw_frames(5, 1 / 10)
+    assert user.state.playing
+    go.set()
+    user.draw_until(lambda: viewer._loaded is not None, "first scene", 1e-3)
+    assert user.state.playing, "the flight goes on"
+    assert viewer._fade.contents[viewer._fade.front] == 2, "the scene of panoramas 0 and 1 is not shown from here"
+    user.draw_until(lambda: not viewer._shows_photograph, "scene", 1 / 10)
+    assert 2 in viewer._scene_views
 
 
 def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user):
@@ -1386,7 +1455,7 @@ def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, 
     assert failed == ["room1-room2"] and user.data.error is None
     user.press(imgui.Key._3)
     fly(user, 0.25)
-    assert find_node(user) == 1, "the flight ends before the scene that is missing"
+    assert find_node(user) == 2 and match_photograph(user, 2) < 1, "there is no scene of the edge"
 
 
 def test_a_scene_after_a_tour_does_not_fade_from_it(tour_user, pair):
@@ -1525,6 +1594,7 @@ def test_a_film_of_a_tour_is_cancelled_during_a_prediction(user, house, load_hou
 
     user.show(SceneEntry(house.name, tour=house))
     monkeypatch.setattr(user.viewer.loader, "_load", load)
+    user.viewer._tour._loaded.clear()
     user.state.path = CameraPath((KeyFrame.of_camera(user.state.camera, 0.0),))
     user.viewer._start_film(SIZE)
     assert predicting.wait(60)

@@ -1,8 +1,8 @@
 """Lists the scenes at a path and loads them in a worker thread.
 
 Pairs go through the prediction pipeline with its cache, scene files are read. Of a tour, the graph and one scene are
-loaded; `tour` requests its other scenes. A file that has the graph of a tour is shown as a tour: its scenes are parts
-of the scene in the file. Imports no torch before it loads.
+loaded; `tour` requests the predictions of its parts. A file that has the graph of a tour is shown as a tour: its scenes
+are parts of the scene in the file. Imports no torch before it loads.
 """
 
 import contextlib
@@ -31,7 +31,9 @@ class SceneEntry:
     """A scene that can be shown: a tour, a pair of panoramas to predict from, or a scene file.
 
     Attributes:
-        pair: the pair, or the panoramas of one scene of a tour; None for a scene file and for a whole tour.
+        pair: the pair, or the panoramas of one prediction of a tour; None for a scene file and for a whole tour.
+        start: of a tour that is loaded: the panorama that it is entered at.
+        max_views: of a tour that is loaded: the number of views, at most, that the predictor takes.
     """
 
     name: str  # shown in the list of scenes and used for output folders
@@ -39,6 +41,8 @@ class SceneEntry:
     file: Path | None = None  # the scene file, or None
     tour: "TourGraph | None" = None  # the tour, or None
     views: tuple[int, ...] = ()  # of one scene of a tour: numbers of its panoramas in the tour
+    start: int | None = None
+    max_views: int = 1
     merged: "Scene | None" = None  # of a tour from a file: the scene in it, of all panoramas
     notes: tuple[str, ...] = ()  # what was not used or not placed at its path, and why
 
@@ -188,9 +192,10 @@ def load_entry(
     progress: Progress,
     show: Callable[[LoadedScene], None] | None = None,
 ) -> LoadedScene:
-    """Read an entry's scene, or predict and refine it. Of a tour, the scene in which `plan_walk` starts.
+    """Read an entry's scene, or predict and refine it. Of a tour, a scene of the panorama in which `plan_walk` starts.
 
-    The entry of the result for a tour has its connected graph and the panoramas of the scene.
+    The entry of the result for a tour has its connected graph and the panoramas of the scene. With `show`, that is the
+    scene of an edge, which is there soon; else it is that of a part, which the scenes of its edges are selected from.
 
     Args:
         entry: the entry.
@@ -229,38 +234,56 @@ def load_entry(
 def _load_tour_scene(
     entry: SceneEntry, options: LoadOptions, progress: Progress, show: Callable[[LoadedScene], None] | None
 ) -> LoadedScene:
-    """Predict and refine one scene of a tour, with its floor outlines; the first one after its graph is connected."""
+    """Predict and refine one prediction of a tour, with its floor outlines; the first one after its graph is connected.
+
+    The first scene of a window is not refined if it is predicted again with the rest of its part.
+    """
     from pansplat import pipeline
     from pansplat.tours import connect, find_floor_outlines, select_views
 
-    tour, views = entry.tour, entry.views
+    tour, views, merged, seconds = entry.tour, entry.views, entry.merged, options.refine_seconds
     assert tour is not None
+    if merged is not None:
+        first, views = _choose_first_scene(tour, tour)
+        entry = replace(entry, views=views, start=first)
+        outlines = find_floor_outlines(tour, merged, tuple(range(len(tour))))
+        return LoadedScene(entry, select_views(merged, views), outlines=outlines)
+    predictor = pipeline.load_model(options.model, compat=options.compat, precision=options.precision)
     if not views:
-        tour = tour if entry.merged is not None else connect(tour, progress)
-        first, *others = tour.plan_walk()
-        is_flown = others and not tour.is_fade(first, others[0])
-        edge = (min(first, others[0]), max(first, others[0])) if is_flown else tour.find_edge(first)
-        views = tour.choose_scene_views()[edge]
-        entry = replace(entry, tour=tour, views=views)
+        connected, max_views = connect(tour, progress), pipeline.find_max_views(predictor)
+        # A window shows photographs before: they begin where the graph that is not connected yet does.
+        first, views = _choose_first_scene(connected, connected if show is None else tour)
+        tour, part = connected, connected.choose_predictions(max_views).get(first, views)
+        if show is None:
+            views = part
+        elif views != part:
+            seconds = 0.0
+        entry = replace(entry, tour=tour, views=views, start=first, max_views=max_views)
     pair = entry.pair or tour.make_pair(views)
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
-        scene = scene if entry.merged is not None else tour.place(scene, views)
+        scene = tour.place(scene, views)
         return LoadedScene(entry, scene, is_final=is_final, outlines=find_floor_outlines(tour, scene, views))
 
-    if entry.merged is not None:
-        return finish(select_views(entry.merged, views), is_final=True)
-    predictor = pipeline.load_model(options.model, compat=options.compat, precision=options.precision)
     scene = pipeline.predict(
         pair,
         model=pipeline.choose_predictor(pair, predictor),
         height=options.height or pipeline.choose_tour_height(pair),
-        refine_seconds=options.refine_seconds,
+        refine_seconds=pipeline.scale_seconds(seconds, pair),
         cache=options.cache,
         progress=progress,
-        on_predicted=None if show is None else lambda scene: show(finish(scene, is_final=False)),
+        on_predicted=None if show is None or not seconds else lambda scene: show(finish(scene, is_final=False)),
     )
     return finish(scene, is_final=True)
+
+
+def _choose_first_scene(tour: "TourGraph", walked: "TourGraph") -> tuple[int, tuple[int, ...]]:
+    """The panorama in which the walk of one graph starts, and the scene of its first edge in another one."""
+    first, *others = walked.plan_walk()
+    is_flown = others and not walked.is_fade(first, others[0])
+    edge = (min(first, others[0]), max(first, others[0])) if is_flown else tour.find_edge(first)
+    scenes = tour.choose_scene_views()
+    return first, scenes.get(edge) or scenes[tour.find_edge(first)]
 
 
 @dataclass

@@ -190,11 +190,11 @@ def step_flight(state: ViewerState, steps: int) -> None:
     fly_to(state, (round(state.flight * _FLIGHT_STEPS) + steps) / _FLIGHT_STEPS)
 
 
-def advance_flight(state: ViewerState, seconds: float, limit: float = 1.0) -> None:
-    """Move along the flight if it is playing, not beyond the fraction `limit`, and stop at its end."""
+def advance_flight(state: ViewerState, seconds: float) -> None:
+    """Move along the flight if it is playing, and stop at its end."""
     if state.playing:
         duration = FLIGHT_SECONDS if state.route is None else state.route.seconds
-        fly_to(state, min(state.flight + seconds / duration, max(limit, state.flight)))
+        fly_to(state, state.flight + seconds / duration)
         state.playing = state.flight < 1
 
 

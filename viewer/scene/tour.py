@@ -5,16 +5,20 @@ Imports no OpenGL: the film and the window use the same objects.
 
 from __future__ import annotations
 
+import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours import (
+    EDGE_HYSTERESIS,
     FADE_SECONDS,
+    MAX_SCENE_VIEWS,
     Edge,
     FloorOutline,
     Route,
@@ -23,19 +27,23 @@ from pansplat.tours import (
     choose_camera_height,
     find_link_ring,
     plan_route,
+    select_views,
 )
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
 
 DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
-_NEXT_SCENES = 3  # that are predicted before they are needed
+_NEXT_SCENES = 3  # that are dropped last
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor
 _MIN_HOTSPOT_PIXELS = 14.0
 
 
 class TourScenes:
     """The scenes of one tour: chooses, requests and keeps them. It loads nothing itself.
+
+    A scene is that of an edge. Its Gaussians are selected from predictions of whole parts
+    (`TourGraph.choose_predictions`); of a network it is a prediction of its own.
 
     Attributes:
         tour: the graph.
@@ -49,22 +57,58 @@ class TourScenes:
         *,
         memory: float = DEFAULT_MEMORY,
         merged: Scene | None = None,
+        max_views: int = MAX_SCENE_VIEWS,
     ) -> None:
         """Start without scenes.
 
         Args:
             tour: the graph.
-            memory: limit of the loaded scenes, GiB; two scenes are kept in any case.
+            memory: limit of the loaded scenes, GiB; two predictions are kept in any case.
             merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
+            max_views: of the predictor (`TourGraph.choose_predictions`).
         """
-        self.tour, self._merged = tour, merged
+        self.tour, self._merged, self._max_views = tour, merged, max_views
         self.edge: Edge = next(iter(tour.overlaps))
         self._is_placed = False  # whether the camera has been at the edge
         self.outlines: dict[int, FloorOutline] = {}
         self._views = tour.choose_scene_views()
+        everything = tuple(range(len(tour)))
+        # The prediction that has the Gaussians of a panorama; none if each scene is a prediction.
+        self._providers = (
+            tour.choose_predictions(max_views) if merged is None else dict.fromkeys(everything, everything)
+        )
+        self._sources = {
+            views: tuple(dict.fromkeys(self._providers.get(node, views) for node in views))
+            for views in self._views.values()
+        }
+        self._predictions = {source for sources in self._sources.values() for source in sources}
         self._budget = memory * 2**30
-        self._loaded: OrderedDict[Views, LoadedScene] = OrderedDict()
+        self._loaded: OrderedDict[Views, LoadedScene] = OrderedDict()  # predictions
+        self._selected: OrderedDict[Views, LoadedScene] = OrderedDict()  # scenes from predictions, and the first one
+        self._known: set[Views] = set()  # predictions that have been loaded
         self._failed: set[Views] = set()
+        self._following: tuple[Edge, list[Views]] | None = None
+        if merged is not None:
+            self._loaded[everything] = LoadedScene(SceneEntry(tour.name, tour=tour, views=everything), merged)
+
+    @staticmethod
+    def start(loaded: LoadedScene, memory: float = DEFAULT_MEMORY) -> TourScenes:
+        """The scenes of the tour whose first scene is loaded."""
+        entry = loaded.entry
+        assert entry.tour is not None
+        scenes = TourScenes(entry.tour, memory=memory, merged=entry.merged, max_views=entry.max_views)
+        scenes.add(loaded)
+        edges = [edge for edge, views in scenes._views.items() if views == entry.views]
+        if edges:  # else it is a prediction of a part
+            scenes.edge, scenes._is_placed = max(edges, key=lambda edge: entry.start in edge), True
+        return scenes
+
+    def copy(self) -> TourScenes:
+        """The same scenes in memory, for a film in another thread."""
+        memory = self._budget / 2**30
+        scenes = TourScenes(self.tour, memory=memory, merged=self._merged, max_views=self._max_views)
+        scenes._loaded = self._loaded.copy()
+        return scenes
 
     @property
     def views(self) -> Views:
@@ -79,41 +123,85 @@ class TourScenes:
     @property
     def num_scenes(self) -> int:
         """Number of scenes of the tour."""
-        return len(set(self._views.values()))
+        return len(self._sources)
 
     @property
     def loaded(self) -> list[Views]:
-        """The scenes in memory, the least recently used first."""
-        return list(self._loaded)
+        """The scenes that need no prediction."""
+        return [views for views in self._sources if views in self._selected or self._has_sources(views)]
+
+    @property
+    def missing(self) -> list[Views]:
+        """The predictions that the scene of the camera needs and that are not in memory."""
+        return [source for source in self._sources[self.views] if source not in self._loaded]
+
+    def _has_sources(self, views: Views) -> bool:
+        return all(source in self._loaded for source in self._sources[views])
 
     def make_entry(self, views: Views) -> SceneEntry:
-        """The scene of these panoramas as an entry for the loader."""
+        """The prediction of these panoramas as an entry for the loader."""
         pair = self.tour.make_pair(views)
-        return SceneEntry(pair.name, pair=pair, tour=self.tour, views=views, merged=self._merged)
+        name = pair.name if len(views) <= MAX_SCENE_VIEWS else f"{len(views)} panoramas"
+        return SceneEntry(name, pair=pair, tour=self.tour, views=views)
 
     def add(self, loaded: LoadedScene) -> None:
-        """Keep a scene; the least recently used ones are dropped if the memory is exceeded."""
+        """Keep a prediction, or the scene of an edge that is shown until there is one.
+
+        The least recently used ones are dropped if the memory is exceeded.
+        """
         views = loaded.entry.views
+        self.outlines |= loaded.outlines
+        if views not in self._predictions:
+            self._selected[views] = loaded
+            return
         self._loaded[views] = loaded
         self._loaded.move_to_end(views)
-        self.outlines |= loaded.outlines
+        self._known.add(views)
         self._failed.discard(views)
-        total = sum(measure_bytes(scene.scene) for scene in self._loaded.values())
-        for other in [other for other in self._loaded if other not in (views, self.views)]:
-            if total <= self._budget or len(self._loaded) <= 2:
-                break
-            total -= measure_bytes(self._loaded.pop(other).scene)
+        for scene in [scene for scene in self._selected if views in self._sources[scene] and self._has_sources(scene)]:
+            del self._selected[scene]
+        self._drop(views)
+
+    def _drop(self, newest: Views) -> None:
+        """Drop what was not used for the longest time, until the memory is not exceeded."""
+        total = sum(measure_bytes(each.scene) for each in (*self._loaded.values(), *self._selected.values()))
+        needed = {newest, self.views, *self._sources[self.views]}
+        for scenes, fewest in ((self._selected, 0), (self._loaded, 2)):
+            for other in [other for other in scenes if other not in needed]:
+                if total <= self._budget or len(scenes) <= fewest:
+                    break
+                total -= measure_bytes(scenes.pop(other).scene)
 
     def fail(self, views: Views) -> None:
-        """Do not request a scene again, because it could not be loaded or refined."""
+        """Do not request a prediction again, because it could not be loaded or refined."""
         self._failed.add(views)
 
     def get(self, views: Views) -> LoadedScene | None:
-        """A scene if it is in memory; it becomes the most recently used."""
-        loaded = self._loaded.get(views)
-        if loaded is not None:
-            self._loaded.move_to_end(views)
+        """The scene of an edge if it is in memory; it becomes the most recently used."""
+        if views in self._predictions:
+            loaded = self._loaded.get(views)
+        elif views not in self._selected and self._has_sources(views):
+            loaded = self._selected[views] = self._select(views)
+            self._drop(views)
+        else:
+            loaded = self._selected.get(views)
+        for scenes in (self._selected, self._loaded):
+            for each in (views, *self._sources[views]):
+                if each in scenes:
+                    scenes.move_to_end(each)
         return loaded
+
+    def _select(self, views: Views) -> LoadedScene:
+        """The scene of these panoramas, from the predictions that have their Gaussians."""
+        parts: list[Gaussians] = []
+        for source in self._sources[views]:
+            nodes = [node for node in views if self._providers[node] == source]
+            scene = select_views(self._loaded[source].scene, tuple(source.index(node) for node in nodes))
+            labels = torch.tensor([views.index(node) for node in nodes])
+            parts.append(replace(scene.gaussians, views=labels[scene.gaussians.views.long()]))
+        cam2world, names = self.tour.cam2world[list(views)], tuple(self.tour.panoramas[node].label for node in views)
+        scene = replace(scene, gaussians=Gaussians.cat(parts), cam2world=cam2world, names=names, gains=())
+        return LoadedScene(self.make_entry(views), scene)
 
     def move(self, position: Float[np.ndarray, "3"], route: Route | None = None, fraction: float = 0.0) -> None:
         """Choose the edge of a camera position, or of a fraction of a route that is being flown."""
@@ -123,61 +211,67 @@ class TourScenes:
             edge = tour.follow_edge(position, self.edge) if known else tour.find_nearest_edge(position)[0]
         self.edge, self._is_placed = edge, True
 
-    def list_next(self, route: Route | None, fraction: float) -> list[Views]:
-        """The scenes to have in memory, the most urgent first: that of the camera, then those that are next.
+    def find_nearest(self, position: Float[np.ndarray, "3"]) -> int:
+        """The end of the edge that is nearer to a position: another panorama may be behind a wall."""
+        return min(self.edge, key=lambda node: float(np.linalg.norm(self.tour.positions[node] - position)))
 
-        These are the next ones of a route; or those around the nearest panorama, then those of other parts: first
-        where links lead to, then in the order of the panoramas.
+    def is_inside(self, position: Float[np.ndarray, "3"], views: Views) -> bool:
+        """Whether the scene of some panoramas is good at a position: they are of its edge, or one of them is there."""
+        node = self.find_nearest(position)
+        is_there = bool(np.linalg.norm(self.tour.positions[node] - position) <= EDGE_HYSTERESIS)
+        return set(self.edge) <= set(views) or (node in views and is_there)
+
+    def list_next(self, route: Route | None, fraction: float) -> list[Views]:
+        """All predictions, the most urgent first: those that the camera needs, then those that are next.
+
+        These are the next ones of a route; then those around the nearest panorama, those of its part by distance, and
+        those of other parts: first where links lead to, then in the order of the panoramas.
         """
-        tour = self.tour
-        if route is not None:
-            edges = list(route.edges_after(fraction))
-        else:
-            a, b = self.edge
-            edges = [edge for edge in self._views if {a, b} & set(edge)]
-            edges.sort(key=tour.length)
-            linked = [end for start, end in tour.links if start in self.edge]
-            following = (node % len(tour) for node in range(b + 1, b + len(tour)))
-            others = [node for node in (*linked, *following) if tour.is_fade(a, node)]
-            edges += [tour.find_edge(node) for node in others[: 2 * _NEXT_SCENES]]
-        wanted = dict.fromkeys([self.views, *(self._views[edge] for edge in edges)])
-        return list(wanted)[: 1 + _NEXT_SCENES]
+        ahead = [] if route is None else [self._views[edge] for edge in route.edges_after(fraction)]
+        if self._following is None or self._following[0] != self.edge:
+            self._following = self.edge, self._list_following()
+        scenes = [self.views, *ahead, *self._following[1]]
+        return list(dict.fromkeys(source for views in scenes for source in self._sources[views]))
+
+    def _list_following(self) -> list[Views]:
+        tour, here = self.tour, set(self.edge)
+        middle = tour.positions[list(self.edge)].mean(axis=0)
+        inside = [edge for edge in self._views if tour.parts[edge[0]] == self.part]
+        inside.sort(key=lambda edge: (not here & set(edge), tour.measure_distance(edge, middle), tour.length(edge)))
+        linked = [end for start, end in tour.links if start in here]
+        following = (node % len(tour) for node in range(self.edge[1] + 1, self.edge[1] + len(tour)))
+        outside = [tour.find_edge(node) for node in (*linked, *following) if tour.parts[node] != self.part]
+        return [self._views[edge] for edge in dict.fromkeys((*inside, *outside, *self._views))]
 
     def choose_request(self, wanted: Sequence[Views], current: SceneEntry | None) -> SceneEntry | None:
         """The entry to load now, or None to let the loader continue with `current` (None: it is idle).
 
-        Predictions come before refinements. A refinement ends if the scene of the camera is missing.
+        Predictions come before refinements. A refinement ends if a prediction that the camera needs is missing; a
+        prediction is finished, so that none is lost. One that was dropped from memory is read again when it is needed.
         """
-        first, wanted = wanted[0], [views for views in wanted if views not in self._failed]
+        wanted = [views for views in wanted if views not in self._failed]
+        for views in reversed(wanted[: 1 + _NEXT_SCENES]):
+            if views in self._loaded:
+                self._loaded.move_to_end(views)
         missing = [views for views in wanted if views not in self._loaded]
-        if current is not None:
-            needed = missing and missing[0] == first
-            replaced = needed and current.views != missing[0]
-            if not replaced and (current.views in wanted or not missing):
+        missing = [views for views in missing if views not in self._known or views in self.missing]
+        if current is not None and (current.views in wanted or not missing):
+            is_refined = current.views in self._loaded
+            if not missing or missing[0] not in self.missing or not is_refined:
                 return None
         if missing:
             return self.make_entry(missing[0])
-        return next((self.make_entry(views) for views in wanted if not self._loaded[views].is_final), None)
-
-    def find_limit(self, route: Route, fraction: float) -> float:
-        """The fraction up to which a route can be flown with the scenes in memory."""
-        numbers = route.legs[round(fraction * (len(route.legs) - 1)) :]
-        ready = [self._views[edge] in self._loaded for edge in route.edges] + [True]  # the last one is leg -1
-        missing = np.flatnonzero(~np.array(ready)[numbers])
-        if not len(missing):
-            return 1.0
-        return max((len(route.legs) - len(numbers) + int(missing[0]) - 1) / (len(route.legs) - 1), fraction)
-
-    def is_blocked(self, route: Route, fraction: float) -> bool:
-        """Whether a route cannot be flown on from a fraction, because the next scene could not be loaded."""
-        leg = int(route.legs[min(round(fraction * (len(route.legs) - 1)) + 1, len(route.legs) - 1)])
-        return leg >= 0 and self._views[route.edges[leg]] in self._failed
+        unrefined = (views for views in wanted if views in self._loaded and not self._loaded[views].is_final)
+        return next((self.make_entry(views) for views in unrefined), None)
 
     def plan_route(self, camera: Float[np.ndarray, "4 4"], remaining: Sequence[int] = ()) -> Route:
         """A route from a pose through the remaining panoramas; without any, through all of them."""
         position = camera[:3, 3]
         if remaining:
-            walk = [*self._find_way(position, remaining[0]), *remaining[1:]]
+            walk = self._find_way(position, remaining[0])
+            for a, b in itertools.pairwise(remaining):
+                is_step = (min(a, b), max(a, b)) in self.tour.overlaps or self.tour.is_fade(a, b)
+                walk += [b] if is_step else self.tour.find_walk(a, b)[1:]
         else:
             edge, _ = self.tour.find_nearest_edge(position, self._find_part(position))
             distances = np.linalg.norm(self.tour.positions[list(edge)] - position, axis=1)
@@ -211,53 +305,55 @@ def measure_bytes(scene: Scene) -> int:
 
 
 class CrossFade:
-    """Two slots for scenes: one is shown, and the other one fades out for `FADE_SECONDS` after an exchange.
+    """Two slots for what is shown: one is, and the other one fades out for `FADE_SECONDS` after an exchange.
 
-    A scene of another part of a tour than that of the camera is drawn from the last pose in its part.
+    The content of a slot is a scene or a photograph, by its number. That of another part of a tour than the camera's is
+    drawn from the last pose in its part.
 
     Attributes:
-        front: slot of the scene that is shown.
-        scenes: of both slots.
-        parts: of the tour, of both scenes.
-        poses: from which the scenes are drawn; None before the first one.
+        front: slot of what is shown.
+        contents: of both slots; None before the first one.
+        parts: of the tour, of both contents.
+        poses: from which they are drawn; None before the first one.
     """
 
     def __init__(self) -> None:
         """Both slots are empty."""
         self.front = 0
-        self.scenes: list[Scene | None] = [None, None]
+        self.contents: list[Scene | int | None] = [None, None]
         self.poses: list[Float[np.ndarray, "4 4"] | None] = [None, None]
         self.parts = [0, 0]
         self._start = -1e9
         self._fading = False
 
-    def choose_slot(self, scene: Scene) -> int | None:
-        """The slot for a scene; None while the other one is fading out, or if it is shown already."""
-        if self._fading or self.scenes[self.front] is scene:
+    def choose_slot(self, content: Scene | int) -> int | None:
+        """The slot for a content; None while the other one is fading out, or if it is shown already."""
+        shown = self.contents[self.front]
+        if self._fading or shown is content or (isinstance(content, int) and shown == content):
             return None
-        return self.front if self.scenes[self.front] is None else 1 - self.front
+        return self.front if shown is None else 1 - self.front
 
-    def show(self, slot: int, scene: Scene, now: float, part: int = 0) -> None:
-        """Show a scene that has been uploaded to a slot; at time `now` (seconds) the other one starts to fade out."""
-        self._fading = self.scenes[slot] is not None or slot != self.front
-        self.scenes[slot], self.front, self._start = scene, slot, now
+    def show(self, slot: int, content: Scene | int, now: float, part: int = 0) -> None:
+        """Show what is ready in a slot; at time `now` (seconds) the other one starts to fade out."""
+        self._fading = self.contents[slot] is not None or slot != self.front
+        self.contents[slot], self.front, self._start = content, slot, now
         self.poses[slot], self.parts[slot] = None, part
 
     def move(self, pose: Float[np.ndarray, "4 4"], part: int = 0) -> None:
-        """Draw the scenes of a part from this pose."""
+        """Draw the contents of a part from this pose."""
         for slot in range(2):
             if self.parts[slot] == part or self.poses[slot] is None:
                 self.poses[slot] = pose
 
     def compute_weight(self, now: float) -> float:
-        """Weight of the scene that is shown, 0 to 1; that of the other one is the rest."""
+        """Weight of what is shown, 0 to 1; that of the other slot is the rest."""
         done = min(max((now - self._start) / FADE_SECONDS, 0.0), 1.0)
         self._fading = self._fading and done < 1
         return done * done * (3 - 2 * done) if self._fading else 1.0
 
     def clear(self) -> None:
-        """Forget both scenes; the first slot is the front."""
-        self.front, self.scenes, self.poses, self._fading = 0, [None, None], [None, None], False
+        """Forget both; the first slot is the front."""
+        self.front, self.contents, self.poses, self._fading = 0, [None, None], [None, None], False
 
 
 @dataclass(frozen=True)

@@ -49,10 +49,12 @@ class Comparer:
             return state.photograph
         return self.photographs.find_nearest(np.asarray(state.camera.position))
 
-    def get_photograph(self, state: ViewerState, *, error: bool = False, split: float = 0.0) -> RightSide | None:
-        """The chosen photograph, or the error against it; None while it is read, or if there is none."""
-        index = self.choose_photograph(state)
-        if index is None:
+    def get_photograph(
+        self, state: ViewerState, index: int | None = None, *, error: bool = False, split: float = 0.0
+    ) -> RightSide | None:
+        """A photograph, the chosen one by default, or the error against it; None while it is read, or without one."""
+        index = self.choose_photograph(state) if index is None else index
+        if index is None or index >= len(self.photographs):
             return None
         try:
             texture = self.photographs.get(index)

@@ -50,7 +50,6 @@ _HANDLE = (
     | imgui.WindowFlags_.no_bring_to_front_on_focus.value
     | imgui.WindowFlags_.no_nav.value
 )
-_NUM_PANORAMAS = 9  # with buttons, as there are keys
 _OPENED_NOTES = 3  # at most, at first
 
 
@@ -70,6 +69,7 @@ class PanelData:
     frame_ms: float = 0.0
     size: tuple[int, int] = (0, 0)  # of the rendered image, pixels; smaller than the window while the camera moves
     photographs: list[str] = field(default_factory=list)  # their names
+    panoramas: list[str] = field(default_factory=list)  # names of the input cameras of the scene
     photograph_distance: float = 0.0  # from the camera to that of the photograph of the comparison, metres
     right_name: str | None = None  # of what is shown right of the divider; None if there is nothing
     pinned: bool = False  # whether an image is pinned
@@ -226,7 +226,7 @@ class Panels:
                 self._section("Gaussians", self._draw_gaussians, state)
             self._section("Display", self._draw_display, state)
             self._section("Compare", self._draw_comparison, state, data, commands)
-            self._section("Camera", self._draw_camera, state)
+            self._section("Camera", self._draw_camera, state, data.panoramas)
             self._section("Screenshot", self._draw_screenshot, commands)
             self._section("Drawing", self._draw_settings, state, data.stats, opened=False)
             self._section("Camera path", self._draw_path, state, data, commands, opened=False)
@@ -334,7 +334,7 @@ class Panels:
         state.settings = settings
         state.adaptive = self._check("coarser while moving", state.adaptive)
 
-    def _draw_camera(self, state: ViewerState) -> None:
+    def _draw_camera(self, state: ViewerState, names: list[str]) -> None:
         if self._radio("fly", not state.orbiting):
             state.orbiting = False
         imgui.same_line()
@@ -350,13 +350,8 @@ class Panels:
         state.speed = self._slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
         if not len(state.context):
             return
-        for view in range(min(len(state.context), _NUM_PANORAMAS)):
-            if view % 5:
-                imgui.same_line()
-            if self._button(f"{view + 1}##panorama"):
-                jump_to_view(state, view)
-        imgui.same_line()
-        imgui.text_unformatted("panorama")
+        if state.tour is None:  # which has a list of its own
+            self._draw_panoramas(state, names)
         if self._button("Stop" if state.playing else "Fly"):
             toggle_play(state)
         imgui.same_line()
@@ -365,6 +360,17 @@ class Panels:
         if flight != state.flight:
             state.playing = False
             fly_to(state, flight)
+
+    def _draw_panoramas(self, state: ViewerState, names: list[str]) -> None:
+        """Draw a button for each panorama, in rows."""
+        style, right = imgui.get_style(), imgui.get_window_pos().x + imgui.get_window_width()
+        for view, name in enumerate(names):
+            width = imgui.calc_text_size(name).x + 2 * style.frame_padding.x + style.item_spacing.x
+            if view and imgui.get_item_rect_max().x + width < right - style.window_padding.x:
+                imgui.same_line()
+            if imgui.button(f"{name}##panorama {view}"):
+                jump_to_view(state, view)
+            self._record_rectangle(f"{view + 1}##panorama")
 
     def _draw_display(self, state: ViewerState) -> None:
         for number, display in enumerate(get_args(Display)):

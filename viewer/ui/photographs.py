@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import moderngl
 import numpy as np
@@ -16,6 +16,7 @@ from pansplat.errors import InputError
 
 MAX_HEIGHT = 2048  # pixels; sharper than the image at fields of view above 65 degrees on 720 rows
 _MAX_TEXTURES = 4  # 25 MB each
+_VIEW_HEIGHT = 64  # pixels, of a panorama in which a view is chosen
 
 
 class Photographs:
@@ -47,7 +48,7 @@ class Photographs:
     @property
     def is_reading(self) -> bool:
         """Whether a photograph is being read."""
-        return bool(self._reading)
+        return any(not reading.done() for reading in self._reading.values())
 
     def open(self, panoramas: Sequence[Panorama]) -> None:
         """Replace the photographs; the same objects are kept, those of a folder that is read again are not."""
@@ -96,6 +97,13 @@ class Photographs:
         self._textures[index] = texture
         return texture
 
+    def wait(self, index: int) -> None:
+        """Wait until a photograph has been read, or cannot be."""
+        if index not in self._textures and index not in self._failed:
+            if index not in self._reading:
+                self._reading[index] = self._reader.submit(_read_pixels, self._panoramas[index])
+            wait([self._reading[index]])
+
     def release(self) -> None:
         """Stop the reader and free the textures."""
         self._clear()
@@ -109,6 +117,21 @@ class Photographs:
         self._reading.clear()
         self._failed.clear()
         self._textures.clear()
+
+
+def find_open_view(panorama: Panorama) -> float:
+    """The yaw with the most edges around it: a wide view rather than a bare wall. Radians right of the centre.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    gray = read_panorama(panorama.image, _VIEW_HEIGHT)[0].mean(dim=0).numpy()
+    around = np.concatenate((gray, gray[:, :1]), axis=1)[_VIEW_HEIGHT // 4 : -_VIEW_HEIGHT // 4]  # within 45 degrees
+    edges = np.abs(np.diff(around, axis=1))[:-1] + np.abs(np.diff(around, axis=0))[:, :-1]
+    angles = np.arange(2 * _VIEW_HEIGHT) * (np.pi / _VIEW_HEIGHT)  # from edge to edge, of a column to the first one
+    window = np.exp(4 * (np.cos(angles) - 1))  # half of its height at 34 degrees
+    nearby = np.fft.irfft(np.fft.rfft(edges.sum(axis=0)) * np.fft.rfft(window).conj(), len(angles))
+    return float(angles[nearby.argmax()] - np.pi)
 
 
 def _read_pixels(panorama: Panorama) -> UInt8[np.ndarray, "height width 3"]:

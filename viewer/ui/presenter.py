@@ -82,6 +82,10 @@ class Presenter:
             self._program["max_error"] = right.max_error
         self._triangle.render(moderngl.TRIANGLES, vertices=3)
 
+    def draw_photograph(self, photograph: RightSide, target: moderngl.Framebuffer, camera: cameras.Camera) -> None:
+        """Fill `target` with a photograph, at an infinite distance around its camera."""
+        self.draw(photograph.texture, target, camera, right=photograph)
+
     def _copy(self, image: moderngl.Texture, target: moderngl.Framebuffer) -> None:
         """Copy an image of the target's size; software OpenGL copies fifty times as fast as it draws."""
         source = self.ctx.framebuffer([image])
@@ -94,3 +98,35 @@ class Presenter:
         self._table.release()
         self._triangle.release()
         self._programs.release()
+
+
+class PhotographLayer:
+    """The image of a photograph in the direction of a camera, to fade it like the image of a scene."""
+
+    def __init__(self, presenter: Presenter) -> None:
+        """`presenter` draws the image."""
+        self._presenter = presenter
+        self._target: moderngl.Framebuffer | None = None
+        self._key: tuple[object, ...] = ()
+
+    def draw(self, photograph: RightSide, camera: cameras.Camera, size: tuple[int, int]) -> moderngl.Texture:
+        """The image of this size (width, height), bottom row first."""
+        target = self._target
+        if target is None or target.size != size:
+            self.release()
+            ctx = self._presenter.ctx
+            self._target = target = ctx.framebuffer([ctx.texture(size, 4)])
+        texture = target.color_attachments[0]
+        assert isinstance(texture, moderngl.Texture)
+        key = (photograph.texture, camera)
+        if key != self._key:
+            self._presenter.draw_photograph(photograph, target, camera)
+            self._key = key
+        return texture
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        if self._target is not None:
+            self._target.color_attachments[0].release()
+            self._target.release()
+        self._target, self._key = None, ()

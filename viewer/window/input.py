@@ -31,6 +31,7 @@ HELP = (
     ("V", "orbit or fly"),
     ("F", "focus the point in the centre"),
     ("1 2 ... 9", "jump to a panorama (tour: fly there)"),
+    ("PgDn, PgUp", "the next or previous panorama"),
     ("Space", "play the flight between them"),
     ("M", "floor plan and hotspots of a tour"),
     (", .", "step along the flight (placing: turn)"),
@@ -107,6 +108,8 @@ _KEYS = {
     ".": "period",
     "tab": "tab",
     "escape": "escape",
+    "page down": "page_down",
+    "page up": "page_up",
     "up": "up_arrow",
     "down": "down_arrow",
     "left": "left_arrow",
@@ -214,6 +217,10 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
     for view in range(9):
         if str(view + 1) in pressed:
             jump_to_view(state, view)
+    for key, steps in (("page up", -1), ("page down", 1)):
+        if key in pressed and len(state.context):
+            distances = np.linalg.norm(state.context[:, :3, 3] - state.camera.position, axis=1)
+            jump_to_view(state, (int(distances.argmin()) + steps) % len(state.context))
     for key, steps in ((",", -1), (".", 1)):
         if key in pressed:
             step_flight(state, steps)

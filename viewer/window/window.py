@@ -81,6 +81,7 @@ class Window:
             glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
             glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
             glfw.window_hint(glfw.SCALE_TO_MONITOR, True)
+            glfw.window_hint(glfw.VISIBLE, False)  # until the first frame: an empty window is black
             glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
             for major, minor in CONTEXT_VERSIONS:
                 glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
@@ -192,6 +193,10 @@ class Window:
         """Set the window's title."""
         self._glfw.set_window_title(self._handle, title)
 
+    def show(self) -> None:
+        """Make the window visible."""
+        self._glfw.show_window(self._handle)
+
     def swap(self) -> None:
         """Swap front and back buffers."""
         self._glfw.swap_buffers(self._handle)
@@ -222,6 +227,7 @@ def run_viewer(window: Window, viewer: Viewer) -> None:
 def _run_loop(window: Window, viewer: Viewer) -> None:
     last, title = time.perf_counter(), None
     active_until = 0.0
+    shown = False
     target = window.ctx.detect_framebuffer(0)
     while not (window.closing or viewer.state.quit):
         before = time.perf_counter()
@@ -250,6 +256,9 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
         viewer.frame(target, seconds, window.new_frame)
         window.swap()
         window.check_context()
+        if not shown:
+            window.show()
+            shown, active_until = True, time.perf_counter() + 0.25
         data = viewer.panel_data
         if data.current >= 0 and title != (title := f"{data.entries[data.current]} - pansplat"):
             window.set_title(title)

@@ -62,12 +62,13 @@ def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
 def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_file):
     (entry,) = find_entries(house_file, LoadOptions())
     first = load_entry(entry, LoadOptions(), ignore)
-    tour, scenes = first.entry.tour, TourScenes(first.entry.tour, merged=first.entry.merged)
+    tour, scenes = first.entry.tour, TourScenes.start(first)
     assert tour.name == "home" and tour.overlaps == house.overlaps and first.is_final
     assert np.allclose(tour.positions, house.positions) and first.entry.views == (0, 1)
     assert first.entry.panoramas == () and first.entry.files == (house_file,)
-    other = load_entry(scenes.make_entry((2, 3)), LoadOptions(), ignore)
-    assert other.entry.views == (2, 3) and other.entry.panoramas == ()
+    assert set(first.outlines) <= {0, 1, 2, 3} and scenes.edge == (0, 1) and not scenes.list_next(None, 0.0)[1:]
+    other = scenes.get((2, 3))
+    assert other.entry.views == (2, 3) and scenes.loaded == [(0, 1), (1, 2), (2, 3)]
     assert other.scene.gaussians.views.unique().tolist() == [0, 1]
     assert np.allclose(other.scene.cam2world, house.cam2world[2:])
 
@@ -94,6 +95,31 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
     for each in (tour, single):
         loaded = load_entry(SceneEntry("house", tour=each), LoadOptions(), ignore)
         assert loaded.entry.views == (0,) and loaded.entry.tour is each and loaded.scene is scene
+
+
+def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_follows(monkeypatch, house, load_house):
+    # The walk of the graph that is not connected starts at 0; that of the connected one at 3.
+    connected = replace(house, overlaps={(0, 1): 0.13, (1, 2): 0.4, (2, 3): 0.4, (0, 2): 0.4})
+    monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: connected)
+    asked = []
+
+    def predict(pair, refine_seconds, on_predicted, **options):
+        views = tuple(int(view.name[-1]) for view in pair.context)
+        asked.append((views, refine_seconds, on_predicted is not None))
+        return load_house(TourScenes(house).make_entry(views)).scene
+
+    monkeypatch.setattr("pansplat.pipeline.predict", predict)
+    first = load_entry(SceneEntry("house", tour=house), LoadOptions(), ignore, lambda loaded: None)
+    assert first.entry.start == 0 and 0 in first.entry.views and first.entry.tour is connected
+    scenes = TourScenes.start(first)
+    request = scenes.choose_request(scenes.list_next(None, 0.0), SceneEntry("house", tour=house))
+    assert request.views == (0, 1, 2, 3)
+    part = load_entry(request, LoadOptions(), ignore, lambda loaded: None)
+    assert asked[0] == ((0, 1, 2), 0.0, False), "the first scene is not refined"
+    assert asked[1] == ((0, 1, 2, 3), pytest.approx(10.0 * 4 / 3), True)
+    assert part.entry.views == request.views and set(part.outlines) <= set(request.views)
+    film = load_entry(SceneEntry("house", tour=house), LoadOptions(), ignore)
+    assert film.entry.views == (0, 1, 2, 3), "a film needs all, so that nothing is predicted twice"
 
 
 def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(monkeypatch, parted_house, load_house):

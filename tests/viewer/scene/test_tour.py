@@ -1,10 +1,12 @@
 """The scenes of a tour are chosen, requested, kept and faded; hotspots are found; the film has no jumps."""
 
+import itertools
 from dataclasses import replace
 
 import av
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from pansplat.data.pairs import Link
@@ -13,6 +15,7 @@ from pansplat_viewer import run
 from pansplat_viewer.capture import Film, TourFrames, write_tour
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.loader import SceneEntry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.tour import CrossFade, TourScenes, find_clicked, find_hotspots, measure_bytes
 
@@ -51,18 +54,73 @@ def test_missing_scenes_are_requested_first_then_refinements(house, load_house, 
     scenes.add(load_house(request))
     assert scenes.choose_request(wanted, None) is None
     refining = scenes.make_entry((1, 2))
-    assert scenes.choose_request([(2, 3), (1, 2)], refining).views == (2, 3), "the scene of the camera is missing"
     assert scenes.choose_request([(1, 2), (2, 3)], refining) is None
+    scenes.move(house.positions[3])
+    assert scenes.choose_request([(2, 3), (1, 2)], refining).views == (2, 3), "the scene of the camera is missing"
+    predicting = scenes.make_entry((0, 2))
+    assert scenes.choose_request([(2, 3), (0, 2)], predicting) is None, "a prediction is not lost"
 
 
-def test_a_route_can_be_flown_up_to_the_first_scene_that_is_missing(house, load_house, scenes):
-    route = plan_route(house, [0, 1, 2, 3])
-    limit = scenes.find_limit(route, 0.0)
-    assert 0 < limit < 1 and route.edge(limit) == (0, 1)
-    assert scenes.list_next(route, 0.0) == [(0, 1), (1, 2), (2, 3)]
-    for views in ((1, 2), (2, 3)):
+def test_scenes_of_edges_are_selected_from_one_prediction_of_their_part(house, load_house):
+    entry = SceneEntry(house.name, tour=house, max_views=64)
+    first = load_house(replace(entry, pair=house.make_pair((0, 1)), views=(0, 1), start=1))
+    scenes = TourScenes.start(first)
+    assert scenes.views == (0, 1) and scenes.loaded == [(0, 1)] and scenes.get((0, 1)) is first
+    (part,) = scenes.list_next(None, 0.0)
+    assert part == (0, 1, 2, 3), "all are predicted at once"
+    request = scenes.choose_request([part], first.entry)
+    assert request.views == part and request.name == "4 panoramas", "the first scene is not refined"
+    predicted = load_house(request)
+    scenes.add(replace(predicted, is_final=False))
+    assert scenes.loaded == [(0, 1), (1, 2), (2, 3)] and scenes.choose_request([part], request) is None
+    for views in scenes.loaded:
+        scene, gaussians = scenes.get(views).scene, predicted.scene.gaussians
+        assert scene is scenes.get(views).scene is not first.scene
+        assert np.allclose(scene.cam2world, house.cam2world[list(views)])
+        for view, node in enumerate(views):
+            means = scene.gaussians.means[scene.gaussians.views == view]
+            assert means.equal(gaussians.means[gaussians.views == node])
+    before = scenes.get((0, 1)).scene
+    scenes.add(predicted)
+    assert scenes.get((0, 1)).scene is not before, "selected from the refined part"
+    assert scenes.choose_request([part], None) is None, "nothing is predicted twice"
+    assert scenes.copy().loaded == scenes.loaded
+
+
+def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_house, monkeypatch):
+    monkeypatch.setattr("pansplat.tours.graph._MAX_PREDICTED", 2)
+    scenes = TourScenes(house, max_views=64)
+    predictions = scenes.list_next(None, 0.0)
+    assert set(predictions) == {(0, 1), (1, 2, 3)}, "with the best neighbour of panorama 2"
+    for views in predictions:
         scenes.add(load_house(scenes.make_entry(views)))
-    assert scenes.find_limit(route, limit) == 1
+    scene = scenes.get((1, 2)).scene
+    for view, views in enumerate(((0, 1), (1, 2, 3))):
+        source = scenes._loaded[views].scene.gaussians
+        expected = source.harmonics[source.views == 1]
+        assert scene.gaussians.harmonics[scene.gaussians.views == view].equal(expected), "panorama 1 of the first"
+
+
+def test_a_scene_is_good_along_its_edges_and_near_its_panoramas(scenes):
+    for z, inside in ((0.4, True), (1.0, True), (1.15, False), (1.6, False)):
+        scenes.edge = (0, 1) if z < 0.8 else (1, 2)
+        assert scenes.is_inside(np.array((0.0, 0.0, z)), (0, 1)) == inside, z
+
+
+def test_predictions_go_on_to_the_last_scene_and_what_was_dropped_is_read_when_it_is_needed(house, load_house):
+    panoramas = [replace(house.panoramas[0], cam2world=torch.eye(4, dtype=torch.float64)) for _ in range(8)]
+    for k, panorama in enumerate(panoramas):
+        panorama.cam2world[2, 3] = 0.8 * k
+    row = replace(house, panoramas=tuple(panoramas), overlaps={(k, k + 1): 0.4 for k in range(7)})
+    scenes, loaded = TourScenes(row, memory=0.0), []
+    while (request := scenes.choose_request(scenes.list_next(None, 0.0), None)) is not None:
+        loaded.append(request.views)
+        scenes.add(load_house(request))
+        assert len(scenes.loaded) <= 3
+    assert loaded == [(k, k + 1) for k in range(7)], "the nearest first, each once"
+    scenes.move(row.positions[3])
+    assert scenes.views not in scenes.loaded
+    assert scenes.choose_request(scenes.list_next(None, 0.0), None).views == scenes.views
 
 
 def test_the_way_to_a_panorama_starts_at_the_camera(scenes):
@@ -122,8 +180,7 @@ def test_scenes_of_other_parts_are_loaded_next_those_of_links_first(parted_house
     route = scenes.plan_way(parted_house.cam2world[3].numpy(), 0)
     assert route.walk == (3, 2, 1, 0) and route.fades == (0,)
     scenes.add(load_house(scenes.make_entry((3,))))
-    limit = scenes.find_limit(route, 0.0)
-    assert route.edge(limit) is None and np.linalg.norm(route.pose(limit)[:3, 3] - parted_house.positions[3]) < 0.71
+    assert scenes.list_next(route, 0.0) == [(3,), (1, 2), (0, 1)], "those of the route"
     assert scenes.camera_height == 1.0
     scenes.move(route.pose(1.0)[:3, 3], route, 1.0)
     assert scenes.views == (0, 1)
@@ -208,6 +265,32 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
     assert change > 30 and steps.max() < 0.3 * change, "scenes of different colours fade"
     with Image.open(written[1]) as plan:
         assert max(plan.size) == 1024
+
+
+def test_a_change_of_scenes_changes_the_picture_no_more_than_a_flight_along_an_edge(house, load_house):
+    scenes = TourScenes(house, max_views=64)
+    loaded = load_house(scenes.make_entry((0, 1, 2, 3)))
+    brightness = torch.tensor((1.0, 0.3, 0.8, 0.1))[loaded.scene.gaussians.views]
+    gaussians = replace(loaded.scene.gaussians, harmonics=loaded.scene.gaussians.harmonics * brightness[:, None, None])
+    scenes.add(replace(loaded, scene=replace(loaded.scene, gaussians=gaussians)))
+    renderers = [CpuRenderer(None), CpuRenderer(None)]
+    frames = TourFrames(renderers, scenes, pytest.fail, (48, 27), DrawSettings(mode="deferred"))
+    route = plan_route(house, [0, 1, 2, 3])
+    times = np.arange(0, route.seconds, 1 / 20)  # steps of 5 cm at most
+    shown, edges = [], []
+    for seconds in times:
+        pose = route.pose(seconds / route.seconds)
+        scenes.move(pose[:3, 3], route, seconds / route.seconds)
+        shown.append(frames.draw_scene(pose, 75.0, seconds)[0])
+        edges.append(scenes.edge)
+    for renderer in renderers:
+        renderer.release()
+    steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3))
+    changes = [k for k, (a, b) in enumerate(itertools.pairwise(edges)) if a != b]
+    is_fading = np.any([(times[:-1] >= times[k]) & (times[:-1] < times[k] + FADE_SECONDS) for k in changes], axis=0)
+    assert len(changes) == 2 and 10 < is_fading.sum() < len(steps) - 10
+    assert steps[changes].max() <= steps[~is_fading].max(), "no jump when an edge ends"
+    assert steps[is_fading].max() <= steps[~is_fading].max(), "nor while the scenes fade"
 
 
 @pytest.mark.gl

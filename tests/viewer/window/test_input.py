@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene
 from pansplat_viewer.window.input import FAST, FLY_SPEED, SLOW, Commands, Input, apply_input
@@ -81,6 +82,17 @@ def test_digits_jump_to_the_panoramas_that_exist(state):
     before = state.camera
     press(state, "3")
     assert state.camera == before
+
+
+def test_page_keys_reach_all_panoramas_in_their_order(state, random_scene):
+    poses = torch.eye(4, dtype=torch.float64).repeat(12, 1, 1)
+    poses[:, 2, 3] = torch.arange(12)
+    enter_scene(state, replace(random_scene(), cam2world=poses))
+    visited = []
+    for key in (*["page down"] * 12, "page up"):
+        press(state, key)
+        visited.append(state.camera.position[2])
+    assert visited == pytest.approx([*range(1, 12), 0, 11])
 
 
 def test_space_plays_the_flight_to_its_end_and_again_from_the_start(state):
