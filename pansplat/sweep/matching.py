@@ -563,22 +563,22 @@ def _jump_penalty(pixel, before, penalties):
 
 
 @nb.njit(fastmath=True, nogil=True, cache=True)
-def _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx):
-    """Add the costs of horizontal paths; each starts a full turn early, so that it is closed."""
+def _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx, run_up):
+    """Add the costs of horizontal paths; each starts `run_up` columns early, so that it has no visible start."""
     height, width, labels = cost.shape
     previous, current = np.empty(labels, np.float32), np.empty(labels, np.float32)
     in_slot, near_slot = np.empty(slots, np.float32), np.empty(slots, np.float32)
     for i in range(height):
         t = stretch[i]  # neighbours near a pole are closer, so penalties are higher
-        previous[:] = cost[i, 0]
-        for n in range(1, 2 * width):
+        previous[:] = cost[i, -dx * run_up % width]
+        for n in range(1 - run_up, width):
             j, j_before = (dx * n) % width, (dx * (n - 1)) % width
             jump = _jump_penalty(guide[i, j], guide[i, j_before], penalties)
             _advance_path(
                 previous, cost[i, j], slot_map[i, j], penalties.step * t, penalties.crease * t, jump * t,
                 in_slot, near_slot, current,
             )  # fmt: skip
-            if n >= width:
+            if n >= 0:
                 for label in range(labels):
                     total[i, j, label] += current[label]
             previous, current = current, previous
@@ -635,7 +635,7 @@ def aggregate_costs(
         total = np.zeros_like(cost)
         for dy, dx in directions:
             if dy == 0:
-                _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx)
+                _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx, height)  # half a turn
             else:
                 _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, height // 4)
         return total

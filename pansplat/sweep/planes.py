@@ -34,7 +34,7 @@ _DOWN_AXIS = 0
 MIN_FLOOR = 0.9  # smallest distance of the floor or ceiling from the camera, in units of `near`
 _FLOOR_SOLID_ANGLE = 0.02  # smallest fraction of the sphere that a floor or ceiling covers
 
-_CANDIDATES = 192  # planes across an axis
+_CANDIDATES = 96  # planes across an axis
 _SOFTNESS = np.float32(0.1)  # difference of cost that divides a vote by e
 _MAX_COST = np.float32(0.6)  # smallest cost of a match without a vote
 _MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight

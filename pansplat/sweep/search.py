@@ -50,7 +50,7 @@ from pansplat.sweep.surface import (
     resize_sphere,
 )
 
-_DETECTION_HEIGHT = 128  # pixels; planes are detected at this size
+_DETECTION_HEIGHT = 96  # pixels; planes are detected at this size
 
 
 @dataclass(frozen=True)

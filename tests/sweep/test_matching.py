@@ -235,7 +235,7 @@ def test_fast_atan2_is_within_two_microradians():
     assert np.allclose(_all_atan2(y, x), np.arctan2(y, x), atol=2e-6)
 
 
-_AWAY_FROM_POLES = slice(4, -4)
+_AWAY_FROM_POLES = slice(8, -8)
 """Rows where the start of a path has no effect after half a turn; near a pole penalties are too high for that."""
 _DEFAULT = AggregationConfig()
 _FREE = AggregationConfig(step_penalty=0, crease_penalty=0, jump_penalty=0)
@@ -346,7 +346,7 @@ def test_the_number_of_threads_changes_no_bit():
 
 
 def test_rolling_the_cost_rolls_the_total():
-    cost, guide, columns = _noise(32, 12), 0.1 * _noise(32, 3, seed=2), 23
+    cost, guide, columns = _noise(64, 12), 0.1 * _noise(64, 3, seed=2), 23
     total = _aggregate(cost, guide)
     rolled = _aggregate(np.roll(cost, columns, axis=1), np.roll(guide, columns, axis=1))
     assert np.allclose(np.roll(rolled, -columns, axis=1)[_AWAY_FROM_POLES], total[_AWAY_FROM_POLES], atol=1e-4)
@@ -354,7 +354,7 @@ def test_rolling_the_cost_rolls_the_total():
 
 @pytest.mark.parametrize("axis", (0, 1))
 def test_mirroring_the_cost_mirrors_the_total(axis):
-    cost, guide = _noise(32, 12), 0.1 * _noise(32, 3, seed=2)
+    cost, guide = _noise(64, 12), 0.1 * _noise(64, 3, seed=2)
     total = _aggregate(cost, guide)
     mirrored = _aggregate(*(np.ascontiguousarray(np.flip(a, axis)) for a in (cost, guide)))
     assert np.allclose(np.flip(mirrored, axis)[_AWAY_FROM_POLES], total[_AWAY_FROM_POLES], atol=1e-4)
