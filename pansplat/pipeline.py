@@ -36,7 +36,7 @@ from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_na
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
 from pansplat.predictor import MIN_HEIGHT, Predictor, Progress
-from pansplat.refinement import RefineConfig, Refinement, RefineReport, refinement_fingerprint
+from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement, RefineReport, refinement_fingerprint
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
@@ -237,6 +237,17 @@ def choose_tour_size(pair: Pair, gaussians: float = math.inf, height: int | None
     return height or choose_tour_height(pair, gaussians), count
 
 
+def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
+    """The context panoramas for the refinement of a scene of a height, to at most a number of Gaussians.
+
+    With a limit they have twice the rows, at most `DISPLAY_HEIGHT`: those of the prediction do not show the gaps
+    between Gaussians.
+    """
+    if gaussians is not None:
+        height = max(height, min(2 * height, DISPLAY_HEIGHT, pair.image_height))
+    return pair.load_context(height)
+
+
 def predict(
     source: Pair | Views | str | Path,
     model: str | Path | Predictor = "default",
@@ -295,7 +306,8 @@ def predict(
     if final is not None:
         return final
     began = time.process_time()
-    refinement = Refinement(scene, views, config)
+    photographs = load_photographs(pair, height, gaussians) if isinstance(pair, Pair) else views
+    refinement = Refinement(scene, photographs, config)
     done = refinement.run(seconds=refine_seconds, progress=lambda what, done: report(what, 0.5 + 0.5 * done))
     scene = refinement.scene()
     if cached is None:

@@ -40,6 +40,9 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.weights import compute_blending_weights
 
 _HEIGHT = 512  # largest of the images that are compared; colours are fitted at the photographs' own height
+# The same with a limit of Gaussians. These are larger than the pixels, and fitted at 512 rows they show as rows of dots
+# in larger images (docs/refinement.md).
+DISPLAY_HEIGHT = 1024
 _HELD_OUT = 0.04  # fraction of the blocks of the photographs
 _SPLIT_ERROR = 0.1  # least sum of a split Gaussian's absolute errors times its blending weights, pixels
 _BETAS = (0.9, 0.99)  # decay of Adam's averages of the gradients and of their squares
@@ -115,7 +118,6 @@ class Refinement:
     """
 
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
-        self._created = time.perf_counter()
         self._factor = working_factor(scene.near)
         scene = scene.scaled(self._factor)
         _check_fit(scene, views, scale_poses(views.cam2world, self._factor))
@@ -124,17 +126,19 @@ class Refinement:
         self._images = views.images.float().to(device)
         self._masks = views.masks.to(device)
         compared = (views.masks & mask_holes(views.images)).to(device)
-        height = min(self._images.shape[-2], _HEIGHT)
+        limit = self.config.gaussians
+        height = min(self._images.shape[-2], _HEIGHT if limit is None else DISPLAY_HEIGHT)
         self._size = (height, 2 * height)
+        self._counted_size = (min(height, _HEIGHT), 2 * min(height, _HEIGHT))  # of contributions
         self._photographs = [
             Photograph.split(image, mask > 0.999, _HELD_OUT, random)
             for image, mask in zip(
                 self._shrink(self._images), self._shrink(compared[:, None].float())[:, 0], strict=True
             )
         ]
-        limit = self.config.gaussians
         if limit is not None and len(scene.gaussians) > limit:
-            scene = merge_to(scene, self._size, limit)
+            scene = merge_to(scene, self._counted_size, limit)
+        self._created = time.perf_counter()
         self._start, gaussians = scene, scene.gaussians
         self._targets = {  # photographs that a view is compared with; the first is its own
             view: [view, *nearest_views(scene.cam2world, view, MAX_OTHERS)] for view in range(len(scene.cam2world))
@@ -339,8 +343,8 @@ class Refinement:
         self._result = self._scene() if after <= before else self._start
         self._release_parameters()
         if after <= before:
-            detail = self._size[0] / self._images.shape[-2]  # of large photographs is in Gaussians of small area
-            self._result = drop_unseen(self._result, self._size, detail * DROP_ERROR)
+            detail = self._counted_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
+            self._result = drop_unseen(self._result, self._counted_size, detail * DROP_ERROR)
             self._result = self._finish(self._result)
         else:
             stopped = "worse"
