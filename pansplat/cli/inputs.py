@@ -27,8 +27,6 @@ Out = Annotated[Path, arg(aliases=["-o"])]
 OptionalOut = Annotated[Path | None, arg(aliases=["-o"])]
 Compat = Literal["trained", "official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
-_REFINE_SECONDS = 10.0
-_PAGE_REFINE_SECONDS = 30.0  # of a pair, which is compared at more rows
 
 
 @dataclass(frozen=True)
@@ -117,15 +115,15 @@ class ScenePrediction:
                 connect(tours[0], progress),
                 model,
                 height=self.predict_height,
-                refine_seconds=_REFINE_SECONDS if self.refine is None else self.refine,
+                refine_seconds=pipeline.choose_refine_seconds(None) if self.refine is None else self.refine,
                 gaussians=gaussians,
                 progress=progress,
             )
 
     def _predict_pair(self, pair: Pair, gaussians: int | None = None) -> Scene:
-        seconds = self.refine
-        if seconds is None:
-            seconds = _REFINE_SECONDS if gaussians is None else _PAGE_REFINE_SECONDS
+        from pansplat import pipeline
+
+        seconds = pipeline.choose_refine_seconds(gaussians) if self.refine is None else self.refine
         return predict_scene(
             pair, self.model.load(), self.predict_height, cache=True, refine_seconds=seconds, gaussians=gaussians
         )
