@@ -413,7 +413,7 @@ class _PairSteps:
 
     def _refine_to(self, path: Path) -> None:
         scene = self.read()
-        views = self._pair.load_context(scene.height)
+        views = pipeline.load_photographs(self._pair, scene.height, self._gaussians)
         config = RefineConfig(gaussians=self._gaussians)
         pipeline.refine_to_file(scene, views, path, seconds=self._refine_seconds, config=config)
 

@@ -36,7 +36,7 @@ from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_na
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
 from pansplat.predictor import MIN_HEIGHT, Predictor, Progress
-from pansplat.refinement import RefineConfig, Refinement, RefineReport, refinement_fingerprint
+from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement, RefineReport, refinement_fingerprint
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
@@ -237,6 +237,22 @@ def choose_tour_size(pair: Pair, gaussians: float = math.inf, height: int | None
     return height or choose_tour_height(pair, gaussians), count
 
 
+def choose_refine_seconds(gaussians: int | None) -> float:
+    """Default time limit of a refinement; with a limit of Gaussians more, because the images have more rows."""
+    return 10.0 if gaussians is None else 30.0
+
+
+def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
+    """The context panoramas for the refinement of a scene of a height, to at most a number of Gaussians.
+
+    With a limit they have twice the rows, at most `DISPLAY_HEIGHT`: those of the prediction do not show the gaps
+    between Gaussians.
+    """
+    if gaussians is not None:
+        height = max(height, min(2 * height, DISPLAY_HEIGHT, pair.image_height))
+    return pair.load_context(height)
+
+
 def predict(
     source: Pair | Views | str | Path,
     model: str | Path | Predictor = "default",
@@ -295,7 +311,8 @@ def predict(
     if final is not None:
         return final
     began = time.process_time()
-    refinement = Refinement(scene, views, config)
+    photographs = load_photographs(pair, height, gaussians) if isinstance(pair, Pair) else views
+    refinement = Refinement(scene, photographs, config)
     done = refinement.run(seconds=refine_seconds, progress=lambda what, done: report(what, 0.5 + 0.5 * done))
     scene = refinement.scene()
     if cached is None:
@@ -343,7 +360,7 @@ def refine(
     Args:
         scene: of one input camera for each photograph.
         views: the photographs, such as `pair.load_context(height)`; masked pixels are not compared.
-        seconds: time limit, 10 by default; the result depends on the speed of the machine.
+        seconds: time limit, by default `choose_refine_seconds`; the result depends on the speed of the machine.
         steps: number of steps instead, for the same result in every run.
         config: settings of the objective, the step sizes and the number of Gaussians.
         seed: of the blocks of pixels that are held out of the loss.
@@ -393,10 +410,10 @@ def refine_to_file(
 def _run_refinement(
     scene: Scene, views: Views, config: RefineConfig | None, seed: int, **run: Any
 ) -> tuple[Scene, RefineReport]:
-    """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`, 10 s by default."""
+    """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`."""
     refinement = Refinement(scene, views, config, seed=seed)
     if run["steps"] is None and run["seconds"] is None:
-        run["seconds"] = 10.0
+        run["seconds"] = choose_refine_seconds(None if config is None else config.gaussians)
     report = refinement.run(**run)
     return refinement.scene(), report
 

@@ -44,7 +44,7 @@ class Export:
     up: Literal["y", "z"] | None = None
     """Axis of a given file that points up, if its program did not keep to the axes of the format."""
     gaussians: Count | None = None
-    """For .html: largest number of Gaussians, 300,000 by default; similar neighbours are merged."""
+    """For .html: largest number of Gaussians, 600,000 by default; similar neighbours are merged."""
     split: bool = False
     """For .html: write the data to a folder beside the page, for scenes that are large for one file."""
     title: str | None = None

@@ -71,8 +71,9 @@ class ScenePrediction:
     """How to predict the scene of a pair; unused for a scene file."""
 
     model: ModelChoice = field(default_factory=ModelChoice)
-    refine: Seconds = 10.0
-    """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none."""
+    refine: Seconds | None = None
+    """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none. 10 by default, for the page
+    of a pair 30."""
     predict_height: Height | None = None
     """Height that the panoramas are resized to before the prediction, for a pair; by default that of the photographs,
     at most 1024 (for networks 512)."""
@@ -91,7 +92,7 @@ class ScenePrediction:
 
         Args:
             path: the file or folder.
-            gaussians: see `pansplat.predict_tour`.
+            gaussians: of a page; see `pansplat.predict_tour`.
         """
         from pansplat import pipeline
         from pansplat.tours import connect, find_tours
@@ -101,7 +102,7 @@ class ScenePrediction:
         pairs = load_choice(path, self.choice)
         tours = find_tours(pairs) if self.choice.pair is None else []
         if not tours:
-            return self._predict_pair(pick_pair(path, pairs, self.choice))
+            return self._predict_pair(pick_pair(path, pairs, self.choice), gaussians)
         alone = sum(a == b for a, b in tours[0].overlaps)
         kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
         more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
@@ -114,13 +115,18 @@ class ScenePrediction:
                 connect(tours[0], progress),
                 model,
                 height=self.predict_height,
-                refine_seconds=self.refine,
+                refine_seconds=pipeline.choose_refine_seconds(None) if self.refine is None else self.refine,
                 gaussians=gaussians,
                 progress=progress,
             )
 
-    def _predict_pair(self, pair: Pair) -> Scene:
-        return predict_scene(pair, self.model.load(), self.predict_height, cache=True, refine_seconds=self.refine)
+    def _predict_pair(self, pair: Pair, gaussians: int | None = None) -> Scene:
+        from pansplat import pipeline
+
+        seconds = pipeline.choose_refine_seconds(gaussians) if self.refine is None else self.refine
+        return predict_scene(
+            pair, self.model.load(), self.predict_height, cache=True, refine_seconds=seconds, gaussians=gaussians
+        )
 
 
 def choose_pair(path: Path, choice: PairChoice) -> Pair:
@@ -154,14 +160,26 @@ def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
 
 
 def predict_scene(
-    pair: Pair, model: Predictor, height: int | None, *, cache: bool, refine_seconds: float = 0.0
+    pair: Pair,
+    model: Predictor,
+    height: int | None,
+    *,
+    cache: bool,
+    refine_seconds: float = 0.0,
+    gaussians: int | None = None,
 ) -> Scene:
     """Predict and refine a scene, and show a progress bar."""
     from pansplat import pipeline
 
     with progress_bar() as progress:
         return pipeline.predict(
-            pair, model, height=height, refine_seconds=refine_seconds, cache=cache, progress=progress
+            pair,
+            model,
+            height=height,
+            refine_seconds=refine_seconds,
+            gaussians=gaussians,
+            cache=cache,
+            progress=progress,
         )
 
 

@@ -38,7 +38,7 @@ class Refine:
     photographs: Path | None = None
     """Folder of the panoramas that a scene file was predicted from."""
     seconds: Seconds | None = None
-    """Time limit; 10 by default."""
+    """Time limit; 10 by default, with --gaussians 30."""
     steps: Count | None = None
     """Number of steps instead, for the same result in every run."""
     gaussians: Count | None = None

@@ -1,5 +1,11 @@
 """Refinement: after a prediction, the scene is fitted to its own photographs by rendering and comparison."""
 
-from pansplat.refinement.refinement import RefineConfig, Refinement, RefineReport, refinement_fingerprint
+from pansplat.refinement.refinement import (
+    DISPLAY_HEIGHT,
+    RefineConfig,
+    Refinement,
+    RefineReport,
+    refinement_fingerprint,
+)
 
-__all__ = ["RefineConfig", "RefineReport", "Refinement", "refinement_fingerprint"]
+__all__ = ["DISPLAY_HEIGHT", "RefineConfig", "RefineReport", "Refinement", "refinement_fingerprint"]

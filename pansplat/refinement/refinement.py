@@ -40,6 +40,9 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.weights import compute_blending_weights
 
 _HEIGHT = 512  # largest of the images that are compared; colours are fitted at the photographs' own height
+# The same with a limit of Gaussians. These are larger than the pixels, and fitted at 512 rows they show as rows of dots
+# in larger images (docs/refinement.md).
+DISPLAY_HEIGHT = 1024
 _HELD_OUT = 0.04  # fraction of the blocks of the photographs
 _SPLIT_ERROR = 0.1  # least sum of a split Gaussian's absolute errors times its blending weights, pixels
 _BETAS = (0.9, 0.99)  # decay of Adam's averages of the gradients and of their squares
@@ -48,6 +51,7 @@ _BETAS = (0.9, 0.99)  # decay of Adam's averages of the gradients and of their s
 _DAMPING = 0.2
 _COLORS = ColorFitConfig()
 _RATE_FLOOR = 0.05  # of the learning rates at the end
+_MIN_STEPS = 8  # of a run with a limit of Gaussians: merged ones that are not fitted look like dots
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
 _PATIENCE = 3  # checks without a sufficient decrease
@@ -115,7 +119,6 @@ class Refinement:
     """
 
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
-        self._created = time.perf_counter()
         self._factor = working_factor(scene.near)
         scene = scene.scaled(self._factor)
         _check_fit(scene, views, scale_poses(views.cam2world, self._factor))
@@ -124,17 +127,19 @@ class Refinement:
         self._images = views.images.float().to(device)
         self._masks = views.masks.to(device)
         compared = (views.masks & mask_holes(views.images)).to(device)
-        height = min(self._images.shape[-2], _HEIGHT)
+        limit = self.config.gaussians
+        height = min(self._images.shape[-2], _HEIGHT if limit is None else DISPLAY_HEIGHT)
         self._size = (height, 2 * height)
+        self._counted_size = (min(height, _HEIGHT), 2 * min(height, _HEIGHT))  # of contributions
         self._photographs = [
             Photograph.split(image, mask > 0.999, _HELD_OUT, random)
             for image, mask in zip(
                 self._shrink(self._images), self._shrink(compared[:, None].float())[:, 0], strict=True
             )
         ]
-        limit = self.config.gaussians
         if limit is not None and len(scene.gaussians) > limit:
-            scene = merge_to(scene, self._size, limit)
+            scene = merge_to(scene, self._counted_size, limit)
+        self._created = time.perf_counter()
         self._start, gaussians = scene, scene.gaussians
         self._targets = {  # photographs that a view is compared with; the first is its own
             view: [view, *nearest_views(scene.cam2world, view, MAX_OTHERS)] for view in range(len(scene.cam2world))
@@ -289,7 +294,8 @@ class Refinement:
         left as it is, within the limit of Gaussians.
 
         Args:
-            seconds: time limit since this object was made; the result depends on the speed of the machine.
+            seconds: time limit since this object was made; the result depends on the speed of the machine. With a limit
+                of Gaussians, a run has at least `_MIN_STEPS` steps, and mergers do not count.
             steps: number of steps; the result is the same in every run on one machine.
             progress: called with a description and the completed fraction.
             should_stop: checked before each step; True ends the run and keeps the state.
@@ -297,7 +303,8 @@ class Refinement:
         Raises:
             InputError: neither or both of `seconds` and `steps` are given, or one is not positive.
         """
-        clock = _Clock(seconds, steps, self.config.release, self._created)
+        min_steps = 0 if self.config.gaussians is None else _MIN_STEPS
+        clock = _Clock(seconds, steps, self.config.release, self._created, min_steps)
         report = progress or (lambda what, fraction: None)
         history: list[tuple[int, float, float]] = []
         if len(self._photographs) == 1:  # one photograph does not show what is wrong seen from elsewhere
@@ -339,8 +346,8 @@ class Refinement:
         self._result = self._scene() if after <= before else self._start
         self._release_parameters()
         if after <= before:
-            detail = self._size[0] / self._images.shape[-2]  # of large photographs is in Gaussians of small area
-            self._result = drop_unseen(self._result, self._size, detail * DROP_ERROR)
+            detail = self._counted_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
+            self._result = drop_unseen(self._result, self._counted_size, detail * DROP_ERROR)
             self._result = self._finish(self._result)
         else:
             stopped = "worse"
@@ -374,9 +381,12 @@ class _Clock:
     Args:
         release: fraction at which the last part begins.
         start: time from which seconds count, by `time.perf_counter`.
+        min_steps: of a timed run, which takes longer for them.
     """
 
-    def __init__(self, seconds: float | None, steps: int | None, release: float, start: float) -> None:
+    def __init__(
+        self, seconds: float | None, steps: int | None, release: float, start: float, min_steps: int = 0
+    ) -> None:
         limit = seconds if steps is None else steps
         if limit is None or (seconds is not None and steps is not None):
             raise InputError("give either `seconds` or `steps` of a refinement, got both or neither")
@@ -384,7 +394,7 @@ class _Clock:
             raise InputError(f"`seconds` or `steps` of a refinement must be positive, got {limit}")
         self._is_timed, self._given, self._release = steps is None, float(limit), release
         self._limit, self._is_shortened, self._reached = self._given, False, 0.0
-        self.steps, self._start = 0, start
+        self.steps, self._start, self._min_steps = 0, start, min_steps
 
     def reserve(self, seconds: float) -> None:
         """End a timed run earlier than its limit by this time, but not before half of it."""
@@ -403,7 +413,10 @@ class _Clock:
     @property
     def fraction(self) -> float:
         """Completed fraction of the run; it never falls."""
-        self._reached = max(self._reached, self._spent / self._limit)
+        fraction = self._spent / self._limit
+        if self._is_timed and self.steps < self._min_steps:
+            fraction = min(fraction, self.steps / self._min_steps)
+        self._reached = max(self._reached, fraction)
         return self._reached
 
     def shorten(self) -> None:

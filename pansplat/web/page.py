@@ -29,12 +29,13 @@ from torch import Tensor
 
 from pansplat import constants, pipeline
 from pansplat.atomic import replacing
+from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import path_poses, turn_pose
 from pansplat.geometry.world import working_factor
 from pansplat.predictor import Progress
-from pansplat.refinement.budget import merge_to
+from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.shaders import load_shader
 from pansplat.tours import (
@@ -53,12 +54,12 @@ from pansplat.tours import (
 from pansplat.tours.layout import REACH
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 
-DEFAULT_GAUSSIANS = 300_000  # phones draw and hold them
+DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
 MAX_GAUSSIANS = 4_000_000  # rows of 1024 in a texture of 4096 rows, which every WebGL 2 device has
 MAX_FILE_BYTES = 64_000_000  # of a page in one file
 _TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
-_MERGE_HEIGHT = 512  # rows of the images that the mergers are measured in
+_FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _POSTER_SIZE = (540, 960)
 _START_FOV = 75.0  # degrees, vertical
 _ROUTE_RATE = 10  # samples of a flight a second
@@ -116,12 +117,12 @@ def write_page(
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
     report("checking the scene", 0.0)
     factor = working_factor(scene.near)
-    tour = make_graph(scene)
+    tour, has_cameras = make_graph(scene), len(scene.cam2world) > 0
     scene = _prepare(scene, factor)
     flights = _plan_flights(scene, tour, factor)
     if len(scene.gaussians) > gaussians:
         report("merging Gaussians", 0.1)
-        scene = _merge(scene, flights.parts, gaussians)
+        scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0)
     report("compressing", 0.6)
     degree = _choose_degree(scene)
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
@@ -242,12 +243,13 @@ def _prepare(scene: Scene, factor: float) -> Scene:
     return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, names=names)
 
 
-def _merge(scene: Scene, parts: Sequence[int], count: int) -> Scene:
+def _merge(scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS) -> Scene:
     """At most `count` Gaussians, an equal number for each panorama of different parts.
 
     Args:
         scene: of `_prepare`.
         parts: of each view; they are merged one after the other.
+        steps: of the fit of shapes; 0 fits colours only.
     """
     merged = []
     for part in dict.fromkeys(parts):
@@ -255,22 +257,34 @@ def _merge(scene: Scene, parts: Sequence[int], count: int) -> Scene:
         chosen = select_views(scene, views)
         kept = max(count * len(views) // len(parts), 1)
         if len(chosen.gaussians) > kept:
-            chosen = _merge_part(chosen, kept)
+            chosen = _merge_part(chosen, kept, steps)
         labels = torch.tensor(views)[chosen.gaussians.views.long()]
         merged.append(dataclasses.replace(chosen.gaussians, views=labels))
     return dataclasses.replace(scene, gaussians=Gaussians.cat(merged))
 
 
-def _merge_part(scene: Scene, count: int) -> Scene:
-    """At most `count` Gaussians. Their colours are fitted to the images of all Gaussians at the input cameras."""
-    height = min(scene.height, _MERGE_HEIGHT)
-    size = (height, 2 * height)
-    merged = merge_to(scene, size, count)
-    with torch.no_grad():
-        drawn = [pipeline.render(scene, pose, blend=view, size=size) for view, pose in enumerate(scene.cam2world)]
-    images = torch.stack([rendering.color for rendering in drawn])
-    masks = torch.ones(len(images), *size, dtype=torch.bool)
-    fitted = fit_colors(merged.gaussians, images, scene.cam2world, masks, ColorFitConfig())
+@torch.no_grad()
+def _draw_inputs(scene: Scene) -> Views:
+    """Images of the scene at its input cameras, at twice its rows: those of the scene do not show the gaps between
+    merged Gaussians."""
+    height = min(2 * scene.height, DISPLAY_HEIGHT)
+    owners = set(scene.gaussians.views.tolist())
+    images = [
+        pipeline.render(scene, pose, blend=view if view in owners else "joint", size=(height, 2 * height)).color
+        for view, pose in enumerate(scene.cam2world)
+    ]
+    masks = torch.ones(len(images), height, 2 * height, dtype=torch.bool)
+    return Views(torch.stack(images), scene.cam2world, masks, scene.near, scene.far, scene.names)
+
+
+def _merge_part(scene: Scene, count: int, steps: int) -> Scene:
+    """At most `count` Gaussians, fitted to the images of all at the input cameras."""
+    views = _draw_inputs(scene)
+    refinement = Refinement(scene, views, RefineConfig(gaussians=count, splits=()))
+    for step in range(steps):
+        refinement.step(step / steps)
+    merged = refinement.scene()
+    fitted = fit_colors(merged.gaussians, views.images, views.cam2world, views.masks, ColorFitConfig())
     return dataclasses.replace(merged, gaussians=fitted)
 
 

@@ -99,11 +99,23 @@ def test_a_folder_of_three_panoramas_is_exported_as_a_tour(
     assert len(pipeline.load(tmp_path / "pair.glb").cam2world) == 2
 
 
+def test_a_pair_is_merged_to_the_limit_of_its_page_before_its_refinement(
+    tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    monkeypatch.setattr(page_module, "_merge", None)  # must not be called
+    command = ["export", str(write_tour(tmp_path / "house", height=64)), "--model", "sphere", "--refine", "0.1"]
+    out = tmp_path / "page.html"
+    assert run([*command, "--predict-height", "64", "--pair", "2", "--gaussians", "2000", "-o", str(out)]) == 0
+    count = int(capsys.readouterr().out.split(": ")[1].split(" Gaussians")[0].replace(",", ""))
+    assert 1000 < count <= 2000
+
+
 def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
     tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
-    monkeypatch.setattr(export_module, "_FEW_GAUSSIANS", 200_000)
+    monkeypatch.setattr(export_module, "_FEW_GAUSSIANS", 300_000)
     first, second = pipeline.load_pairs(write_tour(tmp_path / "house", height=64))
     alone = dataclasses.replace(second.context[1], world=1, title="Attic")
     single = dataclasses.replace(second, context=(alone,))

@@ -11,12 +11,19 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import empty_gaussians
 from pansplat.geometry.pose import invert_pose
 from pansplat.refinement import RefineConfig, Refinement, refinement_fingerprint
+from pansplat.refinement import refinement as refinement_module
 from pansplat.refinement.budget import merge_to
 
 
 def _refine(room, steps: int, views=None, scene=None, **config):
     refinement = Refinement(scene or room.predicted, views or room.views, RefineConfig(**config))
     report = refinement.run(steps=steps)
+    return refinement.scene(), report
+
+
+def _refine_for(room, seconds: float, **config):
+    refinement = Refinement(room.predicted, room.views, RefineConfig(**config))
+    report = refinement.run(seconds=seconds)
     return refinement.scene(), report
 
 
@@ -141,6 +148,23 @@ def test_a_budget_limits_the_gaussians(room) -> None:
     assert len(refined.gaussians) <= 500
     middle = room.truth.pose_between(0.5)
     assert room.error(refined, middle) < room.error(room.predicted, middle)
+
+
+def test_a_limited_scene_is_compared_at_the_rows_of_a_display(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pansplat.refinement.refinement._HEIGHT", 8)
+    errors = []
+    for rows in (8, 32):
+        monkeypatch.setattr("pansplat.refinement.refinement.DISPLAY_HEIGHT", rows)
+        refined, _ = _refine(room, steps=20, gaussians=800)
+        errors.append(room.error(refined, room.truth.cam2world[0]))
+    assert errors[1] < 0.8 * errors[0]
+
+
+@pytest.mark.usefixtures("refinement_clock")
+def test_a_limited_scene_is_fitted_before_its_time_ends(room) -> None:
+    for limit, steps in ((800, refinement_module._MIN_STEPS), (None, 0)):
+        _, report = _refine_for(room, seconds=1e-3, gaussians=limit)
+        assert report.steps == steps
 
 
 def test_a_coarse_scene_is_split_within_its_limit_and_explains_the_photographs_better(room) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import re
 from pathlib import Path
@@ -14,7 +15,9 @@ import torch
 
 from pansplat import pipeline
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.harmonics import SH_0
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.refinement.budget import merge_to
 from pansplat.tours import find_camera_height, select_views
 from pansplat.web import page as page_module
@@ -141,6 +144,74 @@ def test_colours_of_merged_gaussians_are_fitted_to_all(request: pytest.FixtureRe
         for scene in (page_module._merge(full, (0,) * len(full.cam2world), 700), merge_to(full, (64, 128), 700))
     ]
     assert errors[0] < 0.8 * errors[1]
+
+
+def _make_beams(count: int = 12_000, rows: int = 48) -> Scene:
+    """Flat Gaussians on a sphere of 3 m, light with narrow dark bands that cross the lattice at an angle."""
+    directions = fibonacci_directions(count).float()
+    longitudes = torch.atan2(directions[:, 0], directions[:, 2])
+    colors = torch.where(torch.sin(5 * longitudes + 4 * directions[:, 1]) > 0.85, 0.1, 0.9)[:, None].expand(-1, 3)
+    scale, labels = 1.8 * math.sqrt(4 * math.pi / count), torch.zeros(count, dtype=torch.uint8)
+    gaussians = Gaussians(
+        means=3 * directions,
+        scales=torch.tensor((scale, scale, 0.01)).repeat(count, 1),
+        quats=torch.cat((1 + directions[:, 2:], -directions[:, 1:2], directions[:, :1], torch.zeros(count, 1)), dim=1),
+        opacities=torch.full((count,), 0.9),
+        harmonics=((colors - 0.5) / SH_0)[:, None],
+        levels=labels,
+        views=labels,
+    )
+    return Scene(gaussians, torch.eye(4, dtype=torch.float64)[None], 0.5, 10.0, ("camera",), height=rows)
+
+
+def _measure_dots(scene: Scene, full: Scene) -> float:
+    """Energy of the difference of two scenes' images above the sampling limit of the scene's rows, relative to the
+    energy there of the full scene's image, near the horizon at four times the rows."""
+    rows = 4 * full.height
+    window = torch.hann_window(rows // 2, periodic=False, dtype=torch.float64)[:, None]
+
+    def transform(shown: Scene) -> torch.Tensor:
+        image = pipeline.render(shown, full.cam2world[0], size=(rows, 2 * rows)).color.double()
+        return torch.fft.fft2(window * image[:, rows // 4 : 3 * rows // 4])
+
+    merged, needed = transform(scene), transform(full)
+    down, right = (torch.fft.fftfreq(n).abs() for n in needed.shape[1:])
+    is_above = torch.maximum(down[:, None], right[None]) > 0.5 * full.height / rows
+    errors, energies = (values[:, is_above].abs().square().sum() for values in (merged - needed, needed))
+    return float(errors / energies)
+
+
+def test_merged_gaussians_are_lines_and_not_dots_in_large_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = _make_beams()
+    assert _measure_dots(page_module._merge(full, (0,), 3000, steps=0), full) > 2  # colours alone
+    assert _measure_dots(page_module._merge(full, (0,), 3000), full) < 1
+    monkeypatch.setattr(page_module, "DISPLAY_HEIGHT", full.height)  # fitted at the scene's own rows
+    assert _measure_dots(page_module._merge(full, (0,), 3000), full) > 1.2
+
+
+def test_merged_gaussians_of_a_scene_whose_views_are_unknown_keep_their_image(plain_scene: Scene) -> None:
+    foreign = dataclasses.replace(
+        plain_scene, gaussians=dataclasses.replace(plain_scene.gaussians, views=7 + plain_scene.gaussians.views)
+    )
+    full = page_module._prepare(foreign, 1.0)
+    merged = page_module._merge(full, (0, 0), 700)
+    for pose in full.cam2world:  # the second camera has no Gaussians of its own
+        images = [pipeline.render(scene, pose, blend="joint", size=(32, 64)).color for scene in (full, merged)]
+        assert float((images[1] - images[0]).abs().mean()) < 0.05
+
+
+def test_shapes_are_fitted_at_input_cameras_only(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[int] = []
+    merge = page_module._merge
+
+    def record(*args: Any, **options: Any) -> Scene:
+        steps.append(options["steps"])
+        return merge(*args, **options)
+
+    monkeypatch.setattr(page_module, "_merge", record)
+    write_page(scene, tmp_path / "page.html", gaussians=1500)
+    write_page(dataclasses.replace(scene, cam2world=scene.cam2world[:0]), tmp_path / "page.html", gaussians=1500)
+    assert steps == [page_module._FIT_STEPS, 0]
 
 
 def test_a_title_cannot_leave_its_element(scene: Scene, tmp_path: Path) -> None:
