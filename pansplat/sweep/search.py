@@ -66,7 +66,7 @@ class SearchConfig:
     """The smallest depth of the search, relative to `near`."""
     far_margin: float = 10.0
     """The largest depth of the search, relative to `far`: rooms are often larger than the range that was given."""
-    narrow_candidates: tuple[int, int] = (24, 16)
+    narrow_candidates: tuple[int, int] = (16, 8)
     """Hypotheses of a set at the two finer levels."""
     plane_prior: float = 0.3
     """Penalty of a plane without support in the scene."""
