@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pansplat_viewer.draw.stereo import ImageFormat
     from pansplat_viewer.scene.key_frames import CameraPath
 
+_WINDOW_SIZE = 1280, 720  # pixels
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
 
 
@@ -86,7 +87,7 @@ class Options:
     ipd: EyeDistance = EYE_DISTANCE
     """Distance of the eyes, metres."""
     size: str | None = None
-    """Width x height of the window or film, of one eye, pixels (1280x720; panoramas 2048x1024, cubemaps 1536x1024)."""
+    """Width x height of one eye, pixels (window 1280x720, film 1920x1080; panoramas 2880x1440, cubemaps 2160x1440)."""
     seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] | None = None
     """Length of the film (4); of a tour, by default the time at 1 metre per second."""
     fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
@@ -96,7 +97,7 @@ class Options:
 
     @property
     def pixels(self) -> tuple[int, int]:
-        """`size` as (width, height).
+        """`size` of films and stills as (width, height).
 
         Raises:
             InputError: `size` is not WIDTHxHEIGHT, or out of range.
@@ -192,7 +193,7 @@ def _run(options: Options) -> int:
         _write_film(options, entries[first], options.out.parent, pixels, path)
         return 0
     if folder is None:
-        problem = _run_window(options, entries, first, pixels, path)
+        problem = _run_window(options, entries, first, pixels if options.size else _WINDOW_SIZE, path)
         if problem is None:
             return 0
         print(f"{problem}: writing a fly-through instead")

@@ -61,7 +61,7 @@ def find_free_name(folder: Path, stem: str, suffix: str) -> Path:
 class Film:
     """Sizes and times of a fly-through."""
 
-    size: tuple[int, int] = (1280, 720)  # of film and stills, pixels (width, height)
+    size: tuple[int, int] = (1920, 1080)  # of film and stills, pixels (width, height)
     seconds: float | None = None  # length of the film; None is 4, and for a tour the duration of its route
     fps: float = 24.0  # frames per second
     at: float = 0.5  # fraction of the flight at which the panorama is rendered

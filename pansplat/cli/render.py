@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _VIDEO_SUFFIXES = (".mp4", ".webm")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
-_VIDEO_HEIGHT = 360
+_VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440
 _MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
 
 
@@ -54,7 +54,8 @@ class Render:
     ipd: EyeDistance = EYE_DISTANCE
     """Distance of the eyes for --stereo, metres."""
     height: ImageHeight | None = None
-    """Height of the image, pixels; by default that of the input panoramas, for a video 360."""
+    """Height of the image, pixels; by default that of the input panoramas, for a video 1080 (1920x1080), for one of
+    panoramas 1440 (2880x1440)."""
     depth: bool = False
     """Write the depth as a 16-bit .png in millimetres, 0 where there is none; an .exr holds it without this option."""
     blend: str = "deferred"
@@ -83,7 +84,7 @@ class Render:
             )
         scene = self.prediction.open(self.path)
         layout = self.layout or ("perspective" if self._is_video and not self.stereo else "equirect")
-        options = self._render_options(layout, self.height or (_VIDEO_HEIGHT if self._is_video else scene.height))
+        options = self._render_options(layout, self.height or self._choose_height(layout, scene))
         size = f"{options['size'][1]}x{options['size'][0] * (2 if self.stereo else 1)}"
         stereo = "top-bottom" if self.stereo else "mono"
         if self._is_video:
@@ -108,6 +109,11 @@ class Render:
     @property
     def _is_video(self) -> bool:
         return self.out.suffix.lower() in _VIDEO_SUFFIXES
+
+    def _choose_height(self, layout: str, scene: Scene) -> int:
+        if not self._is_video:
+            return scene.height
+        return _VIDEO_HEIGHT if layout == "perspective" else _PANORAMA_VIDEO_HEIGHT
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""

@@ -13,6 +13,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.data.images import read_depth
+from pansplat.rendering import Rendering
 from pansplat.tours import find_tours
 
 HEIGHT = 64
@@ -75,6 +76,20 @@ def test_a_video_moves_between_the_cameras(scene: Path, tmp_path: Path) -> None:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert len(frames) == 4 and frames[0].shape == (18, 32, 3)
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
+
+
+@pytest.mark.parametrize(("layout", "size"), [("perspective", (1080, 1920)), ("equirect", (1440, 2880))])
+def test_a_video_has_the_size_that_it_is_looked_at(layout, size, scene: Path, tmp_path: Path, monkeypatch) -> None:
+    sizes = []
+
+    def record(scene, pose, **options):
+        sizes.append(options["size"])
+        return Rendering(torch.zeros(3, 4, 8), torch.zeros(4, 8), torch.zeros(4, 8))
+
+    monkeypatch.setattr(pipeline, "render", record)
+    arguments = ["--layout", layout, "--seconds", "0.1", "--fps", "20"]
+    assert run(["render", str(scene), "-o", str(tmp_path / "x.mp4"), *arguments]) == 0
+    assert set(sizes) == {size}
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from pansplat_viewer.scene.settings import DrawSettings, FrameStats, Preset, Pro
 
 # Places of the faces in an image of three columns and two rows: layout 0 of the spherical metadata, version 2.
 _GRID = ("right", "left", "up"), ("down", "front", "back")
-_DEFAULT_SIZES = {"perspective": (1280, 720), "equirect": (2048, 1024), "cubemap": (1536, 1024)}
+_DEFAULT_SIZES = {"perspective": (1920, 1080), "equirect": (2880, 1440), "cubemap": (2160, 1440)}
 MAX_TURN = math.radians(20)  # of the camera before the eyes follow, while cached faces are read
 _PREFETCH_TURN = math.radians(5)  # of the camera before the faces at the next places of the eyes are drawn
 _SAME_AXIS = 1e-3
