@@ -309,7 +309,7 @@ def write_tour(
     written = [folder / "tour.mp4"]
     write_video(written[0], render_frames(), film.fps)
     written.append(folder / "floor_plan.png")
-    plan = paint_floor_plan(scenes.tour, list(scenes.outlines.values()), route=route)
+    plan = paint_floor_plan(scenes.tour, scenes.outlines, route=route)
     write_image(written[1], plan.astype(np.float32) / 255)
     progress("done", 1.0)
     return written

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -189,12 +189,28 @@ class FloorPlan:
 def find_other_storeys(tour: TourGraph, position: Float[np.ndarray, "3"]) -> frozenset[int]:
     """The panoramas of the world around a position that are in another storey, each in the one of the nearest level."""
     nearest = int(np.linalg.norm(tour.positions - position, axis=1).argmin())
-    world = [n for n, panorama in enumerate(tour.panoramas) if panorama.world == tour.panoramas[nearest].world]
-    up = -tour.level_axes[:, 1]
-    heights = tour.positions[world] @ up
-    levels = np.array([np.median(heights[storey]) for storey in find_storeys(heights)])
-    storeys = np.abs(np.append(heights, position @ up)[:, None] - levels).argmin(axis=1)
-    return frozenset(np.array(world)[storeys[:-1] != storeys[-1]].tolist())
+    members, levels = _find_levels(tour, tour.panoramas[nearest].world)
+    places = np.concatenate((tour.positions[members], position[None])) @ -tour.level_axes[:, 1]
+    storeys = np.abs(places[:, None] - levels).argmin(axis=1)
+    return frozenset(np.array(members)[storeys[:-1] != storeys[-1]].tolist())
+
+
+def assign_storeys(tour: TourGraph) -> list[int]:
+    """The storey of each panorama in its world, that of the nearest level; 0 is the lowest."""
+    storeys = [0] * len(tour)
+    for world in {panorama.world for panorama in tour.panoramas}:
+        members, levels = _find_levels(tour, world)
+        heights = tour.positions[members] @ -tour.level_axes[:, 1]
+        for node, storey in zip(members, np.abs(heights[:, None] - levels).argmin(axis=1).tolist(), strict=True):
+            storeys[node] = storey
+    return storeys
+
+
+def _find_levels(tour: TourGraph, world: int) -> tuple[list[int], Float[np.ndarray, "storey"]]:
+    """The panoramas of a world, and the levels of its storeys, the lowest first."""
+    members = [node for node, panorama in enumerate(tour.panoramas) if panorama.world == world]
+    heights = tour.positions[members] @ -tour.level_axes[:, 1]
+    return members, np.sort([float(np.median(heights[storey])) for storey in find_storeys(heights)])
 
 
 def draw_floor_plan(
@@ -248,32 +264,49 @@ def write_floor_plan(scene: Scene, path: str | Path) -> None:
             f"cannot write {path}: needed a floor below at least one of the {len(tour)} input cameras, got none; "
             "export a folder of upright panoramas"
         )
-    write_image(path, paint_floor_plan(tour, list(outlines.values())).astype(np.float32) / 255)
+    write_image(path, paint_floor_plan(tour, outlines).astype(np.float32) / 255)
 
 
 def paint_floor_plan(
-    tour: TourGraph, outlines: Sequence[FloorOutline], *, route: Route | None = None
+    tour: TourGraph, outlines: Mapping[int, FloorOutline], *, route: Route | None = None
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The floor plan over dark grey with the names of the panoramas, the edges between them, and a route.
 
-    Panoramas without a known place are squares, those that are only probably placed are rings.
+    Panoramas without a known place are squares, those that are only probably placed are rings. Storeys are next to each
+    other, the lowest on the left; each shows the floors of the others faintly.
 
     Args:
-        tour, outlines: see `draw_floor_plan`.
+        tour: the graph.
+        outlines: by panorama.
         route: drawn instead of the edges.
     """
-    plan = draw_floor_plan(tour, outlines, size=_PLAN_SIZE)
+    storeys = np.array(assign_storeys(tour))
+    panels = [_paint_storey(tour, outlines, storeys == storey, route) for storey in range(storeys.max(initial=0) + 1)]
+    return np.concatenate(panels, axis=1)
+
+
+def _paint_storey(
+    tour: TourGraph, outlines: Mapping[int, FloorOutline], inside: Bool[np.ndarray, "n"], route: Route | None
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The plan of one storey; `inside` are its panoramas."""
+    own, faint = ([o for node, o in outlines.items() if inside[node] == shown] for shown in (True, False))
+    plan = draw_floor_plan(tour, own, faint=faint, size=_PLAN_SIZE)
     alpha = plan.image[..., 3:] / 255.0
     image = np.ascontiguousarray((plan.image[..., :3] * alpha + 24 * (1 - alpha)).astype(np.uint8))
     axes = tour.level_axes[:, (0, 2)]
     centers = plan.to_pixels(tour.positions @ axes).round().astype(np.int32)
     if route is not None:
         line = plan.to_pixels(route.positions @ axes).round().astype(np.int32)
-        cv2.polylines(image, np.split(line, route.jumps + 1), False, (255, 204, 51), 2, cv2.LINE_AA)
+        nearest = np.linalg.norm(route.positions[:, None] - tour.positions, axis=2).argmin(axis=1)
+        for part in np.split(np.arange(len(line)), route.jumps + 1):
+            runs = np.split(part, np.flatnonzero(np.diff(inside[nearest[part]])) + 1)
+            shown = [line[run] for run in runs if inside[nearest[run[0]]]]
+            cv2.polylines(image, shown, False, (255, 204, 51), 2, cv2.LINE_AA)
     else:
-        for edge in tour.overlaps:
+        for edge in (edge for edge in tour.overlaps if inside[list(edge)].any()):
             cv2.polylines(image, [centers[list(edge)]], False, (170, 180, 190), 1, cv2.LINE_AA)
-    for node, (panorama, (x, y)) in enumerate(zip(tour.panoramas, centers.tolist(), strict=True)):
+    for node in np.flatnonzero(inside).tolist():
+        panorama, (x, y) = tour.panoramas[node], centers[node].tolist()
         if (node, node) in tour.overlaps:
             cv2.rectangle(image, (x - 5, y - 5), (x + 5, y + 5), (90, 204, 255), -1)
         else:

@@ -96,8 +96,8 @@ def test_a_panorama_that_is_probably_placed_is_a_ring(room_scene):
     colors = []
     for view in views:
         tour = TourGraph("", Path(), (view, view), 0.45, 10.0, overlaps={(0, 1): 0.5})
-        image = tours.paint_floor_plan(tour, [find_floor_outline(room_scene, 0, pose[:3, :3].numpy())])
-        plan = draw_floor_plan(tour, [find_floor_outline(room_scene, 0, pose[:3, :3].numpy())], size=1024)
+        outline = find_floor_outline(room_scene, 0, pose[:3, :3].numpy())
+        image, plan = tours.paint_floor_plan(tour, {0: outline}), draw_floor_plan(tour, [outline], size=1024)
         x, y = plan.to_pixels(np.array((0.5, 0.0))).round().astype(int)
         colors.append((image[y, x].tolist(), image[y, x + 6].tolist()))
     assert colors[0][0] == [90, 204, 255] != colors[1][0] and colors[1][1] == [90, 204, 255]
@@ -131,6 +131,22 @@ def test_other_storeys_are_those_of_the_same_world_at_another_level(room_scene):
     assert tours.find_other_storeys(tour, tour.positions[4]) == {0, 1}, "the stairs are nearer to the upper storey"
     assert tours.find_other_storeys(tour, tour.positions[2]) == {0, 1}
     assert tours.find_other_storeys(tour, tour.positions[5]) == frozenset(), "levels of two worlds cannot be compared"
+
+
+def test_storeys_of_a_plan_are_next_to_each_other(room_scene):
+    tour = _make_two_storeys(room_scene)
+    outline = find_floor_outline(room_scene, 0, tour.level_axes)
+    image = tours.paint_floor_plan(tour, {0: outline})
+    plan = draw_floor_plan(tour, [outline], size=1024)
+    height, width = plan.image.shape[:2]
+    assert image.shape == (height, 2 * width, 3)
+    for node, panel in ((0, 0), (4, 1), (5, 0)):
+        x, y = plan.to_pixels(tour.positions[node] @ tour.level_axes[:, (0, 2)]).round().astype(int)
+        marked = [image[y, x + shift].tolist() == [90, 204, 255] for shift in (0, width)]
+        assert marked == [panel == 0, panel == 1], "a panorama is marked in its own storey only"
+    corner = plan.to_pixels(np.array(((2.8, 3.8),))).round().astype(int)[0]
+    lower, upper = image[corner[1], corner[0]], image[corner[1], corner[0] + width]
+    assert lower.sum() > upper.sum() > 3 * 24, "the lower floor is faint in the plan of the upper storey"
 
 
 def test_the_floor_of_another_storey_is_faint_below_the_others(room_scene):
