@@ -15,7 +15,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import cv2
 import numba as nb
@@ -44,6 +43,9 @@ from pansplat.sweep.surface import (
     world_points,
 )
 from pansplat.threads import limit_numba_threads
+
+_Lattice = tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]
+"""Rays (n, 3) of a lattice, the same for all views, and the pixels (rows, columns) of a panorama that hold them."""
 
 NUM_LEVELS = 4
 _MAX_LENGTH = 0.2  # largest standard deviation of a disc, relative to its distance
@@ -111,13 +113,14 @@ def lift(
     fine = [_choose_fine_pixels(image, heights, config) for image in photographs]
     parts = []
     for level in range(NUM_LEVELS):
+        lattice = _locate_lattice(heights[-1] >> level, heights[-1])
         for view in views:
             if level == 0:
                 parts += [
                     _lift_fine(scene, view, resize_sphere(photographs[view], height), chosen)
                     for height, chosen in zip(heights[:-1], fine[view][:-1], strict=True)
                 ]
-            parts.append(_lift_level(scene, view, level, fine[view][-1]))
+            parts.append(_lift_level(scene, view, level, lattice, fine[view][-1]))
     return Gaussians.cat(parts)
 
 
@@ -197,34 +200,40 @@ def _lift_fine(scene: _PosedSurfaces, view: int, image: np.ndarray, chosen: np.n
     """The points of level 0 on a lattice that is finer than the surface."""
     chosen = chosen & resize_mask(scene.posed.masks[view], len(image))
     fine = guided_upsample(scene.surfaces[view], scene.posed.images[view], image, chosen)
-    return _lift_lattice(scene, view, 0, image, fine.inverse_depth, chosen)
+    return _lift_lattice(scene, view, 0, _locate_lattice(len(image), len(image)), image, fine.inverse_depth, chosen)
 
 
-def _lift_level(scene: _PosedSurfaces, view: int, level: int, replaced: np.ndarray) -> Gaussians:
+def _lift_level(scene: _PosedSurfaces, view: int, level: int, lattice: _Lattice, replaced: np.ndarray) -> Gaussians:
     """The points of a level that finer lattices do not replace."""
     image, inverse, mask = scene.posed.images[view], scene.surfaces[view].inverse_depth, scene.posed.masks[view]
     if level >= 2:
         # No other view shows what a single one masks, and its depth is the prior's: the background continues there.
         covered = mask if len(scene.surfaces) > 1 else np.ones_like(mask)
         color, inverse = _background_layer(image, inverse, mask, covered, level, scene.config)
-        return _lift_lattice(scene, view, level, color, inverse, covered)
+        return _lift_lattice(scene, view, level, lattice, color, inverse, covered)
     needed = mask & ~replaced & (_choose_levels(image, inverse, scene.config) == level)
     height = len(image) >> level
-    return _lift_lattice(scene, view, level, resize_sphere(image, height), resize_sphere(inverse, height), needed)
+    resized = resize_sphere(image, height), resize_sphere(inverse, height)
+    return _lift_lattice(scene, view, level, lattice, *resized, needed)
 
 
 def _lift_lattice(
-    scene: _PosedSurfaces, view: int, level: int, image: np.ndarray, inverse: np.ndarray, needed: np.ndarray
+    scene: _PosedSurfaces,
+    view: int,
+    level: int,
+    lattice: _Lattice,
+    image: np.ndarray,
+    inverse: np.ndarray,
+    needed: np.ndarray,
 ) -> Gaussians:
     """The points of a lattice with the spacing of the image's pixels, where they are needed."""
     config, pose = scene.config, np.ascontiguousarray(scene.posed.cam2world[view], np.float64)
-    count = lattice_size(2 * len(image))
-    rays, pixel = _locate_lattice(count, len(needed))
+    rays, pixel = lattice
+    spacing = math.sqrt(4 * math.pi / len(rays))
     rays = rays[needed[pixel]]
     inverse_depth = np.maximum(inverse[nearest_pixel(rays, len(inverse))].astype(np.float64), 1e-6)
     points = (rays / inverse_depth[:, None]) @ pose[:3, :3].T + pose[:3, 3]
     opacity, kept = _estimate_opacity(points, scene, view)
-    spacing = math.sqrt(4 * math.pi / count)
     rays, inverse_depth, points, opacity = rays[kept], inverse_depth[kept], points[kept], opacity[kept]
     sloped = inverse if level else scene.surfaces[view].inverse_depth
     gradient = _differentiate_log(sloped, config.discontinuity if level < 2 else math.inf)
@@ -246,10 +255,9 @@ def _lift_lattice(
     )
 
 
-@lru_cache(maxsize=1)
-def _locate_lattice(count: int, height: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Rays (n, 3) of a lattice, the same for all views, and the pixels (rows, columns) that hold them."""
-    rays = fibonacci_directions(count).numpy()
+def _locate_lattice(rows: int, height: int) -> _Lattice:
+    """The lattice with the spacing of the pixels of `rows` rows, in a panorama of `height` rows."""
+    rays = fibonacci_directions(lattice_size(2 * rows)).numpy()
     return rays, nearest_pixel(rays, height)
 
 

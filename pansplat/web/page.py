@@ -268,7 +268,7 @@ def _draw_inputs(scene: Scene) -> Views:
     """Images of the scene at its input cameras, at twice its rows: those of the scene do not show the gaps between
     merged Gaussians."""
     height = min(2 * scene.height, DISPLAY_HEIGHT)
-    owners = set(scene.gaussians.views.tolist())
+    owners = scene.gaussians.views.unique().tolist()
     images = [
         pipeline.render(scene, pose, blend=view if view in owners else "joint", size=(height, 2 * height)).color
         for view, pose in enumerate(scene.cam2world)

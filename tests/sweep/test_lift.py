@@ -10,9 +10,9 @@ import torch
 from pansplat.evaluation.metrics import psnr
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
-from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
+from pansplat.geometry.pose import interpolate_poses, quats_from_rotations, rotations_from_quats
 from pansplat.rendering import blend, blend_weights, rasterize
-from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces, lift
+from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces, _write_quat, lift
 from pansplat.sweep.search import PosedImages
 from pansplat.sweep.surface import Surface
 
@@ -243,3 +243,15 @@ def test_fine_lattices_draw_detail_that_a_coarse_one_loses(detailed):
         drawn = rasterize(gaussians.select(gaussians.views == 0), pose, size=(128, 256)).color
         errors.append(float((drawn - image).abs().mean()))
     assert errors[0] < 0.7 * errors[1]
+
+
+def test_quaternions_of_discs_are_those_of_their_axes():
+    """Each component is the largest of some rotation."""
+    quats = torch.randn(200, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rotations = rotations_from_quats(torch.nn.functional.normalize(quats, dim=1))
+    expected = quats_from_rotations(rotations)
+    assert set(expected.abs().argmax(dim=1).tolist()) == {0, 1, 2, 3}
+    found = np.empty((200, 4))
+    for rotation, quat in zip(rotations.numpy(), found, strict=True):
+        _write_quat(rotation, quat)
+    assert np.abs(found - expected.numpy()).max() < 1e-12

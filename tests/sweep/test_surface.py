@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 
+from pansplat.geometry.equirect import uv_from_directions
 from pansplat.sweep.surface import (
     CONSISTENT,
     FREE_SPACE,
@@ -11,6 +13,7 @@ from pansplat.sweep.surface import (
     classify_visibility,
     consistency_mask,
     guided_upsample,
+    nearest_pixel,
     ray_grid,
     resize_sphere,
     world_points,
@@ -120,3 +123,13 @@ def test_upsampled_orientations_are_those_of_the_surface():
     large = guided_upsample(Surface(inverse, orientation), resize_sphere(fine, 16), fine)
     assert large.orientation.shape == (32, 64) and set(np.unique(large.orientation)) == {0, 2}
     assert ((large.orientation == 2) == (large.inverse_depth < 0.7)).all()
+
+
+def test_the_pixel_of_a_direction_is_that_of_its_panorama_coordinates():
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    directions[:4] = ((0, 1, 0), (0, -1, 0), (0, 0, -1), (1e-9, 0, -1))  # the poles and the seam
+    height = 48
+    u, v = uv_from_directions(torch.from_numpy(directions)).numpy().T
+    row, column = nearest_pixel(directions, height)
+    assert np.array_equal(row, np.minimum((v * height).astype(int), height - 1))
+    assert np.array_equal(column, (u * 2 * height).astype(int) % (2 * height))

@@ -12,7 +12,10 @@ import moderngl
 from pansplat.errors import InputError
 
 CONTEXT_VERSIONS = (4, 3), (3, 3)
-"""Versions of OpenGL to ask for, best first: NVIDIA's drivers return exactly the version, Mesa's the highest."""
+"""Versions of OpenGL that are requested, in this order.
+
+NVIDIA's drivers create a context of exactly the requested version, Mesa's drivers one of the highest version.
+"""
 
 _EGL_PACKAGES = "libegl1 libgl1-mesa-dri libgl1"
 _OSMESA_PACKAGE = "libosmesa6"

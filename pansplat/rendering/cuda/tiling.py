@@ -101,18 +101,17 @@ def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> It
     num_columns, first_row, num_rows = instances.ranges.long()[:, 1:].unbind(1)
     most = max(1, _MAX_TILES // columns)  # rows in a band
     total = int((num_columns * num_rows).sum())
-    bands = [(0, rows)]
+    bands = [(0, rows, total)]
     if total > limit or rows > most:
         per_row = _count_in_rows(num_columns, first_row, num_rows, rows)
-        bands = [
+        ends_of_bands = (
             (row, min(row + most, end)) for first, end in split_rows(per_row, limit) for row in range(first, end, most)
-        ]
-    for low, high in bands:
+        )
+        bands = [(low, high, sum(per_row[low:high])) for low, high in ends_of_bands]
+    for low, high, total in bands:
         top = first_row.clamp_min(low)
         count = ((first_row + num_rows).clamp_max(high) - top).clamp_min(0) * num_columns
         ends = count.cumsum(0)
-        if len(bands) > 1:
-            total = sum(per_row[low:high])
         tiles = torch.empty(total, dtype=torch.int16, device=ends.device)
         record_ids = torch.empty(total, dtype=torch.int32, device=ends.device)
         if total:
