@@ -36,11 +36,19 @@ from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_na
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
 from pansplat.predictor import MIN_HEIGHT, Predictor, Progress
-from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement, RefineReport, refinement_fingerprint
+from pansplat.refinement import (
+    DISPLAY_HEIGHT,
+    RefineConfig,
+    Refinement,
+    RefineReport,
+    fuse_views,
+    refinement_fingerprint,
+)
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
+from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
-from pansplat.tours import MAX_SCENE_VIEWS, TourGraph, list_starts, make_graph, merge_scenes
+from pansplat.tours import MAX_SCENE_VIEWS, TourGraph, list_starts, make_graph, merge_scenes, select_views
 
 __all__ = [
     "estimate_poses",
@@ -237,9 +245,15 @@ def choose_tour_size(pair: Pair, gaussians: float = math.inf, height: int | None
     return height or choose_tour_height(pair, gaussians), count
 
 
-def choose_refine_seconds(gaussians: int | None) -> float:
-    """Default time limit of a refinement; with a limit of Gaussians more, because the images have more rows."""
-    return 10.0 if gaussians is None else 30.0
+def choose_refine_seconds(gaussians: int | None, *, joint: bool = False) -> float:
+    """Default time limit of a refinement, of a scene for joint drawing or for deferred blending.
+
+    With a limit of Gaussians it is longer, because the images have more rows. In joint drawing, too: the Gaussians of
+    different views have to fit together.
+    """
+    if gaussians is not None:
+        return 30.0
+    return 20.0 if joint else 10.0
 
 
 def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
@@ -262,6 +276,7 @@ def predict(
     height: int | None = None,
     refine_seconds: float = 0.0,
     gaussians: int | None = None,
+    joint: bool = False,
     cache: bool = True,
     progress: Progress | None = None,
     on_predicted: Callable[[Scene], None] | None = None,
@@ -279,6 +294,8 @@ def predict(
             size.
         refine_seconds: time limit of the refinement; 0 for none. A single view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it.
+        joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without
+            a refinement, only the colours are fitted.
         cache: whether to read and write the cache.
         progress: called with a description of the current work and the completed fraction.
         on_predicted: called with the prediction before it is refined.
@@ -295,17 +312,21 @@ def predict(
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
     report: Progress = progress or (lambda what, fraction: None)
+    joint = joint and len(views.images) > 1
     if not refine_seconds or len(views.images) == 1:
-        return _predict_views(pair, views, predictor, height, cache, report)
-    refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
+        scene = _predict_views(pair, views, predictor, height, cache, report)
+        return _fuse_scene(scene, views) if joint else scene
+    refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s" + ("-joint" if joint else "")
     is_cached = cache and isinstance(pair, Pair)
     cached = CachedPrediction(pair, views, predictor, height, refinement) if is_cached else None
     found = None if cached is None else cached.read()
-    final = None if found is None or found.is_starved else _make_scene(found, pair, views, predictor)
+    final = None if found is None or found.is_starved else _make_scene(found, pair, views, predictor, joint)
     if final is not None and on_predicted is None:
         report("read from the cache", 1.0)
         return final
     scene = _predict_views(pair, views, predictor, height, cache, lambda what, done: report(what, 0.5 * done))
+    if joint:
+        scene = fuse_views(scene)
     if on_predicted is not None:
         on_predicted(scene)
     if final is not None:
@@ -323,7 +344,14 @@ def predict(
     if found is not None and found.steps > done.steps:
         refined = found._replace(is_starved=False)  # it runs once more only
     cached.write(refined)
-    return _make_scene(refined, pair, views, predictor)
+    return _make_scene(refined, pair, views, predictor, joint)
+
+
+def _fuse_scene(scene: Scene, views: Views) -> Scene:
+    """The scene with each surface once, and colours fitted to all photographs."""
+    scene = fuse_views(scene)
+    colors = fit_colors(scene.gaussians, views.images, scene.cam2world, views.masks, ColorFitConfig(), joint=True)
+    return replace(scene, gaussians=colors)
 
 
 def _predict_views(
@@ -413,7 +441,7 @@ def _run_refinement(
     """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`."""
     refinement = Refinement(scene, views, config, seed=seed)
     if run["steps"] is None and run["seconds"] is None:
-        run["seconds"] = choose_refine_seconds(None if config is None else config.gaussians)
+        run["seconds"] = choose_refine_seconds(None if config is None else config.gaussians, joint=scene.joint)
     report = refinement.run(**run)
     return refinement.scene(), report
 
@@ -427,6 +455,7 @@ def predict_tour(
     height: int | None = None,
     refine_seconds: float = 0.0,
     gaussians: int | None = None,
+    joint: bool = False,
     cache: bool = True,
     progress: Progress | None = None,
 ) -> Scene:
@@ -442,6 +471,7 @@ def predict_tour(
         height: panoramas are resized to (height, 2 height); by default `choose_tour_height`.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.
+        joint: see `predict`; the refinement is then that of each part of the tour as a whole, and not cached.
 
     Raises:
         InputError: the input cannot be used.
@@ -452,7 +482,7 @@ def predict_tour(
     max_views = find_max_views(predictor)
     total = len(tour.choose_sources(max_views))
     part = math.inf if gaussians is None else gaussians / len(tour)  # of a panorama
-    counter = itertools.count()
+    counter, predicted = itertools.count(), 0.5 if joint and refine_seconds else 1.0
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
         number, pair = next(counter), tour.make_pair(views)
@@ -461,13 +491,43 @@ def predict_tour(
             pair,
             choose_predictor(pair, predictor),
             height=rows,
-            refine_seconds=scale_seconds(refine_seconds, pair),
+            refine_seconds=0.0 if joint else scale_seconds(refine_seconds, pair),
             gaussians=count,
             cache=cache,
-            progress=lambda what, done: report(f"scene {number + 1} of {total}: {what}", (number + done) / total),
+            progress=lambda what, done: report(
+                f"scene {number + 1} of {total}: {what}", predicted * (number + done) / total
+            ),
         )
 
-    return merge_scenes(tour, predict_scene, max_views)
+    scene = merge_scenes(tour, predict_scene, max_views)
+    if not joint:
+        return scene
+    return _fuse_tour(tour, scene, refine_seconds, lambda what, done: report(what, predicted + (1 - predicted) * done))
+
+
+def _fuse_tour(tour: TourGraph, scene: Scene, refine_seconds: float, progress: Progress) -> Scene:
+    """The scene of a tour for joint drawing, part by part: parts are separate worlds."""
+    fused: list[Gaussians] = []
+    gains = [(1.0, 1.0, 1.0)] * len(tour)
+    parts = [tuple(np.flatnonzero(np.array(tour.parts) == part).tolist()) for part in range(max(tour.parts) + 1)]
+    for number, nodes in enumerate(parts):
+        part = select_views(scene, nodes)
+        if len(nodes) > 1:
+            pair = tour.make_pair(nodes)
+            views = replace(pair.load_context(scene.height), cam2world=part.cam2world)
+            if refine_seconds:
+                refinement = Refinement(fuse_views(part), views)
+                refinement.run(
+                    seconds=scale_seconds(refine_seconds, pair),
+                    progress=lambda what, done, number=number: progress(what, (number + done) / len(parts)),
+                )
+                part = refinement.scene()
+            else:
+                part = _fuse_scene(part, views)
+        for view, node in enumerate(nodes):
+            gains[node] = part.gains[view] if part.gains else gains[node]
+        fused.append(replace(part.gaussians, views=torch.tensor(nodes)[part.gaussians.views.long()]))
+    return replace(scene, gaussians=Gaussians.cat(fused), gains=tuple(gains), joint=True)
 
 
 def predict_to_file(
@@ -479,6 +539,7 @@ def predict_to_file(
     precision: Precision = "float32",
     height: int | None = None,
     refine_seconds: float = 0.0,
+    joint: bool = False,
     cache: bool = False,
     degree: int | None = None,
     min_opacity: float = 0.0,
@@ -486,11 +547,11 @@ def predict_to_file(
 ) -> int:
     """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
 
-    The prediction of a network that is neither refined nor cached is computed tile by tile, in bounded memory; a .ply
+    The prediction of a network that is not fused, refined or cached is computed tile by tile, in bounded memory; a .ply
     is written tile by tile, too. The Gaussians are those of `predict`, ordered by tile.
 
     Args:
-        source, model, compat, precision, height, refine_seconds, progress: see `predict`.
+        source, model, compat, precision, height, refine_seconds, joint, progress: see `predict`.
         path: the file.
         cache: whether to read and write the cache; networks do not cache heights above 512.
         degree: highest degree of harmonics in the file; None keeps all.
@@ -507,7 +568,7 @@ def predict_to_file(
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
     _require_views(pair, predictor)
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
-    if can_stream(predictor) and not refine_seconds and not (cache and height <= _MAX_CACHED_HEIGHT):
+    if can_stream(predictor) and not joint and not refine_seconds and not (cache and height <= _MAX_CACHED_HEIGHT):
         views = pair if isinstance(pair, Views) else pair.load_context(height)
         parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
             views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
@@ -517,7 +578,8 @@ def predict_to_file(
             return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), pair, views, predictor), pruned, path)
         scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), pair, views, predictor)
     else:
-        scene = predict(pair, predictor, height=height, refine_seconds=refine_seconds, cache=cache, progress=progress)
+        options = {"height": height, "refine_seconds": refine_seconds, "joint": joint, "cache": cache}
+        scene = predict(pair, predictor, **options, progress=progress)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
     save(scene, path)
     return len(scene.gaussians)
@@ -532,7 +594,7 @@ def render(
     scene: Scene,
     cam2world: Float[Tensor, "4 4"] | np.ndarray,
     *,
-    blend: str | int = "deferred",
+    blend: str | int | None = None,
     size: tuple[int, int] | None = None,
     layout: str = "equirect",
     eye_distance: float | None = None,
@@ -546,7 +608,8 @@ def render(
         cam2world: pose of the camera, OpenCV axes, metres.
         blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; in a scene of
             a tour, those of the views at the nearest edge, and other views of its part fill their holes. "joint"
-            renders all Gaussians together, of a tour those of the part; a number renders those of one view only.
+            renders all Gaussians together, of a tour those of the part; a number renders those of one view only. By
+            default as the scene is made for (`Scene.joint`).
         size: (height, width), pixels; by default the scene's height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
         eye_distance: if given, omni-directional stereo (docs/rendering.md, section 9): the left eye's panorama above
@@ -578,6 +641,8 @@ def render(
         options: dict[str, Any] = {"blend": blend, "size": size, "layout": layout, "drawing": drawing, **raster}
         rendering = render(scene.scaled(factor), scale_poses(pose, factor), **options)
         return replace(rendering, depth=rendering.depth / factor)
+    if blend is None:
+        blend = "joint" if scene.joint else "deferred"
     if size is None:
         size = (scene.height, round(scene.height * 16 / 9) if layout == "pinhole" else 2 * scene.height)
     rasterize_gaussians = _choose_rasterizer(drawing, scene, size, layout, raster)
@@ -646,7 +711,9 @@ def _load_only_pair(path: str | Path) -> Pair:
     return pairs[0]
 
 
-def _make_scene(content: CachedScene, source: Pair | Views, views: Views, predictor: Predictor) -> Scene:
+def _make_scene(
+    content: CachedScene, source: Pair | Views, views: Views, predictor: Predictor, joint: bool = False
+) -> Scene:
     panoramas, gaussians = source.context if isinstance(source, Pair) else (), content.gaussians
     if len(views.images) == 1:  # predicted as of a camera at the usual height
         gaussians = gaussians.scaled(views.camera_height / CAMERA_HEIGHT, views.cam2world[0, :3, 3])
@@ -660,4 +727,5 @@ def _make_scene(content: CachedScene, source: Pair | Views, views: Views, predic
         height=views.images.shape[-2],
         gains=content.gains,
         starts=list_starts(panoramas),
+        joint=joint,
     )

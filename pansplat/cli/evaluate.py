@@ -71,7 +71,8 @@ class Evaluate:
     refine: Seconds = 0.0
     """Time limit of the refinement after each prediction, seconds; 0 for none. Not with --protocol."""
     blend: str | None = None
-    """deferred, joint, or view0, view1, ...; by default deferred, with --protocol that of the paper's table."""
+    """deferred, joint, or view0, view1, ...; by default deferred, with --protocol that of the paper's table. For joint,
+    each surface is kept once, except of networks."""
     drawing: Literal["exact", "original"] = "exact"
     """exact, or original: render as the official code does, to compare with its published figures."""
     leave_one_out: bool = False

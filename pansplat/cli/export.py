@@ -43,6 +43,9 @@ class Export:
     """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
     up: Literal["y", "z"] | None = None
     """Axis of a given file that points up, if its program did not keep to the axes of the format."""
+    layers: bool = False
+    """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
+    draw all Gaussians together (docs/formats.md)."""
     gaussians: Count | None = None
     """For .html: largest number of Gaussians, 600,000 by default; similar neighbours are merged."""
     split: bool = False
@@ -66,7 +69,7 @@ class Export:
             raise InputError(f"--gaussians, --split and --title are for an .html page, got {self.out}; leave them out")
         if self.up is not None and not is_scene_file(self.path):
             raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
-        scene = self.prediction.open_tour(self.path, self._count_of_page() if is_page else None)
+        scene = self._open(is_page or is_plan)
         if self.up is not None:
             scene = scene.rotated(_rotation_from(self.up))
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
@@ -85,6 +88,22 @@ class Export:
             kind = "points" if self.points else "Gaussians"
             print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
         return 0
+
+    def _open(self, in_layers: bool) -> Scene:
+        """The scene of the file, pair or tour; of a file for other programs with each surface once."""
+        from pansplat.refinement import fuse_views
+
+        joint = not in_layers and not self.layers
+        count = self._count_of_page() if self.out.suffix.lower() == _PAGE_SUFFIX else None
+        scene = self.prediction.open_tour(self.path, count, joint=joint)
+        if not joint or scene.joint or len(scene.cam2world) < 2:
+            return scene
+        print(
+            f"note: {self.path}: each surface is kept once (--layers keeps all); an export of the folder of the "
+            "photographs fits the Gaussians to them, too",
+            file=sys.stderr,
+        )
+        return fuse_views(scene)
 
     def _count_of_page(self) -> int:
         """The largest number of Gaussians of a page."""

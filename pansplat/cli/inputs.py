@@ -73,7 +73,7 @@ class ScenePrediction:
     model: ModelChoice = field(default_factory=ModelChoice)
     refine: Seconds | None = None
     """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none. 10 by default, for the page
-    of a pair 30."""
+    of a pair 30, for a file of other programs 20."""
     predict_height: Height | None = None
     """Height that the panoramas are resized to before the prediction, for a pair; by default that of the photographs,
     at most 1024 (for networks 512)."""
@@ -87,12 +87,13 @@ class ScenePrediction:
             return pipeline.load(path)
         return self._predict_pair(choose_pair(path, self.choice))
 
-    def open_tour(self, path: Path, gaussians: int | None = None) -> Scene:
+    def open_tour(self, path: Path, gaussians: int | None = None, *, joint: bool = False) -> Scene:
         """The scene of a file, of the chosen pair, or of the first tour of a folder.
 
         Args:
             path: the file or folder.
             gaussians: of a page; see `pansplat.predict_tour`.
+            joint: see `pansplat.predict`; a scene file is returned as it is.
         """
         from pansplat import pipeline
         from pansplat.tours import connect, find_tours
@@ -102,7 +103,7 @@ class ScenePrediction:
         pairs = load_choice(path, self.choice)
         tours = find_tours(pairs) if self.choice.pair is None else []
         if not tours:
-            return self._predict_pair(pick_pair(path, pairs, self.choice), gaussians)
+            return self._predict_pair(pick_pair(path, pairs, self.choice), gaussians, joint)
         alone = sum(a == b for a, b in tours[0].overlaps)
         kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
         more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
@@ -115,18 +116,28 @@ class ScenePrediction:
                 connect(tours[0], progress),
                 model,
                 height=self.predict_height,
-                refine_seconds=pipeline.choose_refine_seconds(None) if self.refine is None else self.refine,
+                refine_seconds=self._choose_seconds(None, joint),
                 gaussians=gaussians,
+                joint=joint,
                 progress=progress,
             )
 
-    def _predict_pair(self, pair: Pair, gaussians: int | None = None) -> Scene:
+    def _predict_pair(self, pair: Pair, gaussians: int | None = None, joint: bool = False) -> Scene:
+        return predict_scene(
+            pair,
+            self.model.load(),
+            self.predict_height,
+            cache=True,
+            refine_seconds=self._choose_seconds(gaussians, joint),
+            gaussians=gaussians,
+            joint=joint,
+        )
+
+    def _choose_seconds(self, gaussians: int | None, joint: bool) -> float:
+        """The time limit of a refinement."""
         from pansplat import pipeline
 
-        seconds = pipeline.choose_refine_seconds(gaussians) if self.refine is None else self.refine
-        return predict_scene(
-            pair, self.model.load(), self.predict_height, cache=True, refine_seconds=seconds, gaussians=gaussians
-        )
+        return pipeline.choose_refine_seconds(gaussians, joint=joint) if self.refine is None else self.refine
 
 
 def choose_pair(path: Path, choice: PairChoice) -> Pair:
@@ -167,6 +178,7 @@ def predict_scene(
     cache: bool,
     refine_seconds: float = 0.0,
     gaussians: int | None = None,
+    joint: bool = False,
 ) -> Scene:
     """Predict and refine a scene, and show a progress bar."""
     from pansplat import pipeline
@@ -178,6 +190,7 @@ def predict_scene(
             height=height,
             refine_seconds=refine_seconds,
             gaussians=gaussians,
+            joint=joint,
             cache=cache,
             progress=progress,
         )

@@ -27,8 +27,12 @@ class Predict:
     height: Height | None = None
     """Panoramas are resized to this height, pixels; by default that of the photographs, at most 1024 (for networks
     512). Networks predict heights above 512 tile by tile, in bounded memory, and do not cache the result."""
-    refine: Seconds = 0.0
-    """Time limit of the refinement after the prediction, seconds; 0 for none. `pansplat refine` has more options."""
+    refine: Seconds | None = None
+    """Time limit of the refinement after the prediction, seconds; 0 for none. 20 by default, with --layers and for
+    networks 0. `pansplat refine` has more options."""
+    layers: bool = False
+    """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
+    draw all Gaussians together (docs/formats.md). Networks keep all."""
     degree: Annotated[int, Range(0, 4), WHOLE] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds. The .ply of 4K
     panoramas has 5 GB with degree 4, 1 GB with degree 0."""
@@ -45,6 +49,8 @@ class Predict:
         require_output_file("--out", self.out, SCENE_SUFFIXES)
         pair = choose_pair(self.path, self.choice)
         model = self.model.load()
+        joint = not self.layers and len(pair.context) > 1 and not pipeline.can_stream(model)
+        seconds = pipeline.choose_refine_seconds(None, joint=True) if joint else 0.0
         began = time.perf_counter()
         with progress_bar() as progress:
             count = pipeline.predict_to_file(
@@ -52,7 +58,8 @@ class Predict:
                 self.out,
                 model,
                 height=self.height,
-                refine_seconds=self.refine,
+                refine_seconds=seconds if self.refine is None else self.refine,
+                joint=joint,
                 cache=not self.no_cache,
                 degree=self.degree,
                 min_opacity=self.min_opacity,

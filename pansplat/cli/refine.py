@@ -38,13 +38,16 @@ class Refine:
     photographs: Path | None = None
     """Folder of the panoramas that a scene file was predicted from."""
     seconds: Seconds | None = None
-    """Time limit; 10 by default, with --gaussians 30."""
+    """Time limit; 20 by default, with --layers 10, with --gaussians 30."""
     steps: Count | None = None
     """Number of steps instead, for the same result in every run."""
+    layers: bool = False
+    """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
+    draw all Gaussians together (docs/formats.md)."""
     gaussians: Count | None = None
     """Largest number of Gaussians: similar neighbours are merged before the refinement."""
     poses: bool = False
-    """Estimate small corrections of the camera poses, too."""
+    """Estimate small corrections of the camera poses, too; with --layers."""
     seed: Seed = 0
     """Of the blocks of pixels that are held out to detect overfitting."""
     report: Path | None = None
@@ -59,10 +62,11 @@ class Refine:
         """Refine, write the scene and print the errors of held-out pixels."""
         from pansplat import pipeline
         from pansplat.evaluation.report import write_json
-        from pansplat.refinement import RefineConfig
+        from pansplat.refinement import RefineConfig, fuse_views
 
         self._refuse_invalid_arguments()
-        scene, views = self._open_scene()
+        given, views = self._open_scene()
+        scene = given if self.layers else fuse_views(given)
         config = RefineConfig(gaussians=self.gaussians, poses=self.poses)
         with stop_at_interrupt() as should_stop, progress_bar() as progress:
             progress("preparing", 0.0)
@@ -80,7 +84,7 @@ class Refine:
         if self.report is not None:
             write_json(dataclasses.asdict(report), self.report)
         print(_describe(report))
-        print(f"{self.out}: {len(refined.gaussians):,} Gaussians (given: {len(scene.gaussians):,})")
+        print(f"{self.out}: {len(refined.gaussians):,} Gaussians (given: {len(given.gaussians):,})")
         return 0
 
     def _refuse_invalid_arguments(self) -> None:
@@ -88,6 +92,8 @@ class Refine:
         require_output_file("--out", self.out, SCENE_SUFFIXES)
         if self.report is not None:
             require_output_file("--report", self.report, (".json",))
+        if self.poses and not self.layers:
+            raise InputError("--poses compares all Gaussians of each view with the photographs; add --layers")
         if self.seconds is not None and self.steps is not None:
             raise InputError("--seconds and --steps both set the length of the refinement; give one of them")
         if is_scene_file(self.path) and self.photographs is None:

@@ -58,8 +58,9 @@ class Render:
     panoramas 1440 (2880x1440)."""
     depth: bool = False
     """Write the depth as a 16-bit .png in millimetres, 0 where there is none; an .exr holds it without this option."""
-    blend: str = "deferred"
-    """deferred (images of single views, weighted by nearness), joint (all Gaussians at once), or view0, view1, ..."""
+    blend: str | None = None
+    """deferred (images of single views, weighted by nearness), joint (all Gaussians at once), or view0, view1, ...;
+    by default what the scene is made for."""
     fov: Annotated[float, Range(1, 170, "degrees"), REAL] = 90.0
     """Vertical field of view of `perspective`, degrees."""
     seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] | None = None
@@ -126,11 +127,14 @@ class Render:
             raise InputError("--at is one position, a video moves through all; write a .png, or leave out --at")
         if self.stereo and self.layout not in (None, "equirect"):
             raise InputError(f"--stereo is for panoramas of --layout equirect, got {self.layout}; leave out --layout")
-        parse_blend(self.blend)
+        self._parse_blend()
+
+    def _parse_blend(self) -> str | int | None:
+        return None if self.blend is None else parse_blend(self.blend)
 
     def _render_options(self, layout: str, height: int) -> dict[str, Any]:
         """Keyword arguments of `pipeline.render`."""
-        options: dict[str, Any] = {"blend": parse_blend(self.blend)}
+        options: dict[str, Any] = {"blend": self._parse_blend()}
         if layout == "perspective":
             return options | {
                 "layout": "pinhole",

@@ -94,7 +94,8 @@ def evaluate(
 
     Args:
         refine_seconds: time limit of the refinement of each scene; 0 for none.
-        blend, drawing: see `pipeline.render`.
+        blend, drawing: see `pipeline.render`. With "joint", scenes are fused (`fuse_views`), but those of networks are
+            not: these are trained for joint drawing.
 
     Raises:
         InputError: no pair has a target, or `out` cannot be written.
@@ -113,7 +114,8 @@ def evaluate(
                 progress(f"{pair.name}: {what}", (index + fraction) / len(with_targets))
 
         taken = {case.prediction.parent.name for case in cases}
-        cases += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, render, lpips, report)
+        joint = blend == "joint" and not pipeline.can_stream(predictor)
+        cases += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, joint, render, lpips, report)
         write_json([case.as_json() for case in cases], out / "results.json")
     return cases
 
@@ -133,13 +135,14 @@ def _evaluate_pair(
     taken: set[str],
     height: int,
     refine_seconds: float,
+    joint: bool,
     render: Callable[[Scene, Tensor], Rendering],
     lpips: Lpips | None,
     progress: Progress,
 ) -> Iterator[Case]:
     context, targets = pair.load_context(height), pair.load_targets(height)
     start = time.perf_counter()
-    scene = pipeline.predict(context, predictor, progress=progress)
+    scene = pipeline.predict(context, predictor, joint=joint, progress=progress)
     predict_seconds = time.perf_counter() - start
     if refine_seconds:
         start = time.perf_counter()

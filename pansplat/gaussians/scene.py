@@ -146,6 +146,8 @@ class Scene:
         overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.TourGraph`.
         links: of a scene of a whole tour: the known directions from one panorama towards another one.
         starts: of a scene of a whole tour: one for each view, or none.
+        joint: whether the Gaussians of all views belong in one image, as other programs draw them. Else those of a view
+            show its whole surroundings, and images of single views are blended ("deferred").
     """
 
     gaussians: Gaussians
@@ -159,6 +161,7 @@ class Scene:
     overlaps: Overlaps = ()
     links: Links = ()
     starts: Starts = ()
+    joint: bool = False
 
     def scaled(self, factor: float) -> Scene:
         """The scene in a world that is multiplied by a factor."""

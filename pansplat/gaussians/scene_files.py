@@ -49,6 +49,7 @@ def format_entry(scene: Scene, runs: list[list[int]]) -> str:
         **({"overlaps": scene.overlaps} if scene.overlaps else {}),
         **({"links": [[*link[:4], _escape(link[4])] for link in scene.links]} if scene.links else {}),
         **({"starts": scene.starts} if any(scene.starts) else {}),
+        **({"joint": True} if scene.joint else {}),
         "runs": runs,
     }
     return json.dumps(content, separators=(",", ":"))
@@ -176,6 +177,7 @@ def _read_entry(content: Any) -> _Entry:
         _read_overlaps(list_field(content, "overlaps", "comment"), len(poses)),
         _read_links(list_field(content, "links", "comment"), len(poses)),
         _read_starts(list_field(content, "starts", "comment"), len(poses)),
+        joint=content.get("joint") is True,
     )
     return scene, list_field(content, "runs", "comment")
 

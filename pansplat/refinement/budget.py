@@ -34,21 +34,36 @@ _MERGED = 0.5  # part of the pairs of a round that is merged; in the next round 
 
 
 def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, "n"]:
-    """Largest contribution of each Gaussian to the images of its view.
+    """Largest contribution of each Gaussian to the images of its view, in joint drawing to those of all views.
 
-    The images are at its own camera, at the nearest other ones, and halfway to them.
+    The images are at the view's own camera, at the nearest other ones, and halfway to them.
     """
     size = (max(size[0] // 2, 1), max(size[1] // 2, 1))  # a quarter of the time; the filter conserves energy
-    gaussians = scene.gaussians
+    gaussians, poses = scene.gaussians, scene.cam2world
     largest = torch.zeros_like(gaussians.opacities)
     area = row_weights(size[0]).to(largest)[None, :, None].expand(1, *size)
     area = area / (row_weights(size[0]).sum() * size[1])
-    for view in torch.unique(gaussians.views).tolist():
-        index = (gaussians.views == view).nonzero()[:, 0]
-        part, own = gaussians.select(index), scene.cam2world[view]
-        others = [scene.cam2world[other] for other in nearest_views(scene.cam2world, view, MAX_OTHERS)]
-        for pose in (own, *others, *(interpolate_poses(own, other, 0.5) for other in others)):
-            contributions = compute_blending_weights(part, pose, size).accumulate(area)[:, 0]
+    near = [nearest_views(poses, view, MAX_OTHERS) for view in range(len(poses))]
+
+    def halfway(a: int, b: int) -> Tensor:
+        return interpolate_poses(poses[a], poses[b], 0.5)
+
+    if scene.joint:
+        middles = {(min(view, other), max(view, other)) for view, others in enumerate(near) for other in others}
+        groups = [(torch.ones_like(largest, dtype=torch.bool), [*poses, *(halfway(*pair) for pair in sorted(middles))])]
+    else:
+        groups = [
+            (
+                gaussians.views == view,
+                [poses[view], *(poses[other] for other in near[view]), *(halfway(view, other) for other in near[view])],
+            )
+            for view in torch.unique(gaussians.views).tolist()
+        ]
+    for chosen, cameras in groups:
+        index = chosen.nonzero()[:, 0]
+        part = gaussians.select(index)
+        for camera in cameras:
+            contributions = compute_blending_weights(part, camera, size).accumulate(area)[:, 0]
             largest[index] = torch.maximum(largest[index], contributions)
     return largest
 

@@ -138,13 +138,17 @@ class CameraParameters:
             len(cam2world), 6, dtype=torch.float64, device=cam2world.device, requires_grad=correct_poses
         )
 
-    def gains(self, view: int, photograph: int) -> Float[Tensor, "3"]:
-        """Factors from the colours of a view to those of a photograph."""
-        return (self.log_gains[photograph] - self.log_gains[view]).exp()
+    def gains(self, view: int | None, photograph: int) -> Float[Tensor, "3"]:
+        """Factors from the colours of a view to those of a photograph; None is the geometric mean of all."""
+        source = self.log_gains.mean(0) if view is None else self.log_gains[view]
+        return (self.log_gains[photograph] - source).exp()
 
-    def pose_in_view(self, view: int, photograph: int) -> Float[Tensor, "4 4"]:
-        """The corrected pose of a photograph relative to the corrected pose of a view, which keeps its given pose."""
-        if view == photograph or not self.twists.requires_grad:
+    def pose_in_view(self, view: int | None, photograph: int) -> Float[Tensor, "4 4"]:
+        """The corrected pose of a photograph relative to the corrected pose of a view, which keeps its given pose.
+
+        Of several views (None) it is the given one: these have no corrections.
+        """
+        if view is None or view == photograph or not self.twists.requires_grad:
             return self._cam2world[photograph]
         given = self._cam2world[view]
         undo = given @ torch.matrix_exp(-self._generator(view)) @ invert_pose(given)

@@ -1,13 +1,15 @@
-"""Render-and-compare after a prediction: the Gaussians of each view are fitted to all photographs of the scene.
+"""Render-and-compare after a prediction: the Gaussians are fitted to all photographs of the scene.
 
 The Gaussians of a view are rasterised at its own camera and at the nearest others, and compared with those photographs.
 So the images between the cameras, which deferred blending mixes from single views, are constrained from both sides.
+Every step rasterises each view once: at its own camera in even steps, at one of the others in odd steps. In a scene for
+joint drawing, a step rasterises the Gaussians of all views together at one camera, the cameras in turn.
 
-Every step rasterises each view once: at its own camera in even steps, at one of the others in odd steps. Adam moves
-depth along the source ray, scales, rotations, opacities and colours; its step sizes fall along a cosine. Twice in a
-run, Gaussians that are larger than a pixel are split where the error of the images is large. Blocks of the photographs
-are held out of the loss. Their error decides when the last part of a run begins, which fits them too, and whether the
-refined scene replaces the given one.
+Adam moves depth along the source ray, scales, rotations, opacities and colours; its step sizes fall along a cosine.
+Twice in a run, Gaussians that are larger than a pixel are split where the error of the images is large. Blocks of the
+photographs are held out of the loss. Their error decides when the last part of a run begins, which fits them too, and
+whether the refined scene replaces the given one. In joint drawing a photograph shows mostly the Gaussians that come
+from it, so that held-out blocks would say nothing, and there are none.
 """
 
 from __future__ import annotations
@@ -104,6 +106,22 @@ class RefineReport:
     history: tuple[tuple[int, float, float], ...]
 
 
+@dataclass(frozen=True)
+class _Layer:
+    """Views whose Gaussians are drawn together, and the photographs that they are compared with.
+
+    The first photograph is that of the view, unless there are several views.
+    """
+
+    views: tuple[int, ...]
+    photographs: tuple[int, ...]
+
+    @property
+    def source(self) -> int | None:
+        """The only view; None if there are several."""
+        return self.views[0] if len(self.views) == 1 else None
+
+
 class Refinement:
     """A refinement of a scene, which `run` or single calls of `step` advance.
 
@@ -115,7 +133,8 @@ class Refinement:
         seed: of the choice of held-out blocks.
 
     Raises:
-        InputError: scene and views do not fit, or an image is not finite.
+        InputError: scene and views do not fit, or an image is not finite. Poses are to be corrected in a scene for
+            joint drawing: each photograph shows mostly its own Gaussians, which would move with it.
     """
 
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
@@ -123,6 +142,11 @@ class Refinement:
         scene = scene.scaled(self._factor)
         _check_fit(scene, views, scale_poses(views.cam2world, self._factor))
         self.config = config or RefineConfig()
+        if self.config.poses and scene.joint:
+            raise InputError(
+                "poses need a scene with all Gaussians of each view, got one with each surface once; refine poses with "
+                "layers first (`pansplat refine --layers --poses`)"
+            )
         device, random = scene.gaussians.means.device, torch.Generator().manual_seed(seed)
         self._images = views.images.float().to(device)
         self._masks = views.masks.to(device)
@@ -131,8 +155,9 @@ class Refinement:
         height = min(self._images.shape[-2], _HEIGHT if limit is None else DISPLAY_HEIGHT)
         self._size = (height, 2 * height)
         self._counted_size = (min(height, _HEIGHT), 2 * min(height, _HEIGHT))  # of contributions
+        held_out = 0.0 if scene.joint else _HELD_OUT
         self._photographs = [
-            Photograph.split(image, mask > 0.999, _HELD_OUT, random)
+            Photograph.split(image, mask > 0.999, held_out, random)
             for image, mask in zip(
                 self._shrink(self._images), self._shrink(compared[:, None].float())[:, 0], strict=True
             )
@@ -141,13 +166,15 @@ class Refinement:
             scene = merge_to(scene, self._counted_size, limit)
         self._created = time.perf_counter()
         self._start, gaussians = scene, scene.gaussians
-        self._targets = {  # photographs that a view is compared with; the first is its own
-            view: [view, *nearest_views(scene.cam2world, view, MAX_OTHERS)] for view in range(len(scene.cam2world))
-        }
         self._views = {
             int(view): ViewParameters(gaussians.select(gaussians.views == view), scene.cam2world[int(view), :3, 3])
             for view in torch.unique(gaussians.views)
         }
+        self._layers = [
+            _Layer((view,), (view, *nearest_views(scene.cam2world, view, MAX_OTHERS))) for view in self._views
+        ]
+        if scene.joint:
+            self._layers = [_Layer(tuple(self._views), tuple(range(len(scene.cam2world))))]
         self._cameras = CameraParameters(scene.cam2world.to(device), correct_poses=self.config.poses)
         self._groups = self._group_parameters()
         self._steps = self._splits = 0
@@ -167,7 +194,7 @@ class Refinement:
         return groups
 
     def step(self, fraction: float) -> None:
-        """Rasterise and compare each view once, and move the Gaussians.
+        """Rasterise and compare each view once, or in joint drawing all views, and move the Gaussians.
 
         Args:
             fraction: of the run, in [0, 1]; sets the step sizes, and whether held-out blocks are fitted.
@@ -178,13 +205,13 @@ class Refinement:
             self._split()
         for group in self._groups:
             group.clear_gradients()
-        for view, parameters in self._views.items():
-            target = self._choose_target(view)
+        for layer in self._layers:
+            target = self._choose_target(layer)
             photograph = self._photographs[target]
             weights = photograph.scene if fraction >= config.release else photograph.fitted
-            error = self._draw(parameters.build(), view, target) - photograph.image
-            loss = image_difference(error, weights) + config.hold * parameters.tensors["distance"].square().mean()
-            loss.backward()
+            error = self._draw(self._build(layer), layer, target) - photograph.image
+            moved = torch.cat([self._views[view].tensors["distance"] for view in layer.views])
+            (image_difference(error, weights) + config.hold * moved.square().mean()).backward()
         if config.poses:
             (config.pose_hold * self._cameras.twists.square().sum()).backward()
         pixels = self._images[0, 0].numel() / math.prod(self._size)
@@ -197,62 +224,74 @@ class Refinement:
             parameters.clamp()
         self._steps += 1
 
-    def _choose_target(self, view: int) -> int:
-        """The photograph that a view is compared with: its own in even steps, the others in turn in odd ones."""
-        own, *others = self._targets[view]
+    def _choose_target(self, layer: _Layer) -> int:
+        """The photograph that a layer is compared with: that of its view in even steps, the others in turn in odd ones.
+        Those of several views are compared with all in turn.
+        """
+        own, *others = layer.photographs
+        if layer.source is None:
+            return layer.photographs[self._steps % len(layer.photographs)]
         return own if self._steps % 2 == 0 or not others else others[self._steps // 2 % len(others)]
+
+    def _build(self, layer: _Layer) -> Gaussians:
+        """The Gaussians of a layer, differentiable."""
+        return Gaussians.cat([self._views[view].build() for view in layer.views])
 
     @torch.no_grad()
     def _split(self) -> None:
         """Split the Gaussians with large errors, within the limit those with the largest."""
         if not self._views:
             return
-        parts = [self._errors(view) for view in self._views]
-        errors = torch.cat(parts)
+        errors = torch.cat([self._errors(layer) for layer in self._layers])
         is_split, limit = errors > _SPLIT_ERROR, self.config.gaussians
         if limit is not None and len(errors) + int(is_split.sum()) > limit:
             is_split = errors > errors.topk(limit - len(errors) + 1).values[-1]
-        for parameters, part in zip(self._views.values(), is_split.split([len(part) for part in parts]), strict=True):
+        counts = [len(parameters.tensors["opacity"]) for parameters in self._views.values()]
+        for parameters, part in zip(self._views.values(), is_split.split(counts), strict=True):
             parameters.split(part)
         for group, name in zip(self._groups[-len(ViewParameters.NAMES) :], ViewParameters.NAMES, strict=True):
             group.replace([parameters.tensors[name] for parameters in self._views.values()])
 
-    def _errors(self, view: int) -> Tensor:
-        """Error of each Gaussian of a view: the absolute errors of the images times its blending weights, as a sum over
-        pixels and a mean over photographs. It is 0 for a Gaussian that is smaller than a pixel at its own camera.
+    def _errors(self, layer: _Layer) -> Tensor:
+        """Error of each Gaussian of a layer: the absolute errors of the images times its blending weights, as a sum
+        over pixels and a mean over photographs. It is 0 for a Gaussian that is smaller than a pixel at its own camera.
         """
-        gaussians = self._views[view].build()
+        gaussians = self._build(layer)
         errors = torch.zeros_like(gaussians.opacities)
         pixels, half = math.prod(self._size), (self._size[0] // 2, self._size[1] // 2)  # a quarter of time and memory
-        for target in self._targets[view]:
+        for target in layer.photographs:
             photograph = self._photographs[target]
-            error = (self._draw(gaussians, view, target) - photograph.image).abs().mean(0)
+            error = (self._draw(gaussians, layer, target) - photograph.image).abs().mean(0)
             error = functional.interpolate((error * photograph.fitted.pixels)[None, None], half, mode="area")[0]
             error = error * pixels * (pixels / math.prod(half))  # of weights that sum to 1; a sum over pixels
-            weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(view, target), half)
-            errors += weights.accumulate(error)[:, 0] / len(self._targets[view])
-        distances = (gaussians.means - self._start.cam2world[view, :3, 3].to(gaussians.means)).norm(dim=1)
+            weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), half)
+            errors += weights.accumulate(error)[:, 0] / len(layer.photographs) * len(layer.views)
+        cameras = self._start.cam2world[:, :3, 3].to(gaussians.means)
+        distances = (gaussians.means - cameras[gaussians.views.long()]).norm(dim=1)
         return errors * (gaussians.scales.amax(1) > math.pi / self._size[0] * distances)
 
-    def _draw(self, gaussians: Gaussians, view: int, target: int) -> Tensor:
-        """The colours (3 height width) of a view's Gaussians in a photograph, with its gain."""
-        color = rasterize(gaussians, self._cameras.pose_in_view(view, target), size=self._size).color
-        return color if target == view else color * self._cameras.gains(view, target)[:, None, None]
+    def _draw(self, gaussians: Gaussians, layer: _Layer, target: int) -> Tensor:
+        """The colours (3 height width) of a layer's Gaussians in a photograph, with its gain."""
+        color = rasterize(gaussians, self._cameras.pose_in_view(layer.source, target), size=self._size).color
+        return color if target == layer.source else color * self._cameras.gains(layer.source, target)[:, None, None]
 
     @torch.no_grad()
     def held_out_error(self) -> float:
         """Mean absolute error of the held-out blocks, over all views and the photographs of other cameras.
 
-        The colours may have been fitted to a view's own photograph; it counts if there is no other one.
+        The colours may have been fitted to a view's own photograph; it counts if there is no other one. In joint
+        drawing it is that of all pixels.
         """
         error = weight = 0.0
-        for view, parameters in self._views.items():
-            gaussians = parameters.build()
-            for target in self._targets[view][1:] or [view]:
+        for layer in self._layers:
+            gaussians = self._build(layer)
+            others = [target for target in layer.photographs if target != layer.source]
+            for target in others or layer.photographs:
                 photograph = self._photographs[target]
-                difference = (self._draw(gaussians, view, target) - photograph.image).abs().mean(0)
-                error += float((difference * photograph.held_out).sum())
-                weight += float(photograph.held_out.sum())
+                difference = (self._draw(gaussians, layer, target) - photograph.image).abs().mean(0)
+                compared = photograph.scene.pixels if self._start.joint else photograph.held_out
+                error += float((difference * compared).sum())
+                weight += float(compared.sum())
         return error / weight if weight > 0 else 0.0
 
     def scene(self) -> Scene:
@@ -324,7 +363,7 @@ class Refinement:
                 stopped = "interrupted"
                 break
             report("refining", fraction)
-            if after is None and fraction >= self.config.release:
+            if after is None and fraction >= self.config.release and not self._start.joint:
                 after = measure()
             if after is not None and after > before:
                 break
@@ -333,7 +372,7 @@ class Refinement:
             clock.steps += 1
             fastest = min(fastest, clock.elapsed - start)  # the first step of a process loads kernels
             clock.reserve(self._end_cost() * fastest)
-            if clock.steps % _CHECK_EVERY or clock.fraction >= self.config.release:
+            if self._start.joint or clock.steps % _CHECK_EVERY or clock.fraction >= self.config.release:
                 continue
             error = measure()
             stale = 0 if error < best * (1 - _MIN_IMPROVEMENT) else stale + 1
@@ -356,22 +395,28 @@ class Refinement:
     def _release_parameters(self) -> None:
         """Free the parameters and the optimiser's state, which are gigabytes for millions of Gaussians."""
         self._views.clear()
+        self._layers.clear()
         self._groups.clear()
 
     def _end_cost(self) -> float:
         """Approximate duration of the contributions and the fit of colours, in steps."""
-        views, images = len(self._views), sum(max(len(targets) - 1, 1) for targets in self._targets.values())
+        layers, photographs = len(self._layers), len(self._photographs)
+        views = photographs if self._start.joint else layers
+        others = sum(max(len(layer.photographs) - 1, 1) for layer in self._layers)
         pixels = self._images[0, 0].numel() / math.prod(self._size)
         gradient = 1.7  # duration of a backward pass relative to its image
         weights, product = 1.2, 0.5  # of blending weights, and of a product with them
-        contributions = (images + views) * (weights + product)
+        contributions = (others + views) * (weights + product)
         steps = _COLORS.steps_at(self._images.shape[-2])
         colors = views * pixels * (weights + product + 2 * steps * product)
-        return (contributions + colors) / (views * (1 + gradient))
+        return (contributions + colors) / (layers * (1 + gradient))
 
     def _finish(self, scene: Scene) -> Scene:
         """Fit the colours to the photographs at their own size."""
-        colors = fit_colors(scene.gaussians, self._images, scene.cam2world, self._masks, _COLORS)
+        images = self._images
+        if scene.joint:
+            images = images / torch.tensor(scene.gains).to(images)[:, :, None, None]
+        colors = fit_colors(scene.gaussians, images, scene.cam2world, self._masks, _COLORS, joint=scene.joint)
         return dataclasses.replace(scene, gaussians=colors)
 
 

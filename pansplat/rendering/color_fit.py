@@ -2,7 +2,8 @@
 
 A Gaussian covers several pixels, so that colours sampled from a photograph give a blurred image. An image is linear in
 the colours: C = W c. Simultaneous iterative reconstruction (SIRT) solves it: c += r W' (photograph - W c) / (W' 1),
-where r is the relaxation, and W' 1 sums the weights of a Gaussian over the image.
+where r is the relaxation, and W' 1 sums the weights of a Gaussian over the image. Gaussians that are drawn together are
+fitted to all photographs: both products are then sums over these.
 
 Source: Gregor and Benson, "Computational analysis and improvement of SIRT", 2008.
 """
@@ -10,6 +11,8 @@ Source: Gregor and Benson, "Computational analysis and improvement of SIRT", 200
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,9 +22,10 @@ from torch.nn import functional
 
 from pansplat.gaussians.harmonics import SH_0, harmonics_basis
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.weights import compute_blending_weights
+from pansplat.rendering.weights import BlendingWeights, compute_blending_weights
 
 _MIN_COVERAGE = 1e-3  # pixels
+_STORED = 2  # photographs whose weights are kept between the steps; those of one take 200 MB at 512 rows
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,8 @@ def fit_colors(
     cam2world: Float[Tensor, "view 4 4"],
     masks: Bool[Tensor, "view height width"],
     config: ColorFitConfig,
+    *,
+    joint: bool = False,
 ) -> Gaussians:
     """The Gaussians with the colours that fit each view's image to its photograph.
 
@@ -55,32 +61,51 @@ def fit_colors(
         images: photographs of all views, RGB in [0, 1].
         cam2world: poses of the photographs, OpenCV axes, metres.
         masks: pixels that are compared.
+        joint: whether the Gaussians of all views are drawn together, and fitted to all photographs.
     """
+    photographs = list(zip(images, cam2world, masks, strict=True))
+    if joint:
+        groups = [(torch.ones_like(gaussians.views, dtype=torch.bool), photographs)]
+    else:
+        groups = [(gaussians.views == view, [photograph]) for view, photograph in enumerate(photographs)]
     harmonics = gaussians.harmonics.clone()
-    for view, (image, pose, mask) in enumerate(zip(images, cam2world, masks, strict=True)):
-        chosen = gaussians.views == view
+    for chosen, compared in groups:
         if chosen.any():
-            harmonics[chosen, 0] = _fit_view(gaussians.select(chosen), image, pose, mask, config)
+            harmonics[chosen, 0] = _fit(gaussians.select(chosen), compared, config)
     return dataclasses.replace(gaussians, harmonics=harmonics)
 
 
 @torch.no_grad()
-def _fit_view(gaussians: Gaussians, image: Tensor, pose: Tensor, mask: Tensor, config: ColorFitConfig) -> Tensor:
-    """The harmonics of degree 0 (n, 3) of a view's Gaussians."""
-    size = (mask.shape[0], mask.shape[1])
-    further = _directional_colors(gaussians, pose) if gaussians.degree else 0.0
-    colors = (0.5 + SH_0 * gaussians.harmonics[:, 0] + further).clamp_min(0)
-    image, mask = image.to(colors), mask.to(colors)
-    weights = compute_blending_weights(gaussians, pose, size)
-    coverage = weights.accumulate(mask[None]).clamp_min(_MIN_COVERAGE)
-    for _ in range(config.steps_at(size[0])):
-        error = (image - weights.blend(colors)) * mask
-        colors = (colors + config.relaxation * weights.accumulate(error) / coverage).clamp_min(0)
-    return (colors - 0.5 - further) / SH_0
+def _fit(gaussians: Gaussians, photographs: Sequence[tuple[Tensor, Tensor, Tensor]], config: ColorFitConfig) -> Tensor:
+    """The harmonics of degree 0 (n, 3) of Gaussians that are drawn together.
+
+    Args:
+        photographs: each with its pose and its mask.
+    """
+    change = torch.zeros_like(gaussians.harmonics[:, 0])
+
+    @functools.lru_cache(_STORED)
+    def compute_weights(number: int) -> BlendingWeights:
+        image, pose, _ = photographs[number]
+        return compute_blending_weights(gaussians, pose, (image.shape[-2], image.shape[-1]))
+
+    coverage = torch.zeros_like(change[:, :1])
+    for number, (*_, mask) in enumerate(photographs):
+        coverage += compute_weights(number).accumulate(mask[None].to(change))
+    coverage.clamp_min_(_MIN_COVERAGE)
+    for _ in range(config.steps_at(photographs[0][0].shape[-2])):
+        total = torch.zeros_like(change)
+        for number, (image, pose, mask) in enumerate(photographs):
+            weights, colors = compute_weights(number), _evaluate_colors(gaussians, pose) + change
+            total += weights.accumulate((image.to(change) - weights.blend(colors.clamp_min(0))) * mask.to(change))
+        change += config.relaxation * total / coverage
+    return gaussians.harmonics[:, 0] + change / SH_0
 
 
-def _directional_colors(gaussians: Gaussians, pose: Tensor) -> Tensor:
-    """The colours (n, 3) by the harmonics of higher degree, as the camera sees them."""
+def _evaluate_colors(gaussians: Gaussians, pose: Tensor) -> Tensor:
+    """The colours (n, 3) as the camera sees them, which may be below 0."""
+    if not gaussians.degree:
+        return 0.5 + SH_0 * gaussians.harmonics[:, 0]
     directions = functional.normalize(gaussians.means - pose[:3, 3].to(gaussians.means), dim=1)
-    basis = harmonics_basis(directions, gaussians.degree)[:, 1:]
-    return (basis[:, None] @ gaussians.harmonics[:, 1:])[:, 0]
+    basis = harmonics_basis(directions, gaussians.degree)
+    return 0.5 + (basis[:, None] @ gaussians.harmonics)[:, 0]

@@ -236,7 +236,7 @@ def _prepare(scene: Scene, factor: float) -> Scene:
     if not len(poses):
         poses, names = torch.eye(4, dtype=torch.float64)[None], ("start",)
         poses[0, :3, 3] = gaussians.means.double().median(0).values
-    if len(poses) < 2 or int(gaussians.views.max()) >= len(poses):
+    if scene.joint or len(poses) < 2 or int(gaussians.views.max()) >= len(poses):
         # The Gaussians of all views are drawn together.
         gaussians = dataclasses.replace(gaussians, views=torch.zeros_like(gaussians.views))
     names = tuple(names[k] if k < len(names) else f"panorama {k + 1}" for k in range(len(poses)))

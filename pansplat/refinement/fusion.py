@@ -1,0 +1,69 @@
+"""One scene for joint drawing: each surface is kept once.
+
+The Gaussians of a view show all that it sees, so that those of two views cover a surface twice, and errors of depth put
+either in front of the other. Deferred blending draws views one by one. Other programs draw all Gaussians together.
+
+Each place belongs to the nearest camera that sees it, whose photograph has most pixels there: a Gaussian is dropped if
+a nearer camera sees its place. The camera does if the surface of its own Gaussians is not in front. A Gaussian in front
+of that surface is dropped too: the nearer camera's depth is the more accurate one. The background levels, which a view
+has behind its surfaces, are kept only where no other camera sees.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.equirect import pad_equirect, uv_from_directions
+from pansplat.geometry.world import working_factor
+from pansplat.rendering import rasterize
+
+_HEIGHT = 512  # rows of the depth of a view's surface
+_TOLERANCE = 0.1  # of a distance from the surface, relative to its depth
+_BACKGROUND_LEVEL = 2  # the finest level of the background
+_OPAQUE = 0.5  # least alpha of a surface
+
+
+@torch.no_grad()
+def fuse_views(scene: Scene) -> Scene:
+    """The scene with each surface once, for joint drawing.
+
+    Gaussians are only left out: colours of different views may differ, and a refinement of the result fits them. A
+    scene of fewer than two cameras is returned as it is.
+    """
+    if scene.joint or len(scene.cam2world) < 2:
+        return scene
+    factor = working_factor(scene.near)
+    scaled = scene.scaled(factor)
+    gaussians, poses = scaled.gaussians, scaled.cam2world
+    own = gaussians.views.long()
+    centers = poses[:, :3, 3].to(gaussians.means)
+    nearest = (gaussians.means - centers[own]).norm(dim=1)
+    is_dropped = torch.zeros_like(own, dtype=torch.bool)
+    for view in own.unique().tolist():
+        surface = gaussians.select(own == view)
+        distances = (gaussians.means - centers[view]).norm(dim=1)
+        is_nearer = (distances < nearest) | ((distances == nearest) & (own > view))
+        asked = (own != view) & ~is_dropped & (is_nearer | (gaussians.levels >= _BACKGROUND_LEVEL))
+        chosen = asked.nonzero()[:, 0]
+        is_dropped[chosen] = _are_seen(gaussians.means[chosen], poses[view], surface, min(scene.height, _HEIGHT))
+    return dataclasses.replace(scene, gaussians=scene.gaussians.select(~is_dropped), joint=True)
+
+
+def _are_seen(
+    points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], surface: Gaussians, height: int
+) -> Bool[Tensor, "n"]:
+    """Whether a camera sees the points, before or at the surface of its own Gaussians."""
+    drawn = rasterize(surface, pose, size=(height, 2 * height))
+    depth = torch.where(drawn.alpha > _OPAQUE, drawn.depth, 0)[None]  # nothing is seen where there is no surface
+    farthest = functional.max_pool2d(pad_equirect(depth, 1), 3, stride=1)[0]  # around, as depth is uncertain at edges
+    offsets = (points.double() - pose[:3, 3].to(points.device)) @ pose[:3, :3].to(points.device)
+    uv = uv_from_directions(offsets)
+    row = (uv[:, 1] * height).long().clamp(0, height - 1)
+    limit = farthest[row, (uv[:, 0] * 2 * height).long() % (2 * height)]
+    return offsets.norm(dim=1) <= (1 + _TOLERANCE) * limit
