@@ -53,26 +53,35 @@ class ParameterGroup:
             self.epsilon = max(damping * float(torch.cat(gradients).square().mean().sqrt()), _MIN_EPSILON)
 
     @torch.no_grad()
-    def step(self, factor: float, betas: tuple[float, float]) -> None:
+    def step(self, factor: float, betas: tuple[float, float], rows: Sequence[Tensor] = ()) -> None:
         """Move the parameters that have a gradient.
 
         Args:
             factor: of the step size.
             betas: decay of the averages of the gradients and of their squares.
+            rows: mask of the rows of each parameter that move, with their averages. Else rows that have a gradient in
+                few steps would go on along each for many. By default all.
         """
         moved = [parameter for parameter in self.parameters if parameter.grad is not None]
         for parameter in moved:
             if parameter not in self._states:
                 count = torch.zeros((), dtype=torch.float32, device=parameter.device)
                 self._states[parameter] = torch.zeros_like(parameter), torch.zeros_like(parameter), count
-        states = [self._states[parameter] for parameter in moved]
+        tensors = [(parameter.detach(), parameter.grad, *self._states[parameter][:2]) for parameter in moved]
+        if rows:
+            indices = {parameter: mask.nonzero()[:, 0] for parameter, mask in zip(self.parameters, rows, strict=True)}
+            tensors = [
+                [tensor[indices[parameter]] for tensor in values if tensor is not None]
+                for parameter, values in zip(moved, tensors, strict=True)
+            ]
+        values, gradients, means, squares = ([row[k] for row in tensors] for k in range(4))
         adam(
-            moved,
-            [parameter.grad for parameter in moved if parameter.grad is not None],
-            [mean for mean, _, _ in states],
-            [square for _, square, _ in states],
+            values,
+            gradients,
+            means,
+            squares,
             [],
-            [count for _, _, count in states],
+            [self._states[parameter][2] for parameter in moved],
             fused=True,
             amsgrad=False,
             beta1=betas[0],
@@ -82,3 +91,8 @@ class ParameterGroup:
             eps=self.epsilon,
             maximize=False,
         )
+        for parameter, value, mean, square in zip(moved, values, means, squares, strict=True) if rows else ():
+            for whole, part in zip(
+                (parameter.detach(), *self._states[parameter][:2]), (value, mean, square), strict=True
+            ):
+                whole[indices[parameter]] = part

@@ -75,6 +75,9 @@ class ViewParameters:
             name: value.detach().clone().requires_grad_() for name, value in zip(self.NAMES, values, strict=True)
         }
 
+    def __len__(self) -> int:
+        return len(self._levels)
+
     def build(self) -> Gaussians:
         """The Gaussians, differentiable in `tensors`."""
         distance, scale, rotation, opacity, color, harmonics = (self.tensors[name] for name in self.NAMES)

@@ -18,7 +18,7 @@ import dataclasses
 import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 
@@ -53,6 +53,7 @@ _BETAS = (0.9, 0.99)  # decay of Adam's averages of the gradients and of their s
 _DAMPING = 0.2
 _COLORS = ColorFitConfig()
 _RATE_FLOOR = 0.05  # of the learning rates at the end
+_SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
 _MIN_STEPS = 8  # of a run with a limit of Gaussians: merged ones that are not fitted look like dots
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
@@ -178,6 +179,7 @@ class Refinement:
         self._cameras = CameraParameters(scene.cam2world.to(device), correct_poses=self.config.poses)
         self._groups = self._group_parameters()
         self._steps = self._splits = 0
+        self._seen: list[Tensor] = []
         self._result: Scene | None = None
 
     def _shrink(self, images: Tensor) -> Tensor:
@@ -205,12 +207,18 @@ class Refinement:
             self._split()
         for group in self._groups:
             group.clear_gradients()
+        rows: Sequence[Tensor] = ()
         for layer in self._layers:
             target = self._choose_target(layer)
             photograph = self._photographs[target]
             weights = photograph.scene if fraction >= config.release else photograph.fitted
-            error = self._draw(self._build(layer), layer, target) - photograph.image
+            gaussians = self._build(layer)
             moved = torch.cat([self._views[view].tensors["distance"] for view in layer.views])
+            if layer.source is None:
+                seen = self._find_seen(layer)[target]
+                gaussians, moved = gaussians.select(seen), moved[seen]
+                rows = seen.split([len(parameters) for parameters in self._views.values()])
+            error = self._draw(gaussians, layer, target) - photograph.image
             (image_difference(error, weights) + config.hold * moved.square().mean()).backward()
         if config.poses:
             (config.pose_hold * self._cameras.twists.square().sum()).backward()
@@ -219,7 +227,8 @@ class Refinement:
             group.clean_gradients()
             if not self._steps:
                 group.set_damping(_DAMPING * pixels)
-            group.step(_cosine_fall(fraction), _BETAS)
+            is_of_views = group in self._groups[-len(ViewParameters.NAMES) :]
+            group.step(_cosine_fall(fraction), _BETAS, rows if is_of_views else ())
         for parameters in self._views.values():
             parameters.clamp()
         self._steps += 1
@@ -238,6 +247,16 @@ class Refinement:
         return Gaussians.cat([self._views[view].build() for view in layer.views])
 
     @torch.no_grad()
+    def _find_seen(self, layer: _Layer) -> list[Tensor]:
+        """Masks of a layer's Gaussians that each photograph shows. The others are not drawn: those of other rooms."""
+        if not self._seen:
+            gaussians, size = self._build(layer), (self._size[0] // 2, self._size[1] // 2)  # a quarter of the time
+            for target in layer.photographs:
+                weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), size)
+                self._seen.append(weights.accumulate(torch.ones(1, *size).to(gaussians.means))[:, 0] > _SEEN)
+        return self._seen
+
+    @torch.no_grad()
     def _split(self) -> None:
         """Split the Gaussians with large errors, within the limit those with the largest."""
         if not self._views:
@@ -246,9 +265,10 @@ class Refinement:
         is_split, limit = errors > _SPLIT_ERROR, self.config.gaussians
         if limit is not None and len(errors) + int(is_split.sum()) > limit:
             is_split = errors > errors.topk(limit - len(errors) + 1).values[-1]
-        counts = [len(parameters.tensors["opacity"]) for parameters in self._views.values()]
+        counts = [len(parameters) for parameters in self._views.values()]
         for parameters, part in zip(self._views.values(), is_split.split(counts), strict=True):
             parameters.split(part)
+        self._seen.clear()
         for group, name in zip(self._groups[-len(ViewParameters.NAMES) :], ViewParameters.NAMES, strict=True):
             group.replace([parameters.tensors[name] for parameters in self._views.values()])
 
@@ -387,9 +407,10 @@ class Refinement:
         if after <= before:
             detail = self._counted_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
             self._result = drop_unseen(self._result, self._counted_size, detail * DROP_ERROR)
-            self._result = self._finish(self._result)
         else:
             stopped = "worse"
+        if after <= before or self._start.joint:  # a fused scene has the colours of single photographs
+            self._result = self._finish(self._result)
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
 
     def _release_parameters(self) -> None:
@@ -414,7 +435,7 @@ class Refinement:
     def _finish(self, scene: Scene) -> Scene:
         """Fit the colours to the photographs at their own size."""
         images = self._images
-        if scene.joint:
+        if scene.joint and scene.gains:
             images = images / torch.tensor(scene.gains).to(images)[:, :, None, None]
         colors = fit_colors(scene.gaussians, images, scene.cam2world, self._masks, _COLORS, joint=scene.joint)
         return dataclasses.replace(scene, gaussians=colors)
