@@ -24,6 +24,7 @@ _PUBLIC = {
     "load_pairs": "pansplat.pipeline",
     "predict": "pansplat.pipeline",
     "predict_to_file": "pansplat.pipeline",
+    "fuse": "pansplat.pipeline",
     "predict_tour": "pansplat.pipeline",
     "rasterize": "pansplat.rendering",
     "refine": "pansplat.pipeline",

@@ -444,8 +444,12 @@ def _export(scene: Scene, path: Path, unit: _Unit, options: BatchOptions) -> Non
         write_page(scene, path, gaussians=count, title=title)
     elif options.suffix == ".png":
         write_floor_plan(scene, path)
+    elif pipeline.can_stream(_load_model(options.model, options.compat, options.precision)):
+        pipeline.save(scene, path)  # networks are trained for joint drawing
+    elif unit.tour is not None:
+        pipeline.save(pipeline.fuse_tour(unit.tour, scene), path)
     else:
-        pipeline.save(scene, path)
+        pipeline.save(pipeline.fuse(scene, unit.pairs[0].load_context(scene.height)), path)
 
 
 def _hash_pair(pair: Pair) -> str:

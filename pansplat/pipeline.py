@@ -52,6 +52,8 @@ from pansplat.tours import MAX_SCENE_VIEWS, TourGraph, list_starts, make_graph, 
 
 __all__ = [
     "estimate_poses",
+    "fuse",
+    "fuse_tour",
     "load",
     "load_model",
     "load_pairs",
@@ -315,7 +317,7 @@ def predict(
     joint = joint and len(views.images) > 1
     if not refine_seconds or len(views.images) == 1:
         scene = _predict_views(pair, views, predictor, height, cache, report)
-        return _fuse_scene(scene, views) if joint else scene
+        return fuse(scene, views) if joint else scene
     refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s" + ("-joint" if joint else "")
     is_cached = cache and isinstance(pair, Pair)
     cached = CachedPrediction(pair, views, predictor, height, refinement) if is_cached else None
@@ -345,13 +347,6 @@ def predict(
         refined = found._replace(is_starved=False)  # it runs once more only
     cached.write(refined)
     return _make_scene(refined, pair, views, predictor, joint)
-
-
-def _fuse_scene(scene: Scene, views: Views) -> Scene:
-    """The scene with each surface once, and colours fitted to all photographs."""
-    scene = fuse_views(scene)
-    colors = fit_colors(scene.gaussians, views.images, scene.cam2world, views.masks, ColorFitConfig(), joint=True)
-    return replace(scene, gaussians=colors)
 
 
 def _predict_views(
@@ -502,11 +497,37 @@ def predict_tour(
     scene = merge_scenes(tour, predict_scene, max_views)
     if not joint:
         return scene
-    return _fuse_tour(tour, scene, refine_seconds, lambda what, done: report(what, predicted + (1 - predicted) * done))
+    return fuse_tour(
+        tour,
+        scene,
+        refine_seconds=refine_seconds,
+        progress=lambda what, done: report(what, predicted + (1 - predicted) * done),
+    )
 
 
-def _fuse_tour(tour: TourGraph, scene: Scene, refine_seconds: float, progress: Progress) -> Scene:
-    """The scene of a tour for joint drawing, part by part: parts are separate worlds."""
+def fuse(scene: Scene, views: Views) -> Scene:
+    """The scene with each surface once, for programs that draw all Gaussians together, and colours of all photographs.
+
+    Args:
+        scene: of one input camera for each photograph.
+        views: the photographs that it was predicted from.
+    """
+    if len(views.images) == 1:
+        return scene
+    fused = fuse_views(scene)
+    colors = fit_colors(fused.gaussians, views.images, fused.cam2world, views.masks, ColorFitConfig(), joint=True)
+    return replace(fused, gaussians=colors)
+
+
+def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, progress: Progress | None = None) -> Scene:
+    """The scene of a whole tour with each surface once, and fitted to all photographs of each part.
+
+    Args:
+        tour, scene: the graph, and its scene by `predict_tour`.
+        refine_seconds: time limit of the refinement, of three panoramas; without one only colours are fitted.
+        progress: see `predict`.
+    """
+    report: Progress = progress or (lambda what, fraction: None)
     fused: list[Gaussians] = []
     gains = [(1.0, 1.0, 1.0)] * len(tour)
     parts = [tuple(np.flatnonzero(np.array(tour.parts) == part).tolist()) for part in range(max(tour.parts) + 1)]
@@ -519,11 +540,11 @@ def _fuse_tour(tour: TourGraph, scene: Scene, refine_seconds: float, progress: P
                 refinement = Refinement(fuse_views(part), views)
                 refinement.run(
                     seconds=scale_seconds(refine_seconds, pair),
-                    progress=lambda what, done, number=number: progress(what, (number + done) / len(parts)),
+                    progress=lambda what, done, number=number: report(what, (number + done) / len(parts)),
                 )
                 part = refinement.scene()
             else:
-                part = _fuse_scene(part, views)
+                part = fuse(part, views)
         for view, node in enumerate(nodes):
             gains[node] = part.gains[view] if part.gains else gains[node]
         fused.append(replace(part.gaussians, views=torch.tensor(nodes)[part.gaussians.views.long()]))

@@ -85,7 +85,9 @@ def test_only_steps_whose_inputs_changed_are_done_again(
 
     first = process("predict", "export")
     assert (first.status, len(first.outputs)) == ("done", 2) and first.error is None
-    assert all(len(pipeline.load(out / name).gaussians) == 2 * HEIGHT * 2 * HEIGHT for name in first.outputs)
+    predicted, exported = (pipeline.load(out / name) for name in first.outputs)
+    assert len(predicted.gaussians) == 2 * HEIGHT * 2 * HEIGHT and not predicted.joint
+    assert exported.joint and 0.4 < len(exported.gaussians) / len(predicted.gaussians) < 0.9, "each surface once"
     files = list_outputs(out)
     assert process("predict", "export").status == "skipped" and list_outputs(out) == files
 
@@ -117,7 +119,7 @@ def test_a_tour_has_a_file_for_each_scene_and_one_page(
         assert process("predict", "export").status == "skipped"
     whole = process("export", suffix=".splat")  # nothing is predicted into files
     assert whole.error is None and len(whole.outputs) == 2
-    assert (out / whole.outputs[1]).stat().st_size == 32 * 4 * HEIGHT * 2 * HEIGHT
+    assert (out / whole.outputs[1]).stat().st_size < 0.9 * 32 * 4 * HEIGHT * 2 * HEIGHT, "each surface once"
     one = process_item(Item("pair", house, "p1-p2"), BatchOptions(("predict",), "sphere", height=HEIGHT), "1", out)
     assert one.error is None and len(one.outputs) == 1
 

@@ -83,7 +83,7 @@ class Refine:
             )
         if self.report is not None:
             write_json(dataclasses.asdict(report), self.report)
-        print(_describe(report))
+        print(_describe(report, "all" if scene.joint else "held-out"))
         print(f"{self.out}: {len(refined.gaussians):,} Gaussians (given: {len(given.gaussians):,})")
         return 0
 
@@ -116,8 +116,8 @@ class Refine:
         return predict_scene(pair, model, height, cache=True), pair.load_context(height)
 
 
-def _describe(report: RefineReport) -> str:
-    """One line on what the refinement did."""
+def _describe(report: RefineReport, compared: str) -> str:
+    """One line on what the refinement did, with the errors of the compared pixels."""
     ending = {
         "done": "",
         "converged": ", converged",
@@ -126,7 +126,7 @@ def _describe(report: RefineReport) -> str:
         "worse": "; the given scene is kept, because the refined one is not better",
     }[report.stopped]
     errors = f"{report.before:.4f} before, {report.after:.4f} after"
-    return f"{report.steps} steps in {report.seconds:.1f} s{ending}; error of held-out pixels {errors}"
+    return f"{report.steps} steps in {report.seconds:.1f} s{ending}; error of {compared} pixels {errors}"
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def predict(room: Path, tmp_path: Path) -> Callable[..., int]:
     """A function that runs `pansplat predict` on the room and returns its status."""
 
     def run_predict(*arguments: str) -> int:
-        start = ["predict", str(room), "-o", str(tmp_path / "scene.ply"), "--model", "sphere"]
+        start = ["predict", str(room), "-o", str(tmp_path / "scene.ply"), "--model", "sphere", "--layers"]
         return run([*start, "--height", str(HEIGHT), *arguments])
 
     return run_predict

@@ -21,13 +21,20 @@ def test_a_scene_is_written_pruned(scene: Path, tmp_path: Path, capsys: pytest.C
     assert run(["export", str(scene), "-o", str(out), "--min-opacity", "0.95"]) == 0
     assert "0 Gaussians" in capsys.readouterr().out
     assert len(pipeline.load(out).gaussians) == 0
-    assert run(["export", str(scene), "-o", str(out)]) == 0
+    assert run(["export", str(scene), "-o", str(out), "--layers"]) == 0
     assert out.read_bytes() == scene.read_bytes()
+    capsys.readouterr()
+    assert run(["export", str(scene), "-o", str(out)]) == 0
+    assert "each surface is kept once" in capsys.readouterr().err
+    fused = pipeline.load(out)
+    assert fused.joint and 100 < len(fused.gaussians) < 900
+    assert run(["export", str(out), "-o", str(tmp_path / "again.ply")]) == 0
+    assert capsys.readouterr().err == "" and (tmp_path / "again.ply").read_bytes() == out.read_bytes()
 
 
 def test_points_have_the_means_and_the_colours(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "points.ply"
-    assert run(["export", str(scene), "-o", str(out), "--points"]) == 0
+    assert run(["export", str(scene), "-o", str(out), "--points", "--layers"]) == 0
     header, body = out.read_bytes().split(b"end_header\n")
     assert b"property float x" in header and b"property uchar blue" in header
     points = np.frombuffer(body, [("position", "<f4", 3), ("color", "u1", 3)])
@@ -42,7 +49,7 @@ def test_every_format_is_described_drawn_and_opened(
     scene: Path, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / f"out{suffix}"
-    assert run(["export", str(scene), "-o", str(out)]) == 0
+    assert run(["export", str(scene), "-o", str(out), "--layers"]) == 0
     assert run(["info", str(out)]) == 0
     assert "1,024 Gaussians, SH degree 0" in capsys.readouterr().out
     images = []
@@ -94,7 +101,11 @@ def test_a_folder_of_three_panoramas_is_exported_as_a_tour(
     assert "a tour of 3 panoramas" in capsys.readouterr().err
     assert '"edges": [[0, 1, 0], [1, 2, 1]]' in (tmp_path / "house.html").read_text()
     assert run([*command, str(tmp_path / "house.glb")]) == 0
-    assert len(pipeline.load(tmp_path / "house.glb").cam2world) == 3
+    fused = pipeline.load(tmp_path / "house.glb")
+    assert fused.joint and len(fused.cam2world) == 3 and len(fused.gains) == 3
+    assert run([*command, str(tmp_path / "layers.glb"), "--layers"]) == 0
+    layers = pipeline.load(tmp_path / "layers.glb")
+    assert not layers.joint and len(layers.gaussians) > len(fused.gaussians)
     assert run([*command, str(tmp_path / "pair.glb"), "--pair", "2"]) == 0
     assert len(pipeline.load(tmp_path / "pair.glb").cam2world) == 2
 

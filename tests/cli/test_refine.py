@@ -22,12 +22,22 @@ def test_a_pair_is_predicted_and_refined_with_a_report(room: Path, scene: Path, 
     out, report = tmp_path / "refined.ply", tmp_path / "report.json"
     assert refine(room, out, "--model", "sphere", "--height", HEIGHT, "--report", report) == 0
     printed = capsys.readouterr().out
-    assert "12 steps in" in printed and "error of held-out pixels" in printed
+    assert "12 steps in" in printed and "error of all pixels" in printed
     values = json.loads(report.read_text())
     assert values["after"] < values["before"] and values["history"][0][0] == 0 and len(values["gains"]) == 2
     refined, predicted = pipeline.load(out), pipeline.load(scene)
+    assert refined.joint and not predicted.joint
     assert refined.names == predicted.names and refined.cam2world.equal(predicted.cam2world)
-    assert not refined.gaussians.means.equal(predicted.gaussians.means)
+    assert len(refined.gaussians) < 0.9 * len(predicted.gaussians)
+
+
+def test_layers_keep_all_gaussians_and_poses_need_them(room: Path, tmp_path: Path, refusal, capsys) -> None:
+    out = tmp_path / "layers.ply"
+    assert refine(room, out, "--model", "sphere", "--height", HEIGHT, "--layers", "--poses") == 0
+    assert "error of held-out pixels" in capsys.readouterr().out
+    layers = pipeline.load(out)
+    assert not layers.joint and len(layers.gaussians) > 900
+    assert "add --layers" in refusal("refine", room, "-o", out, "--model", "sphere", "--poses")
 
 
 def test_a_scene_is_refined_with_the_photographs_of_its_pair(room: Path, scene: Path, tmp_path: Path) -> None:
