@@ -49,7 +49,8 @@ class SplatRenderer:
 
     Attributes:
         stats: counts and times of the last frame.
-        tier: `gl33` or `gl43`; both draw the same image.
+        tier: `gl33` or `gl43`; both draw the same image. A renderer that may choose uses `gl33` for a scene beyond the
+            GPU's storage buffers, and from the first error on of a driver that offers compute shaders.
     """
 
     pacing = Pacing(min_size=(1, 1), settle_seconds=SETTLE_AFTER, turn_ms=BUDGET_MS, waits_while_moving=False)
@@ -78,11 +79,10 @@ class SplatRenderer:
             raise InputError(f"`color_bits` must be 16 or 32, got {color_bits}")
         self.tier = choose_tier(ctx, tier)
         self.stats = FrameStats(tier=self.tier)
-        self._ctx = ctx
+        self._ctx, self._requested = ctx, tier
         self._programs = Programs(ctx)
         self._targets = TargetStore(ctx, color_bits=color_bits)
         self._compositor = Compositor(ctx, self._programs, self._targets)
-        self._sort = color_splats if self.tier == "gl43" else sort_splats  # the GPU sorts in tier gl43
         self._sorter = SplatSorter(self._sort)
         self._splats: Splats | None = None
         self._painter: LayerPainter | None = None
@@ -105,19 +105,38 @@ class SplatRenderer:
         self._upload(prepared or self.prepare(scene))
 
     def _upload(self, splats: Splats) -> None:
-        before = self._splats
-        self._release_scene()  # before the allocation, because the memory may not hold both scenes
         try:
-            self._create_painter(splats)
-        except BaseException:
-            if before is not None:
-                self._create_painter(before)
-            raise
+            painter = self._create_painter(splats)
+        except MemoryError:
+            before = self._splats
+            if before is None:
+                raise
+            self._release_scene()  # the memory does not hold both scenes
+            self._targets.release()
+            try:
+                painter = self._create_painter(splats)
+            except BaseException:
+                self._show(before, self._create_painter(before))
+                raise
+        self._release_scene()
+        self._show(splats, painter)
 
-    def _create_painter(self, splats: Splats) -> None:
-        self._painter = LayerPainter(self._ctx, self._programs, self._targets, splats, self.tier)
-        self._splats = splats
+    def _create_painter(self, splats: Splats) -> LayerPainter:
+        tier = choose_tier(self._ctx, self._requested, len(splats))
+        try:
+            return LayerPainter(self._ctx, self._programs, self._targets, splats, tier)
+        except moderngl.Error:
+            if tier == "gl33" or self._requested != "auto":
+                raise
+            self._requested = "gl33"
+            return self._create_painter(splats)
+
+    def _show(self, splats: Splats, painter: LayerPainter) -> None:
+        self._splats, self._painter, self.tier = splats, painter, painter.rasterizer.tier
         self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
+
+    def _sort(self, splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
+        return (color_splats if self.tier == "gl43" else sort_splats)(splats, position)  # the GPU sorts in tier gl43
 
     def render(
         self,

@@ -130,13 +130,17 @@ def test_unknown_backend_is_refused():
         offscreen.create_context("wgl")
 
 
-def test_tier_follows_the_version_of_the_context():
-    old, new = SimpleNamespace(version_code=410), SimpleNamespace(version_code=430)
+def test_tier_follows_the_version_and_the_limit_of_the_context():
+    old = SimpleNamespace(version_code=410)
+    new = SimpleNamespace(version_code=430, info={"GL_MAX_SHADER_STORAGE_BLOCK_SIZE": 48 * 1000})
     assert choose_tier(old, "auto") == "gl33"
     assert choose_tier(new, "auto") == "gl43"
     assert choose_tier(new, "gl33") == "gl33"
     with pytest.raises(InputError, match=r"needs OpenGL 4.3, this context has 4.1; use tier gl33"):
         choose_tier(old, "gl43")
+    assert choose_tier(new, "auto", 1000) == "gl43" and choose_tier(new, "auto", 1001) == "gl33"
+    with pytest.raises(InputError, match=r"storage buffer of 48,048 bytes for 1,001 Gaussians, .* limit is 48,000"):
+        choose_tier(new, "gl43", 1001)
     with pytest.raises(InputError, match="auto, gl33 or gl43, got 'gl21'"):
         choose_tier(new, "gl21")
 
