@@ -12,8 +12,8 @@ printed:
      "stages": {"project": 2.1, ...}, "image": FILE.npy}
 
 `frame_ms` are times of frames of a moving camera and include the sort; with "cached" the camera turns in place.
-`stages` are medians in milliseconds. Tiers that the context does not support for the scene are skipped. The image is float32, RGB
-and coverage, top row first; with tier `cpu` and "cached", what the screen shows, with 8 bits.
+`stages` are medians in milliseconds. Tiers that the context does not support for the scene are skipped. The
+image is float32, RGB and coverage, top row first; with tier `cpu` and "cached", what the screen shows, with 8 bits.
 """
 
 from __future__ import annotations

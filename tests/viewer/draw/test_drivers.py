@@ -1,5 +1,6 @@
 """What drivers of graphics cards answer and software OpenGL does not: errors, limits, exhausted memory."""
 
+import itertools
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -187,12 +188,12 @@ def test_commands_that_share_a_buffer_are_separated_by_barriers(pose):
     for position in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)):
         splats.draw(quads, [camera], position, np.ones(350, bool), "all", SETTINGS, 1e-4)
     assert commands.count("draw") == 8, "four chunks each"
-    assert all("barrier" in pair for pair in zip(commands, commands[1:], strict=False))
+    assert all("barrier" in pair for pair in itertools.pairwise(commands))
 
 
 def test_a_uniform_that_no_shader_has_is_an_error(ctx):
     programs = Programs(ctx)
     set_uniforms(programs.accumulate(0), focal=1.0)  # which the compiler removes from this variant
-    with pytest.raises(KeyError, match="no uniform 'wieght'; it has .*weight"):
+    with pytest.raises(KeyError, match=r"no uniform 'wieght'; it has .*weight"):
         set_uniforms(programs.accumulate(0), wieght=1.0)
     programs.release()

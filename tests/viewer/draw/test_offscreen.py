@@ -125,8 +125,28 @@ def test_the_newest_version_is_asked_for_first(monkeypatch):
     assert offscreen.create_context("egl").version_code == 330 and asked == [430, 330]
 
 
+@pytest.mark.parametrize("system", ["win32", "darwin"])
+def test_windows_and_macos_have_contexts_of_their_own(monkeypatch, system):
+    """There is no EGL; Windows has 4.6, macOS has 4.1 whatever is asked for."""
+    offered = {"win32": 460, "darwin": 410}[system]
+
+    def create(require, standalone, backend=None):
+        if backend is not None:
+            raise ImportError(f"cannot import name {backend!r} from 'glcontext'")
+        if require > offered:
+            raise ValueError(f"Requested OpenGL version {require}, got version {offered}")
+        return SimpleNamespace(version_code=offered)
+
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(moderngl, "create_context", create)
+    assert offscreen.create_context().version_code == offered
+    offered = 110  # "GDI Generic": no driver is installed
+    with pytest.raises(InputError, match=r"system: Requested .*got version 110\); install the driver of the graphics"):
+        offscreen.create_context()
+
+
 def test_unknown_backend_is_refused():
-    with pytest.raises(InputError, match="auto, egl or osmesa, got 'wgl'"):
+    with pytest.raises(InputError, match="auto, egl, osmesa or system, got 'wgl'"):
         offscreen.create_context("wgl")
 
 
