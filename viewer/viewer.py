@@ -612,7 +612,9 @@ class Viewer:
             fading, more = self._draw_content(1 - front, size, plan)
             milliseconds += more
         if milliseconds > 0:  # else the image is not new, or not finished
-            self._resolution.record(plan, milliseconds)
+            timed = self.renderer.stats.timed
+            timed_plan = plan if timed is None else ResolutionPlan(timed.scale, cached=timed.cached)
+            self._resolution.record(timed_plan, milliseconds)
         if image is None:  # the first one of a large scene is not finished
             image, fading = fading, None
         if image is None:

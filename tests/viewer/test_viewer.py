@@ -869,6 +869,27 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
     assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"
 
 
+def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(user, monkeypatch):
+    viewer, renderer, drawn, recorded = user.viewer, user.viewer.renderer._eyes[0], [], []
+    render = renderer.render
+
+    def log(cam2world, size, settings, *, wait=True):
+        drawn.append(settings.scale)
+        return render(cam2world, size, settings, wait=wait)
+
+    monkeypatch.setattr(renderer, "render", log)
+    monkeypatch.setattr(viewer._resolution, "record", lambda plan, ms: recorded.append((plan.scale, ms > 0)))
+    for step in (0, 1, 2, 1, 0):
+        viewer._resolution.step = step
+        user.state.camera = replace(user.state.camera, position=(0.0, 0.0, 0.01 + 0.01 * len(drawn)))
+        user.draw_frames(1)
+    assert drawn == [1.0, 0.75, 0.5, 0.75, 1.0]
+    assert recorded[-4:] == [(scale, True) for scale in drawn[:-1]]
+
+
+test_the_time_of_a_frame_is_recorded_for_its_own_resolution.renderers = ("gl",)  # type: ignore[attr-defined]
+
+
 def test_an_error_of_opengl_is_not_called_exhausted_memory(user, small_scene, monkeypatch):
     def refuse(*_: object) -> None:
         raise moderngl.Error("GLSL Compiler failed")

@@ -6,6 +6,7 @@ the splats are painted into layers (one for each set of Gaussians), and the laye
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Sequence
@@ -90,6 +91,10 @@ class SplatRenderer:
         self._color_key: tuple[object, ...] | None = None
         self._frame: Frame | None = None
         self._image: Target | None = None
+        self._timer: moderngl.Query | None = ctx.query(time=True)
+        self._unread: tuple[DrawSettings, float] | None = (
+            None  # of the frame in `_timer`: milliseconds of the processor
+        )
 
     def create_sibling(self) -> SplatRenderer:
         """A renderer with a copy of this scene on the GPU."""
@@ -133,6 +138,7 @@ class SplatRenderer:
 
     def _show(self, splats: Splats, painter: LayerPainter) -> None:
         self._splats, self._painter, self.tier = splats, painter, painter.rasterizer.tier
+        self._unread = None
         self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
 
     def _sort(self, splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
@@ -146,25 +152,41 @@ class SplatRenderer:
         *,
         wait: bool = True,
     ) -> moderngl.Texture:
-        """See `FrameRenderer`; without `wait`, a worker thread sorts for the position."""
-        start = time.perf_counter()
+        """See `FrameRenderer`; without `wait`, a worker thread sorts, and the GPU draws while the caller goes on."""
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
         if settings.eye_offset:
             raise InputError("OpenGL does not draw omni-directional stereo; use `CpuRenderer`")
+        before = self._read_times()
+        start = time.perf_counter()
         bound = self._ctx.fbo
         frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
         settled = self._update_order(frame.position, wait)
         self._frame = frame
-        image = self._draw(frame, with_depth=False)
-        self._ctx.finish()
-        assert self._painter is not None
-        drawn = self.stats.drawn + self._painter.rasterizer.take_drawn()
+        with contextlib.nullcontext() if self._timer is None else self._timer:
+            image = self._draw(frame, with_depth=False)
+        waits = wait or self._timer is None
+        if waits:
+            self._ctx.finish()
         bind(bound)
+        self._unread = settings, 1e3 * (time.perf_counter() - start)
+        known = self._read_times() if waits else before
+        drawn = self.stats.drawn + known.drawn
         self.stats = dataclasses.replace(
-            self.stats, settled=settled, drawn=drawn, frame_ms=1e3 * (time.perf_counter() - start)
+            self.stats, settled=settled, drawn=drawn, frame_ms=known.frame_ms, timed=known.timed
         )
         return image.color
+
+    def _read_times(self) -> FrameStats:
+        """Time and splats of the frame that is not read yet, for whose end on the GPU this waits."""
+        if self._unread is None or self._painter is None:
+            return FrameStats()
+        (settings, milliseconds), self._unread = self._unread, None
+        elapsed = 1e-6 * self._timer.elapsed if self._timer is not None else 0.0
+        if elapsed == 0:  # some drivers of macOS do not measure: wait for the end of each frame from now on
+            self._timer = None
+        drawn = self._painter.rasterizer.take_drawn()
+        return FrameStats(frame_ms=max(milliseconds, elapsed), drawn=drawn, timed=settings)
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""
@@ -176,6 +198,7 @@ class SplatRenderer:
         `render` draws no depth. The first call after it draws the frame again with depth.
         """
         if self._image is not None and self._frame is not None and self._image.depth is None:
+            self._read_times()
             bound, stats = self._ctx.fbo, self.stats
             self._draw(self._frame, with_depth=True)
             assert self._painter is not None

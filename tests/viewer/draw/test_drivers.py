@@ -197,3 +197,45 @@ def test_a_uniform_that_no_shader_has_is_an_error(ctx):
     with pytest.raises(KeyError, match=r"no uniform 'wieght'; it has .*weight"):
         set_uniforms(programs.accumulate(0), wieght=1.0)
     programs.release()
+
+
+class Timer:
+    """A query that measures the same time of every frame, nanoseconds."""
+
+    def __init__(self, elapsed: int) -> None:
+        self.elapsed = elapsed
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+@pytest.mark.parametrize("tier", ["gl33", "gl43"])
+def test_a_window_does_not_wait_for_the_frame_that_it_draws(ctx, make, random_scene, pose, tier):
+    finish = Mock()
+    renderer = make(Driver(ctx, finish=finish, query=lambda time: Timer(10**12)), tier=tier)
+    renderer.upload(random_scene())
+    renderer.render(pose, SIZE, SETTINGS)
+    assert finish.call_count == 1 and renderer.stats.frame_ms == 1e6 and renderer.stats.timed == SETTINGS
+    drawn = renderer.stats.drawn
+    coarse, moved = DrawSettings(scale=0.5), pose.copy()
+    for settings, timed in ((coarse, None), (SETTINGS, coarse), (coarse, SETTINGS)):
+        moved[:3, :3] = moved[:3, :3] @ np.diag((-1.0, 1.0, -1.0))  # else nothing is drawn anew
+        renderer.render(moved, SIZE, settings, wait=False)
+        assert renderer.stats.timed == timed and renderer.stats.frame_ms == (0.0 if timed is None else 1e6)
+        assert tier == "gl33" or (renderer.stats.drawn > 0) == (timed is not None), "the GPU counts"
+    assert finish.call_count == 1
+    renderer.render(pose, SIZE, SETTINGS)
+    assert renderer.stats.drawn == drawn, "not those of the frame before"
+
+
+def test_each_frame_is_waited_for_where_the_driver_measures_no_time(ctx, make, random_scene, pose):
+    finish = Mock()
+    renderer = make(Driver(ctx, finish=finish, query=lambda time: Timer(0)))
+    renderer.upload(random_scene())
+    for count in range(1, 4):
+        renderer.render(pose, SIZE, SETTINGS, wait=False)
+        assert finish.call_count == count - 1
+    assert renderer.stats.frame_ms > 0
