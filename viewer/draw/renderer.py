@@ -92,9 +92,8 @@ class SplatRenderer:
         self._frame: Frame | None = None
         self._image: Target | None = None
         self._timer: moderngl.Query | None = ctx.query(time=True)
-        self._unread: tuple[DrawSettings, float] | None = (
-            None  # of the frame in `_timer`: milliseconds of the processor
-        )
+        # Settings and milliseconds on the processor of the frame that `_timer` has measured.
+        self._unread: tuple[DrawSettings, float] | None = None
 
     def create_sibling(self) -> SplatRenderer:
         """A renderer with a copy of this scene on the GPU."""
@@ -182,11 +181,13 @@ class SplatRenderer:
         if self._unread is None or self._painter is None:
             return FrameStats()
         (settings, milliseconds), self._unread = self._unread, None
+        start = time.perf_counter()
         elapsed = 1e-6 * self._timer.elapsed if self._timer is not None else 0.0
+        waited = 1e3 * (time.perf_counter() - start)  # the timer has 32 bits: 4.3 s
         if elapsed == 0:  # some drivers of macOS do not measure: wait for the end of each frame from now on
             self._timer = None
         drawn = self._painter.rasterizer.take_drawn()
-        return FrameStats(frame_ms=max(milliseconds, elapsed), drawn=drawn, timed=settings)
+        return FrameStats(frame_ms=max(milliseconds, elapsed, waited), drawn=drawn, timed=settings)
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""

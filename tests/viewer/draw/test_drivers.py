@@ -1,5 +1,6 @@
 """What drivers of graphics cards answer and software OpenGL does not: errors, limits, exhausted memory."""
 
+import contextlib
 import itertools
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -199,17 +200,12 @@ def test_a_uniform_that_no_shader_has_is_an_error(ctx):
     programs.release()
 
 
-class Timer:
+class Timer(contextlib.nullcontext):
     """A query that measures the same time of every frame, nanoseconds."""
 
     def __init__(self, elapsed: int) -> None:
+        super().__init__()
         self.elapsed = elapsed
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 @pytest.mark.parametrize("tier", ["gl33", "gl43"])
@@ -229,6 +225,26 @@ def test_a_window_does_not_wait_for_the_frame_that_it_draws(ctx, make, random_sc
     assert finish.call_count == 1
     renderer.render(pose, SIZE, SETTINGS)
     assert renderer.stats.drawn == drawn, "not those of the frame before"
+
+
+def test_a_frame_beyond_the_32_bits_of_the_timer_takes_at_least_the_time_that_it_is_waited_for(
+    ctx, make, random_scene, pose, monkeypatch
+):
+    class LongTimer(contextlib.nullcontext):
+        seconds = 0.0
+
+        @property
+        def elapsed(self) -> int:
+            self.seconds += 5.0
+            return (5 * 10**9) % 2**32
+
+    timer = LongTimer()
+    monkeypatch.setattr("pansplat_viewer.draw.renderer.time", Mock(perf_counter=lambda: timer.seconds))
+    renderer = make(Driver(ctx, query=lambda time: timer))
+    renderer.upload(random_scene(20))
+    for _ in range(2):
+        renderer.render(pose, SIZE, SETTINGS, wait=False)
+    assert renderer.stats.frame_ms == 5000
 
 
 def test_each_frame_is_waited_for_where_the_driver_measures_no_time(ctx, make, random_scene, pose):
