@@ -53,15 +53,17 @@ install_libraries() {
     [ -z "$extra" ] || required+=("${DEV_PACKAGES[@]}")
     for package in "${required[@]}"; do installed "$package" || missing+=("$package"); done
     [ ${#missing[@]} -gt 0 ] || return 0
-    if [ ${#as_root[@]} = 0 ]; then
-        say "system libraries of the viewer are missing; to install them, run"
-        say "    sudo apt-get install ${missing[*]}"
-        return
+    local failed=("${missing[@]}")
+    if [ ${#as_root[@]} -gt 0 ]; then
+        say "installing ${missing[*]}"
+        # If this fails, install the packages one by one: some releases lack one of them (newer ones lack libosmesa6).
+        apt_install "${missing[@]}" && return
+        failed=()
+        for package in "${missing[@]}"; do apt_install "$package" || failed+=("$package"); done
+        [ ${#failed[@]} -gt 0 ] || return 0
     fi
-    say "installing ${missing[*]}"
-    # If this fails, install the packages one by one: some releases lack one of them (newer ones lack libosmesa6).
-    apt_install "${missing[@]}" && return
-    for package in "${missing[@]}"; do apt_install "$package" || say "could not install $package; continuing without it"; done
+    say "system packages are missing; everything but the window and OpenGL works without them. To install them, run"
+    say "    sudo apt-get install ${failed[*]}"
 }
 
 # --- Python ---
@@ -75,14 +77,17 @@ find_python() {
 
 make_venv() {
     if .venv/bin/python -c 'import pip, sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then return; fi
+    say "creating .venv with $("$python" -V)"
     if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
         local package
         package=$("$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])')
-        say "installing $package"
-        apt_install "$package" || apt_install python3-venv \
-            || die "Python's venv module is missing; run: sudo apt-get install $package"
+        # Without the package, Debian's Python has venv, but not the pip that it copies into it.
+        if ! apt_install "$package" && ! apt_install python3-venv; then
+            "$python" -m venv --without-pip --clear .venv && "$python" -m pip --python .venv/bin/python install -q pip \
+                || die "Python's venv module is missing; run: sudo apt-get install $package"
+            return
+        fi
     fi
-    say "creating .venv with $("$python" -V)"
     "$python" -m venv --clear .venv
 }
 
@@ -123,7 +128,7 @@ install_torch() {
 
 install_packages() {
     local stamp=.venv/pansplat-setup mark
-    mark="$(cat constraints.txt pyproject.toml setup.sh | sha256sum) $build"
+    mark="$(cat constraints.txt pyproject.toml setup.sh | cksum) $build"
     # The packages of [dev] include the plain ones.
     if [ "$(cat "$stamp" 2>/dev/null)" = "$mark [dev]" ] || [ "$(cat "$stamp" 2>/dev/null)" = "$mark $extra" ]; then
         return

@@ -567,7 +567,7 @@ def _kill_workers(cluster: LocalCluster) -> None:
     for nanny in list(cluster.workers.values()):
         nanny.auto_restart = False
         with contextlib.suppress(OSError, TypeError):
-            os.kill(nanny.pid, signal.SIGKILL)
+            os.kill(nanny.pid, getattr(signal, "SIGKILL", signal.SIGTERM))  # Windows has no SIGKILL
 
 
 def connect(address: str) -> Client:

@@ -276,6 +276,14 @@ def test_without_dask_the_message_names_the_command_that_installs_it(
     assert not (tmp_path / "out").exists()
 
 
+def test_workers_end_on_a_system_without_sigkill(monkeypatch: pytest.MonkeyPatch) -> None:
+    killed: list[tuple[int, int]] = []
+    monkeypatch.delattr(signal, "SIGKILL")  # Windows
+    monkeypatch.setattr(os, "kill", lambda *call: killed.append(call))
+    batch._kill_workers(SimpleNamespace(workers={0: SimpleNamespace(pid=7)}))
+    assert killed == [(7, signal.SIGTERM)]
+
+
 def test_two_batches_do_not_share_a_folder(tmp_path: Path) -> None:
     with (
         batch.lock_folder(tmp_path / "out"),

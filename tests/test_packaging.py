@@ -1,5 +1,6 @@
-"""The wheel contains both packages and nothing else, and works without the checkout."""
+"""The wheel contains both packages and nothing else, and works without the checkout and with its dependencies alone."""
 
+import importlib.metadata
 import os
 import re
 import shutil
@@ -9,8 +10,13 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import torch
+from packaging.requirements import Requirement
 
 import pansplat
+from pansplat.gaussians.ply import save_ply
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.fibonacci import fibonacci_directions
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -41,7 +47,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for file in ("pyproject.toml", "README.md", "LICENSE", "setup.sh", "constraints.txt"):
         shutil.copy(ROOT / file, source)
-    build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-qq", "-w", "dist", "."]
+    build = [sys.executable, "-m", "build", "--no-isolation", "."]  # the wheel of the source distribution
     done = subprocess.run(build, cwd=source, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     (file,) = (source / "dist").glob("*.whl")
@@ -110,6 +116,54 @@ def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: s
     done = run_in(installed, sys.executable, str(installed / "bin" / command), "--help")
     assert done.returncode == 0, done.stderr
     assert command in done.stdout + done.stderr
+
+
+def find_foreign_modules() -> list[str]:
+    """The modules here that neither the wheel nor its dependencies need, except those of installation."""
+    waiting, needed = list(read_project()["project"]["dependencies"]), set()
+    while waiting:
+        requirement = Requirement(waiting.pop())
+        name = re.sub("[-_.]+", "-", requirement.name).lower()
+        if (requirement.marker is None or requirement.marker.evaluate({"extra": ""})) and name not in needed:
+            needed.add(name)
+            waiting += importlib.metadata.requires(name) or []
+    modules = importlib.metadata.packages_distributions().items()
+    foreign = [
+        module
+        for module, owners in modules
+        if not needed & {re.sub("[-_.]+", "-", owner).lower() for owner in owners} and not module.startswith("pansplat")
+    ]
+    return [module for module in foreign if module not in ("_distutils_hack", "pip", "setuptools")]
+
+
+def test_an_installed_wheel_needs_its_dependencies_only(installed: Path, tmp_path: Path) -> None:
+    """As in a clean environment: a scene is drawn to files while all other packages cannot be imported."""
+    foreign = find_foreign_modules()
+    assert {"pytest", "beartype", "distributed"} <= set(foreign) and not {"torch", "llvmlite", "PIL"} & set(foreign)
+    directions = fibonacci_directions(200).float()
+    gaussians = Gaussians(
+        means=2 * directions,
+        scales=torch.full((200, 3), 0.1),
+        quats=torch.tensor((1.0, 0.0, 0.0, 0.0)).expand(200, 4),
+        opacities=torch.full((200,), 0.9),
+        harmonics=directions[:, None],
+        levels=torch.zeros(200, dtype=torch.int64),
+        views=torch.zeros(200, dtype=torch.int64),
+    )
+    save_ply(
+        Scene(gaussians, torch.eye(4, dtype=torch.float64)[None], 0.5, 10.0, ("a",), "", 32), tmp_path / "scene.ply"
+    )
+    program = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(sys.argv.pop(1).split(',')))\n"
+        "import pansplat_viewer\n"
+        "sys.exit(pansplat_viewer.main())\n"
+    )
+    options = ["--offscreen", str(tmp_path / "out"), "--size", "64x32", "--seconds", "0.1"]
+    command = [sys.executable, "-c", program, ",".join(foreign), str(tmp_path / "scene.ply"), *options]
+    done = run_in(installed, *command)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "out" / "flythrough.mp4").stat().st_size > 0
 
 
 def test_tests_pass_against_the_installed_wheel(installed: Path) -> None:

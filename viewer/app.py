@@ -215,9 +215,13 @@ def _run_window(
     """Run the viewer in a window; if no window can be opened, returns the reason."""
     from pansplat_viewer.scene.key_frames import CameraPath
     from pansplat_viewer.scene.state import ViewerState
-    from pansplat_viewer.viewer import Viewer
-    from pansplat_viewer.window.preferences import find_file
-    from pansplat_viewer.window.window import ContextLostError, NoWindowError, Window, run_viewer
+
+    try:
+        from pansplat_viewer.viewer import Viewer
+        from pansplat_viewer.window.preferences import find_file
+        from pansplat_viewer.window.window import ContextLostError, NoWindowError, Window, run_viewer
+    except ImportError as error:  # imgui_bundle needs the libraries of X11
+        return f"the window's libraries cannot be loaded ({error})"
 
     load_options = options.load_options
     state = ViewerState(settings=options.settings, path=path or CameraPath())

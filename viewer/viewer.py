@@ -10,6 +10,7 @@ from typing import Any
 import moderngl
 import numpy as np
 import torch
+from imgui_bundle import imgui
 from jaxtyping import Float
 
 from pansplat.errors import InputError
@@ -302,25 +303,26 @@ class Viewer:
 
     def _show_loaded(self, loaded: LoadedScene, now: float) -> None:
         """Show a scene; if it does not fit into memory, keep the one before and offer the largest Gaussians."""
-        if self._upload(self._slots[0], loaded.scene, loaded.entry):
+        error = self._upload(self._slots[0], loaded.scene, loaded.entry)
+        if error is None:
             self._draw_failed = False
             self._enter(loaded, now)
         else:
-            self._offer_reduced(loaded)
+            self._offer_reduced(loaded, error)
 
-    def _offer_reduced(self, loaded: LoadedScene) -> None:
-        """Offer the largest Gaussians of a scene."""
-        count = len(loaded.scene.gaussians) // _REDUCTION
+    def _offer_reduced(self, loaded: LoadedScene, error: Exception) -> None:
+        """Offer the largest Gaussians of a scene that does not fit into memory."""
+        count = len(loaded.scene.gaussians) // _REDUCTION if isinstance(error, MemoryError) else 0
         self._too_large, self.panel_data.reduced = (loaded, count) if count else (None, None)
 
-    def _upload(self, slot: SceneSlot, scene: Scene, entry: SceneEntry) -> bool:
-        """Upload a scene; returns whether it fits the GPU's memory, and shows an error if not."""
+    def _upload(self, slot: SceneSlot, scene: Scene, entry: SceneEntry) -> Exception | None:
+        """Upload a scene; if this fails, shows the error and returns it."""
         try:
             slot.upload(scene, self._preparer.take(scene))
-        except (InputError, MemoryError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
+        except (InputError, MemoryError, moderngl.Error) as error:
             self.panel_data.error = f"{entry.name}: {_describe(error)}"
-            return False
-        return True
+            return error
+        return None
 
     def _exchange_scene(self) -> None:
         """Show the refined scene or the prediction, whichever is chosen, while the camera stands still."""
@@ -329,7 +331,7 @@ class Viewer:
         scene = self._refined if self.state.refined else self._loaded.scene
         if scene is self._slot.scene or not self._preparer.is_ready(scene):
             return
-        if not self._upload(self._slot, scene, self._loaded.entry):
+        if self._upload(self._slot, scene, self._loaded.entry) is not None:
             self._refined = None
 
     def _enter(self, loaded: LoadedScene, now: float) -> None:
@@ -441,7 +443,7 @@ class Viewer:
             return True
         if self._slots[slot].scene is not loaded.scene:
             ready = self._incoming is None and self._preparer.is_ready(loaded.scene)
-            if not ready or not self._upload(self._slots[slot], loaded.scene, loaded.entry):
+            if not ready or self._upload(self._slots[slot], loaded.scene, loaded.entry) is not None:
                 return False
         self._fade.show(slot, loaded.scene, now, part)
         self._scene_slot, self._scene_views = slot, loaded.entry.views
@@ -479,13 +481,12 @@ class Viewer:
             state.target = None
         advance_flight(state, seconds)
 
-    def _visit(self, place: tuple[float, float], size: tuple[int, int]) -> bool:
+    def _visit(self, place: tuple[float, float]) -> bool:
         """Fly to the panorama whose hotspot is at a place of the window; returns whether there is one."""
-        one_image = get_eye_size(size, self.state.settings.stereo) == size
-        if self._tour is None or not (self.state.hotspots and self.state.overlay and one_image):
+        if not (self.state.hotspots and self.state.overlay):
             return False
-        pixel = place[0] * size[0], place[1] * size[1]
-        self.state.target = find_clicked(find_hotspots(self._tour, self.state.camera, size), pixel)
+        size = imgui.get_io().display_size
+        self.state.target = find_clicked(self.panel_data.hotspots, (place[0] * size.x, place[1] * size.y))
         return self.state.target is not None
 
     # --- frames ---
@@ -516,7 +517,9 @@ class Viewer:
         if self._tour is not None:
             has_arrived = self._fade.parts[self._fade.front] == self._tour.part
             if has_arrived and get_eye_size(size, self.state.settings.stereo) == size:
-                data.hotspots = find_hotspots(self._tour, self.state.camera, size)
+                # Panels are drawn in points of the window, of which a screen of high resolution has fewer than pixels.
+                points = imgui.get_io().display_size
+                data.hotspots = find_hotspots(self._tour, self.state.camera, (int(points.x), int(points.y)))
             data.background = None
             if self._loaded is not None and not self._is_other_requested():
                 data.background, data.loading, data.refinement = self._describe_loading(), None, None
@@ -587,7 +590,7 @@ class Viewer:
         return self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
 
     def _try_to_draw(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
-        """Draw the image. If memory is exhausted, show an error, and try again when it is dismissed."""
+        """Draw the image. If this fails, show an error, and try again when it is dismissed."""
         if not self._draw_failed:
             try:
                 self._draw_image(size, target, now)
@@ -596,7 +599,7 @@ class Viewer:
                 self._draw_failed, self._slot.image = True, None
                 self.panel_data.error = _describe(error)
                 if self._loaded is not None and self._tour is None:
-                    self._offer_reduced(self._loaded)
+                    self._offer_reduced(self._loaded, error)
         target.use()
         self.ctx.clear(*self.state.settings.background)
 
@@ -609,7 +612,9 @@ class Viewer:
             fading, more = self._draw_content(1 - front, size, plan)
             milliseconds += more
         if milliseconds > 0:  # else the image is not new, or not finished
-            self._resolution.record(plan, milliseconds)
+            timed = self.renderer.stats.timed
+            timed_plan = plan if timed is None else ResolutionPlan(timed.scale, cached=timed.cached)
+            self._resolution.record(timed_plan, milliseconds)
         if image is None:  # the first one of a large scene is not finished
             image, fading = fading, None
         if image is None:
@@ -678,7 +683,7 @@ class Viewer:
 
     def _pick(self, place: tuple[float, float], size: tuple[int, int], now: float) -> None:
         """Show the point of the scene at a place of the window, as fractions of width and height."""
-        if self._visit(place, size) or self._slot.scene is None or self._shows_photograph:
+        if self._visit(place) or self._slot.scene is None or self._shows_photograph:
             return
         eye_size = get_eye_size(size, self.state.settings.stereo)
         pixel = place[0] * size[0] % eye_size[0], place[1] * size[1] % eye_size[1]
@@ -855,9 +860,9 @@ class Viewer:
 
 
 def _describe(error: Exception) -> str:
-    if isinstance(error, (InputError, OSError)):
-        return str(error)
-    return f"the memory is exhausted ({type(error).__name__}: {error})"
+    if isinstance(error, MemoryError):
+        return f"the memory is exhausted ({type(error).__name__}: {error})"
+    return f"OpenGL failed: {error}" if isinstance(error, moderngl.Error) else str(error)
 
 
 def measure_center_depth(depth: Float[np.ndarray, "height width"]) -> float | None:

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
 
 import torch
@@ -31,6 +30,7 @@ _BACKEND_MODULES = {
     "numba": "pansplat.rendering.cpu",
     "triton": "pansplat.rendering.cuda",
 }
+MIN_TRITON = 3, 2  # the kernels join tuples, which earlier versions do not compile
 MAX_EYE_OFFSET = 1e6  # metres
 _MAX_POSE_ERROR = 1e-4
 
@@ -275,11 +275,20 @@ def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> Rast
     """Select the backend of this name; "auto" chooses by the kernel and the Gaussians' type and device."""
     if name == "auto":
         on_cpu = gaussians.means.device.type == "cpu"
-        available = kernel == "ray" if on_cpu else gaussians.means.is_cuda and find_spec("triton") is not None
+        available = kernel == "ray" if on_cpu else gaussians.means.is_cuda and get_triton_version() >= MIN_TRITON
         fast: Backend = "numba" if on_cpu else "triton"
         name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
     module = import_module(_BACKEND_MODULES[name])
     return module.rasterize_planes  # type: ignore[no-any-return]
+
+
+def get_triton_version() -> tuple[int, ...]:
+    """The major and minor version of Triton; empty if it is not installed."""
+    try:
+        import triton
+    except ImportError:
+        return ()
+    return tuple(int(number) for number in triton.__version__.split(".")[:2])
 
 
 def _check_choice(name: str, value: str, choices: object) -> None:

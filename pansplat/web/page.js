@@ -98,8 +98,10 @@
       this.splat = this.link(SHADERS.splat);
       this.accumulate = this.link(SHADERS.accumulate);
       this.resolve = this.link(SHADERS.resolve);
-      const width = 1024, height = Math.ceil(HEADER.count / width);
-      if (!gl.isContextLost() && height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The scene is too large for this device.");
+      // WebGL 2 guarantees 2048 texels a side, and `geometry` has three a Gaussian.
+      const largest = gl.getParameter(gl.MAX_TEXTURE_SIZE) || 4096, width = Math.min(1024, Math.floor(largest / 3));
+      const height = Math.ceil(HEADER.count / width);
+      if (height > largest) throw new Error("The scene is too large for this device.");
       this.rows = [width, height];
       this.geometry = this.upload(scene.geometry, 3 * width, height, gl.RGBA32F, gl.FLOAT, 12 * width * height);
       this.colors = this.upload(scene.colors, width, height, gl.RGBA8, gl.UNSIGNED_BYTE, 4 * width * height);

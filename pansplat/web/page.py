@@ -55,7 +55,7 @@ from pansplat.tours.layout import REACH
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
-MAX_GAUSSIANS = 4_000_000  # rows of 1024 in a texture of 4096 rows, which every WebGL 2 device has
+MAX_GAUSSIANS = 4_000_000  # fit textures of 4096 texels a side; 1.4 million fit the 2048 that every device has
 MAX_FILE_BYTES = 64_000_000  # of a page in one file
 _TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3

@@ -67,6 +67,20 @@ def test_with_an_unusable_display_a_fly_through_is_written(room, capsys, monkeyp
     assert (room.parent / "renders" / "room" / "flythrough.mp4").exists()
 
 
+def test_without_the_libraries_of_window_and_opengl_a_fly_through_is_written(room):
+    """On a machine whose user may not install system packages: imgui needs libX11, contexts need libEGL."""
+    code = (
+        "import sys\n"
+        "sys.modules.update(imgui_bundle=None, glfw=None, glcontext=None)\n"
+        "from pansplat_viewer import run\n"
+        f"sys.exit(run([{str(room)!r}, '--size', '64x32', '--seconds', '0.2']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "libraries cannot be loaded" in done.stdout and "writing a fly-through" in done.stdout.splitlines()[0]
+    assert (room.parent / "renders" / "room" / "flythrough.mp4").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -844,7 +844,7 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
 
     def refuse(self, splats):
         if len(splats) == len(twice.gaussians):
-            raise moderngl.Error("too many")
+            raise MemoryError("too many")
         allocate(self, splats)
 
     def refuse_rows(means, *arguments):
@@ -867,6 +867,37 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
     assert user.data.entries == ["large again"]
     assert changed_fraction(before, after) > 0.02
     assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"
+
+
+def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(user, monkeypatch):
+    viewer, renderer, drawn, recorded = user.viewer, user.viewer.renderer._eyes[0], [], []
+    render = renderer.render
+
+    def log(cam2world, size, settings, *, wait=True):
+        drawn.append(settings.scale)
+        return render(cam2world, size, settings, wait=wait)
+
+    monkeypatch.setattr(renderer, "render", log)
+    monkeypatch.setattr(viewer._resolution, "record", lambda plan, ms: recorded.append((plan.scale, ms > 0)))
+    for step in (0, 1, 2, 1, 0):
+        viewer._resolution.step = step
+        user.state.camera = replace(user.state.camera, position=(0.0, 0.0, 0.01 + 0.01 * len(drawn)))
+        user.draw_frames(1)
+    assert drawn == [1.0, 0.75, 0.5, 0.75, 1.0]
+    assert recorded[-4:] == [(scale, True) for scale in drawn[:-1]]
+
+
+test_the_time_of_a_frame_is_recorded_for_its_own_resolution.renderers = ("gl",)  # type: ignore[attr-defined]
+
+
+def test_an_error_of_opengl_is_not_called_exhausted_memory(user, small_scene, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise moderngl.Error("GLSL Compiler failed")
+
+    monkeypatch.setattr(user.viewer._slots[0], "upload", refuse)
+    user.show(SceneEntry("refused"))
+    assert user.data.error == "refused: OpenGL failed: GLSL Compiler failed" and user.data.reduced is None
+    user.click("OK")
 
 
 @both
@@ -1087,6 +1118,23 @@ def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     exchanged = np.abs(user.read_image().mean((0, 1)) - color).mean()
     assert exchanged > 30, "the scenes have different colours"
     assert max(steps) < 0.5 * exchanged, "no jump: a fade changes 30 % in 0.2 s at most"
+
+
+def test_hotspots_are_where_they_are_clicked_on_a_screen_with_two_pixels_a_point(tour_user, ctx, monkeypatch):
+    user = tour_user
+    user.state.camera = replace(user.state.camera, yaw_radians=-0.25)  # the hotspot is right of the panel
+    user.draw_frames(2)
+    expected = [(spot.node, spot.center) for spot in user.data.hotspots]
+    target = ctx.simple_framebuffer((2 * SIZE[0], 2 * SIZE[1]), components=3)
+    monkeypatch.setattr(user, "target", target)
+    user.draw_frames(2)
+    assert [(spot.node, spot.center) for spot in user.data.hotspots] == expected
+    user.click_at(*dict(expected)[2])
+    assert user.state.playing and not user.state.points
+    user.state.playing = False
+    monkeypatch.undo()
+    user.draw_frames(1)
+    target.release()
 
 
 def match_photograph(user: User, node: int) -> float:

@@ -331,6 +331,20 @@ def test_every_load_shows_the_scene(chromium: Any, folder: Path) -> None:
             assert all(url.startswith(("file:", "blob:")) for url in page.requests)
 
 
+def test_the_picture_is_the_same_on_a_device_with_the_smallest_textures(
+    home: OpenPage, chromium: Any, folder: Path
+) -> None:
+    script = """
+      const gl = WebGL2RenderingContext.prototype, { getParameter, texStorage2D } = gl;
+      window.widths = [];
+      gl.getParameter = function (name) { return name === gl.MAX_TEXTURE_SIZE ? 2048 : getParameter.call(this, name); };
+      gl.texStorage2D = function (...values) { window.widths.push(values[3]); texStorage2D.apply(this, values); };"""
+    with opened(chromium, folder / "tour.html", script=script) as page:
+        widths = page.run("widths")
+        assert 3 * 682 in widths and max(widths) <= 2048, "geometry has three texels a Gaussian"
+        assert np.array_equal(page.draw(), home.draw())
+
+
 def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) -> None:
     shutil.copy(folder / "split.html", tmp_path)
     context = chromium.new_context()

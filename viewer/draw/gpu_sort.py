@@ -96,6 +96,7 @@ class GpuSplats:
         self._ctx, self._programs, self._count, self._capacity = ctx, programs, count, capacity
         self._geometry, self._colors, self._records = geometry, colors, records
         self._resources, keep = resources, resources.keep
+        programs.compile_compute()
         self._sort = RadixSort(ctx, programs, resources, count)
         self._order_key: Hashable = None
         self._num_chunks = max(count_groups(MAX_PARTS * count, capacity), 1)
@@ -146,6 +147,7 @@ class GpuSplats:
             project.run_indirect(self._dispatches, _DISPATCH_BYTES * chunk)
             self._ctx.memory_barrier()
             quads.render_indirect(self._draws, moderngl.TRIANGLE_STRIP, count=1, first=chunk)
+            self._ctx.memory_barrier()  # the next chunk overwrites the records that this draw reads
 
     def take_drawn(self) -> int:
         """Number of splats drawn since the last call; waits for the GPU."""

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt
 from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat_viewer.draw.gpu_sort import MAX_PARTS, GpuSplats
-from pansplat_viewer.draw.programs import RECORD, RECORD_BYTES, Programs, Resources, set_uniforms
+from pansplat_viewer.draw.programs import RECORD, RECORD_BYTES, Programs, Resources, checking_memory, set_uniforms
 from pansplat_viewer.draw.splats import SortedSplats, Splats
 from pansplat_viewer.scene.camera import Pinhole, create_face_cameras, find_faces_in_view
 from pansplat_viewer.scene.settings import DrawSettings
@@ -139,16 +139,27 @@ class Target:
     """
 
     def __init__(self, ctx: moderngl.Context, size: tuple[int, int], color_bits: int, depth_components: int) -> None:
-        """Allocate the textures; their content is undefined."""
+        """Allocate the textures; their content is undefined.
+
+        Raises:
+            MemoryError: the GPU's memory is exhausted.
+        """
         self._ctx = ctx
         self.size = size
         self.key: Hashable = None
         self.parts: set[int] = set()
-        self.color = ctx.texture(size, 4, dtype=f"f{color_bits // 8}")
-        self.color.repeat_x = self.color.repeat_y = False
-        self.depth = ctx.texture(size, depth_components, dtype="f4") if depth_components else None
-        attachments = [self.color] if self.depth is None else [self.color, self.depth]
-        self.framebuffer = ctx.framebuffer(attachments)
+        self._resources = Resources()
+        keep = self._resources.keep
+        try:
+            with checking_memory(ctx):
+                self.color = keep(ctx.texture(size, 4, dtype=f"f{color_bits // 8}"))
+                self.color.repeat_x = self.color.repeat_y = False
+                self.depth = keep(ctx.texture(size, depth_components, dtype="f4")) if depth_components else None
+                attachments = [self.color] if self.depth is None else [self.color, self.depth]
+                self.framebuffer = keep(ctx.framebuffer(attachments))
+        except BaseException:
+            self._resources.release()
+            raise
         self.num_bytes = size[0] * size[1] * (color_bits // 2 + 4 * depth_components)
 
     def invalidate(self, key: Hashable) -> None:
@@ -161,10 +172,7 @@ class Target:
         if self._ctx.fbo is self.framebuffer:
             # moderngl binds the previous framebuffer again after it creates one, so the previous one must exist.
             (self._ctx.screen or self._ctx.detect_framebuffer(0)).use()
-        self.framebuffer.release()
-        self.color.release()
-        if self.depth is not None:
-            self.depth.release()
+        self._resources.release()
 
 
 class TargetStore:
@@ -197,7 +205,7 @@ class TargetStore:
             components = 0 if target.depth is None else target.depth.components
             valid = key is not None and target.key == key
             if target.size != size or components < depth_components or (components > depth_components and not valid):
-                target.release()
+                self._targets.pop(name).release()
                 target = None
         if target is None:
             target = Target(self._ctx, size, self.color_bits, depth_components)
@@ -305,20 +313,29 @@ class SplatRasterizer:
 
     Tier `gl33` culls and sorts on the processor and makes records by transform feedback. Tier `gl43` does all of it by
     compute shaders (`GpuSplats`). Both draw the same records in the same order.
+
+    Attributes:
+        tier: `gl33` or `gl43`.
     """
 
     def __init__(self, ctx: moderngl.Context, programs: Programs, splats: Splats, tier: str) -> None:
-        """Upload the geometry and constant colours, and allocate buffers for indices and records."""
+        """Upload the geometry and constant colours, and allocate buffers for indices and records.
+
+        Raises:
+            MemoryError: the GPU's memory is exhausted.
+            moderngl.Error: the driver refuses a program or a buffer.
+        """
         self._ctx = ctx
         self._programs = programs
-        self._tier = tier
+        self.tier = tier
         self._capacity = max(min(_CHUNK_SIZE, len(splats)), 1)
         self._indices: moderngl.Buffer | None = None
         self._points: moderngl.VertexArray | None = None
         self._gpu: GpuSplats | None = None
         self._resources = Resources()
         try:
-            self._allocate(splats)
+            with checking_memory(ctx):
+                self._allocate(splats)
         except BaseException:
             self._resources.release()
             raise
@@ -331,7 +348,7 @@ class SplatRasterizer:
             self.write_colors(splats.base_colors)
         self._records = keep(ctx.buffer(reserve=RECORD_BYTES * self._capacity, dynamic=True))
         self._quads = keep(ctx.vertex_array(programs.splat(), [(self._records, "4f " * len(RECORD) + "/i", *RECORD)]))
-        if self._tier == "gl43":
+        if self.tier == "gl43":
             buffers = self._geometry, self._colors, self._records
             self._gpu = GpuSplats(ctx, programs, self._resources, *buffers, len(splats), self._capacity)
             return
@@ -423,7 +440,7 @@ class SplatRasterizer:
         return len(back_to_front)
 
     def _set_uniforms(self, camera: Pinhole, settings: DrawSettings) -> None:
-        project = self._programs.project() if self._tier == "gl33" else self._programs.project_compute()
+        project = self._programs.project() if self.tier == "gl33" else self._programs.project_compute()
         set_uniforms(
             project,
             # GLSL reads columns: the rows of camera-to-world are the columns of its inverse.

@@ -1,10 +1,11 @@
-"""OpenGL contexts without a window: EGL, or OSMesa where EGL is missing."""
+"""OpenGL contexts without a window: EGL, or OSMesa where EGL is missing; on Windows and macOS those of the system."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import ctypes.util
+import sys
 from typing import Any, Literal
 
 import moderngl
@@ -27,38 +28,44 @@ _OSMESA_CONTEXT_MAJOR, _OSMESA_CONTEXT_MINOR = 0x36, 0x37
 _GL_RGBA, _GL_UNSIGNED_BYTE = 0x1908, 0x1401
 
 
-def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> moderngl.Context:
+def create_context(backend: Literal["auto", "egl", "osmesa", "system"] = "auto") -> moderngl.Context:
     """Return a standalone context of OpenGL 3.3 or later.
 
     Args:
-        backend: `auto` tries EGL (GPU or software), then OSMesa (software only).
+        backend: `auto` is `system` (a hidden window on Windows, none on macOS) where there is no EGL, and elsewhere EGL
+            (GPU or software), then OSMesa (software only).
 
     Raises:
-        InputError: OpenGL 3.3 is not available; the message has the reasons and the Debian packages.
+        InputError: OpenGL 3.3 is not available; the message has the reasons and what to install.
     """
-    makers = {"egl": _create_egl, "osmesa": lambda: moderngl.create_context(require=330, context=_OsMesa())}
+    makers = {
+        "egl": lambda: _create_newest(backend="egl"),
+        "osmesa": lambda: moderngl.create_context(require=330, context=_OsMesa()),
+        "system": _create_newest,
+    }
     if backend != "auto" and backend not in makers:
-        raise InputError(f"`backend` must be auto, egl or osmesa, got {backend!r}")
+        raise InputError(f"`backend` must be auto, egl, osmesa or system, got {backend!r}")
+    has_egl = sys.platform not in ("win32", "darwin")
     load_llvm_before_mesa()
     failures = []
-    for name in makers if backend == "auto" else (backend,):
+    for name in (("egl", "osmesa") if has_egl else ("system",)) if backend == "auto" else (backend,):
         try:
             return makers[name]()
         except Exception as error:  # the libraries raise OSError, ValueError, moderngl.Error or plain Exception
             failures.append(f"{name}: {error}")
-    raise InputError(
-        "drawing needs OpenGL 3.3, and none could be started "
-        f"({'; '.join(failures)}); on Debian or Ubuntu install `apt-get install {_EGL_PACKAGES}`, "
-        f"or for software rendering without EGL `{_OSMESA_PACKAGE}`"
-    )
+    advice = "install the driver of the graphics card"
+    if has_egl:
+        advice = f"on Debian or Ubuntu install `apt-get install {_EGL_PACKAGES}`, "
+        advice += f"or for software rendering without EGL `{_OSMESA_PACKAGE}`"
+    raise InputError(f"drawing needs OpenGL 3.3, and none could be started ({'; '.join(failures)}); {advice}")
 
 
-def _create_egl() -> moderngl.Context:
+def _create_newest(**options: str) -> moderngl.Context:
     best, oldest = (100 * major + 10 * minor for major, minor in CONTEXT_VERSIONS)
     try:
-        return moderngl.create_context(require=best, standalone=True, backend="egl")
+        return moderngl.create_context(require=best, standalone=True, **options)
     except Exception:  # see `create_context`
-        return moderngl.create_context(require=oldest, standalone=True, backend="egl")
+        return moderngl.create_context(require=oldest, standalone=True, **options)
 
 
 def load_llvm_before_mesa() -> None:

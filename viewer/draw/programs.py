@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import re
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import moderngl
@@ -13,25 +15,34 @@ from pansplat.shaders import load_shader
 # Members of a record, in the order of shaders/project.vert and project.comp.
 RECORD = ("quad_1", "quad_2", "row_a", "row_b", "row_l", "color")
 RECORD_BYTES = 16 * len(RECORD)
+STORED_BYTES = 48  # of one Gaussian in the largest buffer, `Splats.geometry`
 
 DIGITS = 64  # of the radix sort, and its threads in a work group
 TILE_SIZE = 1024  # keys or splats of a work group
+_UNIFORM = re.compile(r"^uniform \w+ (\w+)", re.MULTILINE)
+_MAX_ERRORS = 8  # that OpenGL can report at once
 COUNT_STEP = 1 / 256  # that one Gaussian adds to an image of counts, so that half floats hold its square
 
 
-def choose_tier(ctx: moderngl.Context, tier: str) -> str:
-    """Return `gl43` if the context has compute shaders and `tier` allows it, else `gl33`.
+def choose_tier(ctx: moderngl.Context, tier: str, count: int = 0) -> str:
+    """Return `gl43` if the context has compute shaders for `count` Gaussians and `tier` allows it, else `gl33`.
 
     Raises:
-        InputError: `tier` is unknown, or `gl43` on a context without compute shaders.
+        InputError: `tier` is unknown, or `gl43` on a context that does not support it.
     """
     if tier not in ("auto", "gl33", "gl43"):
         raise InputError(f"`tier` must be auto, gl33 or gl43, got {tier!r}")
-    has_compute = ctx.version_code >= 430
-    if tier == "gl43" and not has_compute:
+    if tier == "gl33":
+        return tier
+    missing = None
+    if ctx.version_code < 430:
         version = f"{ctx.version_code // 100}.{ctx.version_code // 10 % 10}"
-        raise InputError(f"tier gl43 needs OpenGL 4.3, this context has {version}; use tier gl33 or auto")
-    return "gl43" if has_compute and tier != "gl33" else "gl33"
+        missing = f"OpenGL 4.3, this context has {version}"
+    elif (size := count * STORED_BYTES) > (limit := ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]):
+        missing = f"a storage buffer of {size:,} bytes for {count:,} Gaussians, this GPU's limit is {limit:,}"
+    if missing is not None and tier == "gl43":
+        raise InputError(f"tier gl43 needs {missing}; use tier gl33 or auto")
+    return "gl43" if missing is None else "gl33"
 
 
 def read_source(name: str, version: int, **defines: float | str) -> str:
@@ -39,11 +50,47 @@ def read_source(name: str, version: int, **defines: float | str) -> str:
     return load_shader(name, f"{version} core", INSPECT=1, COUNT_STEP=COUNT_STEP, **defines)
 
 
+@contextlib.contextmanager
+def checking_memory(ctx: moderngl.Context) -> Iterator[None]:
+    """Raise an error if OpenGL reports one for the calls in the block: moderngl returns buffers without memory.
+
+    Raises:
+        MemoryError: the GPU's memory is exhausted.
+        moderngl.Error: another error of OpenGL.
+    """
+    _take_errors(ctx)  # those of calls before the block
+    try:
+        yield
+    except moderngl.Error as error:  # such as a framebuffer whose texture has no memory
+        if "GL_OUT_OF_MEMORY" in _take_errors(ctx):
+            raise MemoryError(f"the GPU's memory is exhausted: {error}") from error
+        raise
+    errors = _take_errors(ctx)
+    if "GL_OUT_OF_MEMORY" in errors:
+        raise MemoryError("the GPU's memory is exhausted")
+    if errors:
+        raise moderngl.Error(f"OpenGL reports {', '.join(errors)}")
+
+
+def _take_errors(ctx: moderngl.Context) -> list[str]:
+    """The errors since the last call; a context that is lost reports its loss for ever."""
+    errors: list[str] = []
+    while len(errors) < _MAX_ERRORS and (error := ctx.error) != "GL_NO_ERROR":
+        errors.append(error)
+    return errors
+
+
 def set_uniforms(program: Any, **values: Any) -> None:
-    """Set uniforms by name, except those that the compiler removed because nothing reads them."""
+    """Set uniforms by name, except those that the compiler removed because nothing reads them.
+
+    Raises:
+        KeyError: the source of the program, which `Programs` keeps in `extra`, has no uniform of this name.
+    """
     for name, value in values.items():
         member = program.get(name, None)
         if member is None:
+            if name not in program.extra:
+                raise KeyError(f"the program has no uniform {name!r}; it has {', '.join(sorted(program.extra))}")
             continue
         if isinstance(value, bytes):
             member.write(value)
@@ -75,16 +122,12 @@ class Programs:
     def __init__(self, ctx: moderngl.Context) -> None:
         """Create an empty cache."""
         self._ctx = ctx
-        self._compiled: dict[str, Any] = {}
+        self._compiled: dict[tuple[object, ...], Any] = {}
 
     def project(self) -> moderngl.Program:
         """Gaussians to records by transform feedback (GL 3.3)."""
-        return self._compile(
-            "project.vert",
-            lambda: self._ctx.program(
-                vertex_shader=read_source("project.vert", 330), varyings=RECORD, varyings_capture_mode="interleaved"
-            ),
-        )
+        capture: Any = {"varyings": RECORD, "varyings_capture_mode": "interleaved"}
+        return self._compile(lambda source: self._ctx.program(vertex_shader=source, **capture), 330, "project.vert")
 
     def project_compute(self) -> moderngl.ComputeShader:
         """Gaussians to records by a compute shader (GL 4.3)."""
@@ -92,8 +135,15 @@ class Programs:
 
     def compute(self, name: str, **defines: int) -> moderngl.ComputeShader:
         """The compute shader of this file (GL 4.3)."""
-        defines = {"TILE_SIZE": TILE_SIZE, "DIGITS": f"{DIGITS}u"} | defines  # type: ignore[assignment]
-        return self._compile(f"{name} {defines}", lambda: self._ctx.compute_shader(read_source(name, 430, **defines)))
+        return self._compile(self._ctx.compute_shader, 430, name, TILE_SIZE=TILE_SIZE, DIGITS=f"{DIGITS}u", **defines)
+
+    def compile_compute(self) -> None:
+        """Compile all compute shaders at once: a driver may refuse one although it offers OpenGL 4.3."""
+        for name in ("arguments", "scan", "sort_count", "sort_keys", "sort_scatter"):
+            self.compute(f"{name}.comp")
+        for write in range(2):
+            self.compute("cull.comp", WRITE=write)
+        self.project_compute()
 
     def splat(self) -> moderngl.Program:
         """Records to pixels of a layer."""
@@ -122,14 +172,16 @@ class Programs:
         self._compiled.clear()
 
     def _compile_pair(self, vertex: str, fragment: str, **defines: int) -> moderngl.Program:
-        return self._compile(
-            f"{fragment} {defines}",
-            lambda: self._ctx.program(
-                vertex_shader=read_source(vertex, 330), fragment_shader=read_source(fragment, 330, **defines)
-            ),
-        )
+        def compile_pair(*sources: str) -> moderngl.Program:
+            return self._ctx.program(vertex_shader=sources[0], fragment_shader=sources[1])
 
-    def _compile(self, key: str, compile_program: Callable[[], Any]) -> Any:
+        return self._compile(compile_pair, 330, vertex, fragment, **defines)
+
+    def _compile(self, compile_sources: Callable[..., Any], version: int, *files: str, **defines: int | str) -> Any:
+        """The program of these files; `extra` is the set of its uniforms, for `set_uniforms`."""
+        key = (*files, *defines.items())
         if key not in self._compiled:
-            self._compiled[key] = compile_program()
+            sources = [read_source(file, version, **defines) for file in files]
+            program = self._compiled[key] = compile_sources(*sources)
+            program.extra = {name for source in sources for name in _UNIFORM.findall(source)}
         return self._compiled[key]

@@ -6,6 +6,7 @@ the splats are painted into layers (one for each set of Gaussians), and the laye
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Sequence
@@ -49,7 +50,8 @@ class SplatRenderer:
 
     Attributes:
         stats: counts and times of the last frame.
-        tier: `gl33` or `gl43`; both draw the same image.
+        tier: `gl33` or `gl43`; both draw the same image. A renderer that may choose uses `gl33` for a scene beyond the
+            GPU's storage buffers, and from the first error on of a driver that offers compute shaders.
     """
 
     pacing = Pacing(min_size=(1, 1), settle_seconds=SETTLE_AFTER, turn_ms=BUDGET_MS, waits_while_moving=False)
@@ -78,11 +80,10 @@ class SplatRenderer:
             raise InputError(f"`color_bits` must be 16 or 32, got {color_bits}")
         self.tier = choose_tier(ctx, tier)
         self.stats = FrameStats(tier=self.tier)
-        self._ctx = ctx
+        self._ctx, self._requested = ctx, tier
         self._programs = Programs(ctx)
         self._targets = TargetStore(ctx, color_bits=color_bits)
         self._compositor = Compositor(ctx, self._programs, self._targets)
-        self._sort = color_splats if self.tier == "gl43" else sort_splats  # the GPU sorts in tier gl43
         self._sorter = SplatSorter(self._sort)
         self._splats: Splats | None = None
         self._painter: LayerPainter | None = None
@@ -90,6 +91,9 @@ class SplatRenderer:
         self._color_key: tuple[object, ...] | None = None
         self._frame: Frame | None = None
         self._image: Target | None = None
+        self._timer: moderngl.Query | None = ctx.query(time=True)
+        # Settings and milliseconds on the processor of the frame that `_timer` has measured.
+        self._unread: tuple[DrawSettings, float] | None = None
 
     def create_sibling(self) -> SplatRenderer:
         """A renderer with a copy of this scene on the GPU."""
@@ -105,19 +109,39 @@ class SplatRenderer:
         self._upload(prepared or self.prepare(scene))
 
     def _upload(self, splats: Splats) -> None:
-        before = self._splats
-        self._release_scene()  # before the allocation, because the memory may not hold both scenes
         try:
-            self._create_painter(splats)
-        except BaseException:
-            if before is not None:
-                self._create_painter(before)
-            raise
+            painter = self._create_painter(splats)
+        except MemoryError:
+            before = self._splats
+            if before is None:
+                raise
+            self._release_scene()  # the memory does not hold both scenes
+            self._targets.release()
+            try:
+                painter = self._create_painter(splats)
+            except BaseException:
+                self._show(before, self._create_painter(before))
+                raise
+        self._release_scene()
+        self._show(splats, painter)
 
-    def _create_painter(self, splats: Splats) -> None:
-        self._painter = LayerPainter(self._ctx, self._programs, self._targets, splats, self.tier)
-        self._splats = splats
+    def _create_painter(self, splats: Splats) -> LayerPainter:
+        tier = choose_tier(self._ctx, self._requested, len(splats))
+        try:
+            return LayerPainter(self._ctx, self._programs, self._targets, splats, tier)
+        except moderngl.Error:
+            if tier == "gl33" or self._requested != "auto":
+                raise
+            self._requested = "gl33"
+            return self._create_painter(splats)
+
+    def _show(self, splats: Splats, painter: LayerPainter) -> None:
+        self._splats, self._painter, self.tier = splats, painter, painter.rasterizer.tier
+        self._unread = None
         self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
+
+    def _sort(self, splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
+        return (color_splats if self.tier == "gl43" else sort_splats)(splats, position)  # the GPU sorts in tier gl43
 
     def render(
         self,
@@ -127,25 +151,43 @@ class SplatRenderer:
         *,
         wait: bool = True,
     ) -> moderngl.Texture:
-        """See `FrameRenderer`; without `wait`, a worker thread sorts for the position."""
-        start = time.perf_counter()
+        """See `FrameRenderer`; without `wait`, a worker thread sorts, and the GPU draws while the caller goes on."""
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
         if settings.eye_offset:
             raise InputError("OpenGL does not draw omni-directional stereo; use `CpuRenderer`")
+        before = self._read_times()
+        start = time.perf_counter()
         bound = self._ctx.fbo
         frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
         settled = self._update_order(frame.position, wait)
         self._frame = frame
-        image = self._draw(frame, with_depth=False)
-        self._ctx.finish()
-        assert self._painter is not None
-        drawn = self.stats.drawn + self._painter.rasterizer.take_drawn()
+        with contextlib.nullcontext() if self._timer is None else self._timer:
+            image = self._draw(frame, with_depth=False)
+        waits = wait or self._timer is None
+        if waits:
+            self._ctx.finish()
         bind(bound)
+        self._unread = settings, 1e3 * (time.perf_counter() - start)
+        known = self._read_times() if waits else before
+        drawn = self.stats.drawn + known.drawn
         self.stats = dataclasses.replace(
-            self.stats, settled=settled, drawn=drawn, frame_ms=1e3 * (time.perf_counter() - start)
+            self.stats, settled=settled, drawn=drawn, frame_ms=known.frame_ms, timed=known.timed
         )
         return image.color
+
+    def _read_times(self) -> FrameStats:
+        """Time and splats of the frame that is not read yet, for whose end on the GPU this waits."""
+        if self._unread is None or self._painter is None:
+            return FrameStats()
+        (settings, milliseconds), self._unread = self._unread, None
+        start = time.perf_counter()
+        elapsed = 1e-6 * self._timer.elapsed if self._timer is not None else 0.0
+        waited = 1e3 * (time.perf_counter() - start)  # the timer has 32 bits: 4.3 s
+        if elapsed == 0:  # some drivers of macOS do not measure: wait for the end of each frame from now on
+            self._timer = None
+        drawn = self._painter.rasterizer.take_drawn()
+        return FrameStats(frame_ms=max(milliseconds, elapsed, waited), drawn=drawn, timed=settings)
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""
@@ -157,6 +199,7 @@ class SplatRenderer:
         `render` draws no depth. The first call after it draws the frame again with depth.
         """
         if self._image is not None and self._frame is not None and self._image.depth is None:
+            self._read_times()
             bound, stats = self._ctx.fbo, self.stats
             self._draw(self._frame, with_depth=True)
             assert self._painter is not None

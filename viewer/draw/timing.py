@@ -12,8 +12,8 @@ printed:
      "stages": {"project": 2.1, ...}, "image": FILE.npy}
 
 `frame_ms` are times of frames of a moving camera and include the sort; with "cached" the camera turns in place.
-`stages` are medians in milliseconds. Tiers that the context does not support are skipped. The image is float32, RGB
-and coverage, top row first; with tier `cpu` and "cached", what the screen shows, with 8 bits.
+`stages` are medians in milliseconds. Tiers that the context does not support for the scene are skipped. The
+image is float32, RGB and coverage, top row first; with tier `cpu` and "cached", what the screen shows, with 8 bits.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from pansplat.gaussians.ply import load_ply
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
+from pansplat_viewer.draw.programs import choose_tier
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
 
 _TURN_RADIANS = 5e-3  # between frames of a camera that turns
@@ -63,9 +64,10 @@ def run_job(job: dict[str, Any]) -> Iterator[dict[str, object]]:
     try:
         for tier in job["tiers"]:
             try:
-                renderer = CpuRenderer(ctx) if tier == "cpu" else SplatRenderer(ctx, tier=tier, color_bits=32)
+                choose_tier(ctx, "auto" if tier == "cpu" else tier, len(scene.gaussians))
             except InputError:
                 continue
+            renderer = CpuRenderer(ctx) if tier == "cpu" else SplatRenderer(ctx, tier=tier, color_bits=32)
             try:
                 renderer.upload(scene)
                 for index, (each, size) in enumerate(zip(settings, sizes, strict=True)):

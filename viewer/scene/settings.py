@@ -143,6 +143,9 @@ class FrameStats:
         sort_ms: time of the last sort and of the colours that depend on the position, possibly in the background.
         settled: False if the frame used the order and colours of an earlier position because the new ones are not
             ready, or the last image because the new one is not ready; render again to get it.
+        frame_ms: from the call of `render` until the GPU had finished. Of an image that OpenGL draws without waiting,
+            this is the longer of the times on the processor and the GPU, and known when the next one is drawn.
+        timed: settings of the image that took `frame_ms` and, in tier `gl43`, has `drawn` splats; None is this one.
         stages: milliseconds of each stage, where the renderer measures them.
     """
 
@@ -151,7 +154,8 @@ class FrameStats:
     visible: int = 0
     drawn: int = 0
     sort_ms: float = 0.0
-    frame_ms: float = 0.0  # from the call of `render` until the GPU had finished
+    frame_ms: float = 0.0
+    timed: DrawSettings | None = None
     tier: str = "gl33"  # `gl33`, `gl43` or `cpu`
     cached: bool = False  # whether the frame used cached layers only
     settled: bool = True

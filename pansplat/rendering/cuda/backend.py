@@ -5,7 +5,6 @@ is a thousand times slower than the other backends and for tests only.
 """
 
 import contextlib
-import importlib.util
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +26,7 @@ from pansplat.rendering.projection import (
     ray_footprints,
     select_drawable,
 )
-from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
+from pansplat.rendering.rasterize import MIN_TRITON, RasterInfo, RasterOptions, RasterSums, get_triton_version
 
 if TYPE_CHECKING:
     from pansplat.rendering.cuda.tiling import Instances
@@ -71,10 +70,12 @@ def rasterize_planes(
 
 def _check_device(device: torch.device) -> None:
     """Raise an error if Triton cannot run on the device; kernels are imported later, where they are launched."""
-    if importlib.util.find_spec("triton") is None:
+    version, needed = get_triton_version(), ".".join(map(str, MIN_TRITON))
+    if version < MIN_TRITON:
+        found = f"has version {'.'.join(map(str, version))}" if version else "is not installed"
         raise InputError(
-            "backend 'triton' needs the package triton, which is not installed; install it (pip install triton, on "
-            "Linux), or use backend='auto'"
+            f"backend 'triton' needs the package triton {needed} or newer, which {found}; install it (pip install "
+            f"'triton>={needed}', on Linux), or use backend='auto'"
         )
     if device.type != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
         raise InputError(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-import importlib.util
+import sys
 import types
 
 import pytest
@@ -11,7 +11,8 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering import rasterize
+from pansplat.rendering import cuda, rasterize, reference
+from pansplat.rendering.rasterize import _select_backend
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 exhaustive = pytest.mark.exhaustive  # an intersection takes milliseconds in the interpreter
@@ -157,17 +158,31 @@ def test_gaussians_on_the_cpu_are_refused_unless_interpreted(make_scene, pose, m
         rasterize(make_scene(1), pose, size=(4, 8), backend="triton")
 
 
-def test_a_missing_triton_is_an_error(make_scene, pose, monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="needs the package triton, which is not installed"):
+@pytest.mark.parametrize(
+    ("triton", "found"),
+    [
+        (None, "which is not installed"),
+        (types.SimpleNamespace(__version__="3.1.0"), "which has version 3.1"),
+        (types.SimpleNamespace(__version__="2.3.1+git"), "which has version 2.3"),
+    ],
+)
+def test_a_missing_or_old_triton_is_an_error_and_auto_does_not_select_it(
+    make_scene, pose, unchecked, monkeypatch, triton, found
+):
+    monkeypatch.setitem(sys.modules, "triton", triton)
+    with pytest.raises(InputError, match=f"needs the package triton 3.2 or newer, {found}"):
         rasterize(make_scene(1), pose, size=(4, 8), backend="triton")
+    assert select_automatically(is_cuda=True) is reference.rasterize_planes
 
 
-def test_auto_selects_triton_only_on_cuda(unchecked):
-    from pansplat.rendering import cuda, rasterize as _  # noqa: F401, I001
-    from pansplat.rendering.rasterize import _select_backend
+def test_auto_selects_triton_only_on_cuda(unchecked, monkeypatch):
+    assert select_automatically(is_cuda=True) is cuda.rasterize_planes
+    assert select_automatically(is_cuda=False) is not cuda.rasterize_planes
+    monkeypatch.setitem(sys.modules, "triton", types.SimpleNamespace(__version__="3.10.0.post1"))
+    assert select_automatically(is_cuda=True) is cuda.rasterize_planes
 
-    means = types.SimpleNamespace(is_cuda=True, device=torch.device("cuda"), dtype=torch.float32)
-    assert _select_backend("auto", types.SimpleNamespace(means=means), "ewa") is cuda.rasterize_planes
-    means.is_cuda, means.device = False, torch.device("cpu")
-    assert _select_backend("auto", types.SimpleNamespace(means=means), "ewa") is not cuda.rasterize_planes
+
+def select_automatically(*, is_cuda: bool) -> object:
+    device = torch.device("cuda" if is_cuda else "cpu")
+    means = types.SimpleNamespace(is_cuda=is_cuda, device=device, dtype=torch.float32)
+    return _select_backend("auto", types.SimpleNamespace(means=means), "ewa")

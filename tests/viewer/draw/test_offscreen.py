@@ -125,18 +125,42 @@ def test_the_newest_version_is_asked_for_first(monkeypatch):
     assert offscreen.create_context("egl").version_code == 330 and asked == [430, 330]
 
 
+@pytest.mark.parametrize("system", ["win32", "darwin"])
+def test_windows_and_macos_have_contexts_of_their_own(monkeypatch, system):
+    """There is no EGL; Windows has 4.6, macOS has 4.1 whatever is asked for."""
+    offered = {"win32": 460, "darwin": 410}[system]
+
+    def create(require, standalone, backend=None):
+        if backend is not None:
+            raise ImportError(f"cannot import name {backend!r} from 'glcontext'")
+        if require > offered:
+            raise ValueError(f"Requested OpenGL version {require}, got version {offered}")
+        return SimpleNamespace(version_code=offered)
+
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(moderngl, "create_context", create)
+    assert offscreen.create_context().version_code == offered
+    offered = 110  # "GDI Generic": no driver is installed
+    with pytest.raises(InputError, match=r"system: Requested .*got version 110\); install the driver of the graphics"):
+        offscreen.create_context()
+
+
 def test_unknown_backend_is_refused():
-    with pytest.raises(InputError, match="auto, egl or osmesa, got 'wgl'"):
+    with pytest.raises(InputError, match="auto, egl, osmesa or system, got 'wgl'"):
         offscreen.create_context("wgl")
 
 
-def test_tier_follows_the_version_of_the_context():
-    old, new = SimpleNamespace(version_code=410), SimpleNamespace(version_code=430)
+def test_tier_follows_the_version_and_the_limit_of_the_context():
+    old = SimpleNamespace(version_code=410)
+    new = SimpleNamespace(version_code=430, info={"GL_MAX_SHADER_STORAGE_BLOCK_SIZE": 48 * 1000})
     assert choose_tier(old, "auto") == "gl33"
     assert choose_tier(new, "auto") == "gl43"
     assert choose_tier(new, "gl33") == "gl33"
     with pytest.raises(InputError, match=r"needs OpenGL 4.3, this context has 4.1; use tier gl33"):
         choose_tier(old, "gl43")
+    assert choose_tier(new, "auto", 1000) == "gl43" and choose_tier(new, "auto", 1001) == "gl33"
+    with pytest.raises(InputError, match=r"storage buffer of 48,048 bytes for 1,001 Gaussians, .* limit is 48,000"):
+        choose_tier(new, "gl43", 1001)
     with pytest.raises(InputError, match="auto, gl33 or gl43, got 'gl21'"):
         choose_tier(new, "gl21")
 
