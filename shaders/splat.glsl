@@ -11,7 +11,7 @@ uniform vec3 position;           // camera centre, in the moved frame of the mea
 uniform float near;              // smallest radial distance, metres
 uniform bool exact;              // the exact response, order and filter, or those of 3DGS
 uniform float filter_variance;   // e^2 of section 2; of 3DGS, added to the diagonal of the projected covariance
-uniform vec2 half_size;          // half the image
+uniform vec2 half_size;          // half the image; of one off the optical axis, half the smallest one around both
 uniform float margin;            // added to the quad, for the rounding of the rasteriser
 
 struct Gaussian {

@@ -5,6 +5,7 @@ import io
 import math
 import os
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -127,13 +128,15 @@ def home(page: OpenPage) -> OpenPage:
     return page
 
 
-def draw_reference(scene: Scene, level: np.ndarray, origin: np.ndarray, camera: dict[str, Any]) -> np.ndarray:
+def draw_reference(
+    scene: Scene, level: np.ndarray, origin: np.ndarray, camera: dict[str, Any], size: tuple[int, int] = SIZE
+) -> np.ndarray:
     """The rasteriser's image for a camera of the page; `level` is its axes at yaw and pitch 0."""
     cy, sy, cp, sp = (f(camera[angle]) for angle in ("yaw", "pitch") for f in (math.cos, math.sin))
     pose = np.eye(4)
     turn = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
     pose[:3, :3], pose[:3, 3] = level @ turn, camera["position"] + origin
-    options = {"size": SIZE[::-1], "layout": "pinhole", "vertical_fov_degrees": camera["fov"]}
+    options = {"size": size[::-1], "layout": "pinhole", "vertical_fov_degrees": camera["fov"]}
     with torch.no_grad():
         color = pipeline.render(scene, pose, **options).color
     return color.clamp(0, 1).permute(1, 2, 0).double().numpy()
@@ -511,3 +514,100 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         page.page.click("#home")
         assert page.camera == start
         assert page.messages == []
+
+
+# An emulated headset: images of 200x200 pixels with a focal length of 100 pixels, off the optical axis; a frame takes 10 ms.
+HEADSET = """
+    device = new IWER.XRDevice(IWER.metaQuest3, { stereoEnabled: true, ipd: 0.064 });
+    device.installRuntime({ forceInstall: true });
+    Object.defineProperty(XRView.prototype, "projectionMatrix", { get() {
+        const [left, right] = this.eye === "left" ? [-1.2, 0.8] : [-0.8, 1.2], [top, bottom] = [0.9, -1.1];
+        const x = (right + left) / (right - left), y = (top + bottom) / (top - bottom);
+        return new Float32Array([2 / (right - left), 0, 0, 0, 0, 2 / (top - bottom), 0, 0, x, y, -1, -1, 0, 0, -0.2, 0]);
+    } });
+    setHead = (position, yaw, pitch) => {
+        const [cy, sy, cp, sp] = [yaw, pitch].flatMap((angle) => [Math.cos(angle / 2), Math.sin(angle / 2)]);
+        device.position.set(...position);
+        device.quaternion.set(cy * sp, sy * cp, -sy * sp, cy * cp);
+    };
+    const request = requestAnimationFrame;
+    let time = performance.now();
+    step = 10;
+    performance.now = () => time;
+    requestAnimationFrame = (onFrame) => request(() => onFrame(time));
+    frames = 0;
+    const requestXR = XRSession.prototype.requestAnimationFrame;
+    XRSession.prototype.requestAnimationFrame = function (onFrame) {
+        return requestXR.call(this, (now, frame) => {
+            time += step;
+            frames += 1;
+            onFrame(time, frame);
+            if (window.take) take(document.getElementById("view").toDataURL("image/png"));
+        });
+    };
+    takePicture = () => new Promise((resolve) => { take = (url) => { take = null; resolve(url); }; });
+    walked = () => new Promise((resolve) => { const end = frames + 5, check = () => frames >= end ? resolve() : request(check); check(); });
+"""
+
+
+@pytest.fixture(scope="module")
+def iwer() -> str:
+    """The emulator of headsets; without it the tests fail in CI and are skipped elsewhere."""
+    path = Path(sys.prefix) / "iwer" / "iwer.min.js"
+    if not path.is_file():
+        missing = f"{path} (npm package iwer; `bash setup.sh --dev` fetches it)"
+        if os.environ.get("CI"):
+            pytest.fail(f"CI needs {missing}")
+        pytest.skip(f"needs {missing}")
+    return path.read_text()
+
+
+@contextmanager
+def in_headset(
+    chromium: Any, path: Path, iwer: str, script: str = "", head: tuple[float, float, float] = (0.1, 1.6, -0.2)
+) -> Iterator[OpenPage]:
+    """The page after "Enter VR", without controllers, with the head turned 0.2 to the left."""
+    with opened(chromium, path, size=(400, 200), script=f"{iwer};{HEADSET};{script}") as page:
+        page.run("(head) => setHead(head, 0.2, 0)", head)
+        page.run("Object.values(device.controllers).forEach((each) => { each.connected = false; })")
+        page.page.click("#vr")
+        page.wait("frames > 2")
+        yield page
+
+
+def see(page: OpenPage, position: tuple[float, ...], yaw: float, pitch: float) -> Float[np.ndarray, "200 400 3"]:
+    """Both eyes' picture for a pose of the head in the room, after the Gaussians are sorted for it."""
+    page.run("(pose) => setHead(...pose)", [position, yaw, pitch])
+    page.run("walked()")
+    image = None
+    while True:
+        page.page.wait_for_timeout(300)
+        last, image = image, decode(page.run("takePicture()"))
+        if last is not None and np.array_equal(image, last):
+            return image
+
+
+@pytest.mark.slow
+def test_both_eyes_see_the_pictures_of_the_rasteriser(chromium: Any, folder: Path, scene: Scene, iwer: str) -> None:
+    level, origin = path_poses(scene.cam2world)[0, :3, :3].numpy(), scene.cam2world[:, :3, 3].mean(0).numpy()
+    with in_headset(chromium, folder / "tour.html", iwer) as page:
+        start = page.run("HEADER.start")
+        assert math.cos(page.camera["yaw"] - start["yaw"]) == pytest.approx(1)
+        image = see(page, (0.1 + 0.15, 1.7, -0.2 - 0.1), -0.3, 0.6)
+        (mark,) = page.run("HEADER.spots.slice(0, 1).map((spot) => spot.mark)")
+        Image.fromarray((image*255).astype(np.uint8)).save("/work/exp/xr/eyes.png")
+        print(page.camera, start, mark, page.messages)
+    yaw = start["yaw"] + 0.2 + 0.3  # a positive yaw of the page turns right
+    heading = start["yaw"] + 0.2
+    c, s = math.cos(heading), math.sin(heading)
+    moved = level @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ np.array([0.15, 0, 0.1])
+    center = np.array(start["position"]) + moved
+    center += level[:, 1] * (level[:, 1] @ (np.array(mark) - center) - 1.7)  # 1.7 m over the floor
+    right = level @ np.array([math.cos(yaw), 0, -math.sin(yaw)])
+    for eye, crop in ((0, slice(0, 200)), (1, slice(40, 240))):
+        camera = {"position": center + right * (0.064 * eye - 0.032), "yaw": yaw, "pitch": 0.6, "fov": 2 * math.degrees(math.atan(1.1))}
+        reference = draw_reference(scene, level, origin, camera, (240, 220))[20:, crop]
+        picture = image[:, 200 * eye : 200 * eye + 200]
+        Image.fromarray((reference*255).astype(np.uint8)).save(f"/work/exp/xr/ref{eye}.png")
+        print(psnr(picture, reference), psnr(image[:, 200 - 200 * eye : 400 - 200 * eye], reference))
+    assert page.messages == []
