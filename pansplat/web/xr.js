@@ -78,7 +78,7 @@ class Headset {
     this.motion = 0;  // strength of the vignette
     this.pressed = new Map();
     this.isTurned = false;
-    Object.assign(this, { scale: 1, times: [], calm: 0, patience: 1 });
+    Object.assign(this, { scale: 1, times: [], calm: 0, patience: 1, isRaised: false });
     session.updateRenderState({ baseLayer: this.makeLayer(session) });
     const rate = (session.supportedFrameRates || []).find((each) => each >= MIN_RATE);
     if (rate && rate !== session.frameRate) session.updateTargetFrameRate(rate).catch(() => {});
@@ -264,7 +264,8 @@ class Headset {
 
   // ---- resolution ----
 
-  // Lowers the resolution when frames are late, and raises it after a calm time, which grows so that it does not oscillate.
+  // Lowers the resolution when frames are late, and raises it after some calm seconds, the more of them the more often that
+  // has made frames late.
   adaptScale(elapsed) {
     const { session, scale, times } = this;
     times.push(elapsed);
@@ -274,9 +275,11 @@ class Headset {
     this.calm = isLate ? 0 : this.calm + FRAMES * mean / 1000;
     if (isLate) {
       this.scale = Math.max(scale * SCALE_STEP, MIN_SCALE);
-      this.patience = Math.min(2 * this.patience, 64);
+      if (this.isRaised) this.patience = Math.min(2 * this.patience, 64);
+      this.isRaised = false;
     } else if (this.calm > this.patience) {
       this.scale = Math.min(scale / SCALE_STEP, 1);
+      this.isRaised = true;
       this.calm = 0;
     }
     if (this.scale !== scale && !("requestViewportScale" in XRView.prototype)) {
