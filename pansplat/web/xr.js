@@ -15,7 +15,7 @@ const RAY_LENGTH = 3;               // metres
 const FLOOR_SPEED = 5;              // of the way to the height of a new floor, a second
 const HEIGHT_RATIO = 1.5;           // of the head to the panorama's camera, both over their floors
 const MIN_RATE = 72;                // frames a second, if the device has a choice
-const MIN_SCALE = 0.5, SCALE_STEP = 0.85, FRAMES = 30;  // of the resolution, after so many frames
+const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30;  // of the resolution, after so many frames
 const BUTTONS = { 4: "goHome", 5: "leave" };  // A and X, B and Y
 
 const rowsOf = (matrix) => [0, 1, 2].map((row) => [0, 1, 2].map((k) => matrix[4 * k + row]));
@@ -130,7 +130,7 @@ class Headset {
     if (!this.session) return;  // a button has ended it
     this.left = [...page.camera.position];
     page.requestSort(SORT_DISTANCE);
-    this.adaptScale(elapsed);
+    this.adaptScale(1000 * seconds);
     this.motion += ((isWalking || page.isFlying) - this.motion) * Math.min(8 * seconds, 1);
     const marks = this.findMarks(frame), layer = session.renderState.baseLayer;
     for (const view of pose.views) {

@@ -516,14 +516,16 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         assert page.messages == []
 
 
-# An emulated headset: images of 200x200 pixels with a focal length of 100 pixels, off the optical axis; a frame takes 10 ms.
+# An emulated headset: images of 200x200 pixels with a focal length of 100 pixels, off the optical axis. A frame takes
+# `step` milliseconds on every machine.
 HEADSET = """
     device = new IWER.XRDevice(IWER.metaQuest3, { stereoEnabled: true, ipd: 0.064 });
     device.installRuntime({ forceInstall: true });
     Object.defineProperty(XRView.prototype, "projectionMatrix", { get() {
         const [left, right] = this.eye === "left" ? [-1.2, 0.8] : [-0.8, 1.2], [top, bottom] = [0.9, -1.1];
         const x = (right + left) / (right - left), y = (top + bottom) / (top - bottom);
-        return new Float32Array([2 / (right - left), 0, 0, 0, 0, 2 / (top - bottom), 0, 0, x, y, -1, -1, 0, 0, -0.2, 0]);
+        const [width, height] = [right - left, top - bottom];
+        return new Float32Array([2 / width, 0, 0, 0, 0, 2 / height, 0, 0, x, y, -1, -1, 0, 0, -0.2, 0]);
     } });
     setHead = (position, yaw, pitch) => {
         const [cy, sy, cp, sp] = [yaw, pitch].flatMap((angle) => [Math.cos(angle / 2), Math.sin(angle / 2)]);
@@ -546,7 +548,10 @@ HEADSET = """
         });
     };
     takePicture = () => new Promise((resolve) => { take = (url) => { take = null; resolve(url); }; });
-    walked = () => new Promise((resolve) => { const end = frames + 5, check = () => frames >= end ? resolve() : request(check); check(); });
+    walked = () => new Promise((resolve) => {  // five frames later
+        const end = frames + 5, check = () => frames >= end ? resolve() : request(check);
+        check();
+    });
 """
 
 
@@ -659,7 +664,7 @@ def test_sticks_walk_and_turn_in_steps(chromium: Any, folder: Path, iwer: str) -
 
 
 POINT = """
-    // Points a controller or hand at a panorama from below the head; the reference space is the level one, with its heading.
+    // Points a controller or hand at a panorama from below a head that is turned 0.2 to the left.
     pointAt = (input, node) => {
         const heading = pansplat.camera.yaw + 0.2, { mark } = HEADER.spots[node];
         const [x, y, z] = [0, 1, 2].map((k) => mark.reduce((sum, value, i) => {
@@ -688,7 +693,8 @@ def test_controllers_and_hands_select_rings(chromium: Any, folder: Path, iwer: s
         fly = "step = 50; walked().then(walked).then(walked)"
         right = "device.controllers.right"
         page.run(f"pointAt({right}, 1)")
-        pointed = see(page, (0.1, 1.6, -0.2), 0.2, -0.7)
+        rings = see(page, (0.1, 1.6, -0.2), 0.2, -0.7)
+        assert (rings[:, :200].min(axis=2) > 0.98).sum() > 40, "the ring that is pointed at is white"
         page.run(f"{right}.updateButtonValue('trigger', 1)")
         page.run("walked()")
         page.run(f"{right}.updateButtonValue('trigger', 0)")
@@ -717,7 +723,6 @@ def test_controllers_and_hands_select_rings(chromium: Any, folder: Path, iwer: s
         page.run("pointAt(device.hands.right, 1); device.hands.right.updatePinchValue(1)")
         page.run(fly)
         assert above(page, 1) == pytest.approx(0, abs=1e-5)
-        Image.fromarray((pointed * 255).astype(np.uint8)).resize((1200, 600)).save("/work/exp/xr/pointed.png")
 
 
 def test_a_ring_that_is_not_pointed_at_is_not_selected(chromium: Any, folder: Path, iwer: str) -> None:
@@ -732,7 +737,6 @@ def test_a_ring_that_is_not_pointed_at_is_not_selected(chromium: Any, folder: Pa
 @pytest.mark.slow
 def test_a_link_to_another_part_fades_from_black(chromium: Any, folder: Path, iwer: str) -> None:
     with in_headset(chromium, folder / "flat.html", iwer, POINT) as page:
-        page.run("HEADER.links.length === 2 || fail()")
         page.run("step = 30; dispatchEvent(new KeyboardEvent('keydown', {code: 'Digit3'}))")  # along the link
         page.wait("Math.hypot(...pansplat.camera.position.map((x, i) => x - HEADER.spots[2].position[i])) < 3")
         assert decode(page.run("takePicture()")).mean() < 0.1
@@ -776,7 +780,9 @@ def test_leaving_and_a_lost_session_return_to_the_page(chromium: Any, folder: Pa
         page.run("walked()")
         assert page.camera["yaw"] == pytest.approx(seen["yaw"], abs=1e-6)
         # The graphics are lost in the headset.
-        page.run("document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()")
+        page.run(
+            "document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+        )
         page.wait("!device.activeSession && document.getElementById('notice').open")
         assert "Please enter VR again" in page.page.inner_text("#notice")
 
@@ -824,10 +830,10 @@ def test_the_resolution_follows_the_time_between_frames(chromium: Any, folder: P
     with in_headset(chromium, folder / "tour.html", iwer, scaled) as page:
         sharp = see(page, (0.1, 1.6, -0.2), 0.2, 0.6)
         page.run("step = 40")
-        page.wait("scale === 0.5")
+        page.wait("scale === 0.4")
         page.run("step = 10")
         image = decode(page.run("takePicture()"))
-        assert image[:100].max() == image[:, 100:200].max() == 0
-        smaller = 0.25 * sum(sharp[i::2, k::2] for i in (0, 1) for k in (0, 1))
-        assert psnr(image[100:, :100], smaller[:, :100]) > 30
-        page.wait("scale > 0.5")
+        assert image[:120].max() == image[:, 80:200].max() == 0
+        left = Image.fromarray((255 * sharp[:, :200]).astype(np.uint8)).resize((80, 80), Image.Resampling.BOX)
+        assert psnr(image[120:, :80], np.asarray(left) / 255) > 30
+        page.wait("scale > 0.4")

@@ -53,7 +53,13 @@ def test_the_page_and_its_parts_are_served_and_nothing_else(server: PageServer, 
     status, kind, content = get(server, f"/our%20home_files/{part.name}")
     assert (status, kind, content) == (200, "text/javascript; charset=utf-8", part.read_bytes())
     assert f"our%20home_files/{part.name}".encode() in page
-    for path in ("/secret.html", "/our%20home_files/", "/../secret.html", "/our%20home_files/../secret.html", "//etc/passwd"):
+    for path in (
+        "/secret.html",
+        "/our%20home_files/",
+        "/../secret.html",
+        "/our%20home_files/../secret.html",
+        "//etc/passwd",
+    ):
         status, _, content = get(server, path)
         assert status == 404 and b"not for others" not in content
     assert get(server, "/", "HEAD")[::2] == (200, b"")
