@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,9 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import path_poses
 from pansplat.tours import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
 from pansplat.tours.layout import REACH
+from pansplat.web import PageFiles, write_page
 from pansplat.web import page as page_module
-from pansplat.web import write_page
+from pansplat.web.serve import PageServer
 
 SIZE = (320, 240)
 LOADS = int(os.environ.get("PANSPLAT_PAGE_LOADS", "2"))  # docs/web.md has the result of 50
@@ -815,6 +817,18 @@ def test_a_page_from_disk_or_http_says_how_to_enter_vr(chromium: Any, folder: Pa
         page.page.click("#vr")
         page.page.wait_for_selector("#notice[open]")
         assert "--serve" in page.page.inner_text("#notice")
+
+
+def test_a_served_page_may_use_webxr(chromium: Any, folder: Path) -> None:
+    with PageServer(PageFiles((folder / "tour.html",), 0, 0, 0)) as server:
+        Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        page = OpenPage(chromium.new_context(ignore_https_errors=True).new_page())  # the user accepts the certificate
+        page.page.goto(server.url)
+        assert page.run("pansplat.ready.then(() => isSecureContext && 'xr' in navigator)")
+        assert page.draw().std() > 0.05 and page.messages == []
+        assert {url for url in page.requests if not url.startswith("blob:")} == {server.url}
+        page.page.context.close()
+        server.shutdown()
 
 
 @pytest.mark.slow
