@@ -3,7 +3,7 @@
 # and compiled CPU kernels. You may run it again at any time: it skips the steps that are done.
 #
 #   bash setup.sh          to use pansplat
-#   bash setup.sh --dev    to develop it (tests, linters, a virtual display)
+#   bash setup.sh --dev    to develop it (tests, linters, a virtual display, an emulated headset)
 #   bash setup.sh --cuda   to install PyTorch's CUDA build even without a visible NVIDIA GPU (--cpu: never)
 #
 # PYTHON=python3.12 bash setup.sh makes .venv with that Python (3.10 or newer).
@@ -13,6 +13,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")"
 CPU_WHEELS=https://download.pytorch.org/whl/cpu
 GL_PACKAGES=(libegl1 libgl1 libgl1-mesa-dri libgles2 libx11-6 libxcursor1 libxext6 libxi6 libxinerama1 libxkbcommon0 libxrandr2)
 DEV_PACKAGES=(xvfb xdotool libosmesa6 chromium)
+IWER=iwer@2.5.0 # npm package: the emulated headset of the tests
+IWER_SHA256=23d8640949f19db4b1e70398b30e084e4aa555f3a81e4329da3fac1a70b39542 # of iwer.min.js
 
 say() { printf 'setup: %s\n' "$*"; }
 die() { printf 'setup: %s\n' "$*" >&2; exit 1; }
@@ -139,6 +141,24 @@ install_packages() {
     echo "$mark $extra" >"$stamp"
 }
 
+# --- emulated headset ---
+install_headset() {
+    local file=.venv/iwer/iwer.min.js folder
+    [ -n "$extra" ] || return 0
+    ! echo "$IWER_SHA256  $file" | sha256sum --check --status 2>/dev/null || return 0
+    command -v npm >/dev/null || apt_install npm || { say "npm is missing; continuing without $IWER, which tests of web pages need"; return; }
+    say "fetching $IWER"
+    folder=$(mktemp -d)
+    if npm pack --silent --pack-destination "$folder" "$IWER" >/dev/null && tar -xzf "$folder"/*.tgz -C "$folder" \
+        && echo "$IWER_SHA256  $folder/package/build/iwer.min.js" | sha256sum --check --status; then
+        mkdir -p "${file%/*}"
+        mv "$folder/package/build/iwer.min.js" "$file"
+    else
+        say "could not fetch $IWER, or its checksum differs; continuing without it"
+    fi
+    rm -rf "$folder"
+}
+
 # --- kernels ---
 # Numba caches the compiled kernels, so only the first run takes long.
 compile_kernels() {
@@ -150,5 +170,6 @@ find_python
 make_venv
 install_libraries
 install_packages
+install_headset
 compile_kernels
 say "ready: .venv/bin/pansplat --help, .venv/bin/pansplat-view assets/living_room"

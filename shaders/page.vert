@@ -8,6 +8,7 @@ uniform usampler2D order;       // indices of the Gaussians, view by view, farth
 uniform ivec2 segment;          // of the order: first place and count
 uniform vec2 color_range;       // the colours of the bytes 0 and 255
 uniform vec3 sides[4];          // inward unit normals of the view frustum, camera axes
+uniform vec4 window;            // centre and half the size of the image, image plane
 
 flat out vec2 v_base;
 flat out vec4 v_a;
@@ -65,7 +66,7 @@ void main() {
     Footprint f;
     if (!project_gaussian(gaussian, f) || is_cone_outside(gaussian, f)) return;
     vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0;
-    vec2 screen = (f.center + corner.x * f.half_axis_1 + corner.y * f.half_axis_2) / half_size;
+    vec2 screen = (f.center + corner.x * f.half_axis_1 + corner.y * f.half_axis_2 - window.xy) / window.zw;
     gl_Position = vec4(screen.x, -screen.y, 0.0, 1.0);
     v_base = f.base;
     v_a = vec4(f.a, f.thickness);

@@ -2,6 +2,7 @@
 uniform sampler2D sum_color;    // outputs of accumulate.frag, blended
 uniform sampler2D sum_depth;
 uniform vec3 background;
+uniform ivec2 origin;           // window coordinates of the image's corner
 #ifdef INSPECT
 uniform int scalar;             // number whose colour is shown: 0 none, 1 depth, 2 coverage
 uniform float scalar_max;       // with the last colour; the first is 0
@@ -12,7 +13,7 @@ layout(location = 0) out vec4 out_color;    // RGB over the background, coverage
 layout(location = 1) out vec4 out_depth;    // radial distance, metres
 
 void main() {
-    ivec2 pixel = ivec2(gl_FragCoord.xy);
+    ivec2 pixel = ivec2(gl_FragCoord.xy) - origin;
     vec4 color = texelFetch(sum_color, pixel, 0);
     vec2 weighted = texelFetch(sum_depth, pixel, 0).rg;
     float depth = 0.0;

@@ -1,13 +1,14 @@
 // Alpha of one footprint at one pixel: docs/rendering.md, sections 3 and 4.
-uniform float focal;        // pixels
 #ifdef INSPECT
 uniform int footprint;      // 0 Gaussian, 1 count (the blend function adds), 2 ellipsoid of one standard deviation
 #endif
 
 #ifdef PARTS
+uniform float focal;        // pixels
 flat in vec2 v_principal;   // window coordinates of the centre of the part
 #else
-uniform vec2 principal;     // window coordinates of the image centre
+uniform vec2 focal;         // pixels; those of a headset may not be square
+uniform vec2 principal;     // window coordinates of the optical axis
 #endif
 flat in vec2 v_base;
 flat in vec4 v_a;           // a, thickness

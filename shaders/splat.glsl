@@ -11,7 +11,7 @@ uniform vec3 position;           // camera centre, in the moved frame of the mea
 uniform float near;              // smallest radial distance, metres
 uniform bool exact;              // the exact response, order and filter, or those of 3DGS
 uniform float filter_variance;   // e^2 of section 2; of 3DGS, added to the diagonal of the projected covariance
-uniform vec2 half_size;          // half the image
+uniform vec2 half_size;          // half the image; of one off the optical axis, half the smallest one around both
 uniform float margin;            // added to the quad, for the rounding of the rasteriser
 
 struct Gaussian {
@@ -54,6 +54,23 @@ void set_quad(inout Footprint f, float xx, float xy, float yy) {
     f.half_axis_2 = vec2(-direction.y, direction.x) * (sqrt(max(mean - gap, 0.0)) + margin);
 }
 
+// The range of one coordinate of an ellipsoid that crosses the plane z = 0, within -limit to limit. The planes x = c z
+// touch its cone where d_xx - 2 c d_xz + c^2 d_zz = 0; in front of the camera the cone is on one side of one of them. `n`:
+// x and z of the direction of the mean.
+vec2 find_range(float d_xx, float d_xz, float d_zz, vec2 n, float limit) {
+    float square = d_xz * d_xz - d_xx * d_zz;
+    if (!(square > 0.0) || d_zz > -1e-5) return vec2(-limit, limit);
+    float root = sqrt(square), q = d_xz + (d_xz < 0.0 ? -root : root);
+    vec2 c = d_xz < 0.0 ? vec2(d_xx / q, q / d_zz) : vec2(q / d_zz, d_xx / q);  // (d_xz +- root) / d_zz, the smaller first
+    // A plane p = (1, 0, -c) touches at D p, which is on the mean's side of the camera if p . n > 0, and at -D p otherwise.
+    // The z of D p is -root for the first plane and root for the other one.
+    vec2 z = vec2(-root, root) * (n.x - c * n.y);
+    float slack = 1e-3 * limit;
+    if (z.y > 0.0 && z.x < 0.0) return vec2(clamp(c.y - slack, -limit, limit), limit);
+    if (z.x > 0.0 && z.y < 0.0) return vec2(-limit, clamp(c.x + slack, -limit, limit));
+    return vec2(-limit, limit);
+}
+
 // Sets the rows of the exact response, and the quad. `axes`: the half axes in camera axes, divided by the distance;
 // `u v`: the tangent frame at the unit direction n; `b2`: the filtered block (B_uu, B_uv, B_vv).
 bool set_footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2, float determinant, vec2 c) {
@@ -83,11 +100,13 @@ bool set_footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec
     float c_zz = dot(z, z) + e2 * (1.0 - n.z * n.z), c_xz = dot(x, z) - e2 * n.x * n.z;
     float d_zz = n.z * n.z - kappa * c_zz;
     if (d_zz < 1e-3) {
-        // The ellipsoid crosses the plane z = 0: any pixel may see it, unless all of it is behind the camera.
+        // The ellipsoid crosses the plane z = 0, or all of it is behind the camera.
         if (n.z < 0.0 && d_zz > 1e-5) return false;
-        f.center = vec2(0.0);
-        f.half_axis_1 = vec2(half_size.x + margin, 0.0);
-        f.half_axis_2 = vec2(0.0, half_size.y + margin);
+        vec2 x_range = find_range(n.x * n.x - kappa * c_xx, n.x * n.z - kappa * c_xz, d_zz, n.xz, half_size.x + margin);
+        vec2 y_range = find_range(n.y * n.y - kappa * c_yy, n.y * n.z - kappa * c_yz, d_zz, n.yz, half_size.y + margin);
+        f.center = 0.5 * vec2(x_range.x + x_range.y, y_range.x + y_range.y);
+        f.half_axis_1 = vec2(0.5 * max(x_range.y - x_range.x, 0.0), 0.0);
+        f.half_axis_2 = vec2(0.0, 0.5 * max(y_range.y - y_range.x, 0.0));
         return true;
     }
     if (n.z < 0.0) return false;

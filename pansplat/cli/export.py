@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from pansplat.gaussians.scene import Scene
+    from pansplat.web import PageFiles
 
 _PAGE_SUFFIX, _PLAN_SUFFIX = ".html", ".png"
 _FEW_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # of a panorama in a page
@@ -50,6 +51,8 @@ class Export:
     """For .html: largest number of Gaussians, 600,000 by default; similar neighbours are merged."""
     split: bool = False
     """For .html: write the data to a folder beside the page, for scenes that are large for one file."""
+    serve: bool = False
+    """For .html: then show the page to headsets and phones in the local network, by https, until Ctrl+C."""
     title: str | None = None
     """For .html: title of the page; by default the name of the scene."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
@@ -65,8 +68,9 @@ class Export:
         is_page, is_plan = (self.out.suffix.lower() == suffix for suffix in (_PAGE_SUFFIX, _PLAN_SUFFIX))
         if self.points and (is_page or is_plan or find_scene_suffix(self.out) != ".ply"):
             raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
-        if not is_page and (self.gaussians is not None or self.split or self.title is not None):
-            raise InputError(f"--gaussians, --split and --title are for an .html page, got {self.out}; leave them out")
+        if not is_page and (self.gaussians is not None or self.split or self.serve or self.title is not None):
+            names = "--gaussians, --split, --serve and --title"
+            raise InputError(f"{names} are for an .html page, got {self.out}; leave them out")
         if self.up is not None and not is_scene_file(self.path):
             raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
         scene = self._open(is_page or is_plan)
@@ -75,7 +79,11 @@ class Export:
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
         scene = dataclasses.replace(scene, gaussians=gaussians)
         if is_page:
-            self._write_page(scene)
+            page = self._write_page(scene)
+            if self.serve:
+                from pansplat.web.serve import serve_page
+
+                serve_page(page)
         elif is_plan:
             write_floor_plan(scene, self.out)
             print(f"{self.out}: the floors of {len(scene.cam2world)} panoramas")
@@ -111,7 +119,7 @@ class Export:
 
         return DEFAULT_GAUSSIANS if self.gaussians is None else self.gaussians
 
-    def _write_page(self, scene: Scene) -> None:
+    def _write_page(self, scene: Scene) -> PageFiles:
         """Write the web page and print its size."""
         from pansplat.web import write_page
 
@@ -134,6 +142,7 @@ class Export:
                 f"--gaussians {more} shows more detail in about {size:.0f} MB",
                 file=sys.stderr,
             )
+        return page
 
 
 def _rotation_from(up: Literal["y", "z"]) -> Tensor:

@@ -1,5 +1,5 @@
 "use strict";
-// Vectors, and the graph of a tour. The functions of the graph give the results of the methods of
+// Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of the methods of
 // pansplat.tours.TourGraph that they name; tests/web/test_browser.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
@@ -10,6 +10,8 @@ const minus = (a, b) => a.map((value, i) => value - b[i]);
 const plus = (a, b) => a.map((value, i) => value + b[i]);
 const scaled = (a, factor) => a.map((value) => value * factor);
 const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, value, i) => sum + value * b[i][k], 0)));
+const column = (matrix, k) => matrix.map((row) => row[k]);
 const distanceOf = (a, b) => Math.hypot(...minus(a, b));
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const lengthOf = (path) => path.slice(1).reduce((sum, point, i) => sum + distanceOf(point, path[i]), 0);

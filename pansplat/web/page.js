@@ -165,10 +165,11 @@
       if (colors) this.write(this.colors, colors, ...this.rows, gl.RGBA, gl.UNSIGNED_BYTE, 4 * texels);
     }
 
-    // The layer of one view, and the weighted sum of layers with the sum of weights.
-    resize(width, height) {
-      if (this.size[0] === width && this.size[1] === height) return;
-      const gl = this.gl;
+    // The layer of one view, and the weighted sum of layers with the sum of weights; larger than the image if an earlier
+    // one was larger.
+    resize(...size) {
+      if (size.every((side, i) => side <= this.size[i])) return;
+      const gl = this.gl, [width, height] = this.size = size.map((side, i) => Math.max(side, this.size[i]));
       for (const { framebuffer, textures } of this.targets) {
         gl.deleteFramebuffer(framebuffer);
         textures.forEach((texture) => gl.deleteTexture(texture));
@@ -184,18 +185,18 @@
         gl.drawBuffers(attachments);
         return { framebuffer, textures };
       });
-      this.size = [width, height];
     }
 
-    // Draws to the canvas. `rotation` is camera to world; `focal` in pixels.
-    draw({ position, rotation, focal }, weights) {
-      const gl = this.gl, { width, height } = gl.canvas;
+    // Draws to a viewport (left, bottom, width, height) of a framebuffer, null for the canvas. `camera` has a `position`,
+    // a `rotation` (camera to world), and the `center` and `half` the size of the image on the image plane.
+    draw(camera, weights, framebuffer, [left, bottom, width, height]) {
+      const gl = this.gl;
       this.resize(width, height);
-      const [layer, sum] = this.targets, half = [0.5 * width / focal, 0.5 * height / focal];
+      const [layer, sum] = this.targets;
       gl.viewport(0, 0, width, height);
       gl.disable(gl.DEPTH_TEST);
       gl.activeTexture(gl.TEXTURE0);
-      this.setCamera(position, rotation, focal, half);
+      this.setCamera(camera, width, height);
       let first = true;
       HEADER.views.forEach(({ start, count }, view) => {
         if (!weights[view]) return;
@@ -206,10 +207,12 @@
         this.addLayer(layer.textures[0], weights[view], first);
         first = false;
       });
-      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+      gl.viewport(left, bottom, width, height);
       gl.disable(gl.BLEND);
       const { program, places } = this.resolve;
       gl.useProgram(program);
+      gl.uniform2i(places.origin, left, bottom);
       gl.uniform3f(places.background, 0, 0, 0);
       gl.uniform1i(places.sum_color, 0);
       gl.uniform1i(places.sum_depth, 1);
@@ -221,21 +224,23 @@
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
 
-    setCamera(position, rotation, focal, [x, y]) {
-      const gl = this.gl, { program, places } = this.splat, { width, height } = gl.canvas;
+    setCamera({ position, rotation, center, half }, width, height) {
+      const gl = this.gl, { program, places } = this.splat;
+      const [[x, y], [w, h]] = [center, half], focal = [0.5 * width / w, 0.5 * height / h];
       gl.useProgram(program);
       // GLSL reads columns: the rows of camera-to-world are the columns of its inverse.
       gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
       gl.uniform3fv(places.position, position);
       gl.uniform1f(places.near, HEADER.near);
       gl.uniform1i(places.exact, 1);
-      gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal * focal));
-      gl.uniform2f(places.half_size, x, y);
-      gl.uniform1f(places.margin, 0.02 / focal);
-      gl.uniform2f(places.principal, 0.5 * width, 0.5 * height);
-      gl.uniform1f(places.focal, focal);
+      gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal[0] * focal[1]));
+      gl.uniform2f(places.half_size, Math.abs(x) + w, Math.abs(y) + h);
+      gl.uniform4f(places.window, x, y, w, h);
+      gl.uniform1f(places.margin, 0.02 / Math.min(...focal));
+      gl.uniform2f(places.principal, 0.5 * width - x * focal[0], 0.5 * height + y * focal[1]);
+      gl.uniform2fv(places.focal, focal);
       gl.uniform2fv(places.color_range, HEADER.colorRange);
-      const sides = [[-1, 0, x], [1, 0, x], [0, -1, y], [0, 1, y]].map((side) => scaled(side, 1 / Math.hypot(...side)));
+      const sides = [[-1, 0, w + x], [1, 0, w - x], [0, -1, h + y], [0, 1, h - y]].map((side) => scaled(side, 1 / Math.hypot(...side)));
       gl.uniform3fv(places.sides, sides.flat());
       gl.uniform1i(places.geometry, 0);
       gl.uniform1i(places.colors, 1);
@@ -340,6 +345,10 @@
 
   function freeze() {
     if (!renderer || !sorted) return;
+    if (headset.session) {  // it fades from black
+      frozen = { began: null, left: 1 };
+      return;
+    }
     drawAt(canvas.width, canvas.height);  // what a canvas shows can be copied in the task that drew it
     const size = fullSize(), context = still.getContext("2d");
     const isSame = still.width === size[0] && still.height === size[1];
@@ -365,7 +374,7 @@
 
   function showStill() {
     const left = frozen ? frozen.left : 0;
-    still.hidden = !frozen;
+    still.hidden = !frozen || headset.session !== null;
     still.style.opacity = left;
     byId("spots").style.opacity = 1 - left;
   }
@@ -383,15 +392,17 @@
 
   function jump(position, { yaw, pitch }) {
     freeze();
-    Object.assign(camera, { position: [...position], yaw, pitch });
+    place({ position: [...position], yaw, pitch });
+  }
+
+  function place(pose) {
+    Object.assign(camera, pose);
+    headset.turnTo(camera.yaw);
     settleAt(camera.position);
     changed();
   }
 
   // ---- camera ----
-
-  const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, value, i) => sum + value * b[i][k], 0)));
-  const column = (matrix, k) => matrix.map((row) => row[k]);
 
   const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
   const camera = makeStart();
@@ -491,7 +502,7 @@
     leg.length = lengthOf(leg.path);
     leg.done = 0;
     leg.turn = leg.yaw === undefined ? [0, 0] : [Math.atan2(Math.sin(leg.yaw - camera.yaw), Math.cos(leg.yaw - camera.yaw)), -camera.pitch];
-    const turning = Math.hypot(...leg.turn) / TURN_SPEED;
+    const turning = headset.session ? 0 : Math.hypot(...leg.turn) / TURN_SPEED;  // the head turns itself
     leg.seconds = leg.length ? clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : turning;
   }
 
@@ -555,10 +566,9 @@
   function goHome() {
     setTouring(false);
     flight = null;
-    if (edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, HEADER.start.position)) !== currentPart()) freeze();
-    Object.assign(camera, makeStart());
-    settleAt(camera.position);
-    changed();
+    const isFar = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, HEADER.start.position)) !== currentPart();
+    if (isFar || headset.session) freeze();
+    place(makeStart());
   }
 
   // ---- input ----
@@ -706,6 +716,13 @@
     canvas.focus({ preventScroll: true });
   }
 
+  // Goes to a panorama without a flight.
+  function jumpTo(node) {
+    setTouring(false);
+    const isSame = parts[node] === currentPart(), from = edges.length ? nearestNode(camera.position) : node;
+    jump(GRAPH.positions[node], isSame ? camera : arriveAt(node, from));
+  }
+
   // An element with children that are elements or text; text is never HTML.
   function make(tag, className, ...children) {
     const element = document.createElement(tag);
@@ -746,16 +763,22 @@
     }
   }
 
+  // Those of chooseRings without that at the camera.
+  function findRings() {
+    chooseRings();
+    const isAtCamera = (ring) => ring.camera !== null && distanceOf(ring.camera, camera.position) < 2 * ring.radius;
+    return rings.filter((ring) => ring.isNext && !isAtCamera(ring));
+  }
+
   // Rings in perspective. A label that would cover the label of a nearer ring is not shown.
   function placeRings(rotation) {
-    chooseRings();
+    const found = findRings();
     const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
     const taken = [], placed = [];
     for (const ring of rings) {
       const { radius } = ring, offset = minus(ring.mark, camera.position);
       const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
-      const isAtCamera = ring.camera !== null && distanceOf(ring.camera, camera.position) < 2 * radius;
-      ring.button.hidden = !ring.isNext || isAtCamera || z < 0.1 * radius;
+      ring.button.hidden = !found.includes(ring) || z < 0.1 * radius;
       if (!ring.button.hidden) placed.push({ ring, x, y, z, distance: Math.hypot(x, y, z) });
     }
     for (const { ring, x, y, z, distance } of placed.sort((a, b) => a.distance - b.distance)) {
@@ -824,12 +847,13 @@
   let sorter = null, sorting = false, sorted = null;
   const changed = () => { dirty = true; lastChange = performance.now(); };
 
-  const isSortedFor = (position, part) => {
-    return sorted !== null && sorted.part === part && sorted.position.every((value, i) => value === position[i]);
+  const isSortedFor = (position, part, tolerance = 0) => {
+    return sorted !== null && sorted.part === part && distanceOf(sorted.position, position) <= tolerance;
   };
 
-  function requestSort() {
-    if (sorting || isSortedFor(camera.position, currentPart())) return;
+  // `tolerance`: distance in metres for which the order of before is kept.
+  function requestSort(tolerance) {
+    if (sorting || isSortedFor(camera.position, currentPart(), tolerance)) return;
     sorting = true;
     sorter.postMessage({ position: [...camera.position], part: currentPart() });
   }
@@ -850,20 +874,26 @@
 
   function drawAt(width, height) {
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    const rotation = rotationOf(camera), focal = 0.5 * height / tangentOf(width, height);
-    renderer.draw({ position: camera.position, rotation, focal }, blendWeights(camera.position));
+    const rotation = rotationOf(camera), tangent = tangentOf(width, height), half = [tangent * width / height, tangent];
+    renderer.draw({ position: camera.position, rotation, center: [0, 0], half }, blendWeights(camera.position), null, [0, 0, width, height]);
     return rotation;
+  }
+
+  // Moves what moves by itself, `seconds` after the last time.
+  function advance(now, seconds) {
+    advanceFlight(now);
+    advanceRoute(seconds);
+    if (edges.length) updateEdge(now);
+    updateStill(now);
   }
 
   function onFrame(now) {
     requestAnimationFrame(onFrame);
-    const elapsed = now - lastFrame;
+    if (headset.session) return;  // it has frames of its own
+    const elapsed = now - lastFrame, seconds = Math.min(elapsed, 100) / 1000;
     lastFrame = now;
-    walkByKeys(Math.min(elapsed, 100) / 1000, fast);
-    advanceFlight(now);
-    advanceRoute(Math.min(elapsed, 100) / 1000);
-    if (edges.length) updateEdge(now);
-    updateStill(now);
+    walkByKeys(seconds, fast);
+    advance(now, seconds);
     requestSort();
     const moving = now - lastChange < 200;
     if (moving && drawnScale && elapsed < 1000) scale = clamp(scale * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);
@@ -874,6 +904,26 @@
     placeRings(drawAt(...fullSize().map((side) => Math.max(Math.round(side * wanted), 1))));
     showPlace();
   }
+
+  // ---- headset ----
+
+  const findSpot = (position) => HEADER.spots[nearestNode(position)];
+
+  // Of the floor below a position: along an edge, between those of its panoramas.
+  function floorPoint(position) {
+    if (!edges.length) return findSpot(position).mark;
+    const [from, to] = endsOfEdge(), [start, end] = [from, to].map((node) => GRAPH.positions[node]);
+    const part = distanceOf(closestOnEdge(GRAPH, edge, position), start) / Math.max(distanceOf(start, end), 1e-6);
+    return plus(HEADER.spots[from].mark, scaled(minus(HEADER.spots[to].mark, HEADER.spots[from].mark), part));
+  }
+
+  // What the headset needs of the page.
+  const headset = new Headset({
+    camera, advance, walk, goTo, jumpTo, goHome, setTouring, requestSort, blendWeights, findRings, findSpot, floorPoint, changed,
+    get renderer() { return sorted && renderer; },
+    get black() { return frozen ? frozen.left : 0; },
+    get isFlying() { return flight !== null || route !== null; },
+  });
 
   let failure = null;
   function fail(error) {
@@ -889,6 +939,7 @@
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser or device does not have.");
     if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
+    headset.gl = gl;
     let scene = null;
     const makeRenderer = () => {
       if (!scene || gl.isContextLost()) return;
@@ -896,7 +947,7 @@
       if (sorted) renderer.setSorted(sorted);
       changed();
     };
-    canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); renderer = null; });
+    canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); renderer = null; headset.lose(); });
     canvas.addEventListener("webglcontextrestored", () => {
       try { makeRenderer(); } catch (error) { fail(error); }
     });
@@ -924,6 +975,7 @@
     }
     await report(1);
     listen();
+    headset.offer();
     rings = makeRings();
     makeList();
     requestAnimationFrame(onFrame);

@@ -67,7 +67,7 @@ _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 _BATCH = 256  # quads that are drawn together
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
-_SHADERS |= {"resolve": ("screen.vert", "resolve.frag")}
+_SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
 
 
 @dataclass(frozen=True)
@@ -455,6 +455,7 @@ def _write_files(
         sorter=_to_script(_read("sorter.js")),
         parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),
         graph=_read("graph.js"),
+        headset=_read("xr.js"),
         program=_read("page.js"),
     ).encode(errors="replace")  # a title from a file name that is not UTF-8
     if len(page) > MAX_FILE_BYTES and not split:

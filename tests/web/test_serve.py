@@ -1,0 +1,124 @@
+"""Pages on the local network: real requests by https, the QR code, the end by Ctrl+C."""
+
+import http.client
+import os
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from pansplat.gaussians.scene import Scene
+from pansplat.pipeline import save
+from pansplat.web import page as page_module
+from pansplat.web import serve as serve_module
+from pansplat.web import write_page
+from pansplat.web.serve import PageServer, make_certificate
+
+
+@pytest.fixture
+def server(plain_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PageServer]:
+    """A page in two files beside another file."""
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    (tmp_path / "secret.html").write_text("not for others")
+    with PageServer(write_page(plain_scene, tmp_path / "our home.html", split=True)) as server:
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+def get(server: PageServer, path: str, method: str = "GET") -> tuple[int, str | None, bytes]:
+    """Status, type and content; the certificate must be valid for the address."""
+    port = server.server_address[1]
+    context = ssl.create_default_context(cadata=ssl.get_server_certificate(("127.0.0.1", port)))
+    connection = http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=30)
+    connection.request(method, path)
+    answer = connection.getresponse()
+    content = answer.read()
+    connection.close()
+    return answer.status, answer.getheader("Content-Type"), content
+
+
+def test_the_page_and_its_parts_are_served_and_nothing_else(server: PageServer, tmp_path: Path) -> None:
+    page = (tmp_path / "our home.html").read_bytes()
+    for path in ("/", "/our%20home.html", "/?from=qr"):
+        assert get(server, path) == (200, "text/html; charset=utf-8", page)
+    (part,) = (tmp_path / "our home_files").iterdir()
+    status, kind, content = get(server, f"/our%20home_files/{part.name}")
+    assert (status, kind, content) == (200, "text/javascript; charset=utf-8", part.read_bytes())
+    assert f"our%20home_files/{part.name}".encode() in page
+    for path in (
+        "/secret.html",
+        "/our%20home_files/",
+        "/../secret.html",
+        "/our%20home_files/../secret.html",
+        "//etc/passwd",
+    ):
+        status, _, content = get(server, path)
+        assert status == 404 and b"not for others" not in content
+    assert get(server, "/", "HEAD")[::2] == (200, b"")
+    assert get(server, "/", "POST")[0] == 501
+    part.unlink()
+    assert get(server, f"/our%20home_files/{part.name}")[0] == 404
+
+
+def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(
+    server: PageServer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    port = server.server_address[1]
+    with socket.create_connection(("127.0.0.1", port)), socket.create_connection(("127.0.0.1", port)) as plain:
+        plain.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert not plain.recv(1000).startswith(b"HTTP")
+        assert get(server, "/")[0] == 200
+    assert capfd.readouterr() == ("", "")
+
+
+def test_two_pages_are_served_at_once(server: PageServer, tmp_path: Path, plain_scene: Scene) -> None:
+    with PageServer(write_page(plain_scene, tmp_path / "other.html")) as other:
+        assert other.server_address[1] != server.server_address[1] and str(other.server_address[1]) in other.url
+
+
+def test_the_certificate_names_the_address_and_is_not_an_authority() -> None:
+    certificate = x509.load_pem_x509_certificate(make_certificate("192.168.1.20"))
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert [str(name.value) for name in names] == ["192.168.1.20", "127.0.0.1", "localhost"]
+    assert not certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    assert (certificate.not_valid_after_utc - certificate.not_valid_before_utc).days == 31
+
+
+def test_without_a_network_the_address_is_that_of_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serve_module, "_ELSEWHERE", ("no address", 9))
+    assert serve_module.find_address() == "127.0.0.1"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_export_serves_until_a_signal(plain_scene: Scene, tmp_path: Path, number: int) -> None:
+    save(plain_scene, tmp_path / "scene.ply")
+    program = "from pansplat.cli import main; main()"
+    arguments = ["export", tmp_path / "scene.ply", "--gaussians", "100", "--serve", "-o", tmp_path / "page.html"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONIOENCODING": "utf-8"},
+    )
+    assert process.stdout is not None
+    lines: list[str] = []
+    killer = threading.Timer(120, process.kill)
+    killer.start()
+    while not lines or "https://" not in lines[-1]:
+        lines.append(process.stdout.readline().decode())
+        assert lines[-1], lines
+    process.send_signal(number)
+    out, errors = process.communicate()
+    killer.cancel()
+    assert process.returncode == 0
+    assert out.decode() == "stopped\n" and "Traceback" not in errors.decode()
+    assert sum("█" in line for line in lines) > 10
