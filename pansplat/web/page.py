@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -30,7 +31,7 @@ from torch import Tensor
 from pansplat import constants, pipeline
 from pansplat.atomic import replacing
 from pansplat.data.views import Views
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import path_poses, turn_pose
 from pansplat.geometry.world import working_factor
@@ -116,6 +117,14 @@ def write_page(
     if not 1 <= gaussians <= MAX_GAUSSIANS:
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
     report("checking the scene", 0.0)
+    if scene.joint and scene.overlaps:
+        warnings.warn(
+            "a page follows the edges of a tour with all Gaussians of each panorama, got each surface once; its "
+            "flights are straight. Export the folder of the photographs, or a scene file of --layers.",
+            InputWarning,
+            stacklevel=2,
+        )
+        scene = dataclasses.replace(scene, overlaps=(), links=(), starts=())
     factor = working_factor(scene.near)
     tour, has_cameras = make_graph(scene), len(scene.cam2world) > 0
     scene = _prepare(scene, factor)

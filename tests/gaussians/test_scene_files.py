@@ -108,3 +108,14 @@ def test_an_entry_with_an_unusable_field_is_ignored(key: str) -> None:
 def test_an_entry_that_is_not_an_object_of_valid_json_is_ignored(text: str) -> None:
     with pytest.warns(InputWarning, match="comment is damaged"):
         assert not len(read(text).cam2world)
+
+
+@pytest.mark.parametrize("value", [True, False, None, 1, "yes"])
+def test_only_a_stated_scene_for_joint_drawing_is_one(value: object) -> None:
+    entry = ENTRY if value is None else ENTRY | {"joint": value}
+    assert read(json.dumps(entry)).joint is (value is True)
+
+
+def test_joint_drawing_is_written() -> None:
+    scene = Scene(GAUSSIANS, _POSES, near=0.45, far=10.0, joint=True)
+    assert read(format_entry(scene, [[0, 0, 12]])).joint

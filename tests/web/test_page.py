@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes, urljoin, urlsplit
@@ -14,7 +15,7 @@ import pytest
 import torch
 
 from pansplat import pipeline
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -300,3 +301,13 @@ def test_pages_that_cannot_be_drawn_or_written_are_refused(
     with pytest.raises(InputError, match="existing folder"):
         write_page(scene, tmp_path / "missing" / "tour.html")
     assert [file.name for file in tmp_path.iterdir()] == ["tour_files"]
+
+
+def test_the_page_of_a_fused_tour_draws_all_gaussians_everywhere(house: Scene, tmp_path: Path) -> None:
+    fused = dataclasses.replace(house, joint=True)
+    with pytest.warns(InputWarning, match="Export the folder of the photographs"):
+        header = read_header(write_page(fused, tmp_path / "house.html").files[0])
+    assert len(header["spots"]) == 3 and header["edges"] == [] and header["count"] == len(house.gaussians)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_page(dataclasses.replace(fused, overlaps=()), tmp_path / "pair.html")

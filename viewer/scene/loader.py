@@ -211,7 +211,7 @@ def load_entry(
         progress("reading", 0.0)
         assert entry.file is not None
         scene = pipeline.load(entry.file)
-        if not scene.overlaps:
+        if not scene.overlaps or scene.joint:  # the views of an edge alone lack surfaces of others
             return LoadedScene(entry, scene)
         from pansplat.tours import make_graph
 

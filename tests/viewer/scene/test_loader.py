@@ -13,6 +13,8 @@ import pytest
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.ply import save_ply
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
+from pansplat_viewer.scene.settings import DrawSettings
+from pansplat_viewer.scene.state import fit_settings
 from pansplat_viewer.scene.tour import TourScenes
 
 
@@ -257,3 +259,14 @@ def test_an_entry_shows_its_prediction_before_the_refined_scene(monkeypatch, sma
     entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
     final = load_entry(entry, LoadOptions(refine_seconds=3.0), ignore, shown.append)
     assert [loaded.is_final for loaded in (*shown, final)] == [False, True]
+
+
+def test_a_fused_tour_is_one_scene_that_is_drawn_jointly(tmp_path, small_scene):
+    count = len(small_scene.cam2world)
+    edges = tuple((view, view + 1, 0.5) for view in range(count - 1))
+    for joint in (False, True):
+        save_ply(replace(small_scene, overlaps=edges, joint=joint), tmp_path / "tour.ply")
+        (entry,) = find_entries(tmp_path / "tour.ply", LoadOptions())
+        loaded = load_entry(entry, LoadOptions(), ignore)
+        assert (loaded.entry.tour is None) == joint
+        assert fit_settings(DrawSettings(mode="deferred"), loaded.scene).mode == ("joint" if joint else "deferred")
