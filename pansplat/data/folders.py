@@ -46,6 +46,7 @@ from pansplat.data.photographs import (
 )
 from pansplat.data.placements import Placement, is_by_hand, judge, read_rejected, read_ties
 from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
+from pansplat.data.reconstructions import find_reconstruction, read_reconstruction
 from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import expand_home, read_file
@@ -68,8 +69,9 @@ def load_pairs(
 
     Args:
         path: a panorama; a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the
-            formats of docs/input.md (poses.json, PanoGRF, 360Loc, KITTI, TUM, game-map triplets); or one of their files
-            with poses. A folder or web tour of a single panorama is a pair of one view.
+            formats of docs/input.md (poses.json, nerfstudio, COLMAP, openMVG, OpenSfM, Metashape, PanoGRF, 360Loc,
+            KITTI, TUM, game-map triplets); or one of their files with poses. A folder or web tour of a single panorama
+            is a pair of one view.
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
 
@@ -107,14 +109,17 @@ def load_pairs(
 
 
 def _is_pose_file(file: Path) -> bool:
-    return file.name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS) or file == find_trajectory(file.parent)
+    stated = file.name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS)
+    return stated or file in (find_trajectory(file.parent), find_reconstruction(file.parent))
 
 
 def list_stated_files(folder: Path) -> list[Path]:
     """The files of a folder that state poses, pairs, links or a web tour; those of fixed names need not exist."""
     files = [folder / name for name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS)]
     try:
-        others = (find_trajectory(folder), find_web_tour(folder), *triplet_files(folder))
+        others = (
+            find_trajectory(folder), find_reconstruction(folder), find_web_tour(folder), *triplet_files(folder)
+        )  # fmt: skip
     except (OSError, InputError):
         return files
     return files + [file for file in others if file is not None]
@@ -212,6 +217,9 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
         return [(folder, read_triplet(path, convention)) for path in triplets]
     if find_trajectory(folder) is not None:
         return [(folder, read_trajectory_folder(folder, convention))]
+    if (source := find_reconstruction(folder)) is not None:
+        given = None if convention is None else parse_convention(convention, "`convention`")
+        return [(folder, read_reconstruction(source, folder, given))]
     if find_web_tour(folder) is not None:
         return []
     subfolders = _list_subfolders(folder, depth)
@@ -265,7 +273,7 @@ def _find_panorama_folders(folder: Path, depth: int) -> list[Path]:
     has_poses = (folder / _POSES).exists() or is_loc360_sequence(folder) or is_matterport3d_scene(folder)
     if has_poses or triplet_files(folder) or find_trajectory(folder) is not None or list_panorama_files(folder):
         return [folder]
-    if find_web_tour(folder) is not None:
+    if find_reconstruction(folder) is not None or find_web_tour(folder) is not None:
         return [folder]
     return [found for sub in _list_subfolders(folder, depth) for found in _find_panorama_folders(sub, depth - 1)]
 

@@ -334,7 +334,7 @@ def test_one_picture_that_is_no_panorama_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"photo\.png: needed a 2:1 equirectangular panorama, got 24x16"):
             load_pairs(path)
     (tmp_path / "photo.png").write_text("x")
-    with pytest.raises(InputError, match=r"photo\.png: needed a JPG, PNG, WebP or EXR image"):
+    with pytest.raises(InputError, match=r"photo\.png: needed a JPG, PNG, TIFF, WebP, HEIC or EXR image"):
         load_pairs(tmp_path)
 
 
