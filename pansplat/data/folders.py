@@ -53,6 +53,9 @@ from pansplat.files import expand_home, read_file
 from pansplat.strict_json import list_field, number_field, read_json, require_object
 
 _POSES, _PAIRS = "poses.json", "pairs.json"
+VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
+_RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
+_TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # that may hold poses
 _CAMERA_POSES = "camera_pose.json"  # of 360Loc
 
 _MAX_WORLD = 9999  # of poses.json
@@ -82,6 +85,8 @@ def load_pairs(
     root = expand_home(path)
     if not root.exists():
         raise InputError(f"{root}: needed a panorama, or a folder of panoramas, got no such path; check it.")
+    if root.is_file() and root.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES):
+        raise InputError(f"{root}: needed panoramas, got {_advise_on_file(root)}.")
     try:
         if root.suffix.lower() in READABLE_SUFFIXES and root.is_file():
             return single_view_pairs([read_photograph(root)], root.parent, near, far)
@@ -235,6 +240,11 @@ def _leave_out_damaged(collection: Collection) -> Collection:
     problems: dict[int, InputError] = {}
     for number, panorama in enumerate(collection.panoramas):
         try:
+            if not panorama.image.is_file():
+                raise InputError(
+                    f"{collection.source}: needed the image {panorama.image}, got no such file; correct the name or "
+                    "add the file."
+                )
             require_panorama(panorama.image)
         except InputError as error:
             problems[number] = error
@@ -290,19 +300,38 @@ class UnposedPanoramasError(InputError):
     def __init__(self, folder: Path, panoramas: list[Panorama]) -> None:
         names = _list_first([panorama.image.name for panorama in panoramas])
         super().__init__(
-            f"{folder}: needed poses for the panoramas, got images only ({names}); add a pose file (docs/input.md)."
+            f"{folder}: needed poses for the panoramas, got images only ({names}); run `pansplat pose {folder} -o "
+            f"{folder / _POSES}`, or add a pose file (docs/input.md)."
         )
         self.folder = folder
         self.panoramas = panoramas
 
 
 def _nothing_found(root: Path) -> InputError:
-    inside = _list_first([str(folder.relative_to(root)) for folder in find_panorama_folders(root) if folder != root])
-    got = f"some without poses in {inside}" if inside else "none"
-    return InputError(
-        f"{root}: needed panoramas (JPG, PNG, WebP or EXR), got {got}; give the folder that "
-        "holds them, or a folder whose subfolders have pose files (docs/input.md)."
-    )
+    inside = [folder for folder in find_panorama_folders(root) if folder != root]
+    others = [file for file in sorted(root.iterdir()) if file.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES)]
+    tables = [file for file in sorted(root.iterdir()) if file.suffix.lower() in _TABLE_SUFFIXES and file.is_file()]
+    if inside:
+        got = f"some without poses in {_list_first([str(folder.relative_to(root)) for folder in inside])}; "
+        advice = f"open one of these folders, or run `pansplat pose {inside[0]} -o {inside[0] / _POSES}` for each"
+    elif others:
+        got, advice = _advise_on_file(others[0]), ""
+    else:
+        got = (
+            "none; " if not tables else f"none, and {_list_first([file.name for file in tables])}, of no known format; "
+        )
+        advice = "give the folder that holds the pictures; docs/input.md lists the formats of poses"
+    return InputError(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP, HEIC or EXR), got {got}{advice}.")
+
+
+def _advise_on_file(file: Path) -> str:
+    """What a video or a file of a camera is, and what to do with it."""
+    if file.suffix.lower() in VIDEO_FILES:
+        return (
+            f"the video {file.name}; `pansplat pose {file} -o FOLDER` writes its key frames and their poses, then open "
+            "FOLDER"
+        )
+    return f"{file.name}, which the program of its camera must stitch; export it as a 2:1 JPG or MP4"
 
 
 def _list_first(names: list[str]) -> str:
@@ -446,8 +475,6 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
     """One entry of poses.json. `is_stated`: whether `convention` comes from the file."""
     source = f"{folder / _POSES}, {name!r}"
     image = folder / name
-    if not image.is_file():
-        raise InputError(f"{source}: needed the image {image}, got no such file; correct the name or add the file.")
     matrix, mask, depth, world = entry, None, None, 0
     if isinstance(entry, dict):
         key = next((key for key in _MATRIX_KEYS if key in entry), None)
@@ -470,9 +497,12 @@ def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -
     if entry.get(key) is None:
         return None
     path = folder / str(entry[key])
-    if not path.is_file():
+    if path.is_file():
+        return path
+    if key != "depth":
         raise InputError(f'{source}: needed the {key} file {path}, got no such file; correct or remove "{key}".')
-    return path
+    warnings.warn(f"{source}: its depth is left out: there is no file {path}.", InputWarning, stacklevel=5)
+    return None
 
 
 def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
@@ -651,9 +681,8 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
         )
     panoramas = []
     for frame, matrix in content.items():
-        image = next((folder / sub / frame for sub in _IMAGE_FOLDERS if (folder / sub / frame).is_file()), None)
-        if image is None:
-            raise InputError(f"{source}: needed the image {folder / 'image' / frame}, got no such file; add it.")
+        places = [folder / sub / frame for sub in _IMAGE_FOLDERS]
+        image = next((place for place in places if place.is_file()), places[0])
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, {frame!r}"), convention)
         panoramas.append(Panorama(image.stem, image, cam2world, find_mask(image, folder)))
     return Collection(source, tuple(panoramas), ordered=True, far=FAR_SEQUENCE)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,11 +138,11 @@ def _read_shape(path: Path) -> tuple[int, int, Crop | None]:
             head = file.read(32)
         if head.startswith(_EXR_MAGIC):
             return (*_exr_size(path), None)
-        with Image.open(path, formats=_list_formats(path, head)) as image:
+        with _quiet_pillow(), Image.open(path, formats=_list_formats(path, head)) as image:
             size = image.size
-            # Pillow would decode the pixels of a PNG to look for EXIF behind them.
-            is_quick = image.format == "PNG" and "exif" not in image.info
-            if not is_quick and image.getexif().get(_ORIENTATION) in _TURNED:
+            # Pillow would decode the pixels of a PNG to look for EXIF behind them, and turns the size of a TIFF itself.
+            is_done = image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info)
+            if not is_done and image.getexif().get(_ORIENTATION) in _TURNED:
                 size = size[::-1]
             return (*size, find_crop(parse_gpano(find_xmp(image)), *size))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
@@ -199,7 +201,7 @@ def require_panorama(path: Path | str) -> None:
     Raises:
         InputError: it is not.
     """
-    _check_two_to_one(Path(path), *read_size(path))
+    require_two_to_one(Path(path), *read_size(path))
     require_complete(path)
 
 
@@ -273,7 +275,7 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
                 f"metres, got pixels of type {image.mode}; convert it."
             )
         depth = np.asarray(image).astype(np.float32) / np.float32(1000)
-    _check_two_to_one(path, depth.shape[1], depth.shape[0])
+    require_two_to_one(path, depth.shape[1], depth.shape[0])
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
     rows = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)
     columns = ((np.arange(2 * height) + 0.5) * depth.shape[1] / (2 * height)).astype(int)
@@ -405,7 +407,8 @@ def _check_height(height: int) -> None:
         raise InputError(f"`height` must be at least 1 pixel, got {height}; choose one, such as 512.")
 
 
-def _check_two_to_one(path: Path, width: int, height: int) -> None:
+def require_two_to_one(path: Path, width: int, height: int) -> None:
+    """Check the proportions of a picture; the InputError says what to do with pictures of other ones."""
     if width != 2 * height:
         raise InputError(
             f"{path}: needed a 2:1 equirectangular panorama, got {width}x{height} (width x height); "
@@ -445,7 +448,7 @@ def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) ->
     decoded = _decode(path, height if reduced and crop is None else None)
     if crop is not None:
         return _pad_crop(decoded, crop)
-    _check_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
+    require_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
     if _is_dual_fisheye(decoded.color):
         raise InputError(
             f"{path}: needed an equirectangular panorama, got a dual fisheye picture; stitch it with the program of "
@@ -488,7 +491,7 @@ def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:
         return _decode_exr(path)
     if data.startswith(_PNG_MAGIC) and len(data) > 24 and data[24] == 16:
         return _decode_deep(path, data)
-    if data.startswith(_TIFF_MAGIC) and _is_deep_tiff(data):
+    if data.startswith(_TIFF_MAGIC) and _count_tiff_bits(data) > 8:
         return _decode_deep(path, data)
     image = _open_with_pillow(path, data, at_least)
     if "A" in image.getbands() or "transparency" in image.info:
@@ -507,8 +510,7 @@ def _open_with_pillow(
         orient: whether the orientation of EXIF is applied.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # panoramas of 100 megapixels are normal
+        with _quiet_pillow():
             image = Image.open(io.BytesIO(data), formats=_list_formats(path, data[:32]))
             if at_least is not None:
                 image.draft("RGB", (2 * at_least, at_least))
@@ -530,14 +532,23 @@ def _open_with_pillow(
         ) from error
 
 
-def _is_deep_tiff(data: bytes) -> bool:
-    """Whether the samples of a TIFF have more than 8 bits."""
+def _count_tiff_bits(data: bytes) -> int:
+    """Bits of a sample of a TIFF; 1 if its header cannot be read, which is reported later."""
     try:
-        with Image.open(io.BytesIO(data), formats=("TIFF",)) as image:
-            bits = image.tag_v2.get(_BITS_PER_SAMPLE, (1,))  # type: ignore[attr-defined]
+        with _quiet_pillow(), Image.open(io.BytesIO(data), formats=("TIFF",)) as image:
+            value = image.tag_v2.get(_BITS_PER_SAMPLE, 1)  # type: ignore[attr-defined]
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return False  # reported when it is decoded
-    return max(bits if isinstance(bits, tuple) else (bits,)) > 8
+        return 1
+    return max(value) if isinstance(value, tuple) else int(value)
+
+
+@contextmanager
+def _quiet_pillow() -> Iterator[None]:
+    """Without warnings of Pillow: panoramas of 100 megapixels are normal, and damaged files are an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        warnings.filterwarnings("ignore", module="PIL")
+        yield
 
 
 def _decode_deep(path: Path, data: bytes) -> _DecodedImage:
@@ -550,7 +561,8 @@ def _decode_deep(path: Path, data: bytes) -> _DecodedImage:
             f"{path}: needed a readable PNG or TIFF of 8 or 16 bits, got data that OpenCV cannot decode as such; "
             "export it again."
         )
-    orient = _ORIENT.get(image.getexif().get(_ORIENTATION, 1))
+    is_tiff = data.startswith(_TIFF_MAGIC)  # OpenCV turns a TIFF, whatever the flags, and Pillow removes its tag
+    orient = None if is_tiff else _ORIENT.get(image.getexif().get(_ORIENTATION, 1))
     array = array if orient is None else orient(array)
     values = array.astype(np.float32) / np.float32(65535)
     if values.ndim == 2:
