@@ -224,7 +224,9 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
         return [(folder, read_trajectory_folder(folder, convention))]
     if (source := find_reconstruction(folder)) is not None:
         given = None if convention is None else parse_convention(convention, "`convention`")
-        return [(folder, read_reconstruction(source, folder, given))]
+        found = read_reconstruction(source, folder, given)
+        is_joined = any(len(list_pictures(view.image)) > 1 for view in found.panoramas)
+        return [(folder, found if is_joined else _with_further(found))]
     if find_web_tour(folder) is not None:
         return []
     subfolders = _list_subfolders(folder, depth)
@@ -264,7 +266,7 @@ def _leave_out_damaged(collection: Collection) -> Collection:
 
 
 def _with_further(sequence: Collection) -> Collection:
-    """A sequence with the panoramas beside its frames that have no pose."""
+    """A sequence or reconstruction with the panoramas beside its frames that have no pose."""
     folders = tuple(dict.fromkeys(view.image.parent for view in sequence.panoramas))
     unposed = tuple(_list_further(sequence.source, folders, sequence.panoramas))
     return dataclasses.replace(sequence, unposed=unposed, folders=folders)

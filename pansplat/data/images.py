@@ -518,6 +518,10 @@ def _open_with_pillow(
                 image.load()
             return ImageOps.exif_transpose(image) if orient else image
     except Image.UnidentifiedImageError as error:
+        if data.startswith(_TIFF_MAGIC):  # its directory may be at the end
+            raise InputError(
+                f"{path}: needed a complete image, got damaged or truncated data; copy or export it again."
+            ) from error
         raise InputError(
             f"{path}: needed a JPG, PNG, TIFF, WebP, HEIC or EXR image, got an unknown format "
             f"(it starts with {data[:8]!r}); convert it."
