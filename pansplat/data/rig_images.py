@@ -20,8 +20,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
-from pansplat.data.cube_images import Decode, write_description
+from pansplat.data.cube_images import Decode, equirect_from_faces, write_description
 from pansplat.errors import InputError
+from pansplat.geometry.cubemap import face_rotations
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.strict_json import read_json, require_object
 
@@ -32,7 +33,7 @@ _LARGEST_DENSITY, _DENSITY = (
     1.5,
     1.28,
 )  # pixels of a picture for one of the panorama, above which it is reduced, and then
-_BLOCK = 64  # rows of samples at a time
+_CUBE_TOLERANCE = 1e-4  # radians, and of half a face
 _EDGE = 0.5  # pixels beyond the outermost pixel centres' edges that count as covered: rounding at common edges
 
 
@@ -107,12 +108,12 @@ class RigImage:
         Raises:
             InputError: a picture is missing or cannot be read.
         """
+        cube = self._find_cube()
+        if cube is not None:
+            return self._read_cube(cube, height, decode)
         pictures, lenses = [], []
         for view in self.views:
-            pixels = decode(view.file)
-            if view.mask is not None:
-                mask = cv2.resize(decode(view.mask), pixels.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-                pixels = np.concatenate((pixels, mask[..., :1]), axis=2)
+            pixels = _decode_view(view, decode)
             lens = view.lens.scaled(*pixels.shape[1::-1])
             ratio = max(lens.fx, lens.fy) * math.pi / height
             if ratio > _LARGEST_DENSITY:
@@ -121,37 +122,59 @@ class RigImage:
                 lens = lens.scaled(*size)
             pictures.append(pixels)
             lenses.append(lens)
-        rays = pixel_directions(_SAMPLES * height, 2 * _SAMPLES * height).numpy()
-        color = np.empty((height, 2 * height, 3), np.uint8)
-        shown = np.empty((height, 2 * height), np.float32)
-        for top in range(0, height, _BLOCK // _SAMPLES):
-            rows = slice(top, top + _BLOCK // _SAMPLES)
-            block = rays[_SAMPLES * rows.start : _SAMPLES * rows.stop]
-            samples = self._sample(block, pictures, lenses)
-            size = (2 * height, len(block) // _SAMPLES)
-            reduced = cv2.resize(samples, size, interpolation=cv2.INTER_AREA)
-            share = np.maximum(reduced[..., 3:], 1e-6)
-            color[rows] = np.rint((reduced[..., :3] / share).clip(0, 255))
-            shown[rows] = reduced[..., 3]
-        return color, None if shown.min() > 1 - 1e-6 else shown
-
-    def _sample(
-        self, rays: Float[Array, "row column 3"], pictures: list[UInt8[Array, "..."]], lenses: list[Lens]
-    ) -> Float[Array, "row column 4"]:
-        """Colours times shares, and the shares (0 or 1) that show the scene."""
-        chosen = self._choose_views(rays)
-        samples = np.zeros((*rays.shape[:2], 4), np.float32)
+        chosen = self._choose_views(pixel_directions(height, 2 * height).numpy())
+        color = np.zeros((height, 2 * height, 3), np.uint8)
+        shown = np.zeros((height, 2 * height), np.float32)
+        fine = pixel_directions(_SAMPLES * height, 2 * _SAMPLES * height)
+        rays = fine.reshape(height, _SAMPLES, 2 * height, _SAMPLES, 3).permute(0, 2, 1, 3, 4).flatten(2, 3).numpy()
         for number, (view, picture, lens) in enumerate(zip(self.views, pictures, lenses, strict=True)):
             here = chosen == number
             if not here.any():
                 continue
             local = rays[here] @ np.asarray(view.rotation, np.float32)
-            x = lens.fx * local[:, 0] / local[:, 2] + lens.cx - 0.5
-            y = lens.fy * local[:, 1] / local[:, 2] + lens.cy - 0.5
-            found = _remap(picture, x, y)
-            shown = found[:, 3:] >= 127.5 if picture.shape[2] == 4 else np.ones((len(found), 1), bool)
-            samples[here] = np.concatenate((found[:, :3], np.ones_like(found[:, :1])), axis=1) * shown
-        return samples
+            x = lens.fx * local[..., 0] / local[..., 2] + lens.cx - 0.5
+            y = lens.fy * local[..., 1] / local[..., 2] + lens.cy - 0.5
+            found = _remap(picture, x.reshape(-1), y.reshape(-1)).reshape(*x.shape, -1).mean(axis=1)
+            color[here] = np.rint(found[:, :3])
+            shown[here] = (found[:, 3] >= 127.5) if found.shape[1] == 4 else 1
+        return color, None if shown.all() else shown
+
+    def _find_cube(self) -> list[tuple[RigView, int]] | None:
+        """The pictures of the faces of a cube in the order of FACES, and their quarter turns; None for other rigs."""
+        if len(self.views) != 6:
+            return None
+        faces = []
+        for rotation in face_rotations().numpy():
+            turned = [rotation.T @ np.asarray(view.rotation) for view in self.views]
+            best = max(range(6), key=lambda number: turned[number][2, 2])
+            lens, roll = self.views[best].lens, turned[best]
+            half = np.array((lens.fx, lens.fy, lens.cx, lens.cy)) / (lens.width / 2)
+            turns = round(math.atan2(roll[1, 0], roll[0, 0]) / (math.pi / 2))
+            angle = turns * math.pi / 2
+            upright = np.array(((math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle))))
+            errors = np.abs(half - 1).max(), np.abs(roll[:2, :2] - upright).max(), 1 - roll[2, 2]
+            if lens.width != lens.height or max(errors) > _CUBE_TOLERANCE:
+                return None
+            faces.append((self.views[best], turns))
+        return faces
+
+    def _read_cube(
+        self, cube: list[tuple[RigView, int]], height: int, decode: Decode
+    ) -> tuple[UInt8[Array, "height width 3"], Float[Array, "height width"] | None]:
+        """`read` of the faces of a cube, whose samples continue across the edges."""
+        faces = [np.rot90(_decode_view(view, decode), -turns).copy() for view, turns in cube]
+        size = len(faces[0])
+        faces = [
+            face if len(face) == size else cv2.resize(face, (size, size), interpolation=cv2.INTER_AREA)
+            for face in faces
+        ]
+        color = equirect_from_faces([np.ascontiguousarray(face[..., :3]) for face in faces], height)
+        if all(face.shape[2] == 3 for face in faces):
+            return color, None
+        masks = [
+            np.repeat(face[..., 3:], 3, axis=2) if face.shape[2] == 4 else np.full_like(face, 255) for face in faces
+        ]
+        return color, (equirect_from_faces(masks, height)[..., 0] >= 128).astype(np.float32)
 
     def _choose_views(self, rays: Float[Array, "row column 3"]) -> Float[Array, "row column"]:
         """The picture whose edge is farthest from each direction; -1 where none shows it."""
@@ -168,6 +191,15 @@ class RigImage:
             best[better] = margin[better]
             chosen[better] = number
         return chosen
+
+
+def _decode_view(view: RigView, decode: Decode) -> UInt8[Array, "rows columns channel"]:
+    """The pixels of a picture, with its mask as a fourth channel."""
+    pixels = decode(view.file)
+    if view.mask is None:
+        return pixels
+    mask = cv2.resize(decode(view.mask), pixels.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return np.concatenate((pixels, mask[..., :1]), axis=2)
 
 
 def _remap(

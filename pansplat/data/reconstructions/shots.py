@@ -28,6 +28,7 @@ _SCALE = "scale.txt"
 _IMAGE_FOLDERS = ("images", "image", "panos", "frames", "input", ".")
 _SAME_PLACE = 1e-3  # distance of cameras of one rig, over the median distance of cameras from their mean
 _ROUNDING = 1e-5  # of positions in a file
+_AGREE = 0.999  # cosine between down axes
 _PANORAMIC = 0.6  # share of the sphere that the pictures of a panorama show; four side faces show two thirds
 _MIN_POINTS = 100  # to find near and far
 _NEAR_QUANTILE, _FAR_QUANTILE, _MARGIN = 0.01, 0.99, 2.0
@@ -216,10 +217,13 @@ def _group_by_place(shots: Sequence[Shot]) -> Iterable[list[Shot]]:
 def _make_rig(shots: Sequence[Shot]) -> tuple[RigImage, Float[Tensor, "4 4"]]:
     """The panorama of perspective pictures, and its pose.
 
-    Down is the mean of the pictures' down axes, and forward the direction of the first picture that is not vertical.
+    Down is that of three or more pictures that agree, or else the mean of all, and forward the direction of the first
+    picture that is not vertical.
     """
     poses = torch.stack([shot.cam2world for shot in shots])
-    down = poses[:, :3, 1].mean(dim=0)
+    agree = poses[:, :3, 1] @ poses[:, :3, 1].T > _AGREE
+    most = int(agree.sum(dim=1).argmax())
+    down = (poses[agree[most]] if int(agree[most].sum()) > 2 else poses)[:, :3, 1].mean(dim=0)
     down = poses[0, :3, 1] if float(down.norm()) < 0.1 else down / down.norm()
     flat = poses[:, :3, 2] - (poses[:, :3, 2] @ down)[:, None] * down
     first = int((flat.norm(dim=1) > 0.5).int().argmax())

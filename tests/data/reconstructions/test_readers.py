@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -81,21 +82,29 @@ def test_the_transform_and_scale_that_nerfstudio_applied_are_undone(
         np.testing.assert_allclose(panorama.cam2world, pose, atol=1e-9)
 
 
+@pytest.mark.parametrize("rolls", [{}, {"up": 90, "left": 180, "down": -90}, {"up": 20}])
 def test_nerfstudio_cube_faces_are_joined_to_panoramas(
-    tmp_path: Path, cameras: list[Array], write_view, face_cameras, check_colors
+    tmp_path: Path, cameras: list[Array], rolls: dict[str, float], write_view, face_cameras, check_colors
 ) -> None:
     frames, size = [], 48
     for name, pose in zip(("a", "b"), cameras, strict=False):
         for face, turned in face_cameras(pose).items():
             file = f"images/{name}_{face}.png"
+            turned[:3, :3] @= Rotation.from_euler("Z", rolls.get(face, 0), degrees=True).as_matrix()
             write_view(tmp_path / file, turned, (size / 2,) * 4, size, size)
             frames.append({"file_path": file, "transform_matrix": opengl(turned).tolist()})
     write_transforms(tmp_path, frames, camera_model="OPENCV", fl_x=24, fl_y=24, cx=24, cy=24, w=48, h=48)
     (pair,), panoramas = load(tmp_path)
     assert [view.name for view in panoramas] == ["a", "b"] and pair.name == tmp_path.name
     assert panoramas[0].image.parent.name == ".pansplat" and pair.image_height == 76
-    views = pair.load_context(64)
-    assert views.masks.all()
+    if 20 in rolls.values():  # no cube: two corners show nothing
+        with pytest.warns(InputWarning, match="in no picture"):
+            views = pair.load_context(64)
+        assert 0.95 < views.masks.float().mean() < 1
+        views = dataclasses.replace(views, images=torch.where(views.masks[:, None], views.images, torch.nan))
+    else:
+        views = pair.load_context(64)
+        assert views.masks.all()
     for image, found, pose in zip(views.images, views.cam2world, cameras, strict=False):
         np.testing.assert_allclose(found, pose, atol=1e-6)
         check_colors(image, found)
