@@ -6,6 +6,8 @@ Images are RGB in [0, 1] with the sRGB curve, as in JPG and PNG. EXR files hold 
 from __future__ import annotations
 
 import io
+import logging
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,6 +47,10 @@ _ORIENT = {
     2: lambda a: a[:, ::-1], 3: lambda a: a[::-1, ::-1], 4: lambda a: a[::-1], 5: lambda a: a.swapaxes(0, 1),
     6: lambda a: np.rot90(a, -1), 7: lambda a: a[::-1, ::-1].swapaxes(0, 1), 8: lambda a: np.rot90(a),
 }  # fmt: skip
+_DAMAGED = (  # what Pillow raises for damaged files; InputError is a ValueError
+    OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError,
+    RuntimeError, struct.error,
+)  # fmt: skip
 _BITS_PER_SAMPLE = 258  # tag of TIFF
 _DARK, _BRIGHT = 30, 60  # grey values, of the corners of a fisheye picture, and of what its circles show
 _WRAP = 16  # margin of the wrap-around at +-180 degrees for the resampling filter, target pixels
@@ -145,7 +151,7 @@ def _read_shape(path: Path) -> tuple[int, int, Crop | None]:
             if not is_done and image.getexif().get(_ORIENTATION) in _TURNED:
                 size = size[::-1]
             return (*size, find_crop(parse_gpano(find_xmp(image)), *size))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (*_DAMAGED, Image.DecompressionBombError) as error:
         if isinstance(error, InputError):
             raise
         return (*_open_with_pillow(path, _read_bytes(path), load=False).size, None)  # its error names the reason
@@ -530,7 +536,7 @@ def _open_with_pillow(
         raise InputError(f"{path}: needed at most about 13000x6500 pixels, got more ({error}); shrink it.") from error
     except InputError:
         raise
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
+    except _DAMAGED as error:
         raise InputError(
             f"{path}: needed a complete image, got damaged or truncated data ({error}); copy or export it again."
         ) from error
@@ -541,14 +547,15 @@ def _count_tiff_bits(data: bytes) -> int:
     try:
         with _quiet_pillow(), Image.open(io.BytesIO(data), formats=("TIFF",)) as image:
             value = image.tag_v2.get(_BITS_PER_SAMPLE, 1)  # type: ignore[attr-defined]
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+            return int(max(value) if isinstance(value, tuple) else value)
+    except (*_DAMAGED, Image.DecompressionBombError):
         return 1
-    return max(value) if isinstance(value, tuple) else int(value)
 
 
 @contextmanager
 def _quiet_pillow() -> Iterator[None]:
-    """Without warnings of Pillow: panoramas of 100 megapixels are normal, and damaged files are an error."""
+    """Without messages of Pillow: panoramas of 100 megapixels are normal, and damaged files are an error."""
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         warnings.filterwarnings("ignore", module="PIL")
@@ -559,7 +566,14 @@ def _decode_deep(path: Path, data: bytes) -> _DecodedImage:
     """A 16-bit PNG or TIFF at full precision, decoded by OpenCV; Pillow reduces colour to 8 bits."""
     image = _open_with_pillow(path, data, orient=False)  # refuses truncated data
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    array = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    level = cv2.utils.logging.getLogLevel()
+    try:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below is one line
+        array = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        array = None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if array is None or array.dtype != np.uint16:
         raise InputError(
             f"{path}: needed a readable PNG or TIFF of 8 or 16 bits, got data that OpenCV cannot decode as such; "

@@ -71,7 +71,7 @@ def read_colmap(source: Path, folder: Path, convention: str | None = None) -> Re
         images = list(read_images(source))
         points_file = source.with_stem("points3D")
         points = np.array(list(islice(read_points(points_file), _MAX_POINTS)) if points_file.is_file() else [])
-    except (ValueError, IndexError, KeyError, struct.error, UnicodeDecodeError) as error:
+    except (ValueError, IndexError, KeyError, OverflowError, struct.error) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(
