@@ -20,7 +20,8 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from pansplat.data.poses import rigid_matrix, to_cam2world
-from pansplat.data.reconstructions.shots import Lens, Reconstruction, Shot, find_picture
+from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
+from pansplat.data.rig_images import Lens
 from pansplat.errors import InputError
 from pansplat.files import read_file
 from pansplat.geometry.pose import invert_pose, quats_from_rotations, rotations_from_quats

@@ -24,7 +24,8 @@ from torch import Tensor
 from pansplat.atomic import replacing
 from pansplat.data.images import read_size
 from pansplat.data.poses import from_cam2world, rigid_matrix, to_cam2world
-from pansplat.data.reconstructions.shots import Lens, Reconstruction, Shot, find_picture
+from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
+from pansplat.data.rig_images import Lens
 from pansplat.errors import InputError
 from pansplat.files import read_file
 from pansplat.geometry.pose import invert_pose

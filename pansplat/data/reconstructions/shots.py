@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pansplat.data.images import READABLE_SUFFIXES
 from pansplat.data.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
 from pansplat.data.poses import read_number
 from pansplat.data.rig_images import Lens, RigImage, RigView, write_rig
@@ -85,13 +86,10 @@ def find_picture(folder: Path, name: str, *more: Path) -> Path | None:
             return candidate
     for base in bases:  # a label without a suffix
         found = sorted(base.glob(f"{_escape(last)}.*")) if last and base.is_dir() else []
-        pictures = [file for file in found if file.suffix.lower() in _SUFFIXES and file.is_file()]
+        pictures = [file for file in found if file.suffix.lower() in READABLE_SUFFIXES and file.is_file()]
         if pictures:
             return pictures[0]
     return None
-
-
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr", ".tif", ".tiff", ".heic", ".heif")
 
 
 def _escape(text: str) -> str:
