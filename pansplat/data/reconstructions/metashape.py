@@ -4,8 +4,8 @@ The transform of a camera is cam2world in the frame of the chunk (or component),
 chunk has a rotation, a translation and a scale to the world. The translation is left out: in a geographic system its
 origin is the centre of the Earth. With a scale the unit is the metre, otherwise it is arbitrary.
 
-Source: Metashape Python Reference, Camera.transform, Chunk.transform; Agisoft Metashape User Manual, appendix C
-(Camera models); nerfstudio.process_data.metashape_utils
+Source: https://github.com/agisoft-llc/metashape-scripts, src/render_spherical_panorama.py (a basis right, up, back
+becomes a camera by Scale(1, -1, -1)); nerfstudio.process_data.metashape_utils (the fields of the XML)
 """
 
 from __future__ import annotations
