@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -51,6 +52,35 @@ def replacing(path: Path | str, *, failures: tuple[type[Exception], ...] = ()) -
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `folder`, which gets its name when the block succeeds.
+
+    Args:
+        folder: does not exist, or is empty; its parents are made.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    folder = Path(os.path.abspath(folder))
+    temporary = folder.with_name(f".{folder.name[:_MAX_STEM]}.{secrets.token_hex(4)}")
+    try:
+        temporary.mkdir(parents=True)
+        yield temporary
+        if folder.is_dir():
+            folder.rmdir()
+        os.replace(temporary, folder)
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(
+            f"cannot write {folder}: needed a writable folder with free disk space, got '{error.strerror or error}'; "
+            "choose another folder"
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def is_unfinished(path: Path) -> bool:

@@ -285,7 +285,14 @@ def own_warnings() -> Iterator[None]:
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=InputWarning)
         warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(_viewer)?(\.|$)")
-        warnings.showwarning = lambda message, *_: print_message("note", message)
+        printed: set[str] = set()
+
+        def print_once(message: Warning | str, *_: object) -> None:
+            if str(message) not in printed:  # a picture may be read several times
+                printed.add(str(message))
+                print_message("note", message)
+
+        warnings.showwarning = print_once
         yield
 
 

@@ -115,6 +115,17 @@ def require_output_folder(option: str, folder: Path) -> None:
         raise InputError(f"{option} {folder}: needed a writable folder, got {existing}, which is read-only; {advice}")
 
 
+def require_new_folder(option: str, folder: Path) -> None:
+    """Check that a folder can be made, before the work: it does not exist, or is empty. Arguments as above.
+
+    Raises:
+        InputError: it holds files, or cannot be made.
+    """
+    require_output_folder(option, folder)
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{option} {folder}: needed a new or empty folder, got one with files; choose another name")
+
+
 def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = ()) -> None:
     """Check that a file can be written, before the work.
 

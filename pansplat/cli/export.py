@@ -1,4 +1,4 @@
-"""`pansplat export`: a scene or tour in the formats of other programs, as a web page, or as a floor plan."""
+"""`pansplat export`: a scene or tour in the formats of other programs, as a web page, floor plan or training set."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, ScenePrediction, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import SCENE_SUFFIXES, find_scene_suffix, is_scene_file, require_output_file
+from pansplat.files import (
+    SCENE_SUFFIXES,
+    find_scene_suffix,
+    is_scene_file,
+    require_new_folder,
+    require_output_file,
+)
 from pansplat.options import WHOLE, Count, Fraction, Range
 
 if TYPE_CHECKING:
@@ -24,18 +30,20 @@ if TYPE_CHECKING:
 _PAGE_SUFFIX, _PLAN_SUFFIX = ".html", ".png"
 _FEW_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # of a panorama in a page
 _MOST_GAUSSIANS = 2_000_000  # of a page in one file
+_MIN_POINT_OPACITY, _MOST_POINTS = 0.1, 200_000  # of the points to train from
 
 
 @dataclass(frozen=True)
 class Export:
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
-    web page (.html, docs/web.md) or as a floor plan (.png)."""
+    web page (.html, docs/web.md), as a floor plan (.png), or as a folder to train further from (a name without
+    suffix): cube faces, poses and points for COLMAP, nerfstudio, gsplat and brush."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .png for a floor
-    plan."""
+    plan; a new folder, without a suffix, for cube faces with poses."""
     points: bool = False
     """Write a .ply of plain points with colours, for programs without Gaussians."""
     degree: Annotated[int, Range(0, 4), WHOLE] | None = None
@@ -64,15 +72,22 @@ class Export:
         from pansplat.gaussians.scene import prune
         from pansplat.tours import write_floor_plan
 
-        require_output_file("--out", self.out, (*SCENE_SUFFIXES, _PAGE_SUFFIX, _PLAN_SUFFIX))
+        is_dataset = not self.out.suffix
+        if is_dataset:
+            require_new_folder("--out", self.out)
+        else:
+            require_output_file("--out", self.out, (*SCENE_SUFFIXES, _PAGE_SUFFIX, _PLAN_SUFFIX))
         is_page, is_plan = (self.out.suffix.lower() == suffix for suffix in (_PAGE_SUFFIX, _PLAN_SUFFIX))
-        if self.points and (is_page or is_plan or find_scene_suffix(self.out) != ".ply"):
+        if self.points and (is_page or is_plan or is_dataset or find_scene_suffix(self.out) != ".ply"):
             raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
         if not is_page and (self.gaussians is not None or self.split or self.serve or self.title is not None):
             names = "--gaussians, --split, --serve and --title"
             raise InputError(f"{names} are for an .html page, got {self.out}; leave them out")
         if self.up is not None and not is_scene_file(self.path):
             raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
+        if is_dataset:
+            self._write_dataset()
+            return 0
         scene = self._open(is_page or is_plan)
         if self.up is not None:
             scene = scene.rotated(_rotation_from(self.up))
@@ -112,6 +127,42 @@ class Export:
             file=sys.stderr,
         )
         return fuse_views(scene)
+
+    def _write_dataset(self) -> None:
+        """Write cube faces, poses and points to a new folder."""
+        import torch
+
+        from pansplat.atomic import replacing_folder
+        from pansplat.data.pairs import Pair
+        from pansplat.data.reconstructions.dataset import POINTS, PosedPanorama, write_dataset
+        from pansplat.data.reconstructions.nerfstudio import Z_UP
+        from pansplat.gaussians.ply import make_colors, save_points
+        from pansplat.gaussians.scene import prune
+
+        if is_scene_file(self.path):
+            raise InputError(
+                f"{self.path}: needed the folder of the panoramas to write their cube faces, got a scene file; give "
+                "the folder"
+            )
+        scene, source = self.prediction.open_panoramas(self.path, joint=not self.layers)
+        gaussians = prune(scene.gaussians, degree=0, min_opacity=max(self.min_opacity, _MIN_POINT_OPACITY))
+        gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
+        if len(gaussians) > _MOST_POINTS:
+            chosen = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))[:_MOST_POINTS]
+            gaussians = gaussians.select(chosen.sort().values)
+        panoramas = source.context if isinstance(source, Pair) else source.panoramas
+        views = [
+            PosedPanorama(panorama, pose, source.siblings)
+            for panorama, pose in zip(panoramas, scene.cam2world, strict=True)
+        ]
+        means, colors = gaussians.means.double().cpu().numpy(), make_colors(gaussians).cpu().numpy()
+        with replacing_folder(self.out) as folder, progress_bar() as progress:
+            count = write_dataset(folder, views, means, colors, progress)
+            save_points(gaussians.rotated(Z_UP[:3, :3]), folder / POINTS)
+        print(
+            f"{self.out}: {count} cube faces of {len(views)} panoramas, {len(gaussians):,} points; sparse/0 is a model "
+            "of COLMAP, transforms.json is for nerfstudio"
+        )
 
     def _count_of_page(self) -> int:
         """The largest number of Gaussians of a page."""

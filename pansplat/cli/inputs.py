@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
     from pansplat.predictor import Predictor, Progress
+    from pansplat.tours import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
 OptionalOut = Annotated[Path | None, arg(aliases=["-o"])]
@@ -96,14 +97,21 @@ class ScenePrediction:
             joint: see `pansplat.predict`; a scene file is returned as it is.
         """
         from pansplat import pipeline
+
+        return pipeline.load(path) if is_scene_file(path) else self.open_panoramas(path, gaussians, joint=joint)[0]
+
+    def open_panoramas(
+        self, path: Path, gaussians: int | None = None, *, joint: bool = False
+    ) -> tuple[Scene, Pair | TourGraph]:
+        """The scene of the chosen pair, or of the first tour of a folder, and its panoramas in the scene's order."""
+        from pansplat import pipeline
         from pansplat.tours import connect, find_tours
 
-        if is_scene_file(path):
-            return pipeline.load(path)
         pairs = load_choice(path, self.choice)
         tours = find_tours(pairs) if self.choice.pair is None else []
         if not tours:
-            return self._predict_pair(pick_pair(path, pairs, self.choice), gaussians, joint)
+            pair = pick_pair(path, pairs, self.choice)
+            return self._predict_pair(pair, gaussians, joint), pair
         alone = sum(a == b for a, b in tours[0].overlaps)
         kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
         more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
@@ -112,8 +120,9 @@ class ScenePrediction:
         )
         model = self.model.load()
         with progress_bar() as progress:
-            return pipeline.predict_tour(
-                connect(tours[0], progress),
+            tour = connect(tours[0], progress)
+            scene = pipeline.predict_tour(
+                tour,
                 model,
                 height=self.predict_height,
                 refine_seconds=self._choose_seconds(None, joint),
@@ -121,6 +130,7 @@ class ScenePrediction:
                 joint=joint,
                 progress=progress,
             )
+        return scene, tour
 
     def _predict_pair(self, pair: Pair, gaussians: int | None = None, joint: bool = False) -> Scene:
         return predict_scene(

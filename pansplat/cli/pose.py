@@ -37,12 +37,13 @@ class Pose:
 
     def run(self) -> int:
         """Estimate, print the table and write the file."""
+        from pansplat.data.folders import VIDEO_FILES
         from pansplat.poses.estimate import estimate_poses
         from pansplat.poses.files import SUFFIXES, write_poses
 
         if not self.paths:
             raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
-        is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in (".mp4", ".mov", ".mkv", ".webm")
+        is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in VIDEO_FILES
         if self.out is not None and is_video:
             require_output_folder("--out", self.out)
         elif self.out is not None:

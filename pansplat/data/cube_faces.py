@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -79,7 +79,27 @@ def group_faces(images: Sequence[Path]) -> tuple[dict[str, CubeImage], list[Path
         name = name or files[0].parent.resolve().name
         level = CubeLevel(size, size, tuple(file.name for file in files))
         cubes[name if name not in cubes else f"{name}_{len(cubes)}"] = CubeImage(files[0].parent, (level,))
+    _note_missing_faces(groups, used)
     return cubes, [image for image in images if image not in used]
+
+
+def _note_missing_faces(groups: Mapping[tuple[str, str, int], Mapping[str, Path]], used: set[Path]) -> None:
+    """Warn about sets of four or five square pictures with the names of faces."""
+    largest: dict[tuple[str, str], tuple[int, Mapping[str, Path]]] = {}
+    for (name, suffix, number), group in groups.items():
+        if len(group) > len(largest.get((name, suffix), (0, {}))[1]):
+            largest[name, suffix] = number, group
+    for number, group in largest.values():
+        files = list(group.values())
+        if not 4 <= len(files) < 6 or used & set(files) or not all(_is_square(file) for file in files):
+            continue
+        missing = ", ".join(f"_{ending}" for ending in _ENDINGS[number] if ending not in group)
+        warnings.warn(
+            f"{files[0].parent}: needed six cube faces, got {', '.join(file.name for file in files)}; add the picture "
+            f"whose name ends in {missing}.",
+            category=InputWarning,
+            stacklevel=4,
+        )
 
 
 def _is_square(file: Path) -> bool:

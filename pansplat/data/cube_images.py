@@ -14,7 +14,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,6 +120,10 @@ class CubeImage:
         """Height of the equirectangular panorama that has the detail of the largest level, pixels."""
         return 2 * self.levels[-1].size
 
+    def list_files(self) -> Iterator[Path]:
+        """All pictures."""
+        return (self.folder / file for level in self.levels for file in level.list_files())
+
     def read(self, height: int, decode: Decode) -> UInt8[Array, "height width 3"]:
         """The equirectangular panorama at (height, 2 height).
 
@@ -131,9 +135,17 @@ class CubeImage:
 
 
 def write_cube(cube: CubeImage, folder: Path, name: str) -> Path:
-    """Write the file that stands for a cube, if its content has changed; it changes with every picture's time or size.
+    """Write the file that stands for a cube; see `write_description`."""
+    content = {"folder": str(cube.folder.resolve()), "levels": [dataclasses.asdict(level) for level in cube.levels]}
+    return write_description(content, cube.list_files(), folder, name + CUBE_SUFFIX)
+
+
+def write_description(content: dict[str, Any], pictures: Iterable[Path], folder: Path, name: str) -> Path:
+    """Write a file that stands for a panorama, if it has changed; it changes with every picture's time or size.
 
     Args:
+        content: of the file.
+        pictures: that the panorama is made from.
         folder: of the tour, in whose cache folder the file is written.
         name: valid as a file name.
 
@@ -141,17 +153,15 @@ def write_cube(cube: CubeImage, folder: Path, name: str) -> Path:
         InputError: there is no writable cache folder.
     """
     digest = hashlib.blake2b(digest_size=12)
-    for level in cube.levels:
-        for file in level.list_files():
-            status = os.stat(cube.folder / file)
-            digest.update(b"%d %d;" % (status.st_size, status.st_mtime_ns))
-    content = {"folder": str(cube.folder.resolve()), "levels": [dataclasses.asdict(level) for level in cube.levels]}
+    for picture in pictures:
+        status = os.stat(picture)
+        digest.update(b"%d %d;" % (status.st_size, status.st_mtime_ns))
     text = json.dumps(content | {"pictures": digest.hexdigest()}).encode()
     folders = cache_folders(folder)
-    for path in (cache / (name + CUBE_SUFFIX) for cache in folders):
+    for path in (cache / name for cache in folders):
         if path.is_file() and read_file(path) == text:
             return path
-    written = write_cache_file(folders, name + CUBE_SUFFIX, text)
+    written = write_cache_file(folders, name, text)
     if written is None:
         raise InputError(
             f"{folder}: needed a writable cache folder for the cube faces, got none of {folders}; make one."

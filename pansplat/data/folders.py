@@ -46,12 +46,16 @@ from pansplat.data.photographs import (
 )
 from pansplat.data.placements import Placement, is_by_hand, judge, read_rejected, read_ties
 from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
+from pansplat.data.reconstructions import find_reconstruction, read_reconstruction
 from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import expand_home, read_file
 from pansplat.strict_json import list_field, number_field, read_json, require_object
 
 _POSES, _PAIRS = "poses.json", "pairs.json"
+VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
+_RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
+_TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # that may hold poses
 _CAMERA_POSES = "camera_pose.json"  # of 360Loc
 
 _MAX_WORLD = 9999  # of poses.json
@@ -68,8 +72,9 @@ def load_pairs(
 
     Args:
         path: a panorama; a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the
-            formats of docs/input.md (poses.json, PanoGRF, 360Loc, KITTI, TUM, game-map triplets); or one of their files
-            with poses. A folder or web tour of a single panorama is a pair of one view.
+            formats of docs/input.md (poses.json, nerfstudio, COLMAP, openMVG, OpenSfM, Metashape, PanoGRF, 360Loc,
+            KITTI, TUM, game-map triplets); or one of their files with poses. A folder or web tour of a single panorama
+            is a pair of one view.
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
 
@@ -80,6 +85,8 @@ def load_pairs(
     root = expand_home(path)
     if not root.exists():
         raise InputError(f"{root}: needed a panorama, or a folder of panoramas, got no such path; check it.")
+    if root.is_file() and root.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES):
+        raise InputError(f"{root}: needed panoramas, got {_advise_on_file(root)}.")
     try:
         if root.suffix.lower() in READABLE_SUFFIXES and root.is_file():
             return single_view_pairs([read_photograph(root)], root.parent, near, far)
@@ -107,14 +114,17 @@ def load_pairs(
 
 
 def _is_pose_file(file: Path) -> bool:
-    return file.name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS) or file == find_trajectory(file.parent)
+    stated = file.name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS)
+    return stated or file in (find_trajectory(file.parent), find_reconstruction(file.parent))
 
 
 def list_stated_files(folder: Path) -> list[Path]:
     """The files of a folder that state poses, pairs, links or a web tour; those of fixed names need not exist."""
     files = [folder / name for name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS)]
     try:
-        others = (find_trajectory(folder), find_web_tour(folder), *triplet_files(folder))
+        others = (
+            find_trajectory(folder), find_reconstruction(folder), find_web_tour(folder), *triplet_files(folder)
+        )  # fmt: skip
     except (OSError, InputError):
         return files
     return files + [file for file in others if file is not None]
@@ -212,6 +222,11 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
         return [(folder, read_triplet(path, convention)) for path in triplets]
     if find_trajectory(folder) is not None:
         return [(folder, read_trajectory_folder(folder, convention))]
+    if (source := find_reconstruction(folder)) is not None:
+        given = None if convention is None else parse_convention(convention, "`convention`")
+        found = read_reconstruction(source, folder, given)
+        is_joined = any(len(list_pictures(view.image)) > 1 for view in found.panoramas)
+        return [(folder, found if is_joined else _with_further(found))]
     if find_web_tour(folder) is not None:
         return []
     subfolders = _list_subfolders(folder, depth)
@@ -227,6 +242,11 @@ def _leave_out_damaged(collection: Collection) -> Collection:
     problems: dict[int, InputError] = {}
     for number, panorama in enumerate(collection.panoramas):
         try:
+            if not panorama.image.is_file():
+                raise InputError(
+                    f"{collection.source}: needed the image {panorama.image}, got no such file; correct the name or "
+                    "add the file."
+                )
             require_panorama(panorama.image)
         except InputError as error:
             problems[number] = error
@@ -246,7 +266,7 @@ def _leave_out_damaged(collection: Collection) -> Collection:
 
 
 def _with_further(sequence: Collection) -> Collection:
-    """A sequence with the panoramas beside its frames that have no pose."""
+    """A sequence or reconstruction with the panoramas beside its frames that have no pose."""
     folders = tuple(dict.fromkeys(view.image.parent for view in sequence.panoramas))
     unposed = tuple(_list_further(sequence.source, folders, sequence.panoramas))
     return dataclasses.replace(sequence, unposed=unposed, folders=folders)
@@ -265,7 +285,7 @@ def _find_panorama_folders(folder: Path, depth: int) -> list[Path]:
     has_poses = (folder / _POSES).exists() or is_loc360_sequence(folder) or is_matterport3d_scene(folder)
     if has_poses or triplet_files(folder) or find_trajectory(folder) is not None or list_panorama_files(folder):
         return [folder]
-    if find_web_tour(folder) is not None:
+    if find_reconstruction(folder) is not None or find_web_tour(folder) is not None:
         return [folder]
     return [found for sub in _list_subfolders(folder, depth) for found in _find_panorama_folders(sub, depth - 1)]
 
@@ -282,19 +302,38 @@ class UnposedPanoramasError(InputError):
     def __init__(self, folder: Path, panoramas: list[Panorama]) -> None:
         names = _list_first([panorama.image.name for panorama in panoramas])
         super().__init__(
-            f"{folder}: needed poses for the panoramas, got images only ({names}); add a pose file (docs/input.md)."
+            f"{folder}: needed poses for the panoramas, got images only ({names}); run `pansplat pose {folder} -o "
+            f"{folder / _POSES}`, or add a pose file (docs/input.md)."
         )
         self.folder = folder
         self.panoramas = panoramas
 
 
 def _nothing_found(root: Path) -> InputError:
-    inside = _list_first([str(folder.relative_to(root)) for folder in find_panorama_folders(root) if folder != root])
-    got = f"some without poses in {inside}" if inside else "none"
-    return InputError(
-        f"{root}: needed panoramas (JPG, PNG, WebP or EXR), got {got}; give the folder that "
-        "holds them, or a folder whose subfolders have pose files (docs/input.md)."
-    )
+    inside = [folder for folder in find_panorama_folders(root) if folder != root]
+    others = [file for file in sorted(root.iterdir()) if file.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES)]
+    tables = [file for file in sorted(root.iterdir()) if file.suffix.lower() in _TABLE_SUFFIXES and file.is_file()]
+    if inside:
+        got = f"some without poses in {_list_first([str(folder.relative_to(root)) for folder in inside])}; "
+        advice = f"open one of these folders, or run `pansplat pose {inside[0]} -o {inside[0] / _POSES}` for each"
+    elif others:
+        got, advice = _advise_on_file(others[0]), ""
+    else:
+        got = (
+            "none; " if not tables else f"none, and {_list_first([file.name for file in tables])}, of no known format; "
+        )
+        advice = "give the folder that holds the pictures; docs/input.md lists the formats of poses"
+    return InputError(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP, HEIC or EXR), got {got}{advice}.")
+
+
+def _advise_on_file(file: Path) -> str:
+    """What a video or a file of a camera is, and what to do with it."""
+    if file.suffix.lower() in VIDEO_FILES:
+        return (
+            f"the video {file.name}; `pansplat pose {file} -o FOLDER` writes its key frames and their poses, then open "
+            "FOLDER"
+        )
+    return f"{file.name}, which the program of its camera must stitch; export it as a 2:1 JPG or MP4"
 
 
 def _list_first(names: list[str]) -> str:
@@ -438,8 +477,6 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
     """One entry of poses.json. `is_stated`: whether `convention` comes from the file."""
     source = f"{folder / _POSES}, {name!r}"
     image = folder / name
-    if not image.is_file():
-        raise InputError(f"{source}: needed the image {image}, got no such file; correct the name or add the file.")
     matrix, mask, depth, world = entry, None, None, 0
     if isinstance(entry, dict):
         key = next((key for key in _MATRIX_KEYS if key in entry), None)
@@ -462,9 +499,12 @@ def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -
     if entry.get(key) is None:
         return None
     path = folder / str(entry[key])
-    if not path.is_file():
+    if path.is_file():
+        return path
+    if key != "depth":
         raise InputError(f'{source}: needed the {key} file {path}, got no such file; correct or remove "{key}".')
-    return path
+    warnings.warn(f"{source}: its depth is left out: there is no file {path}.", InputWarning, stacklevel=5)
+    return None
 
 
 def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
@@ -643,9 +683,8 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
         )
     panoramas = []
     for frame, matrix in content.items():
-        image = next((folder / sub / frame for sub in _IMAGE_FOLDERS if (folder / sub / frame).is_file()), None)
-        if image is None:
-            raise InputError(f"{source}: needed the image {folder / 'image' / frame}, got no such file; add it.")
+        places = [folder / sub / frame for sub in _IMAGE_FOLDERS]
+        image = next((place for place in places if place.is_file()), places[0])
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, {frame!r}"), convention)
         panoramas.append(Panorama(image.stem, image, cam2world, find_mask(image, folder)))
     return Collection(source, tuple(panoramas), ordered=True, far=FAR_SEQUENCE)

@@ -6,7 +6,11 @@ Images are RGB in [0, 1] with the sRGB curve, as in JPG and PNG. EXR files hold 
 from __future__ import annotations
 
 import io
+import logging
+import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,28 +26,47 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from pansplat.atomic import replacing
-from pansplat.data.cube_images import CUBE_SUFFIX, read_cube
-from pansplat.data.panorama_metadata import make_gpano_xmp
+from pansplat.data.cube_images import CUBE_SUFFIX, CubeImage, read_cube
+from pansplat.data.panorama_metadata import Crop, find_crop, find_xmp, make_gpano_xmp, parse_gpano
+from pansplat.data.rig_images import RIG_SUFFIX, RigImage, read_rig
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import read_file, require_file
 
-READABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
+WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
+READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff", ".heic", ".heif")
 
-_PILLOW_FORMATS = ("JPEG", "PNG", "WEBP")
+_PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
+_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
+_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MAX_BYTES = 1 << 31
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _JPEG_MAGIC, _JPEG_END, _PNG_MAGIC = b"\xff\xd8", b"\xff\xd9", b"\x89PNG"
 _TAIL = 4096  # bytes at the end of a file that are read to find the end of a JPEG
 _ORIENTATION, _TURNED = 0x0112, (5, 6, 7, 8)  # tag of EXIF, and its values for a quarter turn
+_ORIENT = {
+    2: lambda a: a[:, ::-1], 3: lambda a: a[::-1, ::-1], 4: lambda a: a[::-1], 5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: np.rot90(a, -1), 7: lambda a: a[::-1, ::-1].swapaxes(0, 1), 8: lambda a: np.rot90(a),
+}  # fmt: skip
+_DAMAGED = (  # what Pillow raises for damaged files; InputError is a ValueError
+    OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError,
+    RuntimeError, struct.error,
+)  # fmt: skip
+_BITS_PER_SAMPLE = 258  # tag of TIFF
+_DARK, _BRIGHT = 30, 60  # grey values, of the corners of a fisheye picture, and of what its circles show
 _WRAP = 16  # margin of the wrap-around at +-180 degrees for the resampling filter, target pixels
 
 
 @dataclass(frozen=True, eq=False)
 class _DecodedImage:
-    """Pixels of a file: `color` (H W 3) uint8 or float32 in [0, 1]; `alpha` (H W) in [0, 1] or None."""
+    """Pixels of a file: `color` (H W 3) uint8 or float32 in [0, 1]; `alpha` (H W) in [0, 1] or None.
+
+    Attributes:
+        hole: what pixels without alpha are.
+    """
 
     color: NDArray[Any]
     alpha: NDArray[Any] | None
+    hole: str = "is transparent; these pixels are masked. Remove the alpha channel if they show the scene"
 
 
 def srgb_from_linear(linear: NDArray[Any]) -> NDArray[Any]:
@@ -66,12 +89,12 @@ def read_panorama(
     The image is resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees.
 
     Args:
-        path: JPG, PNG (8 or 16 bit), WebP or EXR file, 2:1; or a file that stands for cube faces
-            (pansplat.data.cube_images).
+        path: JPG, PNG and TIFF (8 or 16 bit), WebP, HEIC or EXR file, 2:1 or a crop with GPano properties; or a file
+            that stands for cube faces or perspective pictures (pansplat.data.cube_images, .rig_images).
         height: pixels.
 
     Raises:
-        InputError: no such file, unknown format, damaged or truncated data, not 2:1, NaN.
+        InputError: no such file, unknown format, damaged or truncated data, not 2:1, NaN, a dual fisheye picture.
     """
     decoded = _decode_panorama(path, height)
     image = resize_panorama(decoded.color, height)
@@ -79,8 +102,7 @@ def read_panorama(
         return image, torch.ones(height, 2 * height, dtype=torch.bool)
     opaque = _resize_plane(decoded.alpha, height, Image.Resampling.BOX) >= 0.5
     warnings.warn(
-        f"{path}: {100 * (1 - opaque.mean()):.1f}% of the image is transparent; these pixels are masked. "
-        "Remove the alpha channel if they show the scene.",
+        f"{path}: {100 * (1 - opaque.mean()):.1f}% of the image {decoded.hole}.",
         category=InputWarning,
         stacklevel=2,
     )
@@ -97,32 +119,71 @@ def read_height(path: Path | str) -> int:
 
 
 def read_size(path: Path | str) -> tuple[int, int]:
-    """Width and height of an image file, pixels; see `read_height`."""
+    """Width and height of an image file, pixels, of a crop those of the full panorama; see `read_height`."""
     path = Path(path)
-    if is_cube(path):
-        height = read_cube(path).height
+    if is_assembled(path):
+        height = _read_assembled(path).height
         return 2 * height, height
+    width, height, crop = _read_shape(path)
+    return (width, height) if crop is None else (2 * crop.height, crop.height)
+
+
+def read_crop(path: Path) -> Crop | None:
+    """The place of a picture in its full panorama, by its GPano properties; None if it is one, or cannot be read."""
+    try:
+        return None if is_assembled(path) else _read_shape(path)[2]
+    except InputError:
+        return None
+
+
+def _read_shape(path: Path) -> tuple[int, int, Crop | None]:
+    """Width and height of an image file as it is, and its crop."""
     require_file(path, "a readable image file")
     try:
         with open(path, "rb") as file:
-            is_exr = file.read(len(_EXR_MAGIC)) == _EXR_MAGIC
-        if not is_exr:
-            with Image.open(path, formats=_PILLOW_FORMATS) as image:
-                if image.format == "PNG" and "exif" not in image.info:
-                    return image.size  # Pillow would decode the pixels to look for EXIF behind them
-                is_turned = image.getexif().get(_ORIENTATION) in _TURNED
-                return image.size[::-1] if is_turned else image.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return _open_with_pillow(path, _read_bytes(path), load=False).size  # its error names the reason
-    return _exr_size(path)
+            head = file.read(32)
+        if head.startswith(_EXR_MAGIC):
+            return (*_exr_size(path), None)
+        with _quiet_pillow(), Image.open(path, formats=_list_formats(path, head)) as image:
+            size = image.size
+            # Pillow would decode the pixels of a PNG to look for EXIF behind them, and turns the size of a TIFF itself.
+            is_done = image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info)
+            if not is_done and image.getexif().get(_ORIENTATION) in _TURNED:
+                size = size[::-1]
+            return (*size, find_crop(parse_gpano(find_xmp(image)), *size))
+    except (*_DAMAGED, Image.DecompressionBombError) as error:
+        if isinstance(error, InputError):
+            raise
+        return (*_open_with_pillow(path, _read_bytes(path), load=False).size, None)  # its error names the reason
+
+
+def _list_formats(path: Path, head: bytes) -> tuple[str, ...]:
+    """Pillow's names of the formats of a file that starts with some bytes."""
+    if head[4:8] != b"ftyp" or head[8:12] not in _HEIF_BRANDS:
+        return _PILLOW_FORMATS
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise InputError(
+            f"{path}: needed pillow-heif to read HEIC, got no such package; install it (pip install pillow-heif), or "
+            "convert the picture to JPG."
+        ) from error
+    pillow_heif.register_heif_opener()
+    return ("HEIF",)
+
+
+def is_assembled(path: Path) -> bool:
+    """Whether a file stands for the cube faces or perspective pictures of a panorama."""
+    return path.name.endswith((CUBE_SUFFIX, RIG_SUFFIX))
+
+
+def _read_assembled(path: Path) -> CubeImage | RigImage:
+    return read_rig(path) if path.name.endswith(RIG_SUFFIX) else read_cube(path)
 
 
 def list_pictures(path: Path) -> list[Path]:
-    """The image file, or those of the cube faces that it stands for."""
-    if not is_cube(path):
-        return [path]
-    cube = read_cube(path)
-    return [cube.folder / file for level in cube.levels for file in level.list_files()]
+    """The image file, or those of the pictures that it stands for."""
+    return list(_read_assembled(path).list_files()) if is_assembled(path) else [path]
 
 
 def require_complete(path: Path | str) -> None:
@@ -135,8 +196,9 @@ def require_complete(path: Path | str) -> None:
     """
     path = Path(path)
     require_file(path, "a readable image file")
-    if not _is_complete(path):
-        _decode(path)
+    for file in list_pictures(path):
+        if not _is_complete(file):
+            _decode(file)
 
 
 def require_panorama(path: Path | str) -> None:
@@ -145,7 +207,7 @@ def require_panorama(path: Path | str) -> None:
     Raises:
         InputError: it is not.
     """
-    _check_two_to_one(Path(path), *read_size(path))
+    require_two_to_one(Path(path), *read_size(path))
     require_complete(path)
 
 
@@ -166,11 +228,6 @@ def _is_complete(path: Path) -> bool:
     if head.startswith(b"RIFF"):
         return size >= 8 + int.from_bytes(head[4:8], "little")
     return head.startswith(_JPEG_MAGIC) and tail.rstrip(b"\0").endswith(_JPEG_END)
-
-
-def is_cube(path: Path) -> bool:
-    """Whether a file stands for the cube faces of a panorama."""
-    return path.name.endswith(CUBE_SUFFIX)
 
 
 def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height width"]:
@@ -224,7 +281,7 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
                 f"metres, got pixels of type {image.mode}; convert it."
             )
         depth = np.asarray(image).astype(np.float32) / np.float32(1000)
-    _check_two_to_one(path, depth.shape[1], depth.shape[0])
+    require_two_to_one(path, depth.shape[1], depth.shape[0])
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
     rows = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)
     columns = ((np.arange(2 * height) + 0.5) * depth.shape[1] / (2 * height)).astype(int)
@@ -256,7 +313,7 @@ def write_image(
     if suffix == ".exr":
         _write_exr(path, pixels, depth, panorama)
         return
-    if suffix not in READABLE_SUFFIXES:
+    if suffix not in WRITABLE_SUFFIXES:
         raise InputError(f"cannot write {path}: needed a name ending in .png .jpg .webp or .exr; rename it.")
     if depth is not None:
         raise InputError(f"cannot write depth to {path}: needed an .exr, got '{suffix}'; change the suffix.")
@@ -356,12 +413,25 @@ def _check_height(height: int) -> None:
         raise InputError(f"`height` must be at least 1 pixel, got {height}; choose one, such as 512.")
 
 
-def _check_two_to_one(path: Path, width: int, height: int) -> None:
+def require_two_to_one(path: Path, width: int, height: int) -> None:
+    """Check the proportions of a picture; the InputError says what to do with pictures of other ones."""
     if width != 2 * height:
         raise InputError(
             f"{path}: needed a 2:1 equirectangular panorama, got {width}x{height} (width x height); "
-            "crop or resample it first."
+            f"{_advise_on_shape(width, height)}."
         )
+
+
+def _advise_on_shape(width: int, height: int) -> str:
+    """What to do with a picture of other proportions than 2:1."""
+    if width == height:
+        return (
+            "of six cube faces, name them NAME_f NAME_r NAME_b NAME_l NAME_u NAME_d; stitch a fisheye picture with the "
+            "program of its camera; of a stereo panorama give the upper half"
+        )
+    if width > 2 * height:
+        return "pad a part of a panorama to 2:1, or state its place by GPano properties (exiftool)"
+    return "crop or resample it first"
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -375,11 +445,49 @@ def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) ->
     """Pixels of a 2:1 image file. `reduced`: whether a JPEG may be decoded at a smaller size, of at least `height`."""
     path = Path(path)
     _check_height(height)
-    if is_cube(path):
-        return _DecodedImage(read_cube(path).read(height, read_pixels), None)
-    decoded = _decode(path, height if reduced else None)
-    _check_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
+    if is_assembled(path):
+        parts = _read_assembled(path)
+        if isinstance(parts, CubeImage):
+            return _DecodedImage(parts.read(height, read_pixels), None)
+        return _DecodedImage(*parts.read(height, read_pixels), hole="is in no picture; these pixels are masked")
+    crop = read_crop(path)
+    decoded = _decode(path, height if reduced and crop is None else None)
+    if crop is not None:
+        return _pad_crop(decoded, crop)
+    require_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
+    if _is_dual_fisheye(decoded.color):
+        raise InputError(
+            f"{path}: needed an equirectangular panorama, got a dual fisheye picture; stitch it with the program of "
+            "its camera, or by ffmpeg -i IN -vf v360=dfisheye:e:ih_fov=190:iv_fov=190 OUT."
+        )
     return decoded
+
+
+def _pad_crop(decoded: _DecodedImage, crop: Crop) -> _DecodedImage:
+    """The full panorama of a crop; what it does not show has no alpha."""
+    rows, columns = decoded.color.shape[:2]
+    place = slice(crop.top, crop.top + rows), slice(crop.left, crop.left + columns)
+    color = np.zeros((crop.height, 2 * crop.height, 3), decoded.color.dtype)
+    alpha = np.zeros(color.shape[:2], np.float32)
+    color[place] = decoded.color
+    alpha[place] = 1 if decoded.alpha is None else decoded.alpha
+    hole = f"is masked: it covers {crop.degrees[0]} x {crop.degrees[1]} degrees (GPano)"
+    return _DecodedImage(color, alpha, hole)
+
+
+def _is_dual_fisheye(color: NDArray[Any]) -> bool:
+    """Whether a 2:1 picture shows two circles side by side on black; no panorama is black at these places only."""
+    step = max(color.shape[0] // 96, 1)
+    grey = color[::step, ::step].max(axis=2).astype(np.float32) * (1 if color.dtype == np.uint8 else 255)
+    rows, columns = (np.arange(count) + 0.5 for count in grey.shape)
+    radius = grey.shape[0] / 2
+    across, down = (columns % (2 * radius) - radius) / radius, ((rows - radius) / radius)[:, None]
+    distance = np.hypot(across, down)
+    corners, inside = grey[distance > 1.12], grey[distance < 0.85]
+    tips = grey[(np.abs(across) < 0.2) & (np.abs(down) > 0.75) & (np.abs(down) < 0.92)]  # black, too, at black poles
+    if min(len(corners), len(tips)) < 16:
+        return False
+    return bool(np.quantile(corners, 0.95) < _DARK and np.mean(inside) > _BRIGHT and np.median(tips) > _BRIGHT)
 
 
 def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:
@@ -388,7 +496,9 @@ def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:
     if data.startswith(_EXR_MAGIC):
         return _decode_exr(path)
     if data.startswith(_PNG_MAGIC) and len(data) > 24 and data[24] == 16:
-        return _decode_png16(path, data)
+        return _decode_deep(path, data)
+    if data.startswith(_TIFF_MAGIC) and _count_tiff_bits(data) > 8:
+        return _decode_deep(path, data)
     image = _open_with_pillow(path, data, at_least)
     if "A" in image.getbands() or "transparency" in image.info:
         array = np.asarray(image.convert("RGBA"))
@@ -396,36 +506,82 @@ def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:
     return _DecodedImage(np.asarray(image.convert("RGB")), None)
 
 
-def _open_with_pillow(path: Path, data: bytes, at_least: int | None = None, *, load: bool = True) -> Image.Image:
-    """The fully decoded image, or with `load=False` its header. Unlike OpenCV, Pillow refuses truncated data."""
+def _open_with_pillow(
+    path: Path, data: bytes, at_least: int | None = None, *, load: bool = True, orient: bool = True
+) -> Image.Image:
+    """The fully decoded image, or with `load=False` its header. Unlike OpenCV, Pillow refuses truncated data.
+
+    Args:
+        at_least: least height of a reduced JPEG.
+        orient: whether the orientation of EXIF is applied.
+    """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # panoramas of 100 megapixels are normal
-            image = Image.open(io.BytesIO(data), formats=_PILLOW_FORMATS)
+        with _quiet_pillow():
+            image = Image.open(io.BytesIO(data), formats=_list_formats(path, data[:32]))
             if at_least is not None:
                 image.draft("RGB", (2 * at_least, at_least))
             if load:
                 image.load()
-            return ImageOps.exif_transpose(image)
+            return ImageOps.exif_transpose(image) if orient else image
     except Image.UnidentifiedImageError as error:
+        if data.startswith(_TIFF_MAGIC):  # its directory may be at the end
+            raise InputError(
+                f"{path}: needed a complete image, got damaged or truncated data; copy or export it again."
+            ) from error
         raise InputError(
-            f"{path}: needed a JPG, PNG, WebP or EXR image, got an unknown format "
+            f"{path}: needed a JPG, PNG, TIFF, WebP, HEIC or EXR image, got an unknown format "
             f"(it starts with {data[:8]!r}); convert it."
         ) from error
     except Image.DecompressionBombError as error:
         raise InputError(f"{path}: needed at most about 13000x6500 pixels, got more ({error}); shrink it.") from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
+    except InputError:
+        raise
+    except _DAMAGED as error:
         raise InputError(
             f"{path}: needed a complete image, got damaged or truncated data ({error}); copy or export it again."
         ) from error
 
 
-def _decode_png16(path: Path, data: bytes) -> _DecodedImage:
-    """A 16-bit PNG at full precision, decoded by OpenCV; Pillow reduces colour to 8 bits."""
-    _open_with_pillow(path, data)  # refuses truncated data
-    array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+def _count_tiff_bits(data: bytes) -> int:
+    """Bits of a sample of a TIFF; 1 if its header cannot be read, which is reported later."""
+    try:
+        with _quiet_pillow(), Image.open(io.BytesIO(data), formats=("TIFF",)) as image:
+            value = image.tag_v2.get(_BITS_PER_SAMPLE, 1)  # type: ignore[attr-defined]
+            return int(max(value) if isinstance(value, tuple) else value)
+    except (*_DAMAGED, Image.DecompressionBombError):
+        return 1
+
+
+@contextmanager
+def _quiet_pillow() -> Iterator[None]:
+    """Without messages of Pillow: panoramas of 100 megapixels are normal, and damaged files are an error."""
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        warnings.filterwarnings("ignore", module="PIL")
+        yield
+
+
+def _decode_deep(path: Path, data: bytes) -> _DecodedImage:
+    """A 16-bit PNG or TIFF at full precision, decoded by OpenCV; Pillow reduces colour to 8 bits."""
+    image = _open_with_pillow(path, data, orient=False)  # refuses truncated data
+    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    level = cv2.utils.logging.getLogLevel()
+    try:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below is one line
+        array = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        array = None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if array is None or array.dtype != np.uint16:
-        raise InputError(f"{path}: needed a readable 16-bit PNG, got data that OpenCV cannot decode; export it again.")
+        raise InputError(
+            f"{path}: needed a readable PNG or TIFF of 8 or 16 bits, got data that OpenCV cannot decode as such; "
+            "export it again."
+        )
+    is_tiff = data.startswith(_TIFF_MAGIC)  # OpenCV turns a TIFF, whatever the flags, and Pillow removes its tag
+    orient = None if is_tiff else _ORIENT.get(image.getexif().get(_ORIENTATION, 1))
+    array = array if orient is None else orient(array)
     values = array.astype(np.float32) / np.float32(65535)
     if values.ndim == 2:
         return _DecodedImage(np.repeat(values[..., None], 3, axis=2), None)

@@ -53,7 +53,8 @@ class Panorama:
 
     Attributes:
         name: the stem of the file name, or the view's folder where all files have the same name.
-        image: JPG, PNG, WebP or EXR file, or a file that stands for cube faces (pansplat.data.cube_images).
+        image: picture of a format of `READABLE_SUFFIXES`, or a file that stands for cube faces or perspective pictures
+            (pansplat.data.cube_images, .rig_images).
         cam2world: float64, OpenCV axes, metres.
         mask: image that is white where the panorama shows the scene; None to detect static content.
         depth: radial depth, 16-bit PNG in millimetres or EXR in metres; None when there is none.

@@ -11,11 +11,14 @@ ISO/IEC 14496-12, sections 4.2 (boxes) and 8.7.5 (chunk offsets).
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import shutil
 import struct
 import uuid
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -25,6 +28,8 @@ Projection = Literal["equirect", "cubemap"]
 Stereo = Literal["mono", "top-bottom", "side-by-side"]
 
 _PACKETS = "xmp", "XML:com.adobe.xmp"  # where Pillow stores the packet, by the file's format
+_TAG = re.compile(r"(?<!/)GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)")
+_SHAPE_TOLERANCE = 0.01  # of the proportions that the tags state
 _SPHERICAL_V1 = uuid.UUID("ffcc8263-f855-4a93-8814-587a02521fdd").bytes
 _STEREO_V1 = {"mono": "mono", "top-bottom": "top-bottom", "side-by-side": "left-right"}
 _STEREO_V2 = {"mono": b"\0", "top-bottom": b"\1", "side-by-side": b"\2"}
@@ -65,10 +70,78 @@ def read_xmp(path: Path) -> bytes:
     """The XMP packet of an image file; empty if there is none, or the file cannot be read."""
     try:
         with Image.open(path) as image:
-            packet = next((image.info[name] for name in _PACKETS if name in image.info), b"")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # reported when the pixels are read
+            return find_xmp(image)
+    except Exception:  # Pillow raises many types for damaged files, which are reported when the pixels are read
         return b""
+
+
+def find_xmp(image: Image.Image) -> bytes:
+    """The XMP packet in the header of an image; empty if there is none."""
+    packet = next((image.info[name] for name in _PACKETS if name in image.info), b"")
     return packet if isinstance(packet, bytes) else str(packet).encode()
+
+
+def parse_gpano(xmp: bytes) -> dict[str, str]:
+    """The GPano properties of an XMP packet."""
+    found = _TAG.findall(xmp.decode("utf-8", "replace"))
+    return {name: attribute or element for name, attribute, element in found}
+
+
+def gpano_number(tags: dict[str, str], name: str) -> float | None:
+    """A finite number among GPano properties; None if there is none."""
+    try:
+        value = float(tags[name])
+    except (KeyError, ValueError):
+        return None
+    return value if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Crop:
+    """The place of a picture in the full panorama, pixels of the picture.
+
+    Attributes:
+        height: of the full panorama, which is twice as wide.
+        left, top: of the picture in it.
+        degrees: width and height that the picture covers.
+    """
+
+    height: int
+    left: int
+    top: int
+    degrees: tuple[int, int]
+
+
+def find_crop(tags: dict[str, str], width: int, height: int) -> Crop | None:
+    """The crop that the GPano properties of a picture state; None if it is a full panorama, or they contradict it.
+
+    Args:
+        tags: of `parse_gpano`.
+        width, height: of the picture, pixels; it may have been resized.
+    """
+    names = (
+        "FullPanoWidthPixels", "FullPanoHeightPixels", "CroppedAreaImageWidthPixels", "CroppedAreaImageHeightPixels",
+        "CroppedAreaLeftPixels", "CroppedAreaTopPixels",
+    )  # fmt: skip
+    numbers = [gpano_number(tags, name) for name in names]
+    if any(number is None for number in numbers):
+        return None
+    full_width, full_height, part_width, part_height, left, top = (number or 0.0 for number in numbers)
+    if min(full_width, full_height, part_width, part_height) < 1 or min(left, top) < 0:
+        return None
+    if (part_width, part_height) == (full_width, full_height):
+        return None
+    scale = width / part_width
+    fits = left + part_width <= full_width + 1 and top + part_height <= full_height + 1
+    is_right = (
+        abs(full_width / (2 * full_height) - 1) < _SHAPE_TOLERANCE
+        and abs(height / (scale * part_height) - 1) < _SHAPE_TOLERANCE
+    )
+    if not (fits and is_right):
+        return None
+    rows = max(round(full_width * scale / 2), math.ceil(width / 2), height)
+    degrees = round(360 * part_width / full_width), round(180 * part_height / full_height)
+    return Crop(rows, min(round(left * scale), 2 * rows - width), min(round(top * scale), rows - height), degrees)
 
 
 def mark_spherical_video(path: Path, projection: Projection = "equirect", stereo: Stereo = "mono") -> None:

@@ -13,7 +13,7 @@ import torch
 
 from pansplat.data.cube_faces import find_layout, group_faces
 from pansplat.data.cube_images import CubeImage, write_cube
-from pansplat.data.images import read_size, require_complete
+from pansplat.data.images import read_size, require_complete, require_two_to_one
 from pansplat.data.pairs import Link, Panorama, find_mask, list_panorama_files
 from pansplat.data.panorama_metadata import read_xmp
 from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links
@@ -128,10 +128,7 @@ def _read_picture(image: Path) -> Path | CubeImage:
         return image
     layout = find_layout(image)
     if layout is None:
-        raise InputError(
-            f"{image}: needed a 2:1 equirectangular panorama, got {width}x{height} (width x height); crop or "
-            "resample it first."
-        )
+        require_two_to_one(image, width, height)
     return layout
 
 

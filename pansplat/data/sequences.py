@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.folders import find_trajectory, is_loc360_sequence, read_loc360_sequence
+from pansplat.data.folders import VIDEO_FILES, find_trajectory, is_loc360_sequence, read_loc360_sequence
 from pansplat.data.images import read_mask, resize_panorama
 from pansplat.data.masks import lift_black_surfaces
 from pansplat.data.pairs import FAR_SEQUENCE, NEAR, Pair, Panorama
@@ -31,8 +31,6 @@ LOCATIONS: dict[str, tuple[str, ...]] = {
     "test": ("atrium",),
 }
 """Locations of 360Loc by stage (docs/official.md, section 2.2)."""
-
-_VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
 
 
 @dataclass(frozen=True)
@@ -254,7 +252,7 @@ def read_video_folder(folder: Path) -> VideoSequence:
 
 
 def _list_videos(folder: Path) -> list[Path]:
-    return [path for path in sorted(folder.iterdir()) if path.is_file() and path.suffix.lower() in _VIDEO_SUFFIXES]
+    return [path for path in sorted(folder.iterdir()) if path.is_file() and path.suffix.lower() in VIDEO_FILES]
 
 
 def _read_scale(folder: Path) -> float:

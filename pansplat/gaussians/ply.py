@@ -23,6 +23,8 @@ from typing import BinaryIO
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
+from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError, InputWarning
@@ -171,7 +173,7 @@ def save_points(gaussians: Gaussians, path: str | Path) -> None:
     kept = select_finite(gaussians, path).to(device="cpu")
     fields = [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
     table = np.empty(len(kept), fields)
-    colors = (kept.harmonics[:, 0] * SH_0 + 0.5).clamp(0, 1).mul(255).round().byte()
+    colors = make_colors(kept)
     for column, (name, _) in zip((*kept.means.unbind(1), *colors.unbind(1)), fields, strict=True):
         table[name] = column.detach().numpy()
     kinds = {"<f4": "float", "u1": "uchar"}
@@ -180,6 +182,11 @@ def save_points(gaussians: Gaussians, path: str | Path) -> None:
     with replacing(path) as partial, open(partial, "wb") as file:
         file.write("\n".join(lines).encode())
         file.write(table.data)
+
+
+def make_colors(gaussians: Gaussians) -> UInt8[Tensor, "n 3"]:
+    """The colours of Gaussians without direction, 8-bit sRGB."""
+    return (gaussians.harmonics[:, 0] * SH_0 + 0.5).clamp(0, 1).mul(255).round().byte()
 
 
 def load_ply(path: str | Path) -> Scene:

@@ -417,10 +417,13 @@ def _describe_views(
         mask = masks.get(paths[n])
         scene = static if mask is None else read_mask(mask, _HEIGHT).numpy()
         grey = pixels[n]
+        pixels_of_view, opaque = read_panorama(paths[n], len(grey))
+        if not opaque.all():
+            scene = scene & (cv2.resize(opaque.numpy().astype(np.uint8), scene.shape[::-1]) > 0)
         small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
         axes = with_hints(find_axes(grey), hints[n].down, hints[n].heading if is_compass else None)
         turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
-        image = read_panorama(paths[n], len(grey))[0].permute(1, 2, 0).numpy()
+        image = pixels_of_view.permute(1, 2, 0).numpy()
         learned = None
         if matcher is not None:
             learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)

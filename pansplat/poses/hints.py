@@ -9,7 +9,6 @@ Source: Google, Photo Sphere XMP Metadata, https://developers.google.com/streetv
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,9 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from pansplat.data.panorama_metadata import read_xmp
-
-_TAG = re.compile(r"(?<!/)GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)")
+from pansplat.data.images import read_crop
+from pansplat.data.panorama_metadata import gpano_number, parse_gpano, read_xmp
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,38 +37,30 @@ class Hints:
 
 def read_hints(path: Path) -> Hints:
     """The hints of a file; none if it is unreadable or has no such tags."""
-    text = read_xmp(path).decode("utf-8", "replace")
-    tags = {name: attribute or element for name, attribute, element in _TAG.findall(text)}
+    tags = parse_gpano(read_xmp(path))
     pitch, roll = _radians(tags, "PosePitchDegrees"), _radians(tags, "PoseRollDegrees")
     down = None
     if pitch is not None or roll is not None:
         p, r = pitch or 0.0, roll or 0.0
         down = np.array((math.cos(p) * math.sin(r), math.cos(p) * math.cos(r), -math.sin(p)))
-    return Hints(down, _radians(tags, "PoseHeadingDegrees"), _find_problem(tags))
-
-
-def _number(tags: dict[str, str], name: str) -> float | None:
-    try:
-        value = float(tags[name])
-    except (KeyError, ValueError):
-        return None
-    return value if math.isfinite(value) else None
+    return Hints(down, _radians(tags, "PoseHeadingDegrees"), _find_problem(tags, path))
 
 
 def _radians(tags: dict[str, str], name: str) -> float | None:
-    value = _number(tags, name)
+    value = gpano_number(tags, name)
     return None if value is None else math.radians(value)
 
 
-def _find_problem(tags: dict[str, str]) -> str | None:
+def _find_problem(tags: dict[str, str], path: Path) -> str | None:
     projection = tags.get("ProjectionType", "equirectangular").strip()
     if projection.lower() != "equirectangular":
         return f"its projection is {projection!r} (GPano:ProjectionType); convert it to equirectangular"
     spans = []
     for side, whole in (("Width", 360), ("Height", 180)):
-        full, part = _number(tags, f"FullPano{side}Pixels"), _number(tags, f"CroppedAreaImage{side}Pixels")
+        full, part = gpano_number(tags, f"FullPano{side}Pixels"), gpano_number(tags, f"CroppedAreaImage{side}Pixels")
         spans.append(whole if not full or part is None else round(whole * part / full))
-    if spans != [360, 180]:
+    is_padded = spans[0] == 360 and read_crop(path) is not None  # the rest is masked when it is read
+    if spans != [360, 180] and not is_padded:
         return (
             f"it covers {spans[0]} x {spans[1]} degrees of 360 x 180 (GPano:CroppedArea); give the full panorama, or "
             "pad it to 2:1 with a mask"

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from pansplat.cli import run
-from pansplat.errors import InputError
+from pansplat.console import own_warnings
+from pansplat.errors import InputError, InputWarning
 
 
 def test_help_does_not_import_torch() -> None:
@@ -124,3 +125,10 @@ pansplat.cli.main([])
 
 def test_input_errors_are_value_errors() -> None:
     assert issubclass(InputError, ValueError)
+
+
+def test_equal_notes_are_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with own_warnings():
+        for text in ("first", "second", "first"):
+            warnings.warn(text, InputWarning, stacklevel=2)
+    assert capsys.readouterr().err.splitlines() == ["note: first", "note: second"]

@@ -257,7 +257,6 @@ def test_trajectories_that_do_not_match_are_refused(tmp_path: Path) -> None:
         ({"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}}, r"needed a pose, got only \['room'\]"),
         ({"poses": {"left.png": _pose(0), "right.png": {"world2cam": _pose(1)}}}, 'got the key "world2cam" under'),
         ({"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "mask": "m.png"}}}, "needed the mask file"),
-        ({"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "depth": "d.png"}}}, "needed the depth file"),
         ({"near": 3, "far": 3}, "needed 0 < near < far in metres, got near=3 and far=3"),
         ({"near": 0}, "needed 0 < near < far"),
         ({"far": "much"}, "needed a number in metres as \"far\", got 'much'"),
@@ -334,7 +333,7 @@ def test_one_picture_that_is_no_panorama_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"photo\.png: needed a 2:1 equirectangular panorama, got 24x16"):
             load_pairs(path)
     (tmp_path / "photo.png").write_text("x")
-    with pytest.raises(InputError, match=r"photo\.png: needed a JPG, PNG, WebP or EXR image"):
+    with pytest.raises(InputError, match=r"photo\.png: needed a JPG, PNG, TIFF, WebP, HEIC or EXR image"):
         load_pairs(tmp_path)
 
 

@@ -14,7 +14,7 @@ import safetensors.torch
 
 from pansplat.gaussians.ply import load_ply
 
-READERS = 16
+READERS = 25
 
 
 @pytest.mark.slow

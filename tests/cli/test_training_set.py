@@ -1,0 +1,92 @@
+"""`pansplat export` to a folder, and that no export repeats the metadata of the photographs."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pansplat import pipeline
+from pansplat.cli import run
+from pansplat.web import page as page_module
+
+OPTIONS = ["--model", "sphere", "--refine", "0", "--predict-height", "64"]
+
+
+def test_a_folder_to_train_from_has_the_poses_and_gaussians_of_the_scene(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "sets" / "room"
+    assert run(["export", str(room), "-o", str(out), *OPTIONS]) == 0
+    assert "12 cube faces of 2 panoramas, 1,024 points" in capsys.readouterr().out
+    assert sorted(path.name for path in out.iterdir()) == [
+        "images", "points.ply", "scale.txt", "sparse", "transforms.json",
+    ]  # fmt: skip
+    scene = pipeline.predict(pipeline.load_pairs(room)[0], "sphere", height=64)
+    lines = (out / "sparse/0/points3D.txt").read_text().splitlines()[1:]
+    points = np.array([line.split()[1:4] for line in lines], float)
+    np.testing.assert_allclose(points, scene.gaussians.means, atol=1e-4)
+    _, body = (out / "points.ply").read_bytes().split(b"end_header\n")
+    table = np.frombuffer(body, [("position", "<f4", 3), ("color", "u1", 3)])
+    x, y, z = points.T
+    np.testing.assert_allclose(table["position"], np.stack((x, z, -y), axis=1), atol=1e-4)  # z up
+    (pair,) = pipeline.load_pairs(out)
+    for view, pose in zip(pair.context, scene.cam2world, strict=True):
+        np.testing.assert_allclose(view.cam2world, pose, atol=1e-6)
+
+
+def test_a_folder_with_files_and_a_scene_file_are_refused(
+    room: Path, scene: Path, tmp_path: Path, refusal: Callable[..., str]
+) -> None:
+    assert "needed a new or empty folder, got one with files" in refusal("export", room, "-o", room, *OPTIONS)
+    message = refusal("export", scene, "-o", tmp_path / "set", *OPTIONS)
+    assert "needed the folder of the panoramas to write their cube faces, got a scene file" in message
+    assert not (tmp_path / "set").exists()
+    assert "--points writes a .ply" in refusal("export", room, "-o", tmp_path / "set", "--points", *OPTIONS)
+
+
+def test_no_export_repeats_the_metadata_of_the_photographs(
+    tmp_path: Path, write_room: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    room = write_room(tmp_path / "room", target=False)
+    exif = Image.Exif()
+    exif[0x010F] = "SECRET maker"
+    gps = exif.get_ifd(0x8825)
+    gps[1], gps[2], gps[29] = "N", (47.0, 22.0, 11.0), "SECRET date"
+    content = json.loads((room / "poses.json").read_text())
+    for name in ("a", "b"):
+        with Image.open(room / f"{name}.png") as image:
+            image.save(room / f"{name}.jpg", exif=exif, xmp=b"<x>SECRET packet</x>", comment=b"SECRET comment")
+        (room / f"{name}.png").unlink()
+        content["poses"][f"{name}.jpg"] = content["poses"].pop(f"{name}.png")
+    del content["poses"]["c.png"]
+    (room / "c.png").unlink()
+    (room / "pairs.json").unlink()
+    (room / "poses.json").write_text(json.dumps(content))
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("s.ply", "s.glb", "s.spz", "s.html", "set"):
+        assert run(["export", str(room), "-o", str(out / name), *OPTIONS]) == 0
+    for name in ("r.png", "r.jpg", "r.webp", "r.exr", "r.mp4"):
+        assert run(["render", str(out / "s.ply"), "-o", str(out / name), "--height", "32"]) == 0
+    files = [path for path in sorted(out.rglob("*")) if path.is_file()]
+    assert len(files) > 20
+    for path in files:
+        parts = [path.read_bytes()]
+        for text in re.findall(rb"[A-Za-z0-9+/]{64,}={0,2}", parts[0]) if path.suffix == ".html" else ():
+            parts.append(base64.b64decode(text + b"=" * (-len(text) % 4)))
+        parts += [gzip.decompress(part) for part in parts if part.startswith(b"\x1f\x8b")]
+        assert not any(b"SECRET" in part or str(tmp_path).encode() in part for part in parts), path
+        if path.suffix in (".png", ".jpg", ".webp"):
+            with Image.open(path) as image:
+                assert not image.getexif()
+    shutil.rmtree(out)
