@@ -54,7 +54,9 @@ _DAMPING = 0.2
 _COLORS = ColorFitConfig()
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
-_MIN_STEPS = 8  # of a run with a limit of Gaussians: merged ones that are not fitted look like dots
+# Of a run with a limit of Gaussians, because merged ones that are not fitted look like dots; for each photograph of a
+# scene for joint drawing, because few large steps leave it worse than before.
+_MIN_STEPS = 8
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
 _PATIENCE = 3  # checks without a sufficient decrease
@@ -354,7 +356,8 @@ class Refinement:
 
         Args:
             seconds: time limit since this object was made; the result depends on the speed of the machine. With a limit
-                of Gaussians, a run has at least `_MIN_STEPS` steps, and mergers do not count.
+                of Gaussians, a run has at least `_MIN_STEPS` steps, and mergers do not count; in joint drawing it has
+                as many for each photograph.
             steps: number of steps; the result is the same in every run on one machine.
             progress: called with a description and the completed fraction.
             should_stop: checked before each step; True ends the run and keeps the state.
@@ -363,6 +366,8 @@ class Refinement:
             InputError: neither or both of `seconds` and `steps` are given, or one is not positive.
         """
         min_steps = 0 if self.config.gaussians is None else _MIN_STEPS
+        if self._start.joint:
+            min_steps = _MIN_STEPS * len(self._photographs)
         clock = _Clock(seconds, steps, self.config.release, self._created, min_steps)
         report = progress or (lambda what, fraction: None)
         history: list[tuple[int, float, float]] = []
