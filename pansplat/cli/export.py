@@ -119,7 +119,7 @@ class Export:
         joint = not in_layers and not self.layers
         count = self._count_of_page() if self.out.suffix.lower() == _PAGE_SUFFIX else None
         scene = self.prediction.open_tour(self.path, count, joint=joint)
-        if not joint or scene.joint or len(scene.cam2world) < 2:
+        if not joint or not is_scene_file(self.path) or scene.joint or len(scene.cam2world) < 2:
             return scene
         print(
             f"note: {self.path}: each surface is kept once (--layers keeps all); an export of the folder of the "

@@ -86,7 +86,7 @@ class ScenePrediction:
 
         if is_scene_file(path):
             return pipeline.load(path)
-        return self._predict_pair(choose_pair(path, self.choice))
+        return self._predict_pair(choose_pair(path, self.choice), None, joint=False)
 
     def open_tour(self, path: Path, gaussians: int | None = None, *, joint: bool = False) -> Scene:
         """The scene of a file, of the chosen pair, or of the first tour of a folder.
@@ -94,7 +94,7 @@ class ScenePrediction:
         Args:
             path: the file or folder.
             gaussians: of a page; see `pansplat.predict_tour`.
-            joint: see `pansplat.predict`; a scene file is returned as it is.
+            joint: see `pansplat.predict`; scene files and predictions of networks are returned as they are.
         """
         from pansplat import pipeline
 
@@ -119,6 +119,7 @@ class ScenePrediction:
             f"note: {path}: a tour of {len(tours[0])} panoramas ({kinds}--pair chooses one pair){more}", file=sys.stderr
         )
         model = self.model.load()
+        joint = joint and not pipeline.can_stream(model)
         with progress_bar() as progress:
             tour = connect(tours[0], progress)
             scene = pipeline.predict_tour(
@@ -132,16 +133,13 @@ class ScenePrediction:
             )
         return scene, tour
 
-    def _predict_pair(self, pair: Pair, gaussians: int | None = None, joint: bool = False) -> Scene:
-        return predict_scene(
-            pair,
-            self.model.load(),
-            self.predict_height,
-            cache=True,
-            refine_seconds=self._choose_seconds(gaussians, joint),
-            gaussians=gaussians,
-            joint=joint,
-        )
+    def _predict_pair(self, pair: Pair, gaussians: int | None, joint: bool) -> Scene:
+        from pansplat import pipeline
+
+        model = self.model.load()
+        joint = joint and len(pair.context) > 1 and not pipeline.can_stream(model)
+        seconds, height = self._choose_seconds(gaussians, joint), self.predict_height
+        return predict_scene(pair, model, height, cache=True, refine_seconds=seconds, gaussians=gaussians, joint=joint)
 
     def _choose_seconds(self, gaussians: int | None, joint: bool) -> float:
         """The time limit of a refinement."""
