@@ -565,7 +565,8 @@ def _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx,
     in_slot, near_slot = np.empty(slots, np.float32), np.empty(slots, np.float32)
     for i in range(height):
         t = stretch[i]  # neighbours near a pole are closer, so penalties are higher
-        previous[:] = cost[i, -dx * run_up % width]
+        for label in range(labels):  # a copy of a slice takes two seconds to compile
+            previous[label] = cost[i, -dx * run_up % width, label]
         for n in range(1 - run_up, width):
             j, j_before = (dx * n) % width, (dx * (n - 1)) % width
             jump = _jump_penalty(guide[i, j], guide[i, j_before], penalties)
@@ -594,7 +595,8 @@ def _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, r
         for path in range(width):
             j = (path + shift) % width
             if n == -run_up:
-                current[path] = cost[i, j]
+                for label in range(labels):
+                    current[path, label] = cost[i, j, label]
                 continue
             path_before = (path - dx) % width
             jump = _jump_penalty(guide[i, j], guide[i_before, (path_before + shift_before) % width], penalties)
