@@ -6,7 +6,8 @@ Values of a row: `height` of the panoramas, pixels; `stages_s`, the seconds of e
 `total_ratio`, it over the seconds of `harness.time_workload` just before, so that figures of different machines
 compare; `processor_s` of all threads together, which other load on the machine hardly affects; `peak_gib`, the largest
 resident memory of the process, 2^30 bytes; `depth_median_error` and `depth_max_error`, |depth - reference| / reference
-of the finest sphere sweep; `psnr_db` between the images at the middle pose, rendered by numba, infinite if they are equal.
+of the finest sphere sweep; `psnr_db` between the images at the middle pose, rendered by numba, infinite if they are
+equal.
 """
 
 from __future__ import annotations

@@ -21,11 +21,13 @@ class ParameterGroup:
 
     Attributes:
         rate: step size at the start of a run.
+        betas: decay of the averages of the gradients and of their squares.
         epsilon: added to the root of the mean square of the gradients.
     """
 
     parameters: Sequence[Tensor]
     rate: float
+    betas: tuple[float, float]
     epsilon: float = _MIN_EPSILON
     _states: dict[Tensor, tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict, init=False)
 
@@ -53,13 +55,8 @@ class ParameterGroup:
             self.epsilon = max(damping * float(torch.cat(gradients).square().mean().sqrt()), _MIN_EPSILON)
 
     @torch.no_grad()
-    def step(self, factor: float, betas: tuple[float, float]) -> None:
-        """Move the parameters that have a gradient.
-
-        Args:
-            factor: of the step size.
-            betas: decay of the averages of the gradients and of their squares.
-        """
+    def step(self, factor: float) -> None:
+        """Move the parameters that have a gradient, by a factor of the step size."""
         moved = [parameter for parameter in self.parameters if parameter.grad is not None]
         for parameter in moved:
             if parameter not in self._states:
@@ -75,8 +72,8 @@ class ParameterGroup:
             [count for _, _, count in states],
             fused=True,
             amsgrad=False,
-            beta1=betas[0],
-            beta2=betas[1],
+            beta1=self.betas[0],
+            beta2=self.betas[1],
             lr=factor * self.rate,
             weight_decay=0.0,
             eps=self.epsilon,

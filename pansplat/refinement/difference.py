@@ -33,7 +33,8 @@ class Difference(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        return ctx.gradient * grad_outputs[0], None, None, None
+        factor = float(grad_outputs[0])
+        return ctx.gradient if factor == 1 else ctx.gradient * factor, None, None, None
 
 
 @kernel
