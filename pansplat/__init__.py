@@ -8,6 +8,10 @@ from pansplat.kernel_cache import choose_kernel_cache
 
 choose_kernel_cache(os.path.dirname(__file__), os.environ)
 
+# Threads of torch's operations sleep while they wait. By default they spin for milliseconds: beside another process, an
+# operation of half a millisecond on two threads takes six to nineteen.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 __version__ = "0.1.0"
 
 # Resolved at first use: `import pansplat` and `pansplat --help` must not import torch.

@@ -34,18 +34,6 @@ def one_thread() -> Iterator[None]:
             torch.set_num_threads(_num_threads)
 
 
-def limit_numba_threads() -> None:
-    """Give numba's parallel loops as many threads as torch's operations have; call it in the thread that runs a loop.
-
-    Numba's first loop starts a thread for each processor, and OpenMP then gives torch as many, too.
-    """
-    import numba  # not at the top: most users of this module need no compiler
-
-    threads = torch.get_num_threads()
-    numba.set_num_threads(max(1, min(threads, numba.config.NUMBA_NUM_THREADS)))
-    torch.set_num_threads(threads)
-
-
 def worker_threads() -> ThreadPoolExecutor:
     """A pool for work that releases Python's lock, with a thread for each processor, four at most."""
     return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))

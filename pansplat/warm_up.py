@@ -4,23 +4,22 @@ setup.sh runs this once, so that later commands do not compile them. Kernels for
 rotations, and those of PanSplat and MVSplat, are compiled by the first call that uses them.
 """
 
+from __future__ import annotations
+
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from multiprocessing import get_context
+from typing import TYPE_CHECKING
 
-import numpy as np
-import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pansplat.data.views import Views
-from pansplat.gaussians.scene import Gaussians
-from pansplat.pipeline import predict
-from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels, enlarge
-from pansplat.rendering.cpu.tiling import radix_argsort
-from pansplat.rendering.image_planes import Layout
-from pansplat.rendering.rasterize import Order, RasterOptions, rasterize
+# The processes that compile import torch and the kernels, this one does not: it would take three seconds.
+if TYPE_CHECKING:
+    from pansplat.gaussians.scene import Gaussians
+    from pansplat.rendering.image_planes import Layout
+    from pansplat.rendering.rasterize import Order
 
 
 def main() -> None:
@@ -46,17 +45,39 @@ def compile_kernels(name: str) -> None:
 
 def _rasterize(degree: int, layout: Layout, order: Order) -> None:
     """Rasterise Gaussians with harmonics of a degree, forward and backward."""
+    import torch
+
+    from pansplat.rendering.rasterize import rasterize
+
     scene, pose = _make_gaussians(degree), torch.eye(4, dtype=torch.float64)
     rasterize(scene, pose, size=(16, 32), layout=layout, order=order, backend="numba").color.sum().backward()
 
 
-@torch.no_grad()
 def _rasterize_stereo() -> None:
     """Rasterise the panorama of one eye."""
-    rasterize(_make_gaussians(0), torch.eye(4), size=(16, 32), eye_offset=0.03, backend="numba")
+    import torch
+
+    from pansplat.rendering.rasterize import rasterize
+
+    with torch.no_grad():
+        rasterize(_make_gaussians(0), torch.eye(4), size=(16, 32), eye_offset=0.03, backend="numba")
+
+
+def _compare() -> None:
+    """Compare an image with a photograph, with the gradient."""
+    import torch
+
+    from pansplat.refinement.objective import PixelWeights, image_difference
+
+    weights = PixelWeights.from_mask(torch.ones(16, 32, dtype=torch.bool))
+    image_difference(torch.zeros(3, 16, 32, requires_grad=True), weights).backward()
 
 
 def _make_gaussians(degree: int) -> Gaussians:
+    import torch
+
+    from pansplat.gaussians.scene import Gaussians
+
     return Gaussians(
         means=torch.rand(9, 3).requires_grad_(),
         scales=torch.full((9, 3), 0.1),
@@ -70,6 +91,12 @@ def _make_gaussians(degree: int) -> Gaussians:
 
 def _draw_display_image() -> None:
     """Draw two layers and a view from cube faces as the viewer does without a GPU."""
+    import numpy as np
+
+    from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels, enlarge
+    from pansplat.rendering.cpu.tiling import radix_argsort
+    from pansplat.rendering.rasterize import RasterOptions
+
     scene = DisplayScene(*(np.ones(shape, np.float32) for shape in ((9, 3), 9, (9, 4), (9, 3), (9, 1, 3), 9)))
     faces, pixels = PixelFaces.allocate(7.0), np.zeros((16, 16), np.uint32)
     labels = np.arange(9, dtype=np.int16) % 2
@@ -83,20 +110,26 @@ def _draw_display_image() -> None:
     radix_argsort(np.ones(9, np.float32))
 
 
-def _predict(model: str) -> None:
-    """Predict from two small panoramas of noise."""
+def _predict() -> None:
+    """Predict from two small panoramas of noise by "default", which uses all kernels of "sweep"."""
+    import torch
+
+    from pansplat.data.views import Views
+    from pansplat.pipeline import predict
+
     images, masks = torch.rand(2, 3, 64, 128), torch.ones(2, 64, 128, dtype=torch.bool)
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 0.2
-    predict(Views(images, poses, masks, near=0.1, far=10.0, names=("left", "right")), model)
+    predict(Views(images, poses, masks, near=0.1, far=10.0, names=("left", "right")), "default")
 
 
 # Few kernels are in both; the first process that compiles one writes it to numba's cache for the other.
 STEPS = {
-    "sweep and depth network": (partial(_predict, "sweep"), partial(_predict, "default")),
+    "sweep and depth network": (_predict,),
     "rasteriser and viewer": (
         partial(_rasterize, 0, "equirect", "radial"),
         partial(_rasterize, 1, "pinhole", "z"),
+        _compare,
         _rasterize_stereo,
         _draw_display_image,
     ),

@@ -13,7 +13,8 @@ from numba.core.dispatcher import Dispatcher
 from pansplat import warm_up
 warm_up.ProcessPoolExecutor = lambda count, context: ThreadPoolExecutor(1)  # so that this process holds the kernels
 warm_up.main()
-modules = [m for name, m in sys.modules.items() if name.startswith(("pansplat.rendering.cpu", "pansplat.sweep"))]
+packages = "pansplat.rendering.cpu", "pansplat.sweep", "pansplat.refinement"
+modules = [m for name, m in sys.modules.items() if name.startswith(packages)]
 kernels = {k for m in modules for k in vars(m).values() if isinstance(k, Dispatcher)}
 called_by_kernels = {name for kernel in kernels for name in kernel.py_func.__code__.co_names}
 for kernel in kernels:

@@ -54,6 +54,24 @@ def time_call(call: Callable[[], T], device: torch.device) -> tuple[Timing, T]:
     return Timing(time.perf_counter() - began, time.process_time() - began_cpu), result
 
 
+@torch.inference_mode()
+def time_workload() -> float:
+    """Seconds of a fixed workload on torch's threads, so that times of different machines compare: median of five.
+
+    It is a convolution (1.2 GFLOP) and the exponentials of 4 million numbers, on the CPU.
+    """
+    maps = torch.linspace(-1, 1, 32 * 256 * 512).reshape(1, 32, 256, 512)
+    weights = torch.linspace(-0.1, 0.1, 16 * 32 * 9).reshape(16, 32, 3, 3)
+
+    def work() -> None:
+        torch.nn.functional.conv2d(maps, weights, padding=1)
+        maps.exp()
+
+    cpu = torch.device("cpu")
+    work()
+    return statistics.median(time_call(work, cpu)[0].wall for _ in range(5))
+
+
 def measure_peak_memory(call: Callable[[], T], device: torch.device) -> tuple[float | None, T]:
     """Largest additional memory during a call, 10^6 bytes, and the result of the call.
 

@@ -3,9 +3,11 @@
 Every case runs in a process of its own, `python -m pansplat.bench.model`.
 
 Values of a row: `height` of the panoramas, pixels; `stages_s`, the seconds of each of `STAGES`; `total_s`, their sum;
-`processor_s` of all threads together, which other load on the machine hardly affects; `peak_gib`, the largest resident
-memory of the process, 2^30 bytes; `depth_median_error` and `depth_max_error`, |depth - reference| / reference of the
-finest sphere sweep; `psnr_db` between the images at the middle pose, rendered by numba, infinite if they are equal.
+`total_ratio`, it over the seconds of `harness.time_workload` just before, so that figures of different machines
+compare; `processor_s` of all threads together, which other load on the machine hardly affects; `peak_gib`, the largest
+resident memory of the process, 2^30 bytes; `depth_median_error` and `depth_max_error`, |depth - reference| / reference
+of the finest sphere sweep; `psnr_db` between the images at the middle pose, rendered by numba, infinite if they are
+equal.
 """
 
 from __future__ import annotations
@@ -24,7 +26,14 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from pansplat.bench.harness import CaseFailedError, read_resident_peak, reset_resident_peak, run_child, serve_job
+from pansplat.bench.harness import (
+    CaseFailedError,
+    read_resident_peak,
+    reset_resident_peak,
+    run_child,
+    serve_job,
+    time_workload,
+)
 from pansplat.bench.report import Benchmark, Column, Header, Report, Row, error_or_reference, format_threads, make_axes
 from pansplat.data.views import Views
 from pansplat.errors import InputError
@@ -153,6 +162,7 @@ def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, T
     _warm_up(case)
     bounds = [torch.full((1, len(images)), bound) for bound in (near, far)]
     stages: dict[str, float] = {}
+    workload_s = time_workload()
     has_peak, before = reset_resident_peak(), time.process_time()
     with _timed_stages(network, stages):
         matched = network.match_views(images[None], cam2world[None].float(), *bounds)
@@ -165,7 +175,8 @@ def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, T
     del matched
     scene = Scene(gaussians, cam2world.double(), near, far, height=images.shape[-2])
     image = render(scene, scene.pose_between(0.5), backend="numba").color
-    times = {"stages_s": stages, "total_s": sum(stages.values()), "processor_s": processor}
+    total_s = sum(stages.values())
+    times = {"stages_s": stages, "total_s": total_s, "total_ratio": total_s / workload_s, "processor_s": processor}
     size = {"height": scene.height, "num_gaussians": len(gaussians)}
     return {**size, **times, **peak}, {"depth": depth, "image": image}
 
@@ -239,6 +250,7 @@ MODEL = Benchmark(
         Column("threads", "threads", "{:d}"),
         *map(_stage_column, STAGES),
         Column("total s", "total_s", "{:.1f}"),
+        Column("ratio", "total_ratio", "{:.0f}"),
         Column("processor s", "processor_s", "{:.1f}"),
         Column("peak GiB", "peak_gib", "{:.2f}"),
         Column("depth median", error_or_reference("depth_median_error"), "{:.1e}"),

@@ -5,6 +5,8 @@ the panoramas between the inputs. The cross-fade of the inputs is the row withou
 
 Values of a row: `ws_psnr_db` and `lpips` of the panoramas between the inputs; `inputs_db`, WS-PSNR at the input cameras
 over unmasked pixels; `predict_s` and `refine_s`; `steps` of the refinement; `num_gaussians` of the scene.
+`predict_ratio` and `step_ratio` are the seconds of the prediction and of a step of the refinement over those of
+`harness.time_workload`, measured just before, so that figures of different machines compare.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import torch
 from torch import Tensor
 
 from pansplat import pipeline
+from pansplat.bench.harness import time_workload
 from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views, select_views
@@ -90,7 +93,7 @@ class RefineBench:
     def run(self, pairs: Sequence[Pair], cases: Sequence[RefineCase]) -> None:
         """Measure every case on every pair with targets, then add the means over the pairs."""
         for pair in pairs:
-            predicted: dict[tuple[str, int, int], tuple[Scene, float]] = {}
+            predicted: dict[tuple[str, int, int], tuple[Scene, dict[str, float]]] = {}
             for case in cases:
                 self._report.step(f"{pair.name}: {case}")
                 context, targets = pair.load_context(case.height), pair.load_targets(case.height)
@@ -105,7 +108,7 @@ class RefineBench:
         case: RefineCase,
         context: Views,
         targets: Views,
-        predicted: dict[tuple[str, int, int], tuple[Scene, float]],
+        predicted: dict[tuple[str, int, int], tuple[Scene, dict[str, float]]],
     ) -> dict[str, float]:
         if case.model == CROSS_FADE:
             errors = self._compare(partial(cross_fade, context.images, context.cam2world), targets)
@@ -113,28 +116,30 @@ class RefineBench:
         key = case.model, case.height, len(context.images)
         if key not in predicted:
             predicted[key] = self._predict(case.model, context)
-        scene, predict_s = predicted[key]
-        refine_s, steps = 0.0, 0
+        scene, times = predicted[key]
+        refined = {"refine_s": 0.0, "steps": 0}
         if case.limit_s:
+            workload_s = time_workload()
             start = time.perf_counter()
             refinement = Refinement(scene, context, RefineConfig(gaussians=case.limit_gaussians))
             steps = refinement.run(seconds=case.limit_s).steps
             scene, refine_s = refinement.scene(), time.perf_counter() - start
+            refined = {"refine_s": refine_s, "steps": steps, "step_ratio": refine_s / max(steps, 1) / workload_s}
 
         render = partial(pipeline.render, size=(case.height, 2 * case.height))
         with torch.no_grad():
             errors = self._compare(lambda pose: render(scene, pose).color.float(), targets)
         inputs_db, count = measure_own_views(scene, context, render), len(scene.gaussians)
-        times = {"predict_s": predict_s, "refine_s": refine_s}
-        return {**errors, "inputs_db": inputs_db, **times, "steps": steps, "num_gaussians": count}
+        return {**errors, "inputs_db": inputs_db, **times, **refined, "num_gaussians": count}
 
-    def _predict(self, model: str, context: Views) -> tuple[Scene, float]:
+    def _predict(self, model: str, context: Views) -> tuple[Scene, dict[str, float]]:
         if model not in self._predictors:
             self._predictors[model] = pipeline.load_model(model)
             warm_up(self._predictors[model])
-        start = time.perf_counter()
+        workload_s, start = time_workload(), time.perf_counter()
         scene = pipeline.predict(context, self._predictors[model])
-        return scene, time.perf_counter() - start
+        seconds = time.perf_counter() - start
+        return scene, {"predict_s": seconds, "predict_ratio": seconds / workload_s}
 
     def _compare(self, draw: Callable[[Tensor], Tensor], targets: Views) -> dict[str, float]:
         """Mean WS-PSNR and LPIPS of the targets."""
@@ -197,11 +202,13 @@ REFINE = Benchmark(
         Column("predict s", "predict_s", "{:.1f}"),
         Column("refine s", "refine_s", "{:.1f}"),
         Column("steps", "steps", "{:.0f}"),
+        Column("predict ratio", "predict_ratio", "{:.0f}"),
+        Column("step ratio", "step_ratio", "{:.1f}"),
         Column("WS-PSNR dB", "ws_psnr_db", "{:.2f}"),
         Column("LPIPS", "lpips", "{:.3f}"),
         Column("at inputs dB", "inputs_db", "{:.2f}"),
     ),
     lambda row: row.scene,
     plot_refine,
-    width=150,
+    width=175,
 )

@@ -21,11 +21,13 @@ class ParameterGroup:
 
     Attributes:
         rate: step size at the start of a run.
+        betas: decay of the averages of the gradients and of their squares.
         epsilon: added to the root of the mean square of the gradients.
     """
 
     parameters: Sequence[Tensor]
     rate: float
+    betas: tuple[float, float]
     epsilon: float = _MIN_EPSILON
     _states: dict[Tensor, tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict, init=False)
 
@@ -53,12 +55,11 @@ class ParameterGroup:
             self.epsilon = max(damping * float(torch.cat(gradients).square().mean().sqrt()), _MIN_EPSILON)
 
     @torch.no_grad()
-    def step(self, factor: float, betas: tuple[float, float], rows: Sequence[Tensor] = ()) -> None:
+    def step(self, factor: float, rows: Sequence[Tensor] = ()) -> None:
         """Move the parameters that have a gradient.
 
         Args:
             factor: of the step size.
-            betas: decay of the averages of the gradients and of their squares.
             rows: mask of the rows of each parameter that move, with their averages. Else rows that have a gradient in
                 few steps would go on along each for many. By default all.
         """
@@ -84,8 +85,8 @@ class ParameterGroup:
             [self._states[parameter][2] for parameter in moved],
             fused=True,
             amsgrad=False,
-            beta1=betas[0],
-            beta2=betas[1],
+            beta1=self.betas[0],
+            beta2=self.betas[1],
             lr=factor * self.rate,
             weight_decay=0.0,
             eps=self.epsilon,

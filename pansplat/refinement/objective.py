@@ -70,6 +70,10 @@ class Photograph:
 
 def image_difference(error: Float[Tensor, "3 height width"], weights: PixelWeights) -> Float[Tensor, ""]:
     """Mean absolute error of the colours plus that of their gradients."""
+    if error.device.type == "cpu" and error.dtype == torch.float32:
+        from pansplat.refinement.difference import Difference  # not at the top: a GPU needs no numba
+
+        return Difference.apply(error, weights.pixels, weights.right, weights.below)
     colors = (error.abs().mean(0) * weights.pixels).sum()
     right = error.roll(-1, 2) - error
     below = error[:, 1:] - error[:, :-1]

@@ -47,7 +47,9 @@ _HEIGHT = 512  # largest of the images that are compared; colours are fitted at 
 DISPLAY_HEIGHT = 1024
 _HELD_OUT = 0.04  # fraction of the blocks of the photographs
 _SPLIT_ERROR = 0.1  # least sum of a split Gaussian's absolute errors times its blending weights, pixels
-_BETAS = (0.9, 0.99)  # decay of Adam's averages of the gradients and of their squares
+# Decay of Adam's averages of the gradients and of their squares: short ones, since a run has tens of steps. Wrong poses
+# need long ones: own and other photographs contradict each other until the poses are corrected.
+_BETAS, _POSE_BETAS = (0.5, 0.95), (0.9, 0.99)
 # Adam's epsilon relative to the root mean square of the first gradients, for photographs that are compared at their own
 # size; it grows with the number of their pixels. Gaussians of little effect move less.
 _DAMPING = 0.2
@@ -189,12 +191,13 @@ class Refinement:
         return images if images.shape[-2:] == self._size else functional.interpolate(images, self._size, mode="area")
 
     def _group_parameters(self) -> list[ParameterGroup]:
-        rates = dataclasses.asdict(self.config.rates)
-        groups = [ParameterGroup([self._cameras.log_gains], rates["gain"])]
+        rates, betas = dataclasses.asdict(self.config.rates), _POSE_BETAS if self.config.poses else _BETAS
+        groups = [ParameterGroup([self._cameras.log_gains], rates["gain"], betas)]
         if self.config.poses:
-            groups.append(ParameterGroup([self._cameras.twists], rates["pose"]))
+            groups.append(ParameterGroup([self._cameras.twists], rates["pose"], betas))
         for name in ViewParameters.NAMES if self._views else ():
-            groups.append(ParameterGroup([view.tensors[name] for view in self._views.values()], rates[name]))
+            tensors = [view.tensors[name] for view in self._views.values()]
+            groups.append(ParameterGroup(tensors, rates[name], betas))
         return groups
 
     def step(self, fraction: float) -> None:
@@ -230,7 +233,7 @@ class Refinement:
             if not self._steps:
                 group.set_damping(_DAMPING * pixels)
             is_of_views = group in self._groups[-len(ViewParameters.NAMES) :]
-            group.step(_cosine_fall(fraction), _BETAS, rows if is_of_views else ())
+            group.step(_cosine_fall(fraction), rows if is_of_views else ())
         for parameters in self._views.values():
             parameters.clamp()
         self._steps += 1

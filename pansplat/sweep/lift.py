@@ -15,6 +15,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numba as nb
@@ -32,6 +33,7 @@ from pansplat.sweep.surface import (
     Surface,
     classify_point,
     consistency_mask,
+    for_point_ranges,
     guided_upsample,
     list_others,
     locate,
@@ -42,7 +44,6 @@ from pansplat.sweep.surface import (
     resize_sphere,
     world_points,
 )
-from pansplat.threads import limit_numba_threads
 
 _Lattice = tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]
 """Rays (n, 3) of a lattice, the same for all views, and the pixels (rows, columns) of a panorama that hold them."""
@@ -241,9 +242,11 @@ def _lift_lattice(
     size = spacing * (config.fine_footprint if is_fine else config.footprint)
     # A disc that is nearly parallel to its ray must end well before the camera.
     steepest = min(config.max_stretch[level], _MAX_LENGTH / size)
-    limit_numba_threads()
-    quats, scales = _shape_discs(rays, inverse_depth, gradient, size, steepest, config.thickness, pose)
-    color = _sample_bilinear(pad_sphere(image, 1), rays)
+    quats, scales = np.empty((len(rays), 4), np.float32), np.empty((len(rays), 3), np.float32)
+    shape = rays, inverse_depth, gradient, size, steepest, config.thickness, pose, quats, scales
+    for_point_ranges(partial(_shape_discs, *shape), len(rays))
+    color = np.empty((len(rays), 3), np.float32)
+    for_point_ranges(partial(_sample_bilinear, pad_sphere(image, 1), rays, color), len(rays))
     return Gaussians(
         means=torch.from_numpy(points).float(),
         scales=torch.from_numpy(scales),
@@ -261,12 +264,11 @@ def _locate_lattice(rows: int, height: int) -> _Lattice:
     return rays, nearest_pixel(rays, height)
 
 
-@nb.njit(parallel=True, cache=True)
-def _sample_bilinear(padded, rays):
-    """Bilinear samples (n, c) of a panorama, which is padded by one pixel, along rays (n, 3)."""
+@nb.njit(nogil=True, cache=True)
+def _sample_bilinear(padded, rays, samples, first, end):
+    """Write bilinear samples (n, c) of a panorama, which is padded by one pixel, along rays (n, 3)."""
     height = len(padded) - 2
-    samples = np.empty((len(rays), padded.shape[2]), np.float32)
-    for n in nb.prange(len(rays)):
+    for n in range(first, end):
         x, y = locate(rays[n, 0], rays[n, 1], rays[n, 2], height)
         column, row = min(int(x + 0.5), 2 * height), min(int(y + 0.5), height)  # of the padded image
         right, lower = x + 0.5 - column, y + 0.5 - row
@@ -274,7 +276,6 @@ def _sample_bilinear(padded, rays):
             above = padded[row, column, c] * (1 - right) + padded[row, column + 1, c] * right
             below = padded[row + 1, column, c] * (1 - right) + padded[row + 1, column + 1, c] * right
             samples[n, c] = above * (1 - lower) + below * lower
-    return samples
 
 
 def _window_extremum(values: np.ndarray, radius: int, *, largest: bool) -> np.ndarray:
@@ -330,24 +331,24 @@ def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> t
     A point in the consistent free space of more views than confirm it is not kept.
     """
     config, posed = scene.config, scene.posed
-    limit_numba_threads()
     # Rows of `counts`: views that confirm the point, that contradict it, that may, and that are too near to it.
     counts = np.zeros((4, len(points)), np.int16)
     for other in scene.neighbours[view]:
         certain = scene.consistent[other] & posed.masks[other]
         pose = np.ascontiguousarray(posed.cam2world[other], np.float64)
         inverse = scene.surfaces[other].inverse_depth
-        _count_judgements(points, inverse, certain, pose, config.discontinuity, _MIN_DISTANCE * posed.near, counts)
+        limits = config.discontinuity, _MIN_DISTANCE * posed.near
+        for_point_ranges(partial(_count_judgements, points, inverse, certain, pose, *limits, counts), len(points))
     confirmed, contradicted, doubtful, near = counts
     opacity = np.where(doubtful > 0, np.float32(config.uncertain_opacity), np.float32(config.single_view_opacity))
     opacity[confirmed > 0] = config.consistent_opacity
     return opacity, (near == 0) & (contradicted <= confirmed)
 
 
-@nb.njit(parallel=True, cache=True)
-def _count_judgements(points, inverse_depth, certain, cam2world, tolerance, nearest, counts):
+@nb.njit(nogil=True, cache=True)
+def _count_judgements(points, inverse_depth, certain, cam2world, tolerance, nearest, counts, first, end):
     """Add what a view says about each point to `counts`; see `_estimate_opacity`."""
-    for n in nb.prange(len(points)):
+    for n in range(first, end):
         kind, distance, row, column = classify_point(points[n], inverse_depth, cam2world, tolerance)
         if kind == CONSISTENT:
             counts[0, n] += 1
@@ -371,9 +372,9 @@ def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
     return np.stack((east / (pixel * shrink), south / pixel), axis=-1)
 
 
-@nb.njit(parallel=True, cache=True)
-def _shape_discs(rays, inverse_depth, gradient, size, steepest, thickness, cam2world):
-    """Quaternions (n, 4, wxyz) in the world, and standard deviations (n, 3), float32, of discs on the surface.
+@nb.njit(nogil=True, cache=True)
+def _shape_discs(rays, inverse_depth, gradient, size, steepest, thickness, cam2world, quats, scales, first, end):
+    """Write quaternions (n, 4, wxyz) in the world, and standard deviations (n, 3), of discs on the surface.
 
     Args:
         rays: (n, 3) float64, camera axes.
@@ -382,8 +383,8 @@ def _shape_discs(rays, inverse_depth, gradient, size, steepest, thickness, cam2w
         steepest: largest gradient that a disc follows.
         thickness: standard deviation across the surface, relative to the disc's.
     """
-    quats, scales = np.empty((len(rays), 4), np.float32), np.empty((len(rays), 3), np.float32)
-    for n in nb.prange(len(rays)):
+    axes = np.empty((3, 3))
+    for n in range(first, end):
         x, y, z = rays[n]
         flat = math.sqrt(x * x + z * z)
         east_x, east_z = (z / flat, -x / flat) if flat > 0 else (1.0, 0.0)
@@ -403,7 +404,6 @@ def _shape_discs(rays, inverse_depth, gradient, size, steepest, thickness, cam2w
         long_z = (to_east * east_z + to_south * south_z - steepness * z) / stretch
         across_x, across_y = to_east * south_x - to_south * east_x, to_east * south_y
         across_z = to_east * south_z - to_south * east_z
-        axes = np.empty((3, 3))
         for i in range(3):
             a, b, c = cam2world[i, 0], cam2world[i, 1], cam2world[i, 2]
             axes[i, 0] = a * long_x + b * long_y + c * long_z
@@ -414,7 +414,6 @@ def _shape_discs(rays, inverse_depth, gradient, size, steepest, thickness, cam2w
         _write_quat(axes, quats[n])
         sigma = size / inverse_depth[n]
         scales[n, 0], scales[n, 1], scales[n, 2] = sigma * stretch, sigma, sigma * thickness
-    return quats, scales
 
 
 @nb.njit(inline="always")

@@ -20,6 +20,7 @@ from collections import namedtuple
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, fields
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -27,8 +28,8 @@ import numba as nb
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
+from pansplat.rendering.cpu.runtime import parallel_for, thread_count
 from pansplat.sweep.surface import pad_sphere, ray_grid
-from pansplat.threads import limit_numba_threads
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
 _BLOCK = 8  # hypotheses that a thread processes together
@@ -319,11 +320,13 @@ def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m,
 
 
 @nb.njit(fastmath=True, nogil=True, cache=True)
-def _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, total, offset):
-    """Add the weighted costs of the hypotheses from `first` to `last` to `cost`, the weights to `total` (h, w, labels).
+def _compute_block_cost(view, other, hypotheses, bounds, weights, cost, total, offset, block):
+    """Add the weighted costs of a block of a set's hypotheses to `cost`, the weights to `total` (h, w, labels).
 
     Without `total`, there is one other view: its costs are written. The set starts at `offset`.
     """
+    first = block * _BLOCK
+    last = min(first + _BLOCK, hypotheses.penalty.shape[1])
     height, width = view.mean.shape
     m = (view.gray.shape[0] - height) // 2
     maps, row = np.empty((6, height, width), np.float32), np.empty((5, width), np.float32)
@@ -345,16 +348,6 @@ def _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, c
                     total[i, j, offset + k] += weight
                 else:
                     cost[i, j, offset + k] = result[i, j, k - first]
-
-
-@nb.njit(parallel=True, fastmath=True, cache=True)
-def _compute_set_cost(view, other, hypotheses, bounds, weights, cost, total, offset):
-    """Add the weighted costs of a set's hypotheses to `cost`, the weights to `total` (h, w, labels), from `offset`."""
-    count = hypotheses.penalty.shape[1]
-    for block in nb.prange((count + _BLOCK - 1) // _BLOCK):
-        first = block * _BLOCK
-        last = min(first + _BLOCK, count)
-        _compute_block_cost(first, last, view, other, hypotheses, bounds, weights, cost, total, offset)
 
 
 class DepthRange(NamedTuple):
@@ -467,7 +460,6 @@ def compute_matching_cost(
     cost = np.zeros(shape, np.float32) if several else np.empty(shape, np.float32)
     total = np.zeros(shape if several else (0, 0, 0), np.float32)
     unknown = np.ones((height, width), np.float32)
-    limit_numba_threads()
     for other, pose, sets in others:
         warped = _Other(
             pad_sphere(other.image, 1),
@@ -479,9 +471,12 @@ def compute_matching_cost(
         )
         for n, own in enumerate(sets):
             back_facing = np.zeros((2, count), bool) if own.back_facing is None else own.back_facing
-            hypotheses = _Set(own.base, own.step, own.penalty, own.side, back_facing)
+            # One type for all sets: the kernel is compiled once.
+            maps = (np.ascontiguousarray(each, np.float32) for each in (own.base, own.step, own.penalty))
+            hypotheses = _Set(*maps, np.ascontiguousarray(own.side), back_facing)
             own_weights = weights if own.sphere else weights._replace(opposed_penalty=np.float32(0))
-            _compute_set_cost(matched, warped, hypotheses, bounds, own_weights, cost, total, n * count)
+            arguments = matched, warped, hypotheses, bounds, own_weights, cost, total, n * count
+            parallel_for(partial(_compute_block_cost, *arguments), -(-count // _BLOCK), thread_count())
     if several:
         cost /= total
     return cost
@@ -570,7 +565,8 @@ def _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx,
     in_slot, near_slot = np.empty(slots, np.float32), np.empty(slots, np.float32)
     for i in range(height):
         t = stretch[i]  # neighbours near a pole are closer, so penalties are higher
-        previous[:] = cost[i, -dx * run_up % width]
+        for label in range(labels):  # a copy of a slice takes two seconds to compile
+            previous[label] = cost[i, -dx * run_up % width, label]
         for n in range(1 - run_up, width):
             j, j_before = (dx * n) % width, (dx * (n - 1)) % width
             jump = _jump_penalty(guide[i, j], guide[i, j_before], penalties)
@@ -599,7 +595,8 @@ def _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, r
         for path in range(width):
             j = (path + shift) % width
             if n == -run_up:
-                current[path] = cost[i, j]
+                for label in range(labels):
+                    current[path, label] = cost[i, j, label]
                 continue
             path_before = (path - dx) % width
             jump = _jump_penalty(guide[i, j], guide[i_before, (path_before + shift_before) % width], penalties)
@@ -650,26 +647,23 @@ def aggregate_costs(
 
 def select_labels(total: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Label of lowest cost (h, w) int32, and its subpixel offset in [-0.5, 0.5] labels by a parabola fit."""
-    limit_numba_threads()
-    return _select_labels(total, count)
-
-
-@nb.njit(parallel=True, cache=True)
-def _select_labels(total, count):
-    height, width, labels = total.shape
-    label = np.empty((height, width), np.int32)
-    offset = np.zeros((height, width), np.float32)
-    for i in nb.prange(height):
-        for j in range(width):
-            best = 0
-            for n in range(1, labels):
-                if total[i, j, n] < total[i, j, best]:
-                    best = n
-            label[i, j] = best
-            k = best % count
-            if 0 < k < count - 1:
-                left, right = total[i, j, best - 1], total[i, j, best + 1]
-                curvature = left + right - 2 * total[i, j, best]
-                if curvature > 1e-6:
-                    offset[i, j] = min(max(0.5 * (left - right) / curvature, -0.5), 0.5)
+    label, offset = np.empty(total.shape[:2], np.int32), np.zeros(total.shape[:2], np.float32)
+    parallel_for(partial(_select_labels, total, count, label, offset), len(total), thread_count())
     return label, offset
+
+
+@nb.njit(nogil=True, cache=True)
+def _select_labels(total, count, label, offset, i):
+    width, labels = total.shape[1:]
+    for j in range(width):
+        best = 0
+        for n in range(1, labels):
+            if total[i, j, n] < total[i, j, best]:
+                best = n
+        label[i, j] = best
+        k = best % count
+        if 0 < k < count - 1:
+            left, right = total[i, j, best - 1], total[i, j, best + 1]
+            curvature = left + right - 2 * total[i, j, best]
+            if curvature > 1e-6:
+                offset[i, j] = min(max(0.5 * (left - right) / curvature, -0.5), 0.5)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import cv2
@@ -22,10 +23,10 @@ import torch
 
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.geometry.equirect import rotate_equirect, row_weights
+from pansplat.rendering.cpu.runtime import parallel_for, thread_count
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
 from pansplat.sweep.surface import Surface, list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
-from pansplat.threads import limit_numba_threads
 
 _HEIGHT_CANDIDATES = 40
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
@@ -349,22 +350,20 @@ def apply_prior_cost(
     log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
     scale = np.stack([np.maximum(prior.scale, config.min_scale) for prior in priors]).astype(np.float32)
     penalty = np.where(np.arange(len(priors)) > 0, config.further_penalty, 0).astype(np.float32)
-    limit_numba_threads()
+    weight, cap = np.float32(config.weight), np.float32(config.cap)
     for n, hypotheses in enumerate(sets):
-        _add_cost(
-            cost, log_depth, scale, penalty, hypotheses.base, hypotheses.step, n * count, count,
-            np.float32(config.weight), np.float32(config.cap),
-        )  # fmt: skip
+        base, step = (np.ascontiguousarray(each, np.float32) for each in (hypotheses.base, hypotheses.step))
+        add = partial(_add_cost, cost, log_depth, scale, penalty, base, step, n * count, count, weight, cap)
+        parallel_for(add, len(cost), thread_count())
 
 
-@nb.njit(parallel=True, fastmath=True, cache=True)
-def _add_cost(cost, log_depth, scale, penalty, base, step, offset, count, weight, cap):
-    priors, height, width = log_depth.shape
-    for i in nb.prange(height):
-        for j in range(width):
-            for k in range(count):
-                log_inverse = math.log(max(base[i, j] + np.float32(k) * step[i, j], np.float32(1e-6)))
-                away = cap
-                for n in range(priors):
-                    away = min(away, abs(log_inverse + log_depth[n, i, j]) / scale[n, i, j] + penalty[n])
-                cost[i, j, offset + k] += weight * away
+@nb.njit(nogil=True, fastmath=True, cache=True)
+def _add_cost(cost, log_depth, scale, penalty, base, step, offset, count, weight, cap, i):
+    priors, _, width = log_depth.shape
+    for j in range(width):
+        for k in range(count):
+            log_inverse = math.log(max(base[i, j] + np.float32(k) * step[i, j], np.float32(1e-6)))
+            away = cap
+            for n in range(priors):
+                away = min(away, abs(log_inverse + log_depth[n, i, j]) / scale[n, i, j] + penalty[n])
+            cost[i, j, offset + k] += weight * away

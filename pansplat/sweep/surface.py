@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numba as nb
 import numpy as np
 
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.threads import limit_numba_threads
+from pansplat.rendering.cpu.runtime import parallel_for, thread_count
 
 
 @functools.lru_cache(maxsize=4)
@@ -39,19 +40,22 @@ def locate_pixel(x, y, z, height):
 
 def nearest_pixel(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the pixel that holds each direction (..., 3)."""
-    limit_numba_threads()
-    pixels = _locate_pixels(np.ascontiguousarray(directions).reshape(-1, 3), height)
+    flat = np.ascontiguousarray(directions, np.float64).reshape(-1, 3)
+    pixels = np.empty((2, len(flat)), np.int32)
+    for_point_ranges(partial(_locate_pixels, flat, height, pixels), len(flat))
     row, column = pixels.reshape(2, *directions.shape[:-1])
     return row, column
 
 
-@nb.njit(parallel=True, cache=True)
-def _locate_pixels(directions, height):
-    pixels = np.empty((2, len(directions)), np.int32)
-    for n in nb.prange(len(directions)):
-        x, y, z = np.float64(directions[n, 0]), np.float64(directions[n, 1]), np.float64(directions[n, 2])
-        pixels[0, n], pixels[1, n] = locate_pixel(x, y, z, height)
-    return pixels
+@nb.njit(nogil=True, cache=True)
+def _locate_pixels(directions, height, pixels, first, end):
+    for n in range(first, end):
+        pixels[0, n], pixels[1, n] = locate_pixel(directions[n, 0], directions[n, 1], directions[n, 2], height)
+
+
+def for_point_ranges(work: Callable[[int, int], object], count: int) -> None:
+    """Call `work` on all threads with the ends of ranges of points, 0 to `count`."""
+    parallel_for(lambda item: work(item * _RANGE, min((item + 1) * _RANGE, count)), -(-count // _RANGE), thread_count())
 
 
 def pad_sphere(image: np.ndarray, margin: int) -> np.ndarray:
@@ -87,6 +91,7 @@ def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:
     return cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
 
 
+_RANGE = 1 << 14  # points that a thread processes together
 _SMOOTH = 0.03  # largest relative change of inverse depth that is interpolated bilinearly
 
 CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
@@ -111,9 +116,9 @@ class Surface:
 
 def classify_visibility(points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float) -> np.ndarray:
     """Class (uint8) of world points (..., 3): CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE."""
-    limit_numba_threads()
     flat = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
-    classes = _classify_points(flat, surface.inverse_depth, np.ascontiguousarray(cam2world), tolerance)
+    classes, pose = np.empty(len(flat), np.uint8), np.ascontiguousarray(cam2world)
+    for_point_ranges(partial(_classify_points, flat, surface.inverse_depth, pose, tolerance, classes), len(flat))
     return classes.reshape(points.shape[:-1])
 
 
@@ -131,12 +136,10 @@ def classify_point(point, inverse_depth, cam2world, tolerance):
     return FREE_SPACE if ratio > 1 + tolerance else kind, distance, row, column
 
 
-@nb.njit(parallel=True, cache=True)
-def _classify_points(points, inverse_depth, cam2world, tolerance):
-    classes = np.empty(len(points), np.uint8)
-    for n in nb.prange(len(points)):
+@nb.njit(nogil=True, cache=True)
+def _classify_points(points, inverse_depth, cam2world, tolerance, classes, first, end):
+    for n in range(first, end):
         classes[n] = classify_point(points[n], inverse_depth, cam2world, tolerance)[0]
-    return classes
 
 
 def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
@@ -186,63 +189,61 @@ def guided_upsample(
     """
     if needed is None:
         needed = np.ones(fine.shape[:2], bool)
-    limit_numba_threads()
     inverse, window = surface.inverse_depth, np.ones((5, 5), np.uint8)
     # Columns wrap; the rows beyond a pole, where the filters have no values, do not count.
     wrapped = np.concatenate((inverse[:, -2:], inverse, inverse[:, :2]), axis=1)
     lowest, highest = cv2.erode(wrapped, window)[:, 2:-2], cv2.dilate(wrapped, window)[:, 2:-2]
     smooth = highest < (1 + _SMOOTH) * lowest
-    return Surface(*_upsample(inverse, surface.orientation, smooth, coarse, fine, needed))
+    result, orientations = np.zeros(needed.shape, np.float32), np.zeros(needed.shape, np.uint8)
+    work = partial(_upsample, inverse, surface.orientation, smooth, coarse, fine, needed, result, orientations)
+    parallel_for(work, len(needed), thread_count())
+    return Surface(result, orientations)
 
 
-@nb.njit(parallel=True, fastmath=True, cache=True)
-def _upsample(inverse, orientation, is_smooth, coarse, fine, needed):
+@nb.njit(nogil=True, fastmath=True, cache=True)
+def _upsample(inverse, orientation, is_smooth, coarse, fine, needed, result, orientations, i):
     h, w = inverse.shape
     height, width = fine.shape[:2]
-    result = np.zeros((height, width), np.float32)
-    orientations = np.zeros((height, width), np.uint8)
-    for i in nb.prange(height):
-        values, weights = np.empty(25, np.float32), np.empty(25, np.float32)
-        kinds = np.empty(25, np.uint8)
-        y = (i + 0.5) * h / height - 0.5
-        for j in range(width):
-            if not needed[i, j]:
-                continue
-            x = (j + 0.5) * w / width - 0.5
-            cy, cx = int(math.floor(y + 0.5)), int(math.floor(x + 0.5))
-            y0, x0 = int(math.floor(y)), int(math.floor(x))
-            fy, fx = y - y0, x - x0
-            r0, r1 = min(max(y0, 0), h - 1), min(max(y0 + 1, 0), h - 1)
-            c0, c1 = x0 % w, (x0 + 1) % w
-            smooth = (inverse[r0, c0] * (1 - fx) + inverse[r0, c1] * fx) * (1 - fy)
-            smooth += (inverse[r1, c0] * (1 - fx) + inverse[r1, c1] * fx) * fy
-            r, c = min(max(cy, 0), h - 1), cx % w
-            if is_smooth[r, c]:  # the median is close to the smooth value
-                result[i, j], orientations[i, j] = smooth, orientation[r, c]
-                continue
-            n = 0
-            total = 0.0
-            for di in range(-2, 3):
-                for dj in range(-2, 3):
-                    r = min(max(cy + di, 0), h - 1)
-                    c = (cx + dj) % w
-                    d = 0.0
-                    for q in range(3):
-                        d += abs(fine[i, j, q] - coarse[r, c, q])
-                    near = (cy + di - y) ** 2 + (cx + dj - x) ** 2
-                    value, weight = inverse[r, c], math.exp(-d / 0.1 - near / 2.0) + 1e-12
-                    total += weight
-                    at = n
-                    while at > 0 and values[at - 1] > value:
-                        values[at], kinds[at], weights[at] = values[at - 1], kinds[at - 1], weights[at - 1]
-                        at -= 1
-                    values[at], kinds[at], weights[at] = value, orientation[r, c], weight
-                    n += 1
-            below, median = weights[0], 0
-            while below < 0.5 * total and median < 24:
-                median += 1
-                below += weights[median]
-            close = abs(smooth / values[median] - 1) < _SMOOTH
-            result[i, j] = smooth if close else values[median]
-            orientations[i, j] = kinds[median]
-    return result, orientations
+    values, weights = np.empty(25, np.float32), np.empty(25, np.float32)
+    kinds = np.empty(25, np.uint8)
+    y = (i + 0.5) * h / height - 0.5
+    for j in range(width):
+        if not needed[i, j]:
+            continue
+        x = (j + 0.5) * w / width - 0.5
+        cy, cx = int(math.floor(y + 0.5)), int(math.floor(x + 0.5))
+        y0, x0 = int(math.floor(y)), int(math.floor(x))
+        fy, fx = y - y0, x - x0
+        r0, r1 = min(max(y0, 0), h - 1), min(max(y0 + 1, 0), h - 1)
+        c0, c1 = x0 % w, (x0 + 1) % w
+        smooth = (inverse[r0, c0] * (1 - fx) + inverse[r0, c1] * fx) * (1 - fy)
+        smooth += (inverse[r1, c0] * (1 - fx) + inverse[r1, c1] * fx) * fy
+        r, c = min(max(cy, 0), h - 1), cx % w
+        if is_smooth[r, c]:  # the median is close to the smooth value
+            result[i, j], orientations[i, j] = smooth, orientation[r, c]
+            continue
+        n = 0
+        total = 0.0
+        for di in range(-2, 3):
+            for dj in range(-2, 3):
+                r = min(max(cy + di, 0), h - 1)
+                c = (cx + dj) % w
+                d = 0.0
+                for q in range(3):
+                    d += abs(fine[i, j, q] - coarse[r, c, q])
+                near = (cy + di - y) ** 2 + (cx + dj - x) ** 2
+                value, weight = inverse[r, c], math.exp(-d / 0.1 - near / 2.0) + 1e-12
+                total += weight
+                at = n
+                while at > 0 and values[at - 1] > value:
+                    values[at], kinds[at], weights[at] = values[at - 1], kinds[at - 1], weights[at - 1]
+                    at -= 1
+                values[at], kinds[at], weights[at] = value, orientation[r, c], weight
+                n += 1
+        below, median = weights[0], 0
+        while below < 0.5 * total and median < 24:
+            median += 1
+            below += weights[median]
+        close = abs(smooth / values[median] - 1) < _SMOOTH
+        result[i, j] = smooth if close else values[median]
+        orientations[i, j] = kinds[median]

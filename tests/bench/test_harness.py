@@ -17,6 +17,7 @@ from pansplat.bench.harness import (
     quartile_range,
     relative_deviation,
     time_call,
+    time_workload,
 )
 
 CPU = torch.device("cpu")
@@ -66,6 +67,12 @@ def test_deviation_of_tensors_is_relative_to_the_reference():
     assert relative_deviation(result, reference, together=False) == pytest.approx(0.1)
     with pytest.raises(ValueError, match="must hold"):
         relative_deviation({"a": result["a"]}, reference, together=True)
+
+
+def test_the_workload_takes_time_and_leaves_the_number_of_threads():
+    before = torch.get_num_threads()
+    assert time_workload() > 0
+    assert torch.get_num_threads() == before
 
 
 def test_the_machine_is_described():

@@ -38,6 +38,22 @@ def test_masked_pixels_have_no_gradient() -> None:
     assert not error.grad[:, ~mask].any() and error.grad[:, mask].any()
 
 
+@pytest.mark.parametrize("size", [(16, 32), (37, 74), (1, 2)])
+def test_the_compiled_difference_equals_that_of_torch_in_float64(size: tuple[int, int]) -> None:
+    mask = torch.rand(size, generator=torch.Generator().manual_seed(2)) > 0.3
+    weights, results = PixelWeights.from_mask(mask), []
+    error = torch.randn(3, *size, generator=torch.Generator().manual_seed(4))
+    error[:, : size[0] // 4] = 0.0  # the gradient of an absolute value is 0 at 0
+    for dtype in (torch.float32, torch.float64):
+        leaf = error.to(dtype, copy=True).requires_grad_()
+        loss = image_difference(leaf, weights)
+        (2 * loss).backward()
+        results.append((loss.detach().double(), leaf.grad.double()))  # type: ignore[union-attr]
+    (loss, gradient), (exact_loss, exact_gradient) = results
+    torch.testing.assert_close(loss, exact_loss, rtol=1e-6, atol=0)
+    torch.testing.assert_close(gradient, exact_gradient, rtol=1e-5, atol=1e-7 * float(exact_gradient.abs().max()))
+
+
 def test_held_out_blocks_are_disjoint_from_fitted_pixels_and_repeat_with_the_seed() -> None:
     mask = torch.ones(64, 128, dtype=torch.bool)
     mask[50:] = False

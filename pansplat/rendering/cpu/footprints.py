@@ -73,7 +73,8 @@ def _draw_rows(counts, kind, columns, rows, rotation, records, values, distances
     for y in range(first, end):
         for x in range(width):
             directions[y - first, x] = pixel_point(kind, columns, rows, rotation, x, y)
-    sums[:, first:end] = np.float32(0)
+            for channel in range(len(sums)):  # assigned to a slice, a number takes two seconds to compile
+                sums[channel, y, x] = np.float32(0)
     for g in range(len(boxes)):
         left, right, top, bottom = boxes[g, 0], boxes[g, 1], max(boxes[g, 2], first), min(boxes[g, 3], end - 1)
         record, peak, distance = records[g], records[g, layout.LOG2_PEAK], distances[g]
