@@ -115,16 +115,13 @@ class RefineReport:
 class _Layer:
     """Views whose Gaussians are drawn together, and the photographs that they are compared with.
 
-    The first photograph is that of the view, unless there are several views.
+    Attributes:
+        source: the only view, whose photograph is the first; None in joint drawing.
     """
 
     views: tuple[int, ...]
     photographs: tuple[int, ...]
-
-    @property
-    def source(self) -> int | None:
-        """The only view; None if there are several."""
-        return self.views[0] if len(self.views) == 1 else None
+    source: int | None = None
 
 
 class Refinement:
@@ -176,7 +173,7 @@ class Refinement:
             for view in torch.unique(gaussians.views)
         }
         self._layers = [
-            _Layer((view,), (view, *nearest_views(scene.cam2world, view, MAX_OTHERS))) for view in self._views
+            _Layer((view,), (view, *nearest_views(scene.cam2world, view, MAX_OTHERS)), view) for view in self._views
         ]
         if scene.joint:
             self._layers = [_Layer(tuple(self._views), tuple(range(len(scene.cam2world))))]
@@ -240,7 +237,7 @@ class Refinement:
 
     def _choose_target(self, layer: _Layer) -> int:
         """The photograph that a layer is compared with: that of its view in even steps, the others in turn in odd ones.
-        Those of several views are compared with all in turn.
+        In joint drawing, all in turn.
         """
         own, *others = layer.photographs
         if layer.source is None:

@@ -163,3 +163,12 @@ def test_contributions_of_a_fused_scene_are_those_of_joint_images(room) -> None:
     joint = measure_contributions(covered, size)[hidden].sum()
     layered = measure_contributions(dataclasses.replace(covered, joint=False), size)[hidden].sum()
     assert joint < 0.3 * layered
+
+
+def test_a_fused_scene_of_which_one_view_is_left_is_compared_with_all_photographs(room) -> None:
+    kept = room.predicted.gaussians.select(room.predicted.gaussians.views == 1)
+    scene = dataclasses.replace(room.predicted, gaussians=kept, joint=True)
+    refinement = Refinement(scene, room.views)
+    report = refinement.run(steps=40)
+    assert report.after < report.before
+    assert _joint_error(refinement.scene(), room.views) < 0.5 * _joint_error(scene, room.views)
