@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-PREDICT = "predict pair -o out.ply --model sphere --height 64"
+PREDICT = "predict pair -o out.ply --model sphere --height 64 --refine 0"
 EVALUATE = "evaluate pair --out report --model sphere --height 64"
 RENDER = "render pair -o x.png --model sphere --refine 0 --predict-height 64"
 
@@ -190,7 +190,7 @@ def test_terminals_and_pipes_end_no_command_with_a_traceback(folder: Path, tmp_p
     odd_name = os.fsencode(odd.name).decode("latin-1")
     cases.add(
         "a pair whose name is not UTF-8, without a home and a writable cache",
-        f"predict {odd_name} -o b.ply --model file --height 64",
+        f"predict {odd_name} -o b.ply --model file --height 64 --refine 0",
         0,
         environment={"XDG_CACHE_HOME": "/proc/c"},
         unset=["HOME"],

@@ -68,7 +68,7 @@ class Fault:
 
 INFO = "info scene.ply"
 DRAW = "render scene.ply -o x.png --height 8"
-PREDICT = "predict pair -o out.ply --model sphere --height 64"
+PREDICT = "predict pair -o out.ply --model sphere --height 64 --refine 0"
 WEIGHTS = "predict pair -o out.ply --model weights.safetensors --height 64"
 
 
@@ -205,7 +205,7 @@ SIZES = [
     Fault("a choice that is missing", "render scene.ply -o x.png --layout fisheye", says="--layout"),
     Fault("a number of a view with 400 digits", f"render scene.ply -o x.png --blend view{_HUGE}", says="--blend"),
     Fault("a number of a pair with 400 digits", f"{PREDICT} --pair {_HUGE}", says="--pair"),
-    *(Fault(f"predict --height {height} works", f"predict pair -o out.ply --model sphere --height {height}", status=0) for height in (64, 65)),
+    *(Fault(f"predict --height {height} works", f"predict pair -o out.ply --model sphere --refine 0 --height {height}", status=0) for height in (64, 65)),
     *(Fault(f"render --height {height} works", f"render scene.ply -o x.png --height {height}", status=0) for height in (2, 11)),
 ]  # fmt: skip
 
