@@ -18,6 +18,7 @@ from pansplat.data.views import Views
 from pansplat.gaussians.scene import Gaussians
 from pansplat.pipeline import predict
 from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels, enlarge
+from pansplat.rendering.cpu.runtime import hide_message
 from pansplat.rendering.cpu.tiling import radix_argsort
 from pansplat.rendering.image_planes import Layout
 from pansplat.rendering.rasterize import Order, RasterOptions, rasterize
@@ -39,7 +40,8 @@ def main() -> None:
 
 
 def compile_kernels(name: str) -> None:
-    """Compile the kernels of one of `STEPS` in this process."""
+    """Compile the kernels of one of `STEPS` in this process, without a message about it."""
+    hide_message()
     for step in STEPS[name]:
         step()
 

@@ -146,7 +146,9 @@ class Options:
 def run_arguments(args: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, those of the process by default, and return its exit status."""
     options = parse_arguments(
-        lambda: tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,))
+        lambda: tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,)),
+        "pansplat-view",
+        args,
     )
     check_numbers(options)
     with own_warnings():

@@ -50,7 +50,9 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
             prog="pansplat-train",
             description="Train a network. Run the same command again to resume a stopped run.",
             config=(tyro.conf.FlagCreatePairsOff,),
-        )
+        ),
+        "pansplat-train",
+        argv,
     )
 
 
