@@ -8,6 +8,7 @@ import difflib
 import errno
 import functools
 import io
+import math
 import os
 import re
 import shutil
@@ -36,9 +37,10 @@ DEBUG = "PANSPLAT_DEBUG"  # environment variable; 1 prints the traceback of ever
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
-_COLORS = {"error": 31, "interrupted": 31, "note": 33}  # ANSI codes of red and yellow
+_COLORS = {"error": 31, "interrupted": 31, "note": 33, "progress": 36}  # ANSI codes of red, yellow and cyan
 _MIN_WIDTH, _MAX_WIDTH = 40, 1000  # characters; help and tables need minutes and gigabytes outside
 _COMPLETION = "--tyro-print-completion"
+_LINE_INTERVAL, _MAX_LEFT = 30.0, 86_400.0  # seconds: between two lines of progress; left that are printed
 _REDRAW_INTERVAL = 0.25  # seconds between two states of a progress bar in a notebook
 _AGAIN = 0.02  # seconds after which a lost interrupt is raised again
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -256,7 +258,7 @@ def _prepare_terminal() -> None:
 
 
 def print_message(kind: str, text: object) -> None:
-    """Print one line `kind: text` on standard error; `kind` is "error", "interrupted" or "note"."""
+    """Print one line `kind: text` on standard error; `kind` is "error", "interrupted", "note" or "progress"."""
     start = f"{kind}: "
     try:
         if sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
@@ -370,18 +372,23 @@ def is_notebook() -> bool:
 
 @contextlib.contextmanager
 def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """A function that shows the current step and the fraction done on a temporary bar, with the time left.
+    """A function that shows the current step and the fraction done, with the time left.
 
-    The bar is on standard error, if that is a terminal, or below the cell of a notebook.
+    A temporary bar on standard error shows them, or below the cell of a notebook. If standard error is not a terminal,
+    a line is printed each half minute.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     in_notebook, console = is_notebook(), Console(stderr=True)
+    if not console.is_terminal and not in_notebook:
+        yield _print_progress()
+        return
     columns = TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
     times = TimeElapsedColumn(), TimeRemainingColumn()
-    hidden = not console.is_terminal and not in_notebook
-    bar = Progress(*columns, *times, console=console, transient=True, disable=hidden)
+    # Standard output goes through the bar if it is on the same terminal, and stays what it is if it is a file.
+    is_shared = sys.stdout.isatty() and not in_notebook
+    bar = Progress(*columns, *times, console=console, transient=True, redirect_stdout=is_shared)
     with _draw_in_notebook(bar) if in_notebook else _draw_in_terminal(bar) as redraw:
         task = bar.add_task("", total=1.0)
 
@@ -390,6 +397,23 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
             redraw()
 
         yield report
+
+
+def _print_progress() -> Callable[[str, float], None]:
+    """A function that prints the progress on standard error, a line each half minute."""
+    began = printed = time.monotonic()
+
+    def report(stage: str, fraction: float) -> None:
+        nonlocal printed
+        now = time.monotonic()
+        if now - printed < _LINE_INTERVAL:
+            return
+        printed = now
+        left = (now - began) * (1 - fraction) / fraction if fraction > 0 else math.inf
+        rest = f", about {left:.0f} s left" if left < _MAX_LEFT else ""
+        print_message("progress", f"{stage or 'working'}, {100 * fraction:.0f} %{rest}")
+
+    return report
 
 
 @contextlib.contextmanager

@@ -28,8 +28,10 @@ if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
     from pansplat.rendering import Rendering
 
-DISPLAY_GAUSSIANS = 100_000  # of a scene in a notebook: about 3 MB of its file
+DISPLAY_GAUSSIANS = 100_000  # of a scene in a notebook: 2.4 MB of its file
 _FRAME_HEIGHT = 480  # pixels, of a scene
+_MERGE_SIZE = 128, 256  # pixels, of the images that find what Gaussians contribute
+_MAX_MERGERS = 8  # Gaussians that become one on average; more take up to half a minute
 _MAX_WIDTH = 1024  # pixels, of a picture
 _MAX_PICTURES = 4  # of the panoramas of an object; the others are named in its text
 _JPEG_QUALITY = 85
@@ -40,11 +42,11 @@ _BUNDLE = dict[str, str]  # data by MIME type; pictures in base64
 def show(scene: Scene, *, gaussians: int = DISPLAY_GAUSSIANS, height: int = _FRAME_HEIGHT) -> Path | None:
     """Show a scene in the viewer of web pages: below the cell of a notebook, elsewhere in the browser.
 
-    Larger scenes are thinned out, which is quick and loses detail; `pansplat.web.write_page` merges similar Gaussians.
+    In larger scenes similar Gaussians are merged, without the fit to the photographs of `pansplat.web.write_page`.
 
     Args:
         scene: the scene.
-        gaussians: largest number of Gaussians. In a notebook they are a part of its file, about 30 bytes each.
+        gaussians: largest number of Gaussians. In a notebook they are a part of its file, about 24 bytes each.
         height: of the frame in a notebook, pixels.
 
     Returns:
@@ -96,22 +98,38 @@ def _make_page(scene: Scene, gaussians: int) -> str:
 
     with tempfile.TemporaryDirectory(prefix="pansplat-") as folder:
         path = Path(folder) / "scene.html"
-        write_page(_thin_out(scene, gaussians), path, title="scene")
+        write_page(_reduce(scene, gaussians), path, title="scene")
         return path.read_text("utf-8")
 
 
-def _thin_out(scene: Scene, count: int) -> Scene:
-    """At most `count` Gaussians of the scene, those of a random choice, wider so that they cover the same surfaces.
+def _reduce(scene: Scene, count: int) -> Scene:
+    """At most `count` Gaussians of the scene, in seconds: similar neighbours are merged, without a fit.
 
-    It takes milliseconds, a merger of similar neighbours seconds to minutes.
+    Of very many Gaussians, or without input cameras, a random choice remains before.
     """
+    import torch
+
+    from pansplat.geometry.world import working_factor
+    from pansplat.refinement.budget import merge_to
+
+    if len(scene.gaussians) <= count:
+        return scene
+    if count < 1:
+        raise InputError(f"`gaussians` must be at least 1, got {count}")
+    if int(scene.gaussians.views.max()) >= len(scene.cam2world):
+        return _choose(scene, count)
+    factor = working_factor(scene.near)
+    with torch.no_grad():
+        return merge_to(_choose(scene, _MAX_MERGERS * count).scaled(factor), _MERGE_SIZE, count).scaled(1 / factor)
+
+
+def _choose(scene: Scene, count: int) -> Scene:
+    """A random choice of at most `count` Gaussians, wider, so that they cover the same surfaces."""
     import torch
 
     gaussians = scene.gaussians
     if len(gaussians) <= count:
         return scene
-    if count < 1:
-        raise InputError(f"`gaussians` must be at least 1, got {count}")
     order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))
     chosen = gaussians.select(order[:count].sort().values.to(gaussians.means.device))
     wider = chosen.scales * (len(gaussians) / count) ** 0.5

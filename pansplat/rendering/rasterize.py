@@ -181,9 +181,10 @@ class Rendering:
     def __repr__(self) -> str:
         channels, height, width = self.color.shape
         parts = [f"{height}x{width}", "RGB" if channels == 3 else describe_count(channels, "channel")]
-        if self.alpha.numel():
-            parts.append(f"alpha {describe_range(float(self.alpha.min()), float(self.alpha.max()))}")
-        depths = self.depth[self.alpha > 0]
+        alpha, depth = self.alpha.detach(), self.depth.detach()
+        if alpha.numel():
+            parts.append(f"alpha {describe_range(float(alpha.min()), float(alpha.max()))}")
+        depths = depth[alpha > 0]
         if len(depths):
             parts.append(f"depth {describe_range(float(depths.min()), float(depths.max()), 'm')}")
         return f"<Rendering: {', '.join(parts)}>"
