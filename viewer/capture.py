@@ -15,7 +15,7 @@ from pansplat.data.video import VIDEO_SUFFIXES, write_video
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
-from pansplat.tours import Route, paint_floor_plan
+from pansplat.tours import FADE_SECONDS, Route, TourGraph, paint_floor_plan
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.stereo import ImageFormat, render_image
 from pansplat_viewer.scene import camera as cameras
@@ -26,6 +26,7 @@ from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import NEAR_OF_FAR, ViewerState, enter_scene, fit_settings
 from pansplat_viewer.scene.tour import CrossFade, TourScenes
 
+_FADING_COST = 0.2  # of a still in the first moment of a fade, as a distance from the panorama, fraction of far
 FILM_SECONDS = 4.0  # of a pair
 STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the flight
 
@@ -307,7 +308,7 @@ def write_tour(
     folder.mkdir(parents=True, exist_ok=True)
     num_frames = film.count_frames(route)
     fractions = np.arange(num_frames) / (num_frames - 1)
-    stills = _find_nearest_frames(scenes.tour.positions, route, fractions)
+    stills = _find_nearest_frames(scenes.tour, route, fractions)
 
     def render_frames() -> Iterator[np.ndarray]:
         for frame, fraction in enumerate(fractions.tolist()):
@@ -330,14 +331,18 @@ def write_tour(
     show_file(folder / "floor_plan.png")
 
 
-def _find_nearest_frames(
-    positions: Float[np.ndarray, "node 3"], route: Route, fractions: Float[np.ndarray, "frame"]
-) -> dict[int, list[int]]:
-    """The nodes of a tour by the frame of the flight that is nearest to them."""
+def _find_nearest_frames(tour: TourGraph, route: Route, fractions: Float[np.ndarray, "frame"]) -> dict[int, list[int]]:
+    """The nodes of a tour by the frame of the flight that is near them, and in which no other image fades out."""
     path = np.stack([route.pose(fraction)[:3, 3] for fraction in fractions.tolist()])
+    seconds = fractions * route.seconds
+    fading = np.zeros(len(path))
+    for jump in route.jumps:
+        since = seconds - jump / (len(route.yaws) - 1) * route.seconds
+        fading = np.maximum(fading, np.where(since > 0, 1 - since / FADE_SECONDS, 0.0))
     frames: dict[int, list[int]] = {}
-    for node, position in enumerate(positions):
-        frames.setdefault(int(np.linalg.norm(path - position, axis=1).argmin()), []).append(node)
+    for node, position in enumerate(tour.positions):
+        cost = np.linalg.norm(path - position, axis=1) + _FADING_COST * tour.far * fading
+        frames.setdefault(int(cost.argmin()), []).append(node)
     return frames
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from pansplat.data.pairs import Link
 from pansplat.tours import FADE_SECONDS, plan_route
 from pansplat_viewer import run
-from pansplat_viewer.capture import Film, TourFrames, write_tour
+from pansplat_viewer.capture import Film, TourFrames, _find_nearest_frames, write_tour
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import SceneEntry
@@ -237,6 +237,19 @@ def test_the_film_of_a_fade_between_parts_mixes_both_last_views(parted_house, lo
     assert np.abs(after - before).mean() > 0.1 and np.abs(middle - (before + after) / 2).max() < 1e-6
     for renderer in renderers:
         renderer.release()
+
+
+def test_the_still_of_a_panorama_is_a_frame_in_which_the_last_part_has_faded_out(parted_house):
+    route = plan_route(parted_house, [2, 3])
+    fractions = np.linspace(0, 1, 200)
+    nodes = {
+        node: frame for frame, nodes in _find_nearest_frames(parted_house, route, fractions).items() for node in nodes
+    }
+    faded = route.jumps[0] / (len(route.yaws) - 1) + FADE_SECONDS / route.seconds
+    assert fractions[nodes[2]] < faded - FADE_SECONDS / route.seconds and fractions[nodes[3]] >= faded
+    for node in (2, 3):
+        position = route.pose(fractions[nodes[node]])[:3, 3]
+        assert np.linalg.norm(position - parted_house.positions[node]) < 0.1
 
 
 def read_film(path) -> np.ndarray:
