@@ -460,8 +460,8 @@ def with_progress_bar(function: Callable[_P, _T]) -> Callable[_P, _T]:
         _has_bar = True
         try:
             with progress_bar() as progress:
-                call_with_bar: Callable[..., Any] = functools.partial(function, progress=progress)
-                return call_with_bar(*args, **{name: value for name, value in options.items() if name != "progress"})
+                accepting_progress: Callable[..., Any] = function
+                return accepting_progress(*args, **{**options, "progress": progress})
         finally:
             _has_bar = False
 
