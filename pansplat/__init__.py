@@ -1,6 +1,7 @@
 """pansplat: a few 360-degree panoramas in, a scene of spherical 3D Gaussians you can fly through out."""
 
 import os
+import sys
 from importlib import import_module
 from typing import Any
 
@@ -35,6 +36,7 @@ _PUBLIC = {
     "refine_to_file": "pansplat.pipeline",
     "render": "pansplat.pipeline",
     "save": "pansplat.pipeline",
+    "show": "pansplat.notebook",
 }
 
 __all__ = sorted(_PUBLIC)
@@ -48,3 +50,14 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *_PUBLIC})
+
+
+def _register_displays() -> None:
+    """In the kernel of a notebook, show pictures and viewers (pansplat.notebook)."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    if getattr(shell, "kernel", None) is not None:
+        import_module("pansplat.notebook").register_displays(shell.display_formatter)
+
+
+_register_displays()

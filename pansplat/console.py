@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import difflib
 import errno
+import functools
 import io
+import math
 import os
+import re
 import shutil
 import signal
 import sys
@@ -17,7 +21,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NoReturn, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TextIO, TypeVar
 
 from pansplat.errors import InputError, InputWarning
 
@@ -25,14 +29,19 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from rich.console import Console
+    from rich.progress import Progress
 
 BAD_INPUT, INTERNAL_ERROR, CLOSED_PIPE = 2, 70, 128 + 13  # exit statuses; 128 + signal number after a signal
 DEBUG = "PANSPLAT_DEBUG"  # environment variable; 1 prints the traceback of every error
 
 _T = TypeVar("_T")
+_P = ParamSpec("_P")
 
-_COLORS = {"error": 31, "interrupted": 31, "note": 33}  # ANSI codes of red and yellow
+_COLORS = {"error": 31, "interrupted": 31, "note": 33, "progress": 36}  # ANSI codes of red, yellow and cyan
 _MIN_WIDTH, _MAX_WIDTH = 40, 1000  # characters; help and tables need minutes and gigabytes outside
+_COMPLETION = "--tyro-print-completion"
+_LINE_INTERVAL, _MAX_LEFT = 30.0, 86_400.0  # seconds: between two lines of progress; left that are printed
+_REDRAW_INTERVAL = 0.25  # seconds between two states of a progress bar in a notebook
 _AGAIN = 0.02  # seconds after which a lost interrupt is raised again
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -249,7 +258,7 @@ def _prepare_terminal() -> None:
 
 
 def print_message(kind: str, text: object) -> None:
-    """Print one line `kind: text` on standard error; `kind` is "error", "interrupted" or "note"."""
+    """Print one line `kind: text` on standard error; `kind` is "error", "interrupted", "note" or "progress"."""
     start = f"{kind}: "
     try:
         if sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
@@ -296,11 +305,25 @@ def own_warnings() -> Iterator[None]:
         yield
 
 
-def parse_arguments(parse: Callable[[], _T]) -> _T:
-    """The result of a parser of arguments. The framed message of an error becomes one line, and SystemExit(2)."""
-    message = io.StringIO()
+def parse_arguments(parse: Callable[[], _T], program: str, arguments: Sequence[str] | None) -> _T:
+    """The result of a parser of arguments. The framed message of an error becomes one line, and SystemExit(2).
+
+    Args:
+        parse: tyro's parser.
+        program: name of the command.
+        arguments: None for those of the process. `--version` prints the version and exits;
+            `--tyro-print-completion SHELL` prints a script for the completion of arguments.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        from pansplat import __version__
+
+        print(f"{program} {__version__}")
+        raise SystemExit(0)
+    message, script = io.StringIO(), io.StringIO()
+    is_script = given[:1] == [_COMPLETION]
     try:
-        with contextlib.redirect_stderr(message):
+        with contextlib.redirect_stderr(message), contextlib.redirect_stdout(script if is_script else sys.stdout):
             return parse()
     except SystemExit as stop:
         text = message.getvalue()
@@ -308,6 +331,8 @@ def parse_arguments(parse: Callable[[], _T]) -> _T:
             print_message("error", _flatten(text))
         elif text:
             print(text, file=sys.stderr, end="")
+        # The shell would read the second line of a description as another word.
+        print(re.sub(r"\\n(?=.*'type':)", " ", script.getvalue()), end="")
         raise
 
 
@@ -321,7 +346,20 @@ def _flatten(text: str) -> str:
         elif not line.startswith(("╭", "╰", "+")):
             parts[-1].append(words)
     texts = [_shorten_suggestion(" ".join(part)) for part in parts if part]
+    texts = _suggest_subcommand(texts) or texts
     return "; ".join(text.rstrip(".") for text in texts) or "the arguments cannot be used; see --help"
+
+
+def _suggest_subcommand(texts: Sequence[str]) -> list[str]:
+    """The parts of a message about an unknown subcommand, with the most similar ones; empty for another message."""
+    start, listed = "Unrecognized options: ", "Available subcommands: "
+    given = next((text.removeprefix(start).split(",")[0] for text in texts if text.startswith(start)), "-")
+    known = next((text.removeprefix(listed) for text in texts if text.startswith(listed)), "")
+    if given.startswith("-") or not known:
+        return []
+    similar = difflib.get_close_matches(given, known.split(", "), n=2)
+    advice = f"did you mean {' or '.join(similar)}?" if similar else f"choose one of {known}"
+    return [f"there is no subcommand {given!r}", advice]
 
 
 def _shorten_suggestion(text: str) -> str:
@@ -330,6 +368,111 @@ def _shorten_suggestion(text: str) -> str:
         return text
     names = dict.fromkeys(word for word in text.split() if word.startswith("--") and word != "--help")
     return f"perhaps you meant {', '.join(names)}"
+
+
+def is_notebook() -> bool:
+    """Whether this process is the kernel of a notebook (Jupyter, VS Code, Colab)."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return getattr(shell, "kernel", None) is not None
+
+
+@contextlib.contextmanager
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """A function that shows the current step and the fraction done, with the time left.
+
+    A temporary bar on standard error shows them, or below the cell of a notebook. If standard error is not a terminal,
+    a line is printed each half minute.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    in_notebook, console = is_notebook(), Console(stderr=True)
+    if not console.is_terminal and not in_notebook:
+        yield _print_progress()
+        return
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
+    times = TimeElapsedColumn(), TimeRemainingColumn()
+    # Standard output goes through the bar if it is on the same terminal, and stays what it is if it is a file.
+    is_shared = sys.stdout.isatty() and not in_notebook
+    bar = Progress(*columns, *times, console=console, transient=True, redirect_stdout=is_shared)
+    with _draw_in_notebook(bar) if in_notebook else _draw_in_terminal(bar) as redraw:
+        task = bar.add_task("", total=1.0)
+
+        def report(stage: str, fraction: float) -> None:
+            bar.update(task, description=stage, completed=fraction)
+            redraw()
+
+        yield report
+
+
+def _print_progress() -> Callable[[str, float], None]:
+    """A function that prints the progress on standard error, a line each half minute."""
+    began = printed = time.monotonic()
+
+    def report(stage: str, fraction: float) -> None:
+        nonlocal printed
+        now = time.monotonic()
+        if now - printed < _LINE_INTERVAL:
+            return
+        printed = now
+        left = (now - began) * (1 - fraction) / fraction if fraction > 0 else math.inf
+        rest = f", about {left:.0f} s left" if left < _MAX_LEFT else ""
+        print_message("progress", f"{stage or 'working'}, {100 * fraction:.0f} %{rest}")
+
+    return report
+
+
+@contextlib.contextmanager
+def _draw_in_terminal(bar: Progress) -> Iterator[Callable[[], None]]:
+    with bar:
+        yield lambda: None
+
+
+@contextlib.contextmanager
+def _draw_in_notebook(bar: Progress) -> Iterator[Callable[[], None]]:
+    """A function that draws the bar in its output, which is empty at the end; rich itself would need ipywidgets."""
+    from IPython.display import HTML, display
+
+    output = display(HTML(""), display_id=True)
+    drawn = time.monotonic()
+
+    def redraw() -> None:
+        nonlocal drawn
+        if output is not None and time.monotonic() - drawn >= _REDRAW_INTERVAL:
+            drawn = time.monotonic()
+            output.update(bar)
+
+    try:
+        yield redraw
+    finally:
+        if output is not None:
+            output.update(HTML(""))
+
+
+_has_bar = False  # whether a call that shows a bar in a notebook is running
+
+
+def with_progress_bar(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """The function, which shows a progress bar in a notebook unless its keyword `progress` is given.
+
+    Calls of such functions inside of the function show no bar of their own.
+    """
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **options: _P.kwargs) -> _T:
+        global _has_bar
+        if options.get("progress") is not None or _has_bar or not is_notebook():
+            return function(*args, **options)
+        _has_bar = True
+        try:
+            with progress_bar() as progress:
+                accepting_progress: Callable[..., Any] = function
+                return accepting_progress(*args, **{**options, "progress": progress})
+        finally:
+            _has_bar = False
+
+    return call
 
 
 def make_table_console(width: int = 140) -> Console:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.cache import CachedPrediction, CachedScene
+from pansplat.console import with_progress_bar
 from pansplat.data import folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import CAMERA_HEIGHT, Views
@@ -48,7 +49,16 @@ from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
-from pansplat.tours import MAX_SCENE_VIEWS, TourGraph, list_starts, make_graph, merge_scenes, select_views
+from pansplat.tours import (
+    MAX_SCENE_VIEWS,
+    TourGraph,
+    connect,
+    find_tours,
+    list_starts,
+    make_graph,
+    merge_scenes,
+    select_views,
+)
 
 __all__ = [
     "estimate_poses",
@@ -77,6 +87,7 @@ _STARVED_SHARE = 1 / 3  # of the processor's threads, below which a refinement o
 _MAX_MERGERS = 4  # Gaussians that become one on average
 
 
+@with_progress_bar
 def load_pairs(
     path: Path | str,
     *,
@@ -269,6 +280,7 @@ def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
     return pair.load_context(height)
 
 
+@with_progress_bar
 def predict(
     source: Pair | Views | str | Path,
     model: str | Path | Predictor = "default",
@@ -309,7 +321,7 @@ def predict(
         raise InputError(f"`refine_seconds` must be at least 0, got {refine_seconds}")
     config = RefineConfig(gaussians=gaussians)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
-    pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
+    pair = _load_only_pair(source, progress) if isinstance(source, (str, Path)) else source
     _require_views(pair, predictor)
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
@@ -366,6 +378,7 @@ def _predict_views(
     return _make_scene(predicted, source, views, predictor)
 
 
+@with_progress_bar
 def refine(
     scene: Scene,
     views: Views,
@@ -398,6 +411,7 @@ def refine(
     return _run_refinement(scene, views, config, seed, seconds=seconds, steps=steps, progress=progress)[0]
 
 
+@with_progress_bar
 def refine_to_file(
     scene: Scene,
     views: Views,
@@ -441,8 +455,9 @@ def _run_refinement(
     return refinement.scene(), report
 
 
+@with_progress_bar
 def predict_tour(
-    tour: TourGraph,
+    tour: TourGraph | str | Path,
     model: str | Path | Predictor = "default",
     *,
     compat: CompatChoice = "trained",
@@ -460,7 +475,7 @@ def predict_tour(
     predicted by `default`, with a warning, if the model needs two or more views.
 
     Args:
-        tour: of `pansplat.tours.connect`.
+        tour: of `pansplat.tours.connect`, or the path of a folder that holds the panoramas of one tour.
         model, compat, precision, refine_seconds, cache, progress: see `predict`; the time limit is that of three
             panoramas.
         height: panoramas are resized to (height, 2 height); by default `choose_tour_height`.
@@ -472,6 +487,7 @@ def predict_tour(
         InputError: the input cannot be used.
     """
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
+    tour = _load_only_tour(tour, progress) if isinstance(tour, (str, Path)) else tour
     warn_of_single_views(tour, predictor)
     report: Progress = progress or (lambda what, fraction: None)
     max_views = find_max_views(predictor)
@@ -519,6 +535,7 @@ def fuse(scene: Scene, views: Views) -> Scene:
     return replace(fused, gaussians=colors)
 
 
+@with_progress_bar
 def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, progress: Progress | None = None) -> Scene:
     """The scene of a whole tour with each surface once, and fitted to all photographs of each part.
 
@@ -551,6 +568,7 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
     return replace(scene, gaussians=Gaussians.cat(fused), gains=tuple(gains), joint=True)
 
 
+@with_progress_bar
 def predict_to_file(
     source: Pair | Views | str | Path,
     path: str | Path,
@@ -586,7 +604,7 @@ def predict_to_file(
     """
     suffix = find_scene_suffix(path)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
-    pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
+    pair = _load_only_pair(source, progress) if isinstance(source, (str, Path)) else source
     _require_views(pair, predictor)
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     if can_stream(predictor) and not joint and not refine_seconds and not (cache and height <= _MAX_CACHED_HEIGHT):
@@ -724,12 +742,22 @@ def load(path: str | Path) -> Scene:
     return load_scene(path)
 
 
-def _load_only_pair(path: str | Path) -> Pair:
-    pairs = load_pairs(path)
+def _load_only_pair(path: str | Path, progress: Progress | None) -> Pair:
+    pairs = load_pairs(path, progress=progress)
     if len(pairs) != 1:
         names = ", ".join(pair.name for pair in pairs[:8]) + (", ..." if len(pairs) > 8 else "")
-        raise InputError(f"{path} holds {len(pairs)} pairs ({names}); choose one: predict(load_pairs(path)[0])")
+        every = ", or all in one scene: predict_tour(path)" if len(find_tours(pairs)) == 1 else ""
+        raise InputError(f"{path} holds {len(pairs)} pairs ({names}); choose one: predict(load_pairs(path)[0]){every}")
     return pairs[0]
+
+
+def _load_only_tour(path: str | Path, progress: Progress | None) -> TourGraph:
+    tours = find_tours(load_pairs(path, progress=progress))
+    if len(tours) != 1:
+        names = f" ({', '.join(tour.name for tour in tours[:8])}{', ...' if len(tours) > 8 else ''})" if tours else ""
+        advice = "give its folder" if tours else "predict one pair: predict(load_pairs(path)[0])"
+        raise InputError(f"{path}: needed the panoramas of one tour, got {len(tours)} tours{names}; {advice}")
+    return connect(tours[0], progress)
 
 
 def _make_scene(

@@ -38,7 +38,10 @@ def main() -> None:
 
 
 def compile_kernels(name: str) -> None:
-    """Compile the kernels of one of `STEPS` in this process."""
+    """Compile the kernels of one of `STEPS` in this process, without a message about it."""
+    from pansplat.rendering.cpu.runtime import hide_message
+
+    hide_message()
     for step in STEPS[name]:
         step()
 

@@ -132,6 +132,20 @@ def test_deferred_blending_equals_the_blend_of_single_views(scene: Scene) -> Non
     )
 
 
+def test_a_folder_of_several_pairs_names_the_call_for_all_of_it_which_takes_its_path(
+    tmp_path: Path, write_tour: Callable[..., Path], write_pair: Callable[..., Path], sphere_predictor
+) -> None:
+    house = write_tour(tmp_path / "house", 4)
+    with pytest.raises(InputError, match=r"holds 3 pairs .*, or all in one scene: predict_tour\(path\)$"):
+        predict(house, sphere_predictor())
+    scene = predict_tour(house, sphere_predictor(), height=64, cache=False)
+    assert scene.names == ("p0", "p1", "p2", "p3") and len(scene.overlaps) >= 3
+    with pytest.raises(
+        InputError, match=r"one tour, got 0 tours; predict one pair: predict\(load_pairs\(path\)\[0\]\)"
+    ):
+        predict_tour(write_pair(tmp_path / "pair"), sphere_predictor())
+
+
 def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_their_holes(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor
 ) -> None:

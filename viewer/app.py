@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from pansplat.console import own_warnings, parse_arguments
+from pansplat.console import own_warnings, parse_arguments, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_file, require_output_folder
 from pansplat.options import EYE_DISTANCE, REAL, Depth, EyeDistance, Height, Positive, Range, Seconds, check_numbers
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pansplat_viewer.scene.key_frames import CameraPath
 
 _WINDOW_SIZE = 1280, 720  # pixels
+_PREDICTION_PART = 0.6  # of the work of a film; the rest is drawing
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
 
 
@@ -146,7 +147,9 @@ class Options:
 def run_arguments(args: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, those of the process by default, and return its exit status."""
     options = parse_arguments(
-        lambda: tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,))
+        lambda: tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,)),
+        "pansplat-view",
+        args,
     )
     check_numbers(options)
     with own_warnings():
@@ -185,7 +188,8 @@ def _run(options: Options) -> int:
         if options.path_file is None or options.offscreen is not None or options.pair == "all":
             raise InputError("--out needs --path, one scene and no --offscreen; give the file of a camera path")
     path = None if options.path_file is None else read_path(expand_home(options.path_file))
-    entries = find_entries(expand_home(options.path), options.load_options)
+    with progress_bar() as progress:  # of poses, which take minutes for a tour without them
+        entries = find_entries(expand_home(options.path), options.load_options, progress)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)
     folder = options.offscreen
@@ -260,9 +264,10 @@ def _write_film(
     pixels: tuple[int, int],
     path: "CameraPath | None" = None,
 ) -> None:
-    """Load one entry and write its fly-through to a folder, or the film of a path to `--out`, with progress bars."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    """Load one entry and write its fly-through to a folder, or the film of a path to `--out`, with a progress bar.
 
+    Names of scenes and files are printed as soon as they are there.
+    """
     from pansplat.tours import plan_route
     from pansplat_viewer.capture import Film, TourFrames, open_frames, write_flythrough, write_path_film, write_tour
     from pansplat_viewer.draw.cpu_renderer import create_renderer
@@ -272,26 +277,32 @@ def _write_film(
     film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
     choice = "cpu" if options.image_format.is_omnidirectional else options.renderer
     ctx = _create_context(choice)  # before the prediction, so that missing OpenGL is reported early
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"))
-    with Progress(*columns, TimeElapsedColumn()) as bars:
+    predicted = 0.0  # fraction of the panoramas
+    with progress_bar() as progress:
 
         def load(entry: SceneEntry) -> LoadedScene:
-            bar = bars.add_task(entry.name, total=1.0)
+            nonlocal predicted
+            part = _find_part(entry)
             loaded = load_entry(
                 entry,
                 options.load_options,
-                lambda task, done: bars.update(bar, description=f"{entry.name}: {task}", completed=done),
+                lambda task, done: progress(
+                    f"{entry.name}: {task}", _PREDICTION_PART * min(predicted + part * done, 1.0)
+                ),
             )
+            predicted = min(predicted + part, 1.0)
             name = loaded.entry.pair.name if loaded.entry.pair is not None else entry.name
-            bars.update(bar, description=f"{name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0)
+            print(f"{name}: {len(loaded.scene.gaussians):,} Gaussians", flush=True)
             return loaded
 
-        loaded = load(entry)
-        draw = bars.add_task("film", total=1.0)
-
         def show_progress(task: str, done: float) -> None:
-            bars.update(draw, description="film" if task in ("film", "done") else f"film: {task}", completed=done)
+            stage = "film" if task in ("film", "done") else f"film: {task}"
+            progress(stage, _PREDICTION_PART * predicted + (1 - _PREDICTION_PART) * done)
 
+        def show_file(file: Path) -> None:
+            print(file, flush=True)
+
+        loaded = load(entry)
         tour, settings = loaded.entry.tour, fit_settings(options.settings, loaded.scene)
         scenes = None if tour is None else TourScenes.start(loaded, options.memory)
         format_, create = options.image_format, lambda: create_renderer(ctx, choice, color_bits=32)
@@ -300,18 +311,26 @@ def _write_film(
                 if path is not None:
                     assert options.out is not None
                     level = create_level_camera(loaded.scene, tour)
-                    written = write_path_film(frames, path, level, options.out, options.fps, show_progress)
+                    for file in write_path_film(frames, path, level, options.out, options.fps, show_progress):
+                        show_file(file)
                 elif isinstance(frames, TourFrames):
                     assert scenes is not None
                     route = plan_route(scenes.tour, scenes.tour.plan_walk())
-                    written = write_tour(frames, scenes, route, folder, film, show_progress)
+                    write_tour(frames, scenes, route, folder, film, show_progress, show_file)
                 else:
-                    written = write_flythrough(frames, loaded.scene, folder, film, show_progress)
+                    write_flythrough(frames, loaded.scene, folder, film, show_progress, show_file)
         finally:
             if ctx is not None:
                 ctx.release()
-    for file in written:
-        print(file)
+
+
+def _find_part(entry: SceneEntry) -> float:
+    """The fraction of the panoramas of its tour that an entry is predicted from."""
+    tour = entry.tour
+    if tour is None:
+        return 1.0
+    first = tour.parts[tour.plan_walk()[0]]  # the part that a tour begins with
+    return (len(entry.views) or tour.parts.count(first)) / len(tour)
 
 
 def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":

@@ -15,17 +15,18 @@ from pansplat.data.video import VIDEO_SUFFIXES, write_video
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
-from pansplat.tours import Route, paint_floor_plan
+from pansplat.tours import FADE_SECONDS, Route, TourGraph, paint_floor_plan
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.stereo import ImageFormat, render_image
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.key_frames import CameraPath
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, make_file_name
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import NEAR_OF_FAR, ViewerState, enter_scene, fit_settings
 from pansplat_viewer.scene.tour import CrossFade, TourScenes
 
+_FADING_COST = 0.2  # of a still in the first moment of a fade, as a distance from the panorama, fraction of far
 FILM_SECONDS = 4.0  # of a pair
 STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the flight
 
@@ -95,9 +96,14 @@ def compute_panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4
 
 
 def write_flythrough(
-    frames: SceneFrames, scene: Scene, folder: Path, film: Film, progress: Callable[[str, float], None]
-) -> list[Path]:
-    """Render film, stills and panorama into `folder`; returns the files, each written completely or not at all.
+    frames: SceneFrames,
+    scene: Scene,
+    folder: Path,
+    film: Film,
+    progress: Callable[[str, float], None],
+    show_file: Callable[[Path], None],
+) -> None:
+    """Render film, stills and panorama into `folder`, each written completely or not at all.
 
     Args:
         frames: of the scene.
@@ -105,6 +111,7 @@ def write_flythrough(
         folder: created if it does not exist.
         film: sizes and times.
         progress: called with the task and the fraction done.
+        show_file: called with each file that is written.
 
     Raises:
         InputError: the folder cannot be written, or the scene is empty.
@@ -112,29 +119,30 @@ def write_flythrough(
     folder.mkdir(parents=True, exist_ok=True)
     num_frames = film.count_frames()
     steps = num_frames + len(STILLS) + 1
-    written = []
 
     def draw(fraction: float) -> np.ndarray:
         return frames.draw(compute_flight_pose(scene, fraction), film.vertical_fov_degrees, 0.0)[0]
 
     for done, fraction in enumerate(STILLS):
         progress("stills", done / steps)
-        written.append(folder / f"view_{round(100 * fraction):03d}.png")
-        write_image(written[-1], draw(fraction))
+        file = folder / f"view_{round(100 * fraction):03d}.png"
+        write_image(file, draw(fraction))
+        show_file(file)
     progress("panorama", len(STILLS) / steps)
-    written.append(folder / f"panorama_{round(100 * film.at):03d}.png")
+    file = folder / f"panorama_{round(100 * film.at):03d}.png"
     height = film.panorama_height or scene.height
-    write_image(written[-1], frames.draw_panorama(compute_panorama_pose(scene, film.at), height))
+    write_image(file, frames.draw_panorama(compute_panorama_pose(scene, film.at), height))
+    show_file(file)
 
     def render_frames() -> Iterator[np.ndarray]:
         for frame in range(num_frames):
             progress("film", (len(STILLS) + 1 + frame) / steps)
             yield to_bytes(draw(frame / (num_frames - 1)))
 
-    written.append(folder / "flythrough.mp4")
-    write_video(written[-1], render_frames(), film.fps)
+    file = folder / "flythrough.mp4"
+    write_video(file, render_frames(), film.fps)
     progress("done", 1.0)
-    return written
+    show_file(file)
 
 
 class SceneFrames:
@@ -279,8 +287,11 @@ def write_tour(
     folder: Path,
     film: Film,
     progress: Callable[[str, float], None],
-) -> list[Path]:
-    """Write the film of a route through a tour (`tour.mp4`) and its floor plan (`floor_plan.png`); returns the files.
+    show_file: Callable[[Path], None],
+) -> None:
+    """Write the film of a route through a tour (`tour.mp4`), its floor plan, and a still at each panorama.
+
+    The stills (`01_NAME.png`) are written when the flight is there, before the film is complete.
 
     Args:
         frames: of the tour.
@@ -289,30 +300,50 @@ def write_tour(
         folder: created if it does not exist.
         film: size and times.
         progress: called with the task and the fraction done.
+        show_file: called with each file that is written.
 
     Raises:
         InputError: the folder cannot be written, or a scene cannot be loaded.
     """
     folder.mkdir(parents=True, exist_ok=True)
     num_frames = film.count_frames(route)
+    fractions = np.arange(num_frames) / (num_frames - 1)
+    stills = _find_nearest_frames(scenes.tour, route, fractions)
 
     def render_frames() -> Iterator[np.ndarray]:
-        for frame in range(num_frames):
-            fraction = frame / (num_frames - 1)
+        for frame, fraction in enumerate(fractions.tolist()):
             progress("film", frame / num_frames)
             pose = route.pose(fraction)
             scenes.move(pose[:3, 3], route, fraction)
             # A film that is shorter or longer than the route changes the speed of the camera and that of the fades.
             color, _ = frames.draw_scene(pose, film.vertical_fov_degrees, fraction * route.seconds)
+            for node in stills.get(frame, ()):
+                file = folder / f"{node + 1:02d}_{make_file_name(scenes.tour.panoramas[node].label)}.png"
+                write_image(file, color)
+                show_file(file)
             yield to_bytes(color)
 
-    written = [folder / "tour.mp4"]
-    write_video(written[0], render_frames(), film.fps)
-    written.append(folder / "floor_plan.png")
+    write_video(folder / "tour.mp4", render_frames(), film.fps)
+    show_file(folder / "tour.mp4")
     plan = paint_floor_plan(scenes.tour, scenes.outlines, route=route)
-    write_image(written[1], plan.astype(np.float32) / 255)
+    write_image(folder / "floor_plan.png", plan.astype(np.float32) / 255)
     progress("done", 1.0)
-    return written
+    show_file(folder / "floor_plan.png")
+
+
+def _find_nearest_frames(tour: TourGraph, route: Route, fractions: Float[np.ndarray, "frame"]) -> dict[int, list[int]]:
+    """The nodes of a tour by the frame of the flight that is near them, and in which no other image fades out."""
+    path = np.stack([route.pose(fraction)[:3, 3] for fraction in fractions.tolist()])
+    seconds = fractions * route.seconds
+    fading = np.zeros(len(path))
+    for jump in route.jumps:
+        since = seconds - jump / (len(route.yaws) - 1) * route.seconds
+        fading = np.maximum(fading, np.where(since > 0, 1 - since / FADE_SECONDS, 0.0))
+    frames: dict[int, list[int]] = {}
+    for node, position in enumerate(tour.positions):
+        cost = np.linalg.norm(path - position, axis=1) + _FADING_COST * tour.far * fading
+        frames.setdefault(int(cost.argmin()), []).append(node)
+    return frames
 
 
 def write_path_film(

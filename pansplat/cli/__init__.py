@@ -53,9 +53,12 @@ def parse(argv: Sequence[str] | None = None) -> Command:
             kind,
             args=argv,
             prog="pansplat",
-            description="Predict a scene of 3D Gaussians from two posed 360-degree panoramas, render and evaluate it.",
+            description="Predict a scene of 3D Gaussians from 360-degree panoramas, render and export it. "
+            "Also: pansplat --version.",
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-        )
+        ),
+        "pansplat",
+        argv,
     )
 
 

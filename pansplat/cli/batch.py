@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from pansplat.cli.inputs import Compat, Out, Precision, progress_bar
-from pansplat.console import print_message
+from pansplat.cli.inputs import Compat, Out, Precision
+from pansplat.console import print_message, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
 from pansplat.options import Count, Height, Positive, Seconds, Threads

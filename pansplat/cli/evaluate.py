@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import ModelChoice, Out, parse_blend, progress_bar
-from pansplat.console import make_table_console
+from pansplat.cli.inputs import ModelChoice, Out, parse_blend
+from pansplat.console import make_table_console, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
 from pansplat.options import Count, CountOrNone, Depth, Height, Seconds

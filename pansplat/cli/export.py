@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, ScenePrediction, progress_bar
+from pansplat.cli.inputs import Out, ScenePrediction
+from pansplat.console import progress_bar
 from pansplat.errors import InputError
 from pansplat.files import (
     SCENE_SUFFIXES,

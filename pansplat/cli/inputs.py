@@ -1,4 +1,4 @@
-"""Arguments that several commands share, the pair or scene that they choose, and a progress bar.
+"""Arguments that several commands share, and the pair or scene that they choose.
 
 Modules of this package import torch and everything that needs it inside functions, so that `--help` is fast.
 """
@@ -6,14 +6,13 @@ Modules of this package import torch and everything that needs it inside functio
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
+from pansplat.console import progress_bar
 from pansplat.errors import InputError
 from pansplat.files import is_scene_file
 from pansplat.options import Depth, Height, Positive, Seconds
@@ -21,7 +20,7 @@ from pansplat.options import Depth, Height, Positive, Seconds
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
-    from pansplat.predictor import Predictor, Progress
+    from pansplat.predictor import Predictor
     from pansplat.tours import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
@@ -212,21 +211,3 @@ def parse_blend(text: str) -> str | int:
     if number.isascii() and number.isdecimal() and len(number) < 10:
         return int(number)
     raise InputError(f"--blend must be deferred, joint or view0, view1, ..., got {text!r}")
-
-
-@contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """A temporary bar on standard error; nothing if that is not a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
-    times = TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=1.0)
-
-        def report(stage: str, fraction: float) -> None:
-            bar.update(task, description=stage, completed=fraction)
-
-        yield report

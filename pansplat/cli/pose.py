@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import OptionalOut, progress_bar
-from pansplat.console import make_table_console, print_message
+from pansplat.cli.inputs import OptionalOut
+from pansplat.console import make_table_console, print_message, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import require_output_file, require_output_folder
 from pansplat.options import Count, Positive

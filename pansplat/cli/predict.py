@@ -9,7 +9,8 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair, progress_bar
+from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair
+from pansplat.console import progress_bar
 from pansplat.files import SCENE_SUFFIXES, require_output_file
 from pansplat.options import WHOLE, Fraction, Height, Range, Seconds
 

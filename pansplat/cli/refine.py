@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair, predict_scene, progress_bar
-from pansplat.console import call_at_first_signal
+from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair, predict_scene
+from pansplat.console import call_at_first_signal, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import SCENE_SUFFIXES, is_scene_file, require_output_file
 from pansplat.options import Count, Height, Seconds, Seed

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, ScenePrediction, parse_blend, progress_bar
+from pansplat.cli.inputs import Out, ScenePrediction, parse_blend
+from pansplat.console import progress_bar
 from pansplat.errors import InputError
 from pansplat.files import read_file, require_output_file
 from pansplat.options import EYE_DISTANCE, REAL, EyeDistance, ImageHeight, Range

@@ -17,6 +17,7 @@ from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_height, rea
 from pansplat.data.masks import lift_black_surfaces, scene_mask_of_files
 from pansplat.data.placements import PLACED, Placement
 from pansplat.data.views import CAMERA_HEIGHT, Views
+from pansplat.descriptions import describe_range, list_first
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import require_depth_range, working_factor
 
@@ -80,6 +81,11 @@ class Panorama:
     camera_height: float = CAMERA_HEIGHT
     placement: Placement = PLACED
 
+    def __repr__(self) -> str:
+        position = ", ".join(f"{x:.3g}" for x in self.cam2world[:3, 3].tolist())
+        place = self.placement.state if self.placement.state == "not placed" else f"at ({position}) m"
+        return f"<Panorama {self.label}: {self.image}, {place}>"
+
     @property
     def label(self) -> str:
         """The title, or the name if there is none."""
@@ -107,7 +113,14 @@ class Pair:
     targets: tuple[Panorama, ...]
     near: float
     far: float
-    siblings: tuple[Path, ...] = field(default=(), repr=False)
+    siblings: tuple[Path, ...] = ()
+
+    def __repr__(self) -> str:
+        parts = [f"context {list_first([panorama.name for panorama in self.context])}"]
+        if self.targets:
+            parts.append(f"target{'s' if len(self.targets) > 1 else ''} {list_first([p.name for p in self.targets])}")
+        parts.append(f"near and far {describe_range(self.near, self.far, 'm')}")
+        return f"<Pair {self.name}: {', '.join(parts)}, in {self.folder}>"
 
     @property
     def image_height(self) -> int:

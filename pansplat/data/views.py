@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.errors import InputError
 
 CAMERA_HEIGHT = 1.5  # metres over the floor, if it is not known; tripods of tours stand at 1.3 to 1.6 m
@@ -36,6 +37,19 @@ class Views:
     names: tuple[str, ...]
     depths: Float[Tensor, "view height width"] | None = None
     camera_height: float = CAMERA_HEIGHT
+
+    def __repr__(self) -> str:
+        count, _, height, width = self.images.shape
+        parts = [
+            describe_count(count, "panorama") + (f" ({list_first(self.names)})" if count else ""),
+            f"{height}x{width}",
+            f"near and far {describe_range(self.near, self.far, 'm')}",
+        ]
+        if count:
+            parts.append(f"masks show {100 * float(self.masks.float().mean()):.3g} %")
+        if self.depths is not None:
+            parts.append("with depths")
+        return f"<Views: {', '.join(parts)}>"
 
 
 def select_views(views: Views, indices: Sequence[int]) -> Views:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Integer
 from torch import Tensor
 
+from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import interpolate_poses, multiply_quats, quats_from_rotations, rotations_from_quats
@@ -67,6 +68,18 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def __repr__(self) -> str:
+        parts = [f"{len(self):,}"]
+        if len(self):
+            parts[0] += f" of {describe_count(len(self.views.unique()), 'view')}"
+            levels = describe_range(int(self.levels.min()), int(self.levels.max()))
+            parts.append(f"level{'s' if ' ' in levels else ''} {levels}")
+        parts.append(f"harmonics of degree {self.degree}")
+        if self.harmonics.shape[2] != 3:
+            parts.append(describe_count(self.harmonics.shape[2], "channel"))
+        parts.append(f"{str(self.means.dtype).removeprefix('torch.')} on {self.means.device}")
+        return f"<Gaussians: {', '.join(parts)}>"
 
     @property
     def degree(self) -> int:
@@ -162,6 +175,20 @@ class Scene:
     links: Links = ()
     starts: Starts = ()
     joint: bool = False
+
+    def __repr__(self) -> str:
+        count = len(self.cam2world)
+        names = f" ({list_first(self.names)})" if self.names else ""
+        parts = [
+            describe_count(len(self.gaussians), "Gaussian"),
+            f"{describe_count(count, 'panorama')}{names}" if count else "no input cameras",
+            f"near and far {describe_range(self.near, self.far, 'm')}",
+        ]
+        if self.model:
+            parts.append(f"predicted by {self.model} at {self.height}x{2 * self.height}")
+        if count > 1:
+            parts.append(f"for {'joint drawing' if self.joint else 'deferred blending'}")
+        return f"<Scene: {', '.join(parts)}>"
 
     def scaled(self, factor: float) -> Scene:
         """The scene in a world that is multiplied by a factor."""

@@ -64,6 +64,13 @@ class NetworkPredictor:
         self.network = network
         self.tiles = tiles
 
+    def __repr__(self) -> str:
+        millions = sum(parameter.numel() for parameter in self.network.parameters()) / 1e6
+        return (
+            f"<NetworkPredictor {self.name}: {type(self.network).__name__} of {millions:.1f} million parameters, "
+            f"{self.network.compat}, for {self.min_views} or more panoramas>"
+        )
+
     @functools.cached_property
     def fingerprint(self) -> str:
         """Hash of weights, settings and source code, so that a cached prediction is never outdated."""

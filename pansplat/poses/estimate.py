@@ -15,11 +15,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
+from pansplat.console import with_progress_bar
 from pansplat.data.images import read_height, read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.pairs import FAR, NEAR, find_mask
 from pansplat.data.placements import Tie, find_holds
 from pansplat.data.views import CAMERA_HEIGHT
+from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import require_file
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes, with_hints
@@ -93,6 +95,12 @@ class PoseGroup:
     scale_source: str
     unit: float = CAMERA_HEIGHT
 
+    def __repr__(self) -> str:
+        return (
+            f"<PoseGroup: {describe_count(len(self.poses), 'panorama')} ({list_first([p.name for p in self.poses])}), "
+            f"near and far {describe_range(self.near, self.far, 'm')}, residual {self.residual:.2f} degrees>"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
@@ -113,6 +121,9 @@ class PoseEstimate:
     relations: dict[Pair, RelativePose]
     rejected: tuple[Pair, ...] = ()
     suggestions: Suggestions = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"<PoseEstimate: {self.summary}>"
 
     @property
     def poses(self) -> dict[Path, Float[Array, "4 4"]]:
@@ -209,6 +220,7 @@ class _View:
         return replace(self, features=self.features.mirrored(), learned=None, surroundings=self.surroundings.mirrored())
 
 
+@with_progress_bar
 def estimate_poses(
     images: Sequence[Path | str],
     *,

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.constants import FILTER_VARIANCE, NEAR
+from pansplat.descriptions import describe_count, describe_range
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import orthonormal_error
@@ -176,6 +177,17 @@ class Rendering:
     depth: Float[Tensor, "height width"]
     info: RasterInfo | None = None
     background: Float[Tensor, "channel"] | None = None
+
+    def __repr__(self) -> str:
+        channels, height, width = self.color.shape
+        parts = [f"{height}x{width}", "RGB" if channels == 3 else describe_count(channels, "channel")]
+        alpha, depth = self.alpha.detach(), self.depth.detach()
+        if alpha.numel():
+            parts.append(f"alpha {describe_range(float(alpha.min()), float(alpha.max()))}")
+        depths = depth[alpha > 0]
+        if len(depths):
+            parts.append(f"depth {describe_range(float(depths.min()), float(depths.max()), 'm')}")
+        return f"<Rendering: {', '.join(parts)}>"
 
 
 def _exclude_from_compile(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -55,6 +55,10 @@ class Sweep:
         if prior is not None:
             self.fingerprint += f"-{prior.fingerprint}"
 
+    def __repr__(self) -> str:
+        prior = "no weights" if self.prior is None else "guided by a depth network"
+        return f"<{type(self).__name__} {self.name}: {prior}, panoramas of up to {self.default_height} rows by default>"
+
     def __call__(
         self,
         images: Float[Tensor, "*batch view 3 height width"],

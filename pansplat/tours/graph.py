@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 from torch import Tensor
 
 from pansplat.data.pairs import FAR, NEAR, Link, Pair, Panorama
+from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.gaussians.scene import Gains, Gaussians, Scene, Starts
 from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
 from pansplat.geometry.world import working_factor
@@ -64,9 +65,19 @@ class TourGraph:
     panoramas: tuple[Panorama, ...]
     near: float
     far: float
-    siblings: tuple[Path, ...] = field(default=(), repr=False)
+    siblings: tuple[Path, ...] = ()
     overlaps: dict[Edge, float] = field(default_factory=dict)
-    originals: tuple[Panorama, ...] = field(default=(), repr=False)
+    originals: tuple[Panorama, ...] = ()
+
+    def __repr__(self) -> str:
+        names = list_first([panorama.label for panorama in self.panoramas])
+        edges = sum(a != b for a, b in self.overlaps)
+        parts = [
+            f"{describe_count(len(self), 'panorama')} ({names})",
+            f"{describe_count(edges, 'edge')} in {describe_count(len(set(self.parts)), 'part')}",
+            f"near and far {describe_range(self.near, self.far, 'm')}",
+        ]
+        return f"<TourGraph {self.name}: {', '.join(parts)}>"
 
     def __len__(self) -> int:
         return len(self.panoramas)

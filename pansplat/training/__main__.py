@@ -39,19 +39,21 @@ def _train(config: TrainConfig) -> int:
 
 def parse(argv: Sequence[str] | None = None) -> TrainConfig:
     """The settings of a command line. Prints help or errors and exits like argparse."""
-    import tyro
 
-    from pansplat.training.config import PRESETS
+    def read() -> TrainConfig:
+        import tyro
 
-    return parse_arguments(
-        lambda: tyro.extras.overridable_config_cli(
+        from pansplat.training.config import PRESETS
+
+        return tyro.extras.overridable_config_cli(
             PRESETS,
             args=argv,
             prog="pansplat-train",
             description="Train a network. Run the same command again to resume a stopped run.",
             config=(tyro.conf.FlagCreatePairsOff,),
         )
-    )
+
+    return parse_arguments(read, "pansplat-train", argv)
 
 
 def main() -> NoReturn:

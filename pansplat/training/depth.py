@@ -415,7 +415,7 @@ def run_trainer(config_type: type[DepthTrainConfig], trainer_type: type[DepthTra
     import tyro
 
     def train() -> int:
-        config = parse_arguments(lambda: tyro.cli(config_type))
+        config = parse_arguments(lambda: tyro.cli(config_type), "pansplat.training.depth", None)
         require_output_folder("--out", config.out)
         with own_warnings():
             trainer = trainer_type(config)

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from pansplat import constants, pipeline
 from pansplat.atomic import replacing
+from pansplat.console import with_progress_bar
 from pansplat.data.views import Views
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gaussians, Scene, prune
@@ -88,6 +89,7 @@ class PageFiles:
     degree: int
 
 
+@with_progress_bar
 def write_page(
     scene: Scene,
     path: Path | str,

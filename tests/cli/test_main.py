@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import warnings
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import pansplat
 from pansplat.cli import run
 from pansplat.console import own_warnings
 from pansplat.errors import InputError, InputWarning
@@ -37,6 +39,61 @@ def test_missing_or_misspelt_arguments_exit_with_2(arguments: list[str], capsys:
         run(arguments)
     assert stop.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["predcit", "x", "-o", "y.ply"], "there is no subcommand 'predcit'; did you mean predict?"),
+        (["bench", "rastr"], "there is no subcommand 'rastr'; did you mean raster?"),
+        (["zzz"], "there is no subcommand 'zzz'; choose one of predict, refine, render, export, "),
+    ],
+)
+def test_a_misspelt_subcommand_gets_a_suggestion(arguments: list[str], message: str, capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(arguments)
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and err.startswith(f"error: {message}") and err.count("\n") == 1
+
+
+def test_a_misspelt_option_gets_a_suggestion_too(capsys) -> None:
+    with pytest.raises(SystemExit):
+        run(["render", "x", "-o", "y.png", "--heigth", "3"])
+    assert "perhaps you meant --height" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("module", ["pansplat.cli", "pansplat_viewer", "pansplat.training.__main__"])
+def test_the_version_is_printed_without_torch(module: str) -> None:
+    program = f"import sys\nfrom {module} import run\ntry: run(['--version'])\nexcept SystemExit as stop:\n"
+    program += "    assert stop.code == 0 and 'torch' not in sys.modules\nelse: sys.exit('no exit')"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    name = {"pansplat.cli": "pansplat", "pansplat_viewer": "pansplat-view"}.get(module, "pansplat-train")
+    assert done.stdout == f"{name} {pansplat.__version__}\n"
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("pre", {"predict"}),
+        ("predict --mo", {"--model"}),
+        ("bench ra", {"raster"}),
+        ("render scene.ply --layout per", {"perspective"}),
+    ],
+)
+def test_the_completion_script_completes_in_bash(words: str, expected: set[str], capsys, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(["--tyro-print-completion", "bash"])
+    script = tmp_path / "pansplat"
+    script.write_text(capsys.readouterr().out)
+    program = (
+        f"source {script}; COMP_WORDS=(pansplat {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))\n"
+        '_tyro_pansplat; echo "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", program], capture_output=True, text=True)
+    assert stop.value.code in (0, None) and done.stderr == ""
+    assert set(done.stdout.split()) == expected, "and no words of descriptions"
 
 
 def test_a_warning_of_pansplat_is_one_note(room: Path, predict, tmp_path: Path, capsys) -> None:

@@ -865,3 +865,25 @@ def test_the_resolution_follows_the_time_between_frames(chromium: Any, folder: P
         left = Image.fromarray((255 * sharp[:, :200]).astype(np.uint8)).resize((80, 80), Image.Resampling.BOX)
         assert psnr(image[120:, :80], np.asarray(left) / 255) > 30
         page.wait("scale > 0.4")
+
+
+@pytest.mark.slow
+def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(
+    chromium: Any, plain_scene: Scene, tmp_path: Path
+) -> None:
+    from pansplat.notebook import _bundle_scene
+
+    file = tmp_path / "cell.html"
+    file.write_text(f"<!doctype html><meta charset=utf-8>{_bundle_scene(plain_scene)['text/html']}")
+    page = chromium.new_page(viewport={"width": 640, "height": 560})
+    messages: list[str] = []
+    page.on("console", lambda message: messages.append(message.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    page.goto(file.as_uri())
+    (frame,) = page.main_frame.child_frames
+    frame.wait_for_selector("#cover", state="hidden", timeout=120_000)
+    frame.wait_for_selector("#buttons", state="visible")
+    assert frame.evaluate("origin") == "null"
+    assert frame.evaluate("document.getElementById('name').innerText") in plain_scene.names
+    assert messages == []
+    page.close()

@@ -26,6 +26,11 @@ if TYPE_CHECKING:
 Progress = Callable[[str, float], None]  # task, fraction done
 
 
+def make_file_name(name: str) -> str:
+    """A name of a scene or panorama as a valid name of a file or folder, without separators and leading dots."""
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "scene"
+
+
 @dataclass(frozen=True, eq=False)
 class SceneEntry:
     """A scene that can be shown: a tour, a pair of panoramas to predict from, or a scene file.
@@ -75,7 +80,7 @@ class SceneEntry:
     @property
     def folder_name(self) -> str:
         """The name as a valid folder name, without separators and leading dots."""
-        return re.sub(r"[^\w.-]+", "_", self.name).strip("._") or "scene"
+        return make_file_name(self.name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,6 +45,11 @@ def set_source_stamp(compiled: Any, stamp: str) -> bool:
     return True
 
 
+def find_cache_folder(compiled: Any) -> str | None:
+    """The folder in which numba keeps a cached kernel; None if this numba hides it."""
+    return _find(compiled, "_cache.cache_path")
+
+
 def share_literal_versions(compiled: Any) -> None:
     """Compile one version of a function for all values of a literal argument: LLVM propagates constants anyway."""
     resolve, unliteral = _find(compiled, "get_call_template"), _find(numba, "core.types.unliteral")

@@ -25,6 +25,7 @@ import torch
 
 from pansplat import constants
 from pansplat.rendering.cpu.numba_api import (
+    find_cache_folder,
     known_options,
     notify_of_compilation,
     set_source_stamp,
@@ -43,9 +44,10 @@ _OPTIONS = {
     "no_cfunc_wrapper": True,  # the kernels are not called from C
     "fastmath": {"contract", "nsz"},  # no reassociation: results do not depend on the number of threads
 }
-_MESSAGE = "pansplat: compiling the rasteriser for this processor, once (15 to 30 seconds)"
+_MESSAGE = "pansplat: compiling kernels for this processor; the first run of each command takes 15 to 30 seconds longer"
 _MESSAGE_DELAY = 1.0  # seconds of compilation before the message
 _message_shown = False
+_cache_folder: Path | None = None  # of the kernels; None without a cache
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -62,6 +64,10 @@ def kernel(function: Callable[..., Any]) -> Any:
     # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
     if not set_source_stamp(compiled, _hash_sources(Path(inspect.getfile(function)))):
         return nb.njit(**options)(function)
+    folder = find_cache_folder(compiled)
+    if folder is not None:
+        global _cache_folder
+        _cache_folder = Path(folder)
     return compiled
 
 
@@ -97,7 +103,7 @@ def _inline(function: Callable[..., Any], **options: Any) -> Any:
 
 @contextlib.contextmanager
 def announce_compilation() -> Iterator[None]:
-    """Print a message on stderr, once per process, if kernels are compiled inside for more than a second.
+    """Print a message on stderr if kernels are compiled inside for more than a second, unless it was printed before.
 
     The delay counts from the first of several kernels. Garbage collection pauses meanwhile: compilation makes millions
     of objects and little garbage, whose collection would take a tenth of the time.
@@ -125,10 +131,32 @@ def announce_compilation() -> Iterator[None]:
 
 
 def _show_message() -> None:
+    """Print the message once per process, and once per cache of kernels, which commands fill one after the other."""
     global _message_shown
     if not _message_shown:
         _message_shown = True
-        print(_MESSAGE, file=sys.stderr, flush=True)
+        if _cache_folder is None or _mark(_cache_folder):
+            print(_MESSAGE, file=sys.stderr, flush=True)
+
+
+def hide_message() -> None:
+    """Print no message in this process."""
+    global _message_shown
+    _message_shown = True
+
+
+def _mark(folder: Path) -> bool:
+    """Leave a mark of this version of the kernels in their cache; whether there was none."""
+    digest = hashlib.sha256(nb.__version__.encode())
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(file.read_bytes())
+    try:
+        (folder / f"announced-{digest.hexdigest()[:16]}").touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    except OSError:
+        pass  # it cannot be written
+    return True
 
 
 # --- worker threads ---

@@ -35,6 +35,23 @@ def _compile_as_part_of(module):
     nb.njit(function)(1.0)
 
 
+@pytest.fixture
+def count_messages(monkeypatch, capsys, tmp_path):
+    """A function that compiles two kernels as in a new process, and counts the messages."""
+    monkeypatch.setattr(runtime, "_cache_folder", tmp_path)
+
+    def run(delay, module):
+        monkeypatch.setattr(runtime, "_MESSAGE_DELAY", delay)
+        monkeypatch.setattr(runtime, "_message_shown", False)
+        with announce_compilation():
+            for _ in range(2):
+                _compile_as_part_of(module)
+        assert gc.isenabled()
+        return capsys.readouterr().err.count("compiling kernels for this processor")
+
+    return run
+
+
 @pytest.mark.parametrize(
     ("delay", "module", "messages"),
     [
@@ -43,14 +60,26 @@ def _compile_as_part_of(module):
         (0.0, "elsewhere", 0),
     ],
 )
-def test_long_compilation_of_pansplat_kernels_is_announced_once(delay, module, messages, monkeypatch, capsys):
-    monkeypatch.setattr(runtime, "_MESSAGE_DELAY", delay)
-    monkeypatch.setattr(runtime, "_message_shown", False)
-    with announce_compilation():
-        _compile_as_part_of(module)
-        _compile_as_part_of(module)
-    assert capsys.readouterr().err.count("compiling the rasteriser for this processor") == messages
-    assert gc.isenabled()
+def test_long_compilation_of_pansplat_kernels_is_announced_once(delay, module, messages, count_messages):
+    assert count_messages(delay, module) == messages
+
+
+def test_later_processes_do_not_announce_it_again_until_the_kernels_change(count_messages, monkeypatch, tmp_path):
+    module = "pansplat.rendering.cpu.projection"
+    assert [count_messages(0.0, module) for _ in range(2)] == [1, 0]
+    monkeypatch.setattr(runtime.nb, "__version__", "another one")
+    assert count_messages(0.0, module) == 1
+
+
+def test_without_a_writable_cache_every_process_announces_it(count_messages, monkeypatch, tmp_path):
+    monkeypatch.setattr(runtime, "_cache_folder", tmp_path / "missing")
+    assert [count_messages(0.0, "pansplat.rendering.cpu.projection") for _ in range(2)] == [1, 1]
+
+
+def test_the_kernels_know_the_folder_of_their_cache():
+    import pansplat.rendering.cpu.projection  # noqa: F401
+
+    assert runtime._cache_folder is not None and runtime._cache_folder.is_dir()
 
 
 @pytest.mark.parametrize("decorate", [kernel, inline_kernel])

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import av
 import numpy as np
@@ -12,7 +13,7 @@ from PIL import Image
 from pansplat.data.pairs import Link
 from pansplat.tours import FADE_SECONDS, plan_route
 from pansplat_viewer import run
-from pansplat_viewer.capture import Film, TourFrames, write_tour
+from pansplat_viewer.capture import Film, TourFrames, _find_nearest_frames, write_tour
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import SceneEntry
@@ -238,6 +239,19 @@ def test_the_film_of_a_fade_between_parts_mixes_both_last_views(parted_house, lo
         renderer.release()
 
 
+def test_the_still_of_a_panorama_is_a_frame_in_which_the_last_part_has_faded_out(parted_house):
+    route = plan_route(parted_house, [2, 3])
+    fractions = np.linspace(0, 1, 200)
+    nodes = {
+        node: frame for frame, nodes in _find_nearest_frames(parted_house, route, fractions).items() for node in nodes
+    }
+    faded = route.jumps[0] / (len(route.yaws) - 1) + FADE_SECONDS / route.seconds
+    assert fractions[nodes[2]] < faded - FADE_SECONDS / route.seconds and fractions[nodes[3]] >= faded
+    for node in (2, 3):
+        position = route.pose(fractions[nodes[node]])[:3, 3]
+        assert np.linalg.norm(position - parted_house.positions[node]) < 0.1
+
+
 def read_film(path) -> np.ndarray:
     with av.open(str(path)) as film:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]).astype(float)
@@ -254,16 +268,26 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
     renderers = [CpuRenderer(None), CpuRenderer(None)]
     film = Film((64, 36), fps=12)
     frames = TourFrames(renderers, scenes, load, film.size, DrawSettings(mode="deferred"))
-    written = write_tour(frames, scenes, route, tmp_path, film, lambda task, done: None)
+    written, complete = [], []
+
+    def show_file(file):
+        written.append(file.name)
+        complete.append((tmp_path / "tour.mp4").exists())
+
+    write_tour(frames, scenes, route, tmp_path, film, lambda task, done: None, show_file)
     for renderer in renderers:
         renderer.release()
-    frames = read_film(written[0])
+    names = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
+    assert written == [*names, "tour.mp4", "floor_plan.png"] and complete == [False] * 4 + [True] * 2
+    frames = read_film(tmp_path / "tour.mp4")
+    with Image.open(tmp_path / names[0]) as still:
+        assert np.abs(np.asarray(still).astype(float) - frames[0]).mean() < 6, "the still of the first panorama"
     assert len(frames) == round(12 * route.seconds) and loaded == [(1, 2), (2, 3)]
     assert frames.max(-1).min() > 40, "no black"
     steps = np.abs(np.diff(frames, axis=0)).mean((1, 2, 3))
     change = np.abs(frames[0].mean((0, 1)) - frames[-1].mean((0, 1))).mean()
     assert change > 30 and steps.max() < 0.3 * change, "scenes of different colours fade"
-    with Image.open(written[1]) as plan:
+    with Image.open(tmp_path / "floor_plan.png") as plan:
         assert max(plan.size) == 1024
 
 
@@ -307,6 +331,9 @@ def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house,
     monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: replace(tour, overlaps=house.overlaps))
     arguments = ["--offscreen", str(tmp_path), "--size", "64x32", "--seconds", "0.5", "--renderer", "cpu"]
     assert run([str(house.folder), *arguments]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["floor_plan.png", "tour.mp4"]
+    stills = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*stills, "floor_plan.png", "tour.mp4"]
     assert len(read_film(tmp_path / "tour.mp4")) == 12
-    assert "tour.mp4" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()[1:]  # without the note on several scenes
+    assert [Path(line).name for line in lines if "Gaussians" not in line] == [*stills, "tour.mp4", "floor_plan.png"]
+    assert lines[0].endswith(" Gaussians"), "before the first still"

@@ -1,0 +1,24 @@
+"""Parts of the short texts that stand for objects (`repr`): names, counts and ranges."""
+
+from collections.abc import Sequence
+
+_MAX_NAMES = 4
+
+
+def describe_count(count: int, noun: str) -> str:
+    """A number and its noun, such as "1 panorama" or "1,200 panoramas"."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def list_first(names: Sequence[str]) -> str:
+    """The names, of many the first ones and the number of the others."""
+    if len(names) <= _MAX_NAMES + 1:
+        return ", ".join(names)
+    return f"{', '.join(names[:_MAX_NAMES])} and {len(names) - _MAX_NAMES} more"
+
+
+def describe_range(low: float, high: float, unit: str = "") -> str:
+    """Two numbers of three digits, such as "0.45 to 10 m"; one if they are equal."""
+    low_text, high_text = f"{low:.3g}", f"{high:.3g}"
+    unit = f" {unit}" if unit else ""
+    return f"{low_text}{unit}" if low_text == high_text else f"{low_text} to {high_text}{unit}"

@@ -1,0 +1,232 @@
+"""In a notebook, scenes are shown in the viewer of web pages, panoramas as pictures, and long calls with a bar."""
+
+import base64
+import dataclasses
+import html
+import io
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from IPython.core.formatters import DisplayFormatter
+from PIL import Image
+from torch import Tensor
+
+import pansplat
+from pansplat import console, notebook
+from pansplat.data.views import Views
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
+from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.rendering import Rendering
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """400 Gaussians on a sphere of 2 m around two cameras."""
+    directions = fibonacci_directions(400).float()
+    gaussians = Gaussians(
+        means=2 * directions,
+        scales=torch.full((400, 3), 0.1),
+        quats=torch.tensor((1.0, 0.0, 0.0, 0.0)).expand(400, 4),
+        opacities=torch.full((400,), 0.9),
+        harmonics=directions[:, None],
+        levels=torch.zeros(400, dtype=torch.int64),
+        views=torch.arange(400) % 2,
+    )
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[1, 0, 3] = 0.5
+    return Scene(gaussians, poses, 0.5, 10.0, ("left", "right"), height=64)
+
+
+def display(value: object) -> dict:
+    formatter = DisplayFormatter()
+    notebook.register_displays(formatter)
+    formatter.active_types = formatter.format_types
+    return formatter.format(value)[0]
+
+
+def open_picture(bundle: dict) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(bundle["image/jpeg"]))))
+
+
+def open_page(bundle: dict) -> str:
+    (source,) = re.findall(r'srcdoc="([^"]+)"', bundle["text/html"])
+    return html.unescape(source)
+
+
+def test_a_scene_is_the_page_in_a_frame_with_a_picture_and_the_size(scene: Scene) -> None:
+    bundle = display(scene)
+    page = open_page(bundle)
+    assert page.startswith("<!doctype html>") and "400 Gaussians." in page
+    assert 'sandbox="allow-scripts' in bundle["text/html"] and "allow-same-origin" not in bundle["text/html"]
+    assert f"400 of 400 Gaussians, {len(page) / 1e6:.1f} MB" in bundle["text/html"]
+    assert open_picture(bundle).shape == (540, 960, 3)
+    assert bundle["text/plain"] == repr(scene)
+
+
+def test_similar_gaussians_of_a_large_scene_are_merged_without_a_fit(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a fit takes up to a minute")
+
+    monkeypatch.setattr("pansplat.web.page._merge", refuse)
+    bundle = notebook._bundle_scene(scene, 100)
+    assert "100 of 400 Gaussians" in bundle["text/html"] and "100 Gaussians." in open_page(bundle)
+
+
+def test_of_a_scene_without_cameras_or_of_very_many_gaussians_a_choice_of_wider_ones_remains(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    foreign = dataclasses.replace(scene, cam2world=scene.cam2world[:0], names=())
+    fewer = notebook._reduce(foreign, 100).gaussians
+    assert len(fewer) == 100 and torch.allclose(fewer.scales, torch.tensor(0.2))
+    assert "100 Gaussians." in open_page(notebook._bundle_scene(foreign, 100))
+    merged: list[Scene] = []
+    monkeypatch.setattr("pansplat.refinement.budget.merge_to", lambda scene, *_: merged.append(scene) or scene)
+    notebook._reduce(scene, 10)
+    assert len(merged[0].gaussians) == 80
+
+
+def test_the_unit_of_the_world_does_not_change_the_mergers(scene: Scene) -> None:
+    fewer = [notebook._reduce(scene.scaled(factor), 150).scaled(1 / factor).gaussians for factor in (1.0, 2.0**-12)]
+    assert torch.allclose(fewer[0].means, fewer[1].means, atol=1e-5)
+
+
+def test_an_empty_scene_is_text(scene: Scene) -> None:
+    bundle = display(dataclasses.replace(scene, gaussians=empty_gaussians()))
+    assert set(bundle) == {"text/plain"} and "no visible Gaussians" in bundle["text/plain"]
+
+
+def test_a_rendering_is_a_picture_of_its_colours() -> None:
+    color = torch.tensor((0.2, 0.5, 1.4))[:, None, None].expand(3, 32, 64).clone().requires_grad_()
+    bundle = display(Rendering(color, torch.ones(32, 64), torch.ones(32, 64)))
+    picture = open_picture(bundle)
+    assert picture.shape == (32, 64, 3)
+    assert np.abs(picture.astype(int) - (51, 128, 255)).max() <= 3
+    assert bundle["text/plain"].startswith("<Rendering: 32x64, RGB")
+
+
+def test_a_large_rendering_is_shown_smaller_and_other_channels_as_text() -> None:
+    big = Rendering(torch.rand(3, 1024, 2048), torch.ones(1024, 2048), torch.ones(1024, 2048))
+    assert open_picture(display(big)).shape == (512, 1024, 3)
+    assert set(display(dataclasses.replace(big, color=big.color[:1]))) == {"text/plain"}
+
+
+def test_views_and_pairs_are_pictures_of_their_panoramas(pair_folder: Path) -> None:
+    (pair,) = pansplat.load_pairs(pair_folder)
+    assert open_picture(display(pair)).shape[:2] == (256, 1024)
+    images = torch.stack([torch.zeros(3, 16, 32), torch.ones(3, 16, 32), torch.zeros(3, 16, 32)])
+    poses, masks = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1), torch.ones(3, 16, 32, dtype=torch.bool)
+    picture = open_picture(display(Views(images, poses, masks, 0.5, 10.0, ("a", "b", "c"))))
+    assert picture.shape == (32, 64, 3)
+    assert picture[8, 16].max() < 8 and picture[8, 48].min() > 247 and picture[24, 16].max() < 8
+
+
+def test_a_pair_whose_files_are_missing_is_text(pair_folder: Path) -> None:
+    (pair,) = pansplat.load_pairs(pair_folder)
+    (pair_folder / "left.png").unlink()
+    assert set(display(pair)) == {"text/plain"}
+
+
+def test_show_writes_a_page_and_opens_it(scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or True)
+    path = pansplat.show(scene)
+    assert path is not None and opened == [path.as_uri()]
+    assert path.read_text().startswith("<!doctype html>") and capsys.readouterr().err == ""
+    monkeypatch.setattr("webbrowser.open", lambda url: False)
+    assert str(pansplat.show(scene)) in capsys.readouterr().err
+
+
+def test_show_refuses_a_scene_without_gaussians(scene: Scene) -> None:
+    with pytest.raises(InputError, match="no visible Gaussians"):
+        pansplat.show(dataclasses.replace(scene, gaussians=empty_gaussians()))
+    with pytest.raises(InputError, match="at least 1, got 0"):
+        pansplat.show(scene, gaussians=0)
+
+
+class Output:
+    """What a cell of a notebook shows, update by update."""
+
+    def __init__(self) -> None:
+        self.states: list[object] = []
+
+    def display(self, value: object, **options: object) -> "Output":
+        self.options = options
+        self.states.append(value)
+        return self
+
+    def update(self, value: object) -> None:
+        mime = value._repr_mimebundle_([], [])["text/plain"] if hasattr(value, "columns") else value.data
+        self.states.append(mime)
+
+
+@pytest.fixture
+def cell(monkeypatch: pytest.MonkeyPatch) -> Output:
+    """The output of a notebook's cell in which this process seems to run."""
+    output = Output()
+    monkeypatch.setattr("IPython.get_ipython", lambda: SimpleNamespace(kernel=object()))
+    monkeypatch.setattr("IPython.display.display", output.display)
+    monkeypatch.setattr(console, "_REDRAW_INTERVAL", 0.0)
+    return output
+
+
+def test_show_displays_the_frame_in_a_notebook(scene: Scene, cell: Output) -> None:
+    assert pansplat.show(scene, gaussians=200, height=300) is None
+    frame = cell.states[-1]
+    assert "200 of 400 Gaussians" in frame["text/html"] and "height: 300px" in frame["text/html"]
+    assert cell.options == {"raw": True}
+
+
+def test_calls_show_one_bar_in_a_notebook_and_remove_it(
+    cell: Output, sphere_predictor: type, pair_folder: Path
+) -> None:
+    class Slow(sphere_predictor):
+        def __call__(self, images: Tensor, *rest: object, progress=None, **options: object) -> Gaussians:
+            progress("placing Gaussians", 0.5)
+            return super().__call__(images, *rest, **options)
+
+    pansplat.predict(pair_folder, Slow(), cache=False, height=64)
+    assert any("placing Gaussians" in str(state) and "50 %" in str(state) for state in cell.states)
+    assert cell.states[-1] == "" and len([state for state in cell.states if state == ""]) == 1
+    assert not console._has_bar
+
+
+def test_a_bar_is_not_shown_with_another_progress_or_without_a_notebook(
+    cell: Output, sphere_predictor: type, pair_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pansplat.predict(pair_folder, sphere_predictor(), cache=False, height=64, progress=lambda what, done: None)
+    monkeypatch.setattr("IPython.get_ipython", lambda: None)
+    pansplat.predict(pair_folder, sphere_predictor(), cache=False, height=64)
+    assert cell.states == []
+
+
+def test_an_error_removes_the_bar(cell: Output, tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        pansplat.predict(tmp_path / "missing")
+    assert cell.states[-1] == "" and not console._has_bar
+
+
+@pytest.mark.parametrize("kernel", [True, False])
+def test_an_import_registers_the_displays_in_a_kernel_only(kernel: bool) -> None:
+    program = f"""
+import sys, types
+from IPython.core.formatters import DisplayFormatter
+import IPython
+shell = types.SimpleNamespace(display_formatter=DisplayFormatter(), **({{"kernel": 1}} if {kernel} else {{}}))
+IPython.get_ipython = lambda: shell
+import pansplat
+deferred = shell.display_formatter.mimebundle_formatter.deferred_printers
+assert (("pansplat.gaussians.scene", "Scene") in deferred) == {kernel}, deferred
+assert "torch" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
