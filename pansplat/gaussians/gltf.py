@@ -64,18 +64,20 @@ def save_glb(scene: Scene, path: Path) -> None:
     attributes = _list_attributes(gaussians)
     entry = format_entry(scene, find_label_runs(gaussians))
     blocks = [np.ascontiguousarray(values).data for values in attributes.values()]
-    advice = f"write a .ply, or reduce --degree: {len(gaussians):,} Gaussians of degree {gaussians.degree} are too many"
-    write_glb(_describe(attributes, entry), blocks, path, advice)
+    content = f"{len(gaussians):,} Gaussians of degree {gaussians.degree}"
+    write_glb(_describe(attributes, entry), blocks, path, content, "write a .ply, or reduce --degree")
 
 
-def write_glb(document: dict[str, Any], blocks: Sequence[memoryview | bytes], path: Path, advice: str) -> None:
+def write_glb(
+    document: dict[str, Any], blocks: Sequence[memoryview | bytes], path: Path, content: str, advice: str
+) -> None:
     """Write the container of a .glb, atomically.
 
     Args:
         document: the JSON document.
         blocks: of the buffer, in order; each takes a multiple of 4 bytes.
         path: the file.
-        advice: what to do if the file is too large, for the message.
+        content, advice: what it holds, and what to do if that is too much, for the message.
 
     Raises:
         InputError: more than 4 GiB, or a folder that cannot be written.
@@ -85,7 +87,9 @@ def write_glb(document: dict[str, Any], blocks: Sequence[memoryview | bytes], pa
     size = sum(memoryview(block).nbytes for block in blocks)
     total = 12 + 8 + len(text) + 8 + size
     if total > _MAX_BYTES:
-        raise InputError(f"cannot write {path}: the format holds {_MAX_BYTES:,} bytes, it needs {total:,}; {advice}")
+        raise InputError(
+            f"cannot write {path}: the format holds {_MAX_BYTES:,} bytes, {content} need {total:,}; {advice}"
+        )
     with replacing(path) as partial, open(partial, "wb") as file:
         file.write(struct.pack("<4sIIII", _MAGIC, _VERSION, total, len(text), _JSON) + text)
         file.write(struct.pack("<II", size, _BINARY))

@@ -124,14 +124,15 @@ def _save_glb(mesh: Mesh, path: Path) -> tuple[Path, ...]:
     }
 
     def add_block(content: bytes, **more: Any) -> int:
-        lists["bufferViews"].append({"buffer": 0, "byteOffset": sum(map(len, blocks)), "byteLength": len(content), **more})
+        start = sum(map(len, blocks))
+        lists["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": len(content), **more})
         blocks.append(content + bytes(-len(content) % 4))
         return len(lists["bufferViews"]) - 1
 
     def add_accessor(values: np.ndarray, kind: str, component: int, target: int, **more: Any) -> int:
-        view = add_block(np.ascontiguousarray(values).tobytes(), target=target)
-        accessor = {"bufferView": view, "componentType": component, "count": values.size // {"SCALAR": 1, "VEC2": 2}.get(kind, 3)}
-        lists["accessors"].append(accessor | {"type": kind} | more)
+        view = add_block(values.tobytes(), target=target)
+        accessor = {"bufferView": view, "componentType": component, "count": len(values), "type": kind}
+        lists["accessors"].append(accessor | more)
         return len(lists["accessors"]) - 1
 
     for number, part in enumerate(mesh.parts):
@@ -152,5 +153,5 @@ def _save_glb(mesh: Mesh, path: Path) -> tuple[Path, ...]:
         lists["textures"].append({"sampler": 0, "source": number})
         lists["images"].append({"bufferView": add_block(_encode(part.texture)), "mimeType": "image/jpeg"})
     document |= lists | {"buffers": [{"byteLength": sum(map(len, blocks))}]}
-    write_glb(document, blocks, path, "reduce --triangles")
+    write_glb(document, blocks, path, f"{mesh.num_triangles:,} triangles", "reduce --triangles")
     return (path,)

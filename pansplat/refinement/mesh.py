@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.gaussians.mesh_files import Mesh, MeshPart
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.world import working_factor
 from pansplat.refinement.fusion import OPAQUE, are_seen, measure_reach
@@ -127,7 +127,7 @@ def _connect(places: Float[np.ndarray, "row column 3"], *poles: Float[Tensor, "3
 
 
 def _are_surfaces(corners: Float[np.ndarray, "triangle 3 3"]) -> Bool[np.ndarray, "triangle"]:
-    """Whether triangles around a camera at the origin have a surface at each corner, and are not seen at a grazing angle."""
+    """Whether triangles have a surface at each corner, and the camera, at the origin, sees them at no grazing angle."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     middles = corners.mean(axis=1)
     cosine = -(normals * middles).sum(axis=1)
@@ -153,10 +153,11 @@ def _are_seen_nearer(
     return seen
 
 
-def _draw(surface, pose: Float[Tensor, "4 4"], scene: Scene) -> Float[Tensor, "3 height width"]:
+def _draw(surface: Gaussians, pose: Float[Tensor, "4 4"], scene: Scene) -> Float[Tensor, "3 height width"]:
     """The image of a view's Gaussians at its camera."""
     rows = min(scene.height, _TEXTURE_ROWS)
-    return rasterize(surface, pose, size=(rows, 2 * rows)).color
+    drawn = rasterize(surface, pose, size=(rows, 2 * rows))
+    return drawn.color / drawn.alpha.clamp_min(OPAQUE)
 
 
 def _balance(texture: Float[Tensor, "3 height width"], scene: Scene, view: int) -> UInt8[np.ndarray, "height width 3"]:

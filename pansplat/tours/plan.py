@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from shapely.geometry import MultiPolygon, Polygon
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.floor import assign_storeys, find_ceiling, find_camera_height, locate_surfaces, trace_floor
+from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, locate_surfaces, trace_floor
 from pansplat.tours.graph import TourGraph
 
 _RAYS = 360
@@ -518,8 +518,12 @@ def _find_doors(rooms: Sequence[Room], sights: Sequence[_Sight | None], unit: fl
     doors: list[Door] = []
     for number, ends, _ in found:
         middle = ends.mean(axis=0)
-        near = [k for k, door in enumerate(doors) if np.linalg.norm(door.ends.mean(axis=0) - middle) < _SAME_DOOR * unit]
-        near = [k for k in near if rooms[doors[k].rooms[0]].storey == rooms[number].storey]
+        near = [
+            k
+            for k, door in enumerate(doors)
+            if np.linalg.norm(door.ends.mean(axis=0) - middle) < _SAME_DOOR * unit
+            and rooms[door.rooms[0]].storey == rooms[number].storey
+        ]
         if not near:
             doors.append(Door(ends, (number,)))
         elif number not in doors[near[0]].rooms:
@@ -561,7 +565,7 @@ def _meet_line(center: np.ndarray, angle: float, start: np.ndarray, end: np.ndar
 
 
 def _meet_outline(center: Float[np.ndarray, "2"], outline: Outline) -> tuple[np.ndarray, np.ndarray]:
-    """Distance at which each ray meets the outline first, and the number of that wall; infinite and -1 if it does not."""
+    """Distance at which each ray meets the outline, and the number of that wall; infinite and -1 if it does not."""
     rays, along = _rays(), np.roll(outline, -1, axis=0) - outline
     cross = rays[:, None, 0] * along[:, 1] - rays[:, None, 1] * along[:, 0]
     offset = outline - center

@@ -183,7 +183,8 @@ def _draw_svg(plan: Plan) -> str:
     ]
     for room in plan.rooms:
         corners = " ".join(point(corner, room.storey) for corner in room.outline)
-        parts.append(f'<polygon{"" if room.is_placed else " class=" + chr(34) + "loose" + chr(34)} points="{corners}"/>')
+        kind = "room" if room.is_placed else "loose"
+        parts.append(f'<polygon class="{kind}" points="{corners}"/>')
     for door in plan.doors:
         storey = plan.rooms[door.rooms[0]].storey
         parts += [line(kind, door.ends, storey, storey) for kind in ("door", "leaf")]
