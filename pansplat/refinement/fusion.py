@@ -25,7 +25,7 @@ from pansplat.rendering import rasterize
 
 _HEIGHT = 512  # rows of the depth of a view's surface
 _TOLERANCE = 0.1  # of a distance from the surface, relative to its depth
-_BACKGROUND_LEVEL = 2  # the finest level of the background
+BACKGROUND_LEVEL = 2  # the finest level of the background
 OPAQUE = 0.5  # least alpha of a surface
 
 
@@ -49,7 +49,7 @@ def fuse_views(scene: Scene) -> Scene:
         surface = gaussians.select(own == view)
         distances = (gaussians.means - centers[view]).norm(dim=1)
         is_nearer = (distances < nearest) | ((distances == nearest) & (own > view))
-        asked = (own != view) & ~is_dropped & (is_nearer | (gaussians.levels >= _BACKGROUND_LEVEL))
+        asked = (own != view) & ~is_dropped & (is_nearer | (gaussians.levels >= BACKGROUND_LEVEL))
         chosen = asked.nonzero()[:, 0]
         reach = measure_reach(surface, poses[view], min(scene.height, _HEIGHT))
         is_dropped[chosen] = are_seen(gaussians.means[chosen], poses[view], reach)

@@ -20,7 +20,7 @@ from pansplat.gaussians.mesh_files import Mesh, MeshPart
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.world import working_factor
-from pansplat.refinement.fusion import OPAQUE, are_seen, measure_reach
+from pansplat.refinement.fusion import BACKGROUND_LEVEL, OPAQUE, are_seen, measure_reach
 from pansplat.rendering import rasterize
 
 DEFAULT_TRIANGLES = 2_000_000
@@ -58,9 +58,11 @@ def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Tex
     scaled = scene.scaled(factor)
     size = rows, 2 * rows
     poses, own = scaled.cam2world.double(), scaled.gaussians.views
-    surfaces = [scaled.gaussians if scene.joint else scaled.gaussians.select(own == view) for view in range(count)]
+    seen = [scaled.gaussians if scene.joint else scaled.gaussians.select(own == view) for view in range(count)]
     depths, reaches = [], []
-    for surface, pose in zip(surfaces, poses, strict=True):
+    for gaussians, pose in zip(seen, poses, strict=True):
+        # Where a mask leaves out the surface, the background shows beside it.
+        surface = gaussians.select(gaussians.levels < BACKGROUND_LEVEL)
         drawn = rasterize(surface, pose, size=size)
         depths.append(torch.where(drawn.alpha > OPAQUE, drawn.depth, 0).double().cpu())
         reaches.append(measure_reach(surface, pose, rows).cpu())
@@ -72,7 +74,7 @@ def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Tex
         points = points @ pose[:3, :3].T + pose[:3, 3]
         is_free = ~_are_seen_nearer(points, view, poses.cpu(), reaches).numpy()
         triangle = corners[is_free[_find_points(corners, rows)].any(axis=1)]
-        texture = _draw(surfaces[view], pose, scene) if textures is None else textures(view)
+        texture = _draw(seen[view], pose, scene) if textures is None else textures(view)
         name = scene.names[view] if view < len(scene.names) else f"panorama {view + 1}"
         parts.append(_make_part(name, points.numpy() / factor, triangle, rows, _balance(texture, scene, view)))
     return Mesh(tuple(part for part in parts if len(part.triangles)))
@@ -153,10 +155,10 @@ def _are_seen_nearer(
     return seen
 
 
-def _draw(surface: Gaussians, pose: Float[Tensor, "4 4"], scene: Scene) -> Float[Tensor, "3 height width"]:
+def _draw(gaussians: Gaussians, pose: Float[Tensor, "4 4"], scene: Scene) -> Float[Tensor, "3 height width"]:
     """The image of a view's Gaussians at its camera."""
     rows = min(scene.height, _TEXTURE_ROWS)
-    drawn = rasterize(surface, pose, size=(rows, 2 * rows))
+    drawn = rasterize(gaussians, pose, size=(rows, 2 * rows))
     return drawn.color / drawn.alpha.clamp_min(OPAQUE)
 
 

@@ -124,6 +124,20 @@ def test_no_triangle_spans_a_step_in_depth(box: Scene) -> None:
     assert np.ptp(middle, axis=1).max() < 0.5, "the wall is 3.2 m behind the screen"
 
 
+def test_the_background_is_no_surface(box: Scene, mesh: Mesh) -> None:
+    """Where a mask leaves out the floor below a camera, the background behind the surfaces shows beside the hole."""
+    is_masked = (box.gaussians.views == 0) & (
+        (box.gaussians.means - CENTERS[0])[:, 1] > 0.85 * (box.gaussians.means - CENTERS[0]).norm(dim=1)
+    )
+    behind = box.gaussians.select((box.gaussians.views == 0) & ~is_masked)
+    means = CENTERS[0] + 1.5 * (behind.means - CENTERS[0])
+    behind = dataclasses.replace(behind, means=means, scales=4 * behind.scales, levels=behind.levels + 2)
+    gaussians = Gaussians.cat([box.gaussians.select(~is_masked), behind])
+    filled = make_mesh(dataclasses.replace(box, gaussians=gaussians), triangles=TRIANGLES)
+    assert max(_measure_offset(part.positions).max() for part in filled.parts) < 0.1
+    assert _measure_area(filled) == pytest.approx(_measure_area(mesh), rel=0.03), "the other camera fills the hole"
+
+
 def test_a_joint_scene_and_another_unit_give_the_same_surface(box: Scene, mesh: Mesh) -> None:
     scaled = make_mesh(box.scaled(1024.0), triangles=TRIANGLES)
     assert scaled.num_triangles == mesh.num_triangles
@@ -154,7 +168,8 @@ def test_files_are_read_by_another_program(mesh: Mesh, tmp_path: Path, name: str
         error = np.abs(pixels[row, column] - 255 * _color(torch.from_numpy(places)).numpy())
         assert np.quantile(error, 0.98) < 6 and error.max() < 24
     for file in files[2:]:
-        assert not Image.open(file).getexif()
+        with Image.open(file) as image:
+            assert not image.getexif()
 
 
 def test_bad_scenes_and_names_are_refused(box: Scene, mesh: Mesh, tmp_path: Path) -> None:
