@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+from torch.nn import functional
 
 from pansplat.errors import InputError
 from pansplat.gaussians.mesh_files import Mesh, MeshPart
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.equirect import pad_equirect, pixel_directions
 from pansplat.geometry.world import working_factor
 from pansplat.refinement.fusion import BACKGROUND_LEVEL, OPAQUE, are_seen, measure_reach
 from pansplat.rendering import rasterize
@@ -64,8 +65,11 @@ def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Tex
         # Where a mask leaves out the surface, the background shows beside it.
         surface = gaussians.select(gaussians.levels < BACKGROUND_LEVEL)
         drawn = rasterize(surface, pose, size=size)
-        depths.append(torch.where(drawn.alpha > OPAQUE, drawn.depth, 0).double().cpu())
-        reaches.append(measure_reach(surface, pose, rows).cpu())
+        depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, 0)
+        # At the edge of a hole the camera has no whole triangles: others fill it up to there.
+        hole = functional.max_pool2d(pad_equirect((depth == 0).to(depth)[None], 1), 3, stride=1)[0] > 0
+        reaches.append(torch.where(hole, 0, measure_reach(surface, pose, rows)).cpu())
+        depths.append(depth.double().cpu())
     parts = []
     for view, (depth, pose) in enumerate(zip(depths, poses.cpu(), strict=True)):
         places = depth[..., None] * pixel_directions(*size, dtype=torch.float64)
