@@ -78,7 +78,7 @@ class Export:
         from pansplat.gaussians.formats import save_scene
         from pansplat.gaussians.ply import save_points
         from pansplat.gaussians.scene import prune
-        from pansplat.tours import describe_plan, write_floor_plan, write_plan
+        from pansplat.tours import write_floor_plan
 
         is_dataset = not self.out.suffix
         if is_dataset:
@@ -118,6 +118,8 @@ class Export:
 
                 serve_page(page)
         elif is_drawing:
+            from pansplat.tours.plan_files import describe_plan, write_plan
+
             plan = write_plan(scene, self.out)
             print(f"{self.out}: {'; '.join(describe_plan(plan))}")
         elif is_picture:

@@ -33,7 +33,6 @@ from pansplat.tours.graph import (
 )
 from pansplat.tours.links import find_link_ring, find_way_along_link
 from pansplat.tours.overlap import connect
-from pansplat.tours.plan_files import describe_plan, write_plan
 from pansplat.tours.route import FADE_SECONDS, Route, find_angles, plan_route
 
 __all__ = [
@@ -48,7 +47,6 @@ __all__ = [
     "Views",
     "choose_camera_height",
     "connect",
-    "describe_plan",
     "draw_floor_plan",
     "find_angles",
     "find_camera_height",
@@ -67,5 +65,4 @@ __all__ = [
     "select_views",
     "trace_floor",
     "write_floor_plan",
-    "write_plan",
 ]

@@ -15,9 +15,9 @@ import torch
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat.tours import make_graph, write_plan
+from pansplat.tours import make_graph
 from pansplat.tours.plan import Plan, make_plan
-from pansplat.tours.plan_files import describe_plan
+from pansplat.tours.plan_files import describe_plan, write_plan
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
