@@ -1,9 +1,10 @@
-"""`pansplat export`: a scene or tour in the formats of other programs, as a web page, floor plan or training set."""
+"""`pansplat export`: a scene or tour in the formats of other programs, as a web page, mesh, plan or training set."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -28,7 +29,9 @@ if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
     from pansplat.web import PageFiles
 
-_PAGE_SUFFIX, _PLAN_SUFFIX = ".html", ".png"
+_PAGE_SUFFIX, _PICTURE_SUFFIX, _DRAWING_SUFFIXES, _MESH_SUFFIX = ".html", ".png", (".svg", ".dxf"), ".obj"
+_SUFFIXES = (*SCENE_SUFFIXES, _PAGE_SUFFIX, _PICTURE_SUFFIX, *_DRAWING_SUFFIXES, _MESH_SUFFIX)
+_TEXTURE_HEIGHT = 2048  # of the photographs on a mesh, at most
 _FEW_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # of a panorama in a page
 _MOST_GAUSSIANS = 2_000_000  # of a page in one file
 _MIN_POINT_OPACITY, _MOST_POINTS = 0.1, 200_000  # of the points to train from
@@ -37,14 +40,19 @@ _MIN_POINT_OPACITY, _MOST_POINTS = 0.1, 200_000  # of the points to train from
 @dataclass(frozen=True)
 class Export:
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
-    web page (.html, docs/web.md), as a floor plan (.png), or as a folder to train further from (a name without
-    suffix): cube faces, poses and points for COLMAP, nerfstudio, gsplat and brush."""
+    web page (.html, docs/web.md), as a floor plan (.svg and .dxf with straight walls and areas; .png), as textured
+    triangles (.obj, .glb with --mesh), or as a folder to train further from (a name without suffix): cube faces, poses
+    and points for COLMAP, nerfstudio, gsplat and brush."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
     out: Out
-    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .png for a floor
-    plan; a new folder, without a suffix, for cube faces with poses."""
+    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg, .dxf or .png
+    for a floor plan; .obj for a mesh; a new folder, without a suffix, for cube faces with poses."""
+    mesh: bool = False
+    """Write a .glb of triangles with the photographs as textures. An .obj always has them."""
+    triangles: Count | None = None
+    """For a mesh: largest number of triangles, 2,000,000 by default."""
     points: bool = False
     """Write a .ply of plain points with colours, for programs without Gaussians."""
     degree: Annotated[int, Range(0, 4), WHOLE] | None = None
@@ -77,9 +85,16 @@ class Export:
         if is_dataset:
             require_new_folder("--out", self.out)
         else:
-            require_output_file("--out", self.out, (*SCENE_SUFFIXES, _PAGE_SUFFIX, _PLAN_SUFFIX))
-        is_page, is_plan = (self.out.suffix.lower() == suffix for suffix in (_PAGE_SUFFIX, _PLAN_SUFFIX))
-        if self.points and (is_page or is_plan or is_dataset or find_scene_suffix(self.out) != ".ply"):
+            require_output_file("--out", self.out, _SUFFIXES)
+        suffix = self.out.suffix.lower()
+        is_page, is_picture, is_drawing = suffix == _PAGE_SUFFIX, suffix == _PICTURE_SUFFIX, suffix in _DRAWING_SUFFIXES
+        is_mesh = self.mesh or suffix == _MESH_SUFFIX
+        if self.mesh and suffix not in (_MESH_SUFFIX, ".glb"):
+            raise InputError(f"--mesh writes a .glb or .obj, got {self.out}; leave it out, or choose another name")
+        if self.triangles is not None and not is_mesh:
+            raise InputError(f"--triangles is for a mesh (.obj, or .glb with --mesh), got {self.out}; leave it out")
+        is_scene = not (is_page or is_picture or is_drawing or is_dataset or is_mesh)
+        if self.points and not (is_scene and find_scene_suffix(self.out) == ".ply"):
             raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
         if not is_page and (self.gaussians is not None or self.split or self.serve or self.title is not None):
             names = "--gaussians, --split, --serve and --title"
@@ -89,7 +104,10 @@ class Export:
         if is_dataset:
             self._write_dataset()
             return 0
-        scene = self._open(is_page or is_plan)
+        if is_mesh:
+            self._write_mesh()
+            return 0
+        scene = self._open(not is_scene)
         if self.up is not None:
             scene = scene.rotated(_rotation_from(self.up))
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
@@ -100,7 +118,12 @@ class Export:
                 from pansplat.web.serve import serve_page
 
                 serve_page(page)
-        elif is_plan:
+        elif is_drawing:
+            from pansplat.tours.plan_files import describe_plan, write_plan
+
+            plan = write_plan(scene, self.out)
+            print(f"{self.out}: {'; '.join(describe_plan(plan))}")
+        elif is_picture:
             write_floor_plan(scene, self.out)
             print(f"{self.out}: the floors of {len(scene.cam2world)} panoramas")
         else:
@@ -128,6 +151,40 @@ class Export:
             file=sys.stderr,
         )
         return fuse_views(scene)
+
+    def _write_mesh(self) -> None:
+        """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
+        from pansplat.data.pairs import Pair
+        from pansplat.gaussians.mesh_files import save_mesh
+        from pansplat.gaussians.scene import prune
+        from pansplat.refinement.mesh import DEFAULT_TRIANGLES, make_mesh
+
+        load: Callable[[int], Tensor] | None = None
+        if is_scene_file(self.path):
+            scene = self.prediction.open(self.path)
+        else:
+            scene, source = self.prediction.open_panoramas(self.path)
+
+            def load(view: int) -> Tensor:
+                if isinstance(source, Pair):
+                    pair = dataclasses.replace(source, context=(source.context[view],))
+                else:
+                    pair = source.make_pair([view])
+                return pair.load_context(min(pair.image_height, _TEXTURE_HEIGHT)).images[0]
+
+        if self.up is not None:
+            scene = scene.rotated(_rotation_from(self.up))
+        gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
+        scene = dataclasses.replace(scene, gaussians=gaussians)
+        mesh = make_mesh(scene, triangles=self.triangles or DEFAULT_TRIANGLES, textures=load)
+        files = save_mesh(mesh, self.out)
+        size = sum(file.stat().st_size for file in files)
+        beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
+        count = len(mesh.parts)
+        print(
+            f"{self.out}{beside}: {mesh.num_triangles:,} triangles of {count} panorama{'s' if count > 1 else ''}, "
+            f"{size / 1e6:.1f} MB"
+        )
 
     def _write_dataset(self) -> None:
         """Write cube faces, poses and points to a new folder."""

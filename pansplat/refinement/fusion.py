@@ -25,8 +25,8 @@ from pansplat.rendering import rasterize
 
 _HEIGHT = 512  # rows of the depth of a view's surface
 _TOLERANCE = 0.1  # of a distance from the surface, relative to its depth
-_BACKGROUND_LEVEL = 2  # the finest level of the background
-_OPAQUE = 0.5  # least alpha of a surface
+BACKGROUND_LEVEL = 2  # the finest level of the background
+OPAQUE = 0.5  # least alpha of a surface
 
 
 @torch.no_grad()
@@ -49,21 +49,34 @@ def fuse_views(scene: Scene) -> Scene:
         surface = gaussians.select(own == view)
         distances = (gaussians.means - centers[view]).norm(dim=1)
         is_nearer = (distances < nearest) | ((distances == nearest) & (own > view))
-        asked = (own != view) & ~is_dropped & (is_nearer | (gaussians.levels >= _BACKGROUND_LEVEL))
+        asked = (own != view) & ~is_dropped & (is_nearer | (gaussians.levels >= BACKGROUND_LEVEL))
         chosen = asked.nonzero()[:, 0]
-        is_dropped[chosen] = _are_seen(gaussians.means[chosen], poses[view], surface, min(scene.height, _HEIGHT))
+        reach = measure_reach(surface, poses[view], min(scene.height, _HEIGHT))
+        is_dropped[chosen] = are_seen(gaussians.means[chosen], poses[view], reach)
     return dataclasses.replace(scene, gaussians=scene.gaussians.select(~is_dropped), joint=True)
 
 
-def _are_seen(
-    points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], surface: Gaussians, height: int
-) -> Bool[Tensor, "n"]:
-    """Whether a camera sees the points, before or at the surface of its own Gaussians."""
+def measure_reach(surface: Gaussians, pose: Float[Tensor, "4 4"], height: int) -> Float[Tensor, "height width"]:
+    """How far a camera sees in each direction; 0 where there is no surface.
+
+    It is the largest depth around each pixel, as depth is uncertain at edges.
+
+    Args:
+        surface: the Gaussians that the camera shows.
+        pose: of the camera.
+        height: rows.
+    """
     drawn = rasterize(surface, pose, size=(height, 2 * height))
-    depth = torch.where(drawn.alpha > _OPAQUE, drawn.depth, 0)[None]  # nothing is seen where there is no surface
-    farthest = functional.max_pool2d(pad_equirect(depth, 1), 3, stride=1)[0]  # around, as depth is uncertain at edges
+    depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, 0)[None]
+    return functional.max_pool2d(pad_equirect(depth, 1), 3, stride=1)[0]
+
+
+def are_seen(
+    points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], reach: Float[Tensor, "height width"]
+) -> Bool[Tensor, "n"]:
+    """Whether a camera sees the points, before or at its surfaces (`measure_reach`)."""
+    height, width = reach.shape
     offsets = (points.double() - pose[:3, 3].to(points.device)) @ pose[:3, :3].to(points.device)
     uv = uv_from_directions(offsets)
     row = (uv[:, 1] * height).long().clamp(0, height - 1)
-    limit = farthest[row, (uv[:, 0] * 2 * height).long() % (2 * height)]
-    return offsets.norm(dim=1) <= (1 + _TOLERANCE) * limit
+    return offsets.norm(dim=1) <= (1 + _TOLERANCE) * reach[row, (uv[:, 0] * width).long() % width]

@@ -50,7 +50,7 @@ def find_camera_height(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
         view: index of the view.
         level: right, down and forward (columns) of a level camera.
     """
-    return _find_floor(_locate_surfaces(scene, view, level))
+    return _find_floor(locate_surfaces(scene, view, level))
 
 
 def choose_camera_height(heights: Iterable[float | None], far: float) -> float:
@@ -64,12 +64,21 @@ def choose_camera_height(heights: Iterable[float | None], far: float) -> float:
     return float(np.median(known)) if known else _CAMERA_HEIGHT * far
 
 
-def _locate_surfaces(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
+def locate_surfaces(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
     """Places (right, down, forward) relative to a view's camera of its Gaussians that show surfaces, metres."""
     gaussians = scene.gaussians
     # Coarse levels have Gaussians behind the surfaces.
     shown = (gaussians.views == view) & (gaussians.opacities > 0.1) & (gaussians.levels <= 1)
     return (gaussians.means[shown].double().numpy() - scene.cam2world[view, :3, 3].double().numpy()).dot(level)
+
+
+def find_ceiling(places: Float[np.ndarray, "n 3"]) -> float | None:
+    """Height of the ceiling over a camera, in the unit of the places; None if they show none.
+
+    Args:
+        places: of surfaces relative to the camera (right, down, forward).
+    """
+    return _find_floor(places * (1, -1, 1))
 
 
 def _find_floor(places: Float[np.ndarray, "n 3"]) -> float | None:
@@ -93,7 +102,7 @@ def find_floor_outline(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
     Args:
         scene, view, level: see `find_camera_height`.
     """
-    found = trace_floor(_locate_surfaces(scene, view, level))
+    found = trace_floor(locate_surfaces(scene, view, level))
     if found is None:
         return None
     corners, height = found

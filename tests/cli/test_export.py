@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import export as export_module
 from pansplat.cli import run
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.web import page as page_module
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
@@ -86,7 +89,7 @@ def test_a_web_page_is_written(scene: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_options_of_pages_are_for_pages(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--split")
-    assert ".sog, .glb, .ply" in refusal("export", scene, "-o", tmp_path / "scene.obj")
+    assert ".sog, .glb, .ply" in refusal("export", scene, "-o", tmp_path / "scene.stl")
     assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "x.spz", "--points")
     assert "--up is for a scene file" in refusal("export", tmp_path, "-o", tmp_path / "out.ply", "--up", "z")
 
@@ -147,3 +150,63 @@ def test_a_floor_plan_needs_a_floor(scene: Path, tmp_path: Path, refusal: Callab
     message = refusal("export", scene, "-o", tmp_path / "plan.png", "--min-opacity", "0.95")
     assert "needed a floor below at least one of the 2 input cameras" in message
     assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "plan.png", "--points")
+
+
+def test_a_drawn_plan_needs_walls_and_all_that_each_panorama_shows(
+    scene: Path, tmp_path: Path, refusal: Callable[..., str]
+) -> None:
+    message = refusal("export", scene, "-o", tmp_path / "plan.svg", "--min-opacity", "0.95")
+    assert "needed a floor, and walls around at least one of the 2 input cameras" in message
+    assert run(["export", str(scene), "-o", str(tmp_path / "joint.ply")]) == 0
+    assert "exported with --layers" in refusal("export", tmp_path / "joint.ply", "-o", tmp_path / "plan.dxf")
+    assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "plan.dxf", "--points")
+
+
+def test_a_plan_states_rooms_and_uncertainty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A room of 4 x 6 x 2.6 m."""
+    rays, here = fibonacci_directions(20000).double() + 1e-9, torch.tensor((0.3, -1.5, 0.2), dtype=torch.float64)
+    low, high = torch.tensor((-2.0, -2.6, -3.0)), torch.tensor((2.0, 0.0, 3.0))
+    distance = (torch.where(rays > 0, high - here, low - here) / rays).min(dim=1, keepdim=True).values
+    labels = torch.zeros(20000, dtype=torch.int64)
+    means = (here + distance * rays).float()
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(20000, 4)
+    sizes, black = torch.full((20000, 3), 0.02), torch.zeros(20000, 1, 3)
+    gaussians = Gaussians(means, sizes, quats, torch.ones(20000), black, labels, labels)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = here
+    scene = tmp_path / "scene.ply"
+    pipeline.save(Scene(gaussians, pose[None], 0.5, 10.0, names=("Kitchen",)), scene)
+    assert run(["export", str(scene), "-o", str(tmp_path / "plan.svg")]) == 0
+    printed = capsys.readouterr().out
+    assert "plan.svg: 1 room, 24.0 m² between the walls; scale: cameras 1.50 m over the floor" in printed
+    assert "walls: of one panorama each" in printed
+    assert ">Kitchen</text>" in (tmp_path / "plan.svg").read_text()
+
+
+@pytest.mark.parametrize("name", ["my room.obj", "mesh.glb"])
+def test_a_folder_is_written_as_triangles_with_its_photographs(
+    room: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["export", str(room), "--model", "sphere", "--refine", "0", "--predict-height", "64", "--mesh"]
+    assert run([*command, "--triangles", "5000", "-o", str(tmp_path / name)]) == 0
+    count = int(capsys.readouterr().out.split(": ")[1].split(" triangles")[0].replace(",", ""))
+    assert 1000 < count <= 5000
+    mesh = trimesh.load(tmp_path / name, process=False)
+    parts = list(mesh.geometry.values())
+    assert len(parts) == 2 and sum(len(part.faces) for part in parts) == count
+    textures = [getattr(part.visual.material, "baseColorTexture", None) or part.visual.material.image for part in parts]
+    photographs = [np.asarray(Image.open(room / file).convert("RGB"), float) for file in ("a.png", "b.png")]
+    errors = [min(np.abs(np.asarray(t, float) - photo).mean() for photo in photographs) for t in textures]
+    assert max(errors) < 60, "random pixels, as JPEG; another photograph differs by 85"
+
+
+def test_options_of_meshes_are_for_meshes(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
+    assert "--mesh writes a .glb or .obj" in refusal("export", scene, "-o", tmp_path / "x.ply", "--mesh")
+    assert "--triangles is for a mesh" in refusal("export", scene, "-o", tmp_path / "x.glb", "--triangles", "9")
+    assert "needs 512 triangles or more" in refusal("export", scene, "-o", tmp_path / "x.obj", "--triangles", "9")
+    assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "x.obj", "--points")
+    foreign = pipeline.load(scene)
+    pipeline.save(dataclasses.replace(foreign, cam2world=foreign.cam2world[:0], names=()), tmp_path / "foreign.splat")
+    message = refusal("export", tmp_path / "foreign.splat", "-o", tmp_path / "x.obj")
+    assert "a mesh needs a scene with input cameras" in message
+    assert not (tmp_path / "x.obj").exists()

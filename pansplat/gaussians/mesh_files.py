@@ -1,0 +1,157 @@
+"""Textured triangles, and their files: Wavefront .obj with .mtl and .jpg beside it, and binary glTF (.glb).
+
+Both have y up, as programs expect. Triangles are seen from the side of the camera that showed them: a program that
+culls back faces, as glTF asks for, shows rooms from outside without the ceiling or wall in front: a doll's house.
+
+Source: the glTF 2.0 specification, sections 3.7 (geometry), 3.8 (textures), 3.9 (materials), and its extension
+KHR_materials_unlit, because the light is in the photographs; Wavefront Technologies, Object Files (.obj).
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
+
+from pansplat.atomic import replacing
+from pansplat.errors import InputError
+from pansplat.gaussians.gltf import write_glb
+from pansplat.gaussians.scene_files import Y_UP
+
+MESH_SUFFIXES = (".obj", ".glb")
+
+_QUALITY = 92  # of textures
+_UNLIT = "KHR_materials_unlit"
+_ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+_FLOAT, _UINT = 5126, 5125
+_LINEAR, _MIPMAPS, _REPEAT, _CLAMP = 9729, 9987, 10497, 33071
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Triangles that one panorama shows.
+
+    Attributes:
+        name: of the panorama.
+        positions: world, y down, metres.
+        uv: places in the texture, u to the right and v down; u may exceed 1 by a part of a pixel, where it repeats.
+        triangles: vertices; the normals (b - a) x (c - a) point to the camera.
+        texture: equirectangular, sRGB.
+    """
+
+    name: str
+    positions: Float[np.ndarray, "vertex 3"]
+    uv: Float[np.ndarray, "vertex 2"]
+    triangles: Int[np.ndarray, "triangle 3"]
+    texture: UInt8[np.ndarray, "height width 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A surface of textured parts."""
+
+    parts: tuple[MeshPart, ...]
+
+    @property
+    def num_triangles(self) -> int:
+        """Of all parts."""
+        return sum(len(part.triangles) for part in self.parts)
+
+
+def save_mesh(mesh: Mesh, path: Path) -> tuple[Path, ...]:
+    """Write a mesh in the format of the suffix, each file atomically, and return the files, the named one first.
+
+    Raises:
+        InputError: no triangle, another suffix, more than 4 GiB, or a folder that cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise InputError(f"cannot write {path}: a mesh must end in {' or '.join(MESH_SUFFIXES)}; rename it")
+    if not mesh.num_triangles:
+        raise InputError(f"cannot write {path}: needed one or more triangles, got none; give a scene with surfaces")
+    return _save_obj(mesh, path) if suffix == ".obj" else _save_glb(mesh, path)
+
+
+def _encode(texture: UInt8[np.ndarray, "height width 3"]) -> bytes:
+    """A JPEG without metadata."""
+    stream = io.BytesIO()
+    Image.fromarray(texture).save(stream, "JPEG", quality=_QUALITY)
+    return stream.getvalue()
+
+
+def _save_obj(mesh: Mesh, path: Path) -> tuple[Path, ...]:
+    # Readers split lines of .obj and .mtl at spaces.
+    stem = re.sub(r"[^\w-]+", "_", path.stem, flags=re.ASCII) or "scene"
+    materials = path.with_name(f"{stem}.mtl")
+    files, described, first = [path, materials], [], 1
+    for number, part in enumerate(mesh.parts):
+        image = path.with_name(f"{stem}_{number}.jpg")
+        with replacing(image) as partial:
+            partial.write_bytes(_encode(part.texture))
+        files.append(image)
+        described.append(f"newmtl view_{number}\nKd 1 1 1\nillum 0\nmap_Kd {image.name}\n")
+    with replacing(materials) as partial:
+        partial.write_text("\n".join(described), encoding="utf-8")
+    with replacing(path) as partial, open(partial, "w", encoding="utf-8", newline="\n") as file:
+        file.write(f"# pansplat; metres, y up\nmtllib {materials.name}\n")
+        for number, part in enumerate(mesh.parts):
+            file.write(f"o view_{number}\nusemtl view_{number}\n")
+            np.savetxt(file, part.positions @ Y_UP.numpy(), "v %.4f %.4f %.4f")
+            np.savetxt(file, part.uv * (1, -1) + (0, 1), "vt %.6f %.6f")  # v up
+            corners = np.repeat(part.triangles + first, 2, axis=1)  # position and texture have one number
+            np.savetxt(file, corners, "f %d/%d %d/%d %d/%d")
+            first += len(part.positions)
+    return tuple(files)
+
+
+def _save_glb(mesh: Mesh, path: Path) -> tuple[Path, ...]:
+    blocks: list[bytes] = []
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "pansplat"},
+        "extensionsUsed": [_UNLIT],
+        "scene": 0,
+        "scenes": [{"nodes": [*range(len(mesh.parts))]}],
+        "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _REPEAT, "wrapT": _CLAMP}],
+    }
+    lists: dict[str, list[dict[str, Any]]] = {
+        key: [] for key in ("nodes", "meshes", "materials", "textures", "images", "accessors", "bufferViews")
+    }
+
+    def add_block(content: bytes, **more: Any) -> int:
+        start = sum(map(len, blocks))
+        lists["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": len(content), **more})
+        blocks.append(content + bytes(-len(content) % 4))
+        return len(lists["bufferViews"]) - 1
+
+    def add_accessor(values: np.ndarray, kind: str, component: int, target: int, **more: Any) -> int:
+        view = add_block(values.tobytes(), target=target)
+        accessor = {"bufferView": view, "componentType": component, "count": len(values), "type": kind}
+        lists["accessors"].append(accessor | more)
+        return len(lists["accessors"]) - 1
+
+    for number, part in enumerate(mesh.parts):
+        positions = (part.positions @ Y_UP.numpy()).astype(np.float32)
+        bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+        primitive = {
+            "attributes": {
+                "POSITION": add_accessor(positions, "VEC3", _FLOAT, _ARRAY_BUFFER, **bounds),
+                "TEXCOORD_0": add_accessor(part.uv.astype(np.float32), "VEC2", _FLOAT, _ARRAY_BUFFER),
+            },
+            "indices": add_accessor(part.triangles.astype(np.uint32).ravel(), "SCALAR", _UINT, _ELEMENT_BUFFER),
+            "material": number,
+        }
+        surface = {"baseColorTexture": {"index": number}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+        lists["nodes"].append({"mesh": number, "name": part.name})
+        lists["meshes"].append({"primitives": [primitive]})
+        lists["materials"].append({"pbrMetallicRoughness": surface, "extensions": {_UNLIT: {}}})
+        lists["textures"].append({"sampler": 0, "source": number})
+        lists["images"].append({"bufferView": add_block(_encode(part.texture)), "mimeType": "image/jpeg"})
+    document |= lists | {"buffers": [{"byteLength": sum(map(len, blocks))}]}
+    write_glb(document, blocks, path, f"{mesh.num_triangles:,} triangles", "reduce --triangles")
+    return (path,)

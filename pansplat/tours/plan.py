@@ -1,0 +1,578 @@
+"""The floor plan of a scene as straight walls: rooms with their areas, doors, and how far the panoramas disagree.
+
+A wall is sought above the doors, just below the ceiling, where a room is closed and little furniture stands. Each
+direction around a camera ends at one of few lines, which are parallel to the main directions of the place: the
+sequence of lines with the least error is found by dynamic programming. Panoramas that are in each other's outlines are
+in one room; their lines are common and their outlines are joined.
+
+Lengths below are fractions of the height of the cameras over the floor, about 1.5 m, so that the unit has no influence.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from shapely.geometry import MultiPolygon, Polygon
+
+from pansplat.gaussians.scene import Scene
+from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, locate_surfaces, trace_floor
+from pansplat.tours.graph import TourGraph
+
+_RAYS = 360
+_BAND = 0.6, 0.85  # of a wall above doors and below beams, fractions of the ceiling's height over the camera
+_LEAST_CEILING = 0.25  # height over the camera, below which doors may reach into the band
+_SURFACE = 0.12  # largest difference from the distance of a surface, as a fraction
+_BESIDE = 1  # rays whose places count, too
+_LEAST_DISTANCE = 0.25  # of a wall; a lamp may be above a camera
+_SPAN = 2  # rays on either side of the chord that states a wall's direction
+_LARGEST_STEP = 0.3  # length of such a chord, as a fraction of its distance
+_PARALLEL = math.radians(15)  # of a chord and its wall
+_SKEW = math.radians(3)  # largest angle between a side of an outline and its wall
+_OBLIQUE, _OBLIQUE_SHARE = math.radians(12), 0.15  # least angle to the main directions, and share of all chords
+_CLUSTER, _LEAST_WALL, _MOST_LINES = 0.07, 0.2, 24  # half width of a line's chords, its length, lines of a direction
+_NOISE, _LARGEST_ERROR = 0.07, 0.35  # of the distance of a wall
+_CORNER, _JUMP, _LARGEST_JUMP = 5.0, 0.15, 5.0  # costs of another wall, in errors of one ray; of a jump in depth
+_NARROW, _COLLINEAR = 0.12, 0.02  # half width of spikes that are left out; merged pieces of walls
+_LEAST_AREA = 0.4  # of a room, squared camera heights
+_BEYOND = 0.25  # of the floor behind an opening
+_LOW = 0.5, 0.9  # where an opening that reaches to the floor is seen, fractions of the height below the camera
+_DOOR_WIDTHS = 0.33, 1.7
+_SAME_DOOR = 0.4  # distance of the middles of an opening from two sides
+_NEAR_WALL, _LEAST_SEEN = 0.2, 8  # places that show a wall; number of them by one panorama
+
+Outline = Float[np.ndarray, "corner 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A room of a plan.
+
+    Attributes:
+        name: from the titles of its panoramas.
+        panoramas: those in it, by number.
+        outline: corners in plan coordinates, metres to the right and forward of the tour's level axes, anticlockwise.
+        storey: 0 is the lowest.
+        is_placed: whether its place relative to other rooms is known.
+    """
+
+    name: str
+    panoramas: tuple[int, ...]
+    outline: Outline
+    storey: int
+    is_placed: bool
+
+    @property
+    def area(self) -> float:
+        """Square metres."""
+        return float(Polygon(self.outline).area)
+
+
+@dataclass(frozen=True, eq=False)
+class Door:
+    """An opening of a room down to the floor: a door, or a window of a room's height.
+
+    Attributes:
+        ends: on the wall of the room, metres.
+        rooms: the room, and the one on the other side if the opening is seen from there, too.
+    """
+
+    ends: Float[np.ndarray, "2 2"]
+    rooms: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A floor plan.
+
+    Attributes:
+        tour: the panoramas, their edges and links.
+        rooms: of all storeys.
+        doors: of all rooms; one between two rooms once.
+        camera_height: of the cameras over the floor, metres, the median.
+        scale_error: standard deviation of these heights as a fraction; None if fewer than three are known.
+        wall_error: standard deviation of a wall as one panorama shows it, metres; None if no wall is shown by two.
+        num_heights, num_walls: that these figures are from.
+    """
+
+    tour: TourGraph
+    rooms: tuple[Room, ...]
+    doors: tuple[Door, ...]
+    camera_height: float
+    scale_error: float | None
+    wall_error: float | None
+    num_heights: int
+    num_walls: int
+
+    def area_error(self, room: Room) -> float | None:
+        """Standard deviation of a room's area by those of the scale and of its walls, square metres, if known."""
+        if self.scale_error is None and self.wall_error is None:
+            return None
+        edges = np.linalg.norm(np.roll(room.outline, -1, axis=0) - room.outline, axis=1)
+        walls = (self.wall_error or 0.0) * float(np.linalg.norm(edges))
+        return math.hypot(walls, 2 * (self.scale_error or 0.0) * room.area)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """What one panorama shows of its room.
+
+    Attributes:
+        center: of the camera, in the plan.
+        walls: where each ray meets a wall, relative to the camera; NaN where it is unknown.
+        shown: all places of walls, in the plan.
+        low: places below the camera and above the floor, relative to the camera.
+    """
+
+    center: Float[np.ndarray, "2"]
+    walls: Float[np.ndarray, "ray 2"]
+    shown: Float[np.ndarray, "n 2"]
+    low: Float[np.ndarray, "m 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Lines of walls: places with normal @ place = offset."""
+
+    normals: Float[np.ndarray, "line 2"]
+    offsets: Float[np.ndarray, "line"]
+
+
+def make_plan(scene: Scene, tour: TourGraph) -> Plan:
+    """The floor plan of a scene; without rooms if no panorama shows walls around it.
+
+    Args:
+        scene: with input cameras, not fused: each panorama with its own Gaussians.
+        tour: the graph of the scene's cameras (`make_graph`).
+    """
+    level, count = tour.level_axes, len(tour)
+    heights = [find_camera_height(scene, view, level) for view in range(count)]
+    known = np.array([height for height in heights if height is not None])
+    if not len(known):
+        return Plan(tour, (), (), math.nan, None, None, 0, 0)
+    unit = float(np.median(known))
+    sights = [_look(scene, view, level, heights[view] or unit) for view in range(count)]
+    storeys, parts = assign_storeys(tour), tour.parts if tour.overlaps else (0,) * count  # a pair has no edges
+    rooms: list[Room] = []
+    for part, storey in sorted({*zip(parts, storeys, strict=True)}):
+        members = [k for k in range(count) if sights[k] is not None and (parts[k], storeys[k]) == (part, storey)]
+        in_part = [sights[k] for k in range(count) if sights[k] is not None and parts[k] == part]
+        if members:
+            normals = _find_directions(in_part, unit)
+            for nodes, outline in _outline_rooms(sights, members, normals, unit):
+                is_placed = (nodes[0], nodes[0]) not in tour.overlaps or len(tour) == 1
+                rooms.append(Room(_name_room(tour, nodes), nodes, outline, storey, is_placed))
+    disagreement, num_walls = _measure_walls(rooms, sights, parts, unit)
+    scale = float(1.4826 * np.median(np.abs(known - unit)) / unit) if len(known) > 2 else None
+    doors = _find_doors(rooms, sights, unit)
+    return Plan(tour, tuple(rooms), doors, unit, scale, disagreement, len(known), num_walls)
+
+
+def _name_room(tour: TourGraph, nodes: Sequence[int]) -> str:
+    names = [*dict.fromkeys(tour.panoramas[node].title or tour.panoramas[node].name for node in nodes)]
+    return " / ".join(names) if len(names) < 3 else f"{names[0]} + {len(names) - 1}"
+
+
+def _look(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], height: float) -> _Sight | None:
+    """What a panorama shows; None if it shows no walls."""
+    places = locate_surfaces(scene, view, level)
+    center = level[:, (0, 2)].T @ scene.cam2world[view, :3, 3].double().numpy()
+    down, flat = places[:, 1], places[:, (0, 2)]
+    low = flat[(down > _LOW[0] * height) & (down < _LOW[1] * height)]
+    ceiling = find_ceiling(places)
+    if ceiling is None or ceiling < _LEAST_CEILING * height:
+        found = trace_floor(places)
+        if found is None:
+            return None
+        walls = np.repeat(found[0], _RAYS // len(found[0]), axis=0)
+        angles = _ray_angles()
+        walls = np.linalg.norm(walls, axis=1)[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1)
+        return _Sight(center, walls, center + walls, low[:0])  # no wall is above the openings
+    band = flat[(-down > _BAND[0] * ceiling) & (-down < _BAND[1] * ceiling)]
+    band = band[np.linalg.norm(band, axis=1) > _LEAST_DISTANCE * height]
+    reach = _measure_reach(band)
+    if np.isfinite(reach).sum() < _RAYS // 2:
+        return None
+    return _Sight(center, reach[:, None] * _rays(), center + band, low)
+
+
+def _ray_angles() -> Float[np.ndarray, "ray"]:
+    """Azimuths from forward to the right, radians."""
+    return (np.arange(_RAYS) + 0.5) * 2 * math.pi / _RAYS
+
+
+def _rays() -> Float[np.ndarray, "ray 2"]:
+    angles = _ray_angles()
+    return np.stack((np.sin(angles), np.cos(angles)), axis=1)
+
+
+def _sectors(places: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    """The ray next to each place."""
+    return ((np.arctan2(places[:, 0], places[:, 1]) / (2 * math.pi) % 1.0) * _RAYS).astype(int) % _RAYS
+
+
+def _measure_reach(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "ray"]:
+    """Distance around each ray of the surface that most places show; NaN where there are fewer than three.
+
+    It is the median of those near the median of all, so that a beam in front or an opening does not move it.
+    """
+    sector, distance = _sectors(places), np.linalg.norm(places, axis=1)
+    beside = np.concatenate([sector + shift for shift in range(-_BESIDE, _BESIDE + 1)]) % _RAYS
+    order = np.argsort(beside, kind="stable")
+    ordered = np.tile(distance, 2 * _BESIDE + 1)[order]
+    borders = np.searchsorted(beside[order], np.arange(_RAYS + 1))
+    reach = np.full(_RAYS, np.nan)
+    for ray, (first, last) in enumerate(itertools.pairwise(borders.tolist())):
+        if last - first > 2:
+            found = ordered[first:last]
+            level = np.quantile(found, 0.5, method="lower")
+            reach[ray] = np.median(found[np.abs(found - level) <= _SURFACE * level])
+    return reach
+
+
+def _find_chords(sight: _Sight, unit: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """Middles in the plan, and vectors, of chords along the walls."""
+    chords = np.roll(sight.walls, -_SPAN, axis=0) - np.roll(sight.walls, _SPAN, axis=0)
+    length, distance = (np.linalg.norm(values, axis=1) for values in (chords, sight.walls))
+    with np.errstate(invalid="ignore"):
+        usable = (length > 0) & (length < np.maximum(_LARGEST_STEP * distance, _LEAST_WALL * unit))
+    return sight.center + sight.walls[usable], chords[usable] / (2 * _SPAN)
+
+
+def _find_directions(sights: Sequence[_Sight], unit: float) -> Float[np.ndarray, "direction 2"]:
+    """Normals of the main walls, two of them at right angles, and those of frequent oblique ones."""
+    chords = np.concatenate([_find_chords(sight, unit)[1] for sight in sights])
+    angles, weights = np.arctan2(chords[:, 1], chords[:, 0]), np.linalg.norm(chords, axis=1)
+    main = _find_peak(angles, weights, 90)
+    found = [main, main + math.pi / 2]
+    total = weights.sum()
+    for _ in range(2):
+        free = np.min([np.abs(_wrap(angles - angle, math.pi)) for angle in found], axis=0) > _OBLIQUE
+        if not free.any():
+            break
+        angle = _find_peak(angles[free], weights[free], 180)
+        near = np.abs(_wrap(angles - angle, math.pi)) < math.radians(5)
+        if weights[near & free].sum() < _OBLIQUE_SHARE * total:
+            break
+        found.append(angle)
+    turned = np.array(found) + math.pi / 2
+    return np.stack((np.cos(turned), np.sin(turned)), axis=1)
+
+
+def _find_peak(angles: np.ndarray, weights: np.ndarray, period: int) -> float:
+    """The most frequent angle, radians, of angles that are equal after a period (degrees)."""
+    degrees = np.degrees(angles) % period
+    counts = np.bincount(degrees.astype(int) % period, weights, period)
+    smooth = sum(np.roll(counts, shift) for shift in range(-2, 3))
+    peak = math.radians(int(np.argmax(smooth)) + 0.5)
+    for tolerance in (6, 3, 3):
+        offset = _wrap(angles - peak, math.radians(period))
+        near = np.abs(offset) < math.radians(tolerance)
+        if not near.any():
+            break
+        peak += float(np.average(offset[near], weights=weights[near]))
+    return peak
+
+
+def _wrap(angles: np.ndarray, period: float) -> np.ndarray:
+    """Angles in half a period around 0."""
+    return (angles + period / 2) % period - period / 2
+
+
+def _find_lines(sights: Sequence[_Sight], normals: Float[np.ndarray, "direction 2"], unit: float) -> _Lines:
+    """The lines on which the walls of some panoramas are."""
+    middles, chords = (np.concatenate(values) for values in zip(*(_find_chords(s, unit) for s in sights), strict=True))
+    length = np.linalg.norm(chords, axis=1)
+    found = []
+    for normal in normals:
+        chosen = np.abs(chords @ normal) < math.sin(_PARALLEL) * length
+        offsets, weights = middles[chosen] @ normal, length[chosen]
+        for _ in range(_MOST_LINES):
+            if not len(offsets):
+                break
+            order = np.argsort(offsets)
+            offsets, weights = offsets[order], weights[order]
+            sums = np.concatenate(([0.0], np.cumsum(weights)))
+            first, last = (np.searchsorted(offsets, offsets + sign * _CLUSTER * unit) for sign in (-1, 1))
+            near = sums[last] - sums[first]
+            best = int(near.argmax())
+            if near[best] < _LEAST_WALL * unit * len({id(s) for s in sights}) ** 0.5:
+                break
+            a, b = first[best], last[best]
+            middle = np.searchsorted(sums[a : b + 1], (sums[a] + sums[b]) / 2)
+            found.append((normal, offsets[a + max(int(middle) - 1, 0)]))
+            offsets, weights = (np.delete(values, np.s_[a:b]) for values in (offsets, weights))
+    return _Lines(np.array([n for n, _ in found]).reshape(-1, 2), np.array([offset for _, offset in found]))
+
+
+def _trace_outline(sight: _Sight, lines: _Lines, unit: float) -> Polygon | None:
+    """The outline of the walls around a camera; None if no lines enclose it."""
+    sequence = _choose_lines(sight, lines, unit)
+    if sequence is None:
+        return None
+    changes = np.flatnonzero(sequence != np.roll(sequence, 1))
+    if len(changes) < 3:
+        return None
+    corners: list[np.ndarray] = []
+    offsets = lines.offsets - lines.normals @ sight.center  # relative to the camera
+    for ray in changes.tolist():
+        before, after = int(sequence[ray - 1]), int(sequence[ray])
+        border = ray * 2 * math.pi / _RAYS  # between the two rays
+        direction = np.array((math.sin(border), math.cos(border)))
+        corners += _join(direction, lines.normals[[before, after]], offsets[[before, after]], unit)
+    outline = np.array(corners).reshape(-1, 2)
+    if len(outline) < 3 or not _is_along(outline, lines, unit):
+        return None
+    polygon = shapely.make_valid(Polygon(sight.center + outline))
+    return _choose_piece(polygon.buffer(0), sight.center)
+
+
+def _is_along(outline: Outline, lines: _Lines, unit: float) -> bool:
+    """Whether all longer sides of an outline are parallel to a wall, so that the walls enclose the camera."""
+    sides = np.roll(outline, -1, axis=0) - outline
+    length = np.linalg.norm(sides, axis=1)
+    away = np.abs(sides @ lines.normals.T).min(axis=1)
+    return not ((length > _LEAST_WALL * unit) & (away > math.sin(_SKEW) * length)).any()
+
+
+def _choose_piece(shape: shapely.Geometry, center: Float[np.ndarray, "2"]) -> Polygon | None:
+    """The polygon of a shape that is at a camera; None without one."""
+    pieces = [piece for piece in getattr(shape, "geoms", [shape]) if isinstance(piece, Polygon) and piece.area > 0]
+    place = shapely.Point(center)
+    return min(pieces, key=lambda piece: piece.distance(place), default=None)
+
+
+def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | None:
+    """The line that each ray ends at, by dynamic programming around the circle; None without lines."""
+    if len(lines.offsets) < 3:
+        return None
+    measured = np.linalg.norm(sight.walls, axis=1)
+    offsets = lines.offsets - lines.normals @ sight.center
+
+    def meet(rays: np.ndarray) -> np.ndarray:
+        """Distances (ray, line) at which rays meet the lines; infinite if they do not."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = offsets / (rays @ lines.normals.T)
+        return np.where(distance > 0, distance, np.inf)
+
+    error = np.abs(meet(_rays()) - measured[:, None]) / unit
+    costs = np.minimum(np.where(np.isnan(error), 0, error), _LARGEST_ERROR) / _NOISE
+    angles = np.arange(_RAYS) * 2 * math.pi / _RAYS
+    between = np.minimum(meet(np.stack((np.sin(angles), np.cos(angles)), axis=1)), 1e3 * unit)
+    total, origins = costs[0], []
+    for step in range(1, 3 * _RAYS):
+        ray = step % _RAYS
+        jump = np.abs(between[ray][:, None] - between[ray]) / (_JUMP * unit)
+        change = _CORNER + np.minimum(jump, _LARGEST_JUMP)
+        np.fill_diagonal(change, 0)
+        reached = total[:, None] + change  # from each line to each line
+        origins.append(reached.argmin(axis=0))
+        total = reached.min(axis=0) + costs[ray]
+    state, sequence = int(total.argmin()), []
+    for origin in reversed(origins):
+        sequence.append(state)
+        state = int(origin[state])
+    sequence.append(state)
+    return np.array(sequence[::-1])[_RAYS : 2 * _RAYS]
+
+
+def _join(
+    direction: Float[np.ndarray, "2"], normals: Float[np.ndarray, "2 2"], offsets: Float[np.ndarray, "2"], unit: float
+) -> list[np.ndarray]:
+    """Corners relative to a camera between two walls that meet, or of which the nearer one hides the other's end.
+
+    Args:
+        direction: in which the first wall ends.
+        normals, offsets: of the two walls, relative to the camera.
+    """
+    along = normals @ direction
+    distance = offsets / np.where(np.abs(along) < 1e-9, 1e-9, along)
+    ends = distance[:, None] * direction
+    if abs(np.linalg.det(normals)) > 0.17:  # 10 degrees
+        corner = np.linalg.solve(normals, offsets)
+        if min(np.linalg.norm(ends - corner, axis=1)) < 2 * _LARGEST_ERROR * unit and corner @ direction > 0:
+            return [corner]
+    if (distance <= 0).any() or not np.isfinite(distance).all():
+        return []
+    near = int(distance.argmin())
+    far = 1 - near
+    if abs(np.linalg.det(normals)) < 0.17:
+        step = (offsets[far] - normals[far] @ ends[near]) / (normals[far] @ normals[near])
+        hidden = [ends[near] + step * normals[near]]
+    else:
+        # The hidden wall starts at right angles to the nearer one, and another one ends at the farther one.
+        across = np.stack((normals[near], -normals[far]), axis=1)
+        lengths = np.linalg.solve(across, ends[far] - ends[near])
+        hidden = [ends[near] + lengths[0] * normals[near], ends[far]]
+    path = [ends[near], *hidden]
+    return path if near == 0 else path[::-1]
+
+
+def _outline_rooms(
+    sights: Sequence[_Sight | None], members: Sequence[int], normals: Float[np.ndarray, "direction 2"], unit: float
+) -> list[tuple[tuple[int, ...], Outline]]:
+    """The panoramas and outlines of the rooms of a storey; those whose own walls are open come last in their room."""
+    seen = {k: sights[k] for k in members}
+    alone = {k: _trace_outline(sight, _find_lines([sight], normals, unit), unit) for k, sight in seen.items()}
+    traced = [k for k in members if alone[k] is not None and alone[k].area > _LEAST_AREA * unit**2]
+    points = {k: shapely.Point(seen[k].center) for k in traced}
+    mutual = [
+        (a, b)
+        for a, b in itertools.product(range(len(traced)), repeat=2)
+        if alone[traced[a]].contains(points[traced[b]]) and alone[traced[b]].contains(points[traced[a]])
+    ]
+    if not mutual:
+        return []
+    graph = coo_array((np.ones(len(mutual)), np.array(mutual).T), shape=(len(traced),) * 2)
+    labels = connected_components(graph, directed=False)[1]
+    shapes: list[tuple[tuple[int, ...], shapely.Geometry]] = []
+    for label in dict.fromkeys(labels.tolist()):
+        nodes = tuple(traced[k] for k in np.flatnonzero(labels == label))
+        lines = _find_lines([seen[k] for k in nodes], normals, unit)
+        outlines = [_trace_outline(seen[k], lines, unit) or alone[k] for k in nodes]
+        shapes.append((nodes, _clean(shapely.union_all(outlines), unit)))
+    rooms, free = [], set(members) - set(traced)
+    for nodes, shape in _separate(shapes, seen):
+        piece = _choose_piece(_clean(shape, unit), seen[nodes[0]].center)
+        if piece is not None and piece.area > _LEAST_AREA * unit**2:
+            ring = shapely.normalize(piece).exterior
+            corners = np.array((ring if ring.is_ccw else ring.reverse()).coords)[:-1]
+            guests = tuple(sorted(k for k in free if piece.contains(shapely.Point(seen[k].center))))
+            rooms.append((nodes + guests, corners))
+    return rooms
+
+
+def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
+    """A shape without spikes and slots, and with one piece for each straight wall."""
+    narrow = _NARROW * unit
+    for sign in (-1, 1):  # first spikes, then slots
+        shape = shape.buffer(sign * narrow, join_style="mitre").buffer(-sign * narrow, join_style="mitre")
+    # The start of a ring may be in the middle of a wall, where `simplify` keeps it.
+    pieces = [piece for piece in getattr(shape, "geoms", [shape]) if isinstance(piece, Polygon) and not piece.is_empty]
+    rings = []
+    for piece in pieces:
+        corners = np.array(piece.exterior.simplify(_COLLINEAR * unit).coords)[:-1]
+        turned = np.roll(corners, -1, axis=0)
+        rings.append(Polygon(np.array(Polygon(turned).exterior.simplify(_COLLINEAR * unit).coords)))
+    return MultiPolygon(rings) if len(rings) != 1 else rings[0]
+
+
+def _separate(
+    shapes: Sequence[tuple[tuple[int, ...], shapely.Geometry]], sights: dict[int, _Sight]
+) -> list[tuple[tuple[int, ...], shapely.Geometry]]:
+    """The rooms without the places that belong to other ones: those of the room with the nearest camera."""
+    result = [shape for _, shape in shapes]
+    centers = [shapely.MultiPoint([sights[node].center for node in nodes]) for nodes, _ in shapes]
+    for a, b in itertools.combinations(range(len(shapes)), 2):
+        common = result[a].intersection(result[b])
+        for piece in getattr(common, "geoms", [common]):
+            if piece.area == 0:
+                continue
+            place = piece.representative_point()
+            loser = b if centers[a].distance(place) < centers[b].distance(place) else a
+            result[loser] = result[loser].difference(piece)
+    return [(nodes, shape) for (nodes, _), shape in zip(shapes, result, strict=True)]
+
+
+def _measure_walls(
+    rooms: Sequence[Room], sights: Sequence[_Sight | None], parts: Sequence[int], unit: float
+) -> tuple[float | None, int]:
+    """Standard deviation of a wall by the panoramas that show it from the room's side, and the number of such walls."""
+    variances = []
+    for room in rooms:
+        near_room = [s for k, s in enumerate(sights) if s is not None and parts[k] == parts[room.panoramas[0]]]
+        for start, end in zip(room.outline, np.roll(room.outline, -1, axis=0), strict=True):
+            length = float(np.linalg.norm(end - start))
+            if length < 2 * _LEAST_WALL * unit:
+                continue
+            along = (end - start) / length
+            inward = np.array((-along[1], along[0]))  # corners are anticlockwise
+            offsets = []
+            for sight in near_room:
+                if (sight.center - start) @ inward < _NEAR_WALL * unit:
+                    continue
+                places = sight.shown - start
+                offset, position = places @ inward, places @ along / length
+                near = (np.abs(offset) < _NEAR_WALL * unit) & (position > 0.1) & (position < 0.9)
+                if near.sum() >= _LEAST_SEEN:
+                    offsets.append(float(np.median(offset[near])))
+            if len(offsets) > 1:
+                variances.append(float(np.var(offsets, ddof=1)))
+    return (math.sqrt(float(np.mean(variances))), len(variances)) if variances else (None, 0)
+
+
+def _find_doors(rooms: Sequence[Room], sights: Sequence[_Sight | None], unit: float) -> tuple[Door, ...]:
+    """The openings through which panoramas show what is beyond the walls of their rooms, down to the floor."""
+    found: list[tuple[int, np.ndarray, int]] = []  # room, ends, rays
+    for number, room in enumerate(rooms):
+        for node in room.panoramas:
+            found += [(number, ends, rays) for ends, rays in _find_openings(sights[node], room.outline, unit)]
+    found.sort(key=lambda opening: -opening[2])
+    doors: list[Door] = []
+    for number, ends, _ in found:
+        middle = ends.mean(axis=0)
+        near = [
+            k
+            for k, door in enumerate(doors)
+            if np.linalg.norm(door.ends.mean(axis=0) - middle) < _SAME_DOOR * unit
+            and rooms[door.rooms[0]].storey == rooms[number].storey
+        ]
+        if not near:
+            doors.append(Door(ends, (number,)))
+        elif number not in doors[near[0]].rooms:
+            doors[near[0]] = Door(doors[near[0]].ends, (*doors[near[0]].rooms, number))
+    return tuple(doors)
+
+
+def _find_openings(sight: _Sight, outline: Outline, unit: float) -> list[tuple[np.ndarray, int]]:
+    """Ends on one wall of each opening that a panorama shows, and the number of its rays."""
+    reach = _measure_reach(sight.low)
+    distance, wall = _meet_outline(sight.center, outline)
+    with np.errstate(invalid="ignore"):
+        is_open: Bool[np.ndarray, "ray"] = (reach > distance + _BEYOND * unit) & (wall >= 0)
+    labels = np.where(is_open, wall, -1)
+    start = int(np.argmin(is_open)) if not is_open.all() else 0  # a ray that is not open, so that no run is cut
+    order = np.roll(np.arange(_RAYS), -start)
+    openings = []
+    for label, run in itertools.groupby(order.tolist(), key=lambda ray: labels[ray]):
+        rays = list(run)
+        if label < 0 or len(rays) < 3:
+            continue
+        half = math.pi / _RAYS
+        corners = outline[label], outline[(label + 1) % len(outline)]
+        angles = _ray_angles()[[rays[0], rays[-1]]] + (-half, half)
+        ends = np.array([_meet_line(sight.center, angle, *corners) for angle in angles])
+        width = float(np.linalg.norm(ends[1] - ends[0]))
+        if _DOOR_WIDTHS[0] * unit < width < _DOOR_WIDTHS[1] * unit:
+            openings.append((ends, len(rays)))
+    return openings
+
+
+def _meet_line(center: np.ndarray, angle: float, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Where a ray meets the line of a wall, within its ends."""
+    direction = np.array((math.sin(angle), math.cos(angle)))
+    system = np.stack((end - start, -direction), axis=1)
+    if abs(np.linalg.det(system)) < 1e-12:
+        return start
+    return start + float(np.clip(np.linalg.solve(system, center - start)[0], 0, 1)) * (end - start)
+
+
+def _meet_outline(center: Float[np.ndarray, "2"], outline: Outline) -> tuple[np.ndarray, np.ndarray]:
+    """Distance at which each ray meets the outline, and the number of that wall; infinite and -1 if it does not."""
+    rays, along = _rays(), np.roll(outline, -1, axis=0) - outline
+    cross = rays[:, None, 0] * along[:, 1] - rays[:, None, 1] * along[:, 0]
+    offset = outline - center
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / cross
+        position = (offset[:, 0] * rays[:, None, 1] - offset[:, 1] * rays[:, None, 0]) / cross
+    distance = np.where((distance > 0) & (position >= 0) & (position <= 1), distance, np.inf)
+    nearest = distance.argmin(axis=1)
+    reached = distance[np.arange(_RAYS), nearest]
+    return reached, np.where(np.isfinite(reached), nearest, -1)

@@ -1,0 +1,183 @@
+"""Textured triangles of a box room: places, textures, steps in depth, each place once, and the files."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from pansplat.errors import InputError
+from pansplat.gaussians.mesh_files import Mesh, save_mesh
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.refinement.mesh import make_mesh
+
+LOW, HIGH = torch.tensor((-2.0, -1.1, -3.0)), torch.tensor((2.0, 1.5, 3.0))  # y is down
+CENTERS = torch.tensor(((-0.8, 0.0, -1.0), (0.8, 0.1, 1.2)))
+TURN = torch.tensor(((0.8, 0.0, 0.6), (0.0, 1.0, 0.0), (-0.6, 0.0, 0.8)))  # of the second camera
+TRIANGLES = 4 * 2 * 64**2
+
+
+def _color(places: torch.Tensor) -> torch.Tensor:
+    """A smooth colour of each place of the room."""
+    return 0.1 + 0.8 * (places - LOW) / (HIGH - LOW)
+
+
+def _view(view: int, screen: float | None = None, count: int = 60000) -> Gaussians:
+    """The Gaussians of the walls around a camera, and of a disc at a distance ahead of it."""
+    rays = fibonacci_directions(count).float() + 1e-9
+    center = CENTERS[view]
+    distance = (torch.where(rays > 0, HIGH - center, LOW - center) / rays).min(dim=1).values
+    if screen is not None:
+        distance = torch.where(rays[:, 2] > 0.95, screen, distance)
+    means = center + distance[:, None] * rays
+    labels = torch.zeros(count, dtype=torch.int64)
+    return Gaussians(
+        means=means,
+        scales=0.009 * distance[:, None].repeat(1, 3),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        opacities=torch.full((count,), 0.98),
+        harmonics=((_color(means) - 0.5) / 0.28209479)[:, None],
+        levels=labels,
+        views=labels + view,
+    )
+
+
+@pytest.fixture(scope="module")
+def box() -> Scene:
+    """A room that two cameras see."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[:, :3, 3] = CENTERS.double()
+    poses[1, :3, :3] = TURN.double()
+    return Scene(Gaussians.cat([_view(0), _view(1)]), poses, 0.5, 10.0, names=("a.jpg", "b.jpg"), height=128)
+
+
+@pytest.fixture(scope="module")
+def mesh(box: Scene) -> Mesh:
+    return make_mesh(box, triangles=TRIANGLES)
+
+
+def _measure_offset(places: np.ndarray) -> np.ndarray:
+    """Distance of places from the nearest wall, metres."""
+    return np.minimum(np.abs(places - LOW.numpy()), np.abs(places - HIGH.numpy())).min(axis=1)
+
+
+def _measure_area(mesh: Mesh) -> float:
+    return sum(trimesh.Trimesh(part.positions, part.triangles, process=False).area for part in mesh.parts)
+
+
+def test_vertices_are_on_the_walls_and_cover_them_once(mesh: Mesh) -> None:
+    size = (HIGH - LOW).numpy()
+    for part in mesh.parts:
+        offset = _measure_offset(part.positions)
+        assert np.quantile(offset, 0.99) < 0.01 * size.max() and offset.max() < 0.03 * size.max()
+        assert part.uv.min() >= 0 and part.uv[:, 0].max() <= 1 + 1 / 128 and part.uv[:, 1].max() <= 1
+    box_area = 2 * float(size[0] * size[1] + size[1] * size[2] + size[0] * size[2])
+    assert _measure_area(mesh) == pytest.approx(box_area, rel=0.05), "closed, and little of it twice"
+    assert 0.5 * TRIANGLES < mesh.num_triangles < 0.95 * TRIANGLES
+
+
+def test_triangles_face_their_camera(mesh: Mesh) -> None:
+    for part, center in zip(mesh.parts, CENTERS.numpy(), strict=True):
+        a, b, c = (part.positions[part.triangles[:, k]] for k in range(3))
+        assert ((np.cross(b - a, c - a) * (center - a)).sum(axis=1) > 0).all()
+
+
+def test_each_place_is_kept_from_the_nearest_camera(mesh: Mesh) -> None:
+    for view, part in enumerate(mesh.parts):
+        distance = [np.linalg.norm(part.positions - center, axis=1) for center in CENTERS.numpy()]
+        nearer = distance[view] - distance[1 - view]
+        assert np.quantile(nearer, 0.97) < 0.05 and nearer.max() < 0.4, "but for one triangle beyond the border"
+
+
+def test_a_texture_has_the_colour_of_the_place(mesh: Mesh) -> None:
+    """Also at the seam and the poles: the texture repeats beyond its last column."""
+    for part in mesh.parts:
+        height, width, _ = part.texture.shape
+        column = (part.uv[:, 0] * width).astype(int) % width
+        row = (part.uv[:, 1] * height).astype(int).clip(0, height - 1)
+        expected = _color(torch.from_numpy(part.positions)).numpy() * 255
+        error = np.abs(part.texture[row, column] - expected)
+        assert np.quantile(error, 0.98) < 4 and error.max() < 20, "more in corners, which the image rounds"
+        spans = np.ptp(part.uv[part.triangles], axis=1)
+        assert spans.max() < 0.02, "no triangle spans the whole texture"
+
+
+def test_photographs_are_textures_without_their_exposure(box: Scene) -> None:
+    grey = torch.full((3, 16, 32), 0.4)
+    exposed = dataclasses.replace(box, gains=((2.0, 1.0, 1.0), (0.5, 1.0, 1.0)))
+    parts = make_mesh(exposed, triangles=TRIANGLES, textures=lambda view: grey * (1 + view)).parts
+    assert [part.texture[0, 0].tolist() for part in parts] == [[51, 102, 102], [255, 204, 204]]
+
+
+def test_no_triangle_spans_a_step_in_depth(box: Scene) -> None:
+    scene = dataclasses.replace(box, gaussians=_view(0, screen=0.8), cam2world=box.cam2world[:1], names=("a.jpg",))
+    (part,) = make_mesh(scene, triangles=TRIANGLES).parts
+    corners = part.positions[part.triangles] - CENTERS[0].numpy()
+    distance = np.linalg.norm(corners, axis=2)
+    on_screen = distance < 1.0
+    assert on_screen.all(axis=1).sum() > 20, "the screen"
+    middle = distance[(np.abs(corners.mean(axis=1)[:, :2]) < 0.6).all(axis=1) & (corners[..., 2] > 0).all(axis=1)]
+    assert np.ptp(middle, axis=1).max() < 0.5, "the wall is 3.2 m behind the screen"
+
+
+def test_the_background_is_no_surface(box: Scene, mesh: Mesh) -> None:
+    """Where a mask leaves out the floor below a camera, the background behind the surfaces shows beside the hole."""
+    is_masked = (box.gaussians.views == 0) & (
+        (box.gaussians.means - CENTERS[0])[:, 1] > 0.85 * (box.gaussians.means - CENTERS[0]).norm(dim=1)
+    )
+    behind = box.gaussians.select((box.gaussians.views == 0) & ~is_masked)
+    means = CENTERS[0] + 1.5 * (behind.means - CENTERS[0])
+    behind = dataclasses.replace(behind, means=means, scales=4 * behind.scales, levels=behind.levels + 2)
+    gaussians = Gaussians.cat([box.gaussians.select(~is_masked), behind])
+    filled = make_mesh(dataclasses.replace(box, gaussians=gaussians), triangles=TRIANGLES)
+    assert max(_measure_offset(part.positions).max() for part in filled.parts) < 0.1
+    assert _measure_area(filled) == pytest.approx(_measure_area(mesh), rel=0.03), "the other camera fills the hole"
+
+
+def test_a_joint_scene_and_another_unit_give_the_same_surface(box: Scene, mesh: Mesh) -> None:
+    scaled = make_mesh(box.scaled(1024.0), triangles=TRIANGLES)
+    assert scaled.num_triangles == mesh.num_triangles
+    assert np.allclose(scaled.parts[0].positions, 1024 * mesh.parts[0].positions, rtol=1e-3, atol=1)
+    joint = make_mesh(dataclasses.replace(box, joint=True), triangles=TRIANGLES)
+    assert _measure_area(joint) == pytest.approx(_measure_area(mesh), rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["house.glb", "our house.obj"])
+def test_files_are_read_by_another_program(mesh: Mesh, tmp_path: Path, name: str) -> None:
+    files = save_mesh(mesh, tmp_path / name)
+    assert sorted(tmp_path.iterdir()) == sorted(files)
+    assert all(" " not in file.name for file in files[1:])
+    read = trimesh.load(files[0], process=False)
+    parts = sorted(read.geometry.values(), key=lambda part: part.vertices[:, 2].mean(), reverse=True)  # z backward
+    assert len(parts) == 2
+    for part, written in zip(parts, mesh.parts, strict=True):
+        corners = np.asarray(part.triangles) * (1, -1, -1)
+        expected = written.positions[written.triangles]
+        assert corners.shape == expected.shape
+        assert np.allclose(corners.mean(axis=(0, 1)), expected.mean(axis=(0, 1)), atol=1e-3)
+        image = getattr(part.visual.material, "baseColorTexture", None) or part.visual.material.image
+        pixels = np.asarray(image.convert("RGB"), float)
+        uv = part.visual.uv
+        column = (uv[:, 0] * pixels.shape[1]).astype(int) % pixels.shape[1]
+        row = ((1 - uv[:, 1]) * pixels.shape[0]).astype(int).clip(0, pixels.shape[0] - 1)
+        places = np.asarray(part.vertices) * (1, -1, -1)
+        error = np.abs(pixels[row, column] - 255 * _color(torch.from_numpy(places)).numpy())
+        assert np.quantile(error, 0.98) < 6 and error.max() < 24
+    for file in files[2:]:
+        with Image.open(file) as image:
+            assert not image.getexif()
+
+
+def test_bad_scenes_and_names_are_refused(box: Scene, mesh: Mesh, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="needs a scene with input cameras"):
+        make_mesh(dataclasses.replace(box, cam2world=box.cam2world[:0]))
+    with pytest.raises(InputError, match="needs 512 triangles or more, got a limit of 100"):
+        make_mesh(box, triangles=100)
+    with pytest.raises(InputError, match=r"must end in \.obj or \.glb"):
+        save_mesh(mesh, tmp_path / "a.stl")
+    with pytest.raises(InputError, match="needed one or more triangles"):
+        save_mesh(Mesh(()), tmp_path / "a.obj")

@@ -1,0 +1,245 @@
+"""Floor plans of straight walls: rooms with known walls, their files, and refused scenes."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import ezdxf
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.tours import make_graph
+from pansplat.tours.plan import Plan, make_plan
+from pansplat.tours.plan_files import describe_plan, write_plan
+
+_CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
+
+Wall = tuple[tuple[float, float], tuple[float, float], float]
+"""Ends (right, forward) of a wall and the height of its lower edge over the floor, or minus that of its upper one."""
+
+
+def _walls_around(corners: Sequence[tuple[float, float]], doors: Sequence[Wall] = ()) -> list[Wall]:
+    """The walls of a room, with openings below the lower edges of doors, whose ends are on one of them in its order."""
+    walls: list[Wall] = []
+    for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+        direction, rest = np.subtract(end, start), start
+        for door in doors:
+            offsets = [np.subtract(point, start) for point in door[:2]]
+            if all(abs(direction[0] * offset[1] - direction[1] * offset[0]) < 1e-9 for offset in offsets):
+                walls += [(rest, door[0], 0.0), door]
+                rest = door[1]
+        walls.append((rest, end, 0.0))
+    return walls
+
+
+def _make_house(
+    walls: Sequence[Wall],
+    cameras: Sequence[tuple[float, float]],
+    *,
+    turn_degrees: float = 0.0,
+    floors: Sequence[float] = (),
+    noise: float = 0.0,
+    shifts: Sequence[tuple[float, float]] = (),
+    names: Sequence[str] = (),
+    count: int = 40000,
+) -> Scene:
+    """The scene of cameras between walls.
+
+    Args:
+        walls: of all rooms of all storeys.
+        cameras: places, metres.
+        turn_degrees: of the house relative to the cameras.
+        floors: heights of the floors of the cameras, metres.
+        noise: relative standard deviation of a distance.
+        shifts: of what each camera shows, metres.
+        names: of the panoramas.
+        count: Gaussians of each camera.
+    """
+    generator = np.random.default_rng(0)
+    angle = math.radians(turn_degrees)
+    turn = np.array(((math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle))))
+    ends = np.array([(start, end) for start, end, _ in walls]) @ turn.T
+    lower = np.array([edge for *_, edge in walls])
+    rays = fibonacci_directions(count).double().numpy() + 1e-9  # right, down, forward
+    flat = rays[:, (0, 2)]
+    means, views, poses = [], [], []
+    for number, place in enumerate(np.array(cameras) @ turn.T):
+        along, offset = ends[:, 1] - ends[:, 0], ends[:, 0] - place
+        cross = flat[:, None, 0] * along[:, 1] - flat[:, None, 1] * along[:, 0]
+        distance = (offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / cross
+        position = (offset[:, 0] * flat[:, None, 1] - offset[:, 1] * flat[:, None, 0]) / cross
+        height = CAMERA_HEIGHT - distance * rays[:, 1:2]
+        is_met = (
+            (distance > 0) & (position >= 0) & (position <= 1) & np.where(lower < 0, height <= -lower, height >= lower)
+        )
+        to_wall = np.where(is_met, distance, 30.0).min(axis=1)
+        to_plane = np.where(rays[:, 1] > 0, CAMERA_HEIGHT, CAMERA_HEIGHT - _CEILING) / rays[:, 1]
+        reached = np.minimum(to_wall, to_plane) * (1 + noise * generator.standard_normal(count))
+        center = np.array((place[0], -(floors[number] if floors else 0.0), place[1]))
+        shift = np.array(shifts[number]) @ turn.T if shifts else np.zeros(2)
+        means.append(center + reached[:, None] * rays + (shift[0], 0, shift[1]))
+        views.append(np.full(count, number))
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = torch.from_numpy(center)
+        poses.append(pose)
+    total = count * len(cameras)
+    gaussians = Gaussians(
+        torch.from_numpy(np.concatenate(means)).float(),
+        torch.full((total, 3), 0.02),
+        torch.tensor((1.0, 0, 0, 0)).expand(total, 4),
+        torch.ones(total),
+        torch.zeros(total, 1, 3),
+        torch.zeros(total, dtype=torch.int64),
+        torch.from_numpy(np.concatenate(views)),
+    )
+    edges = tuple((k, k + 1, 0.5) for k in range(len(cameras) - 1)) if len(cameras) > 1 else ((0, 0, 1.0),)
+    return Scene(gaussians, torch.stack(poses), 0.45, 10.0, names=tuple(names), overlaps=edges)
+
+
+L_ROOM = [(0.0, 0.0), (5.0, 0.0), (5.0, 3.0), (3.0, 3.0), (3.0, 6.0), (0.0, 6.0)]  # 24 square metres
+HALL = [(5.1, 0.0), (9.0, 0.0), (9.0, 4.0), (5.1, 4.0)]  # 15.6
+DOOR: tuple[Wall, Wall] = (((5.0, 1.0), (5.0, 1.9), DOOR_TOP), ((5.1, 1.9), (5.1, 1.0), DOOR_TOP))
+WALLS = [*_walls_around(L_ROOM, DOOR[:1]), *_walls_around(HALL, DOOR[1:])]
+CAMERAS = [(1.5, 1.5), (1.2, 4.5), (7.0, 2.0)]
+
+
+def _plan(scene: Scene) -> Plan:
+    return make_plan(scene, make_graph(scene))
+
+
+def _measure_angles(outline: np.ndarray) -> list[float]:
+    """Angles at the corners, degrees."""
+    before, after = outline - np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0) - outline
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    return np.degrees(np.arctan2(cross, (before * after).sum(axis=1))).tolist()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_rooms_have_their_areas_angles_and_corners(noise: float) -> None:
+    plan = _plan(_make_house(WALLS, CAMERAS, turn_degrees=17, noise=noise))
+    assert [(room.panoramas, len(room.outline)) for room in plan.rooms] == [((0, 1), 6), ((2,), 4)]
+    assert [room.area for room in plan.rooms] == pytest.approx([24.0, 15.6], rel=0.02)
+    turn = math.radians(17)
+    axes = np.array(((math.cos(turn), math.sin(turn)), (-math.sin(turn), math.cos(turn))))
+    for room, corners in zip(plan.rooms, (L_ROOM, HALL), strict=True):
+        assert sorted(abs(angle) for angle in _measure_angles(room.outline)) == pytest.approx([90] * len(corners))
+        distances = np.linalg.norm(room.outline[:, None] - np.array(corners) @ axes, axis=2).min(axis=0)
+        assert distances.max() < 0.08
+    assert plan.camera_height == pytest.approx(CAMERA_HEIGHT, rel=0.01)
+
+
+def test_an_oblique_wall_stays_oblique() -> None:
+    corners = [(0.0, 0.0), (5.0, 0.0), (5.0, 2.0), (3.0, 4.0), (0.0, 4.0)]
+    (room,) = _plan(_make_house(_walls_around(corners), [(2.0, 1.8)])).rooms
+    assert room.area == pytest.approx(18.0, rel=0.02)
+    assert sorted(_measure_angles(room.outline)) == pytest.approx([45, 45, 90, 90, 90], abs=1)
+
+
+def test_a_door_is_where_the_floor_beyond_is_seen_and_joins_both_rooms() -> None:
+    plan = _plan(_make_house(WALLS, CAMERAS))
+    (door,) = plan.doors
+    assert sorted(door.rooms) == [0, 1]
+    assert door.ends.mean(axis=0) == pytest.approx((5.05, 1.45), abs=0.1)
+    assert np.linalg.norm(door.ends[1] - door.ends[0]) == pytest.approx(0.9, abs=0.2)
+    closed = _make_house([*_walls_around(L_ROOM), *_walls_around(HALL)], CAMERAS)
+    assert _plan(closed).doors == ()
+
+
+def test_a_window_above_a_sill_is_no_door() -> None:
+    """The opening starts 0.9 m over the floor."""
+    sills = [(start, end, -0.9) for start, end, lower in WALLS if lower]
+    assert len(sills) == 2 and _plan(_make_house([*WALLS, *sills], CAMERAS)).doors == ()
+
+
+def test_the_uncertainty_of_walls_is_the_disagreement_of_the_panoramas_that_show_them() -> None:
+    exact = _plan(_make_house(WALLS, CAMERAS))
+    assert exact.wall_error == pytest.approx(0, abs=0.005) and exact.num_walls >= 6
+    shifted = _plan(_make_house(WALLS, CAMERAS, shifts=((0.03, 0.03), (-0.03, -0.03), (0, 0))))
+    assert shifted.wall_error == pytest.approx(0.06 / math.sqrt(2), rel=0.25)
+    room = shifted.rooms[0]
+    walls = math.sqrt(sum(side**2 for side in (5, 3, 2, 3, 3, 6)))
+    assert shifted.area_error(room) == pytest.approx(shifted.wall_error * walls, rel=0.05)
+    alone = _plan(_make_house(_walls_around(HALL), CAMERAS[2:]))
+    assert alone.wall_error is None and alone.scale_error is None and alone.area_error(alone.rooms[0]) is None
+
+
+def test_the_plan_does_not_depend_on_the_unit_of_length() -> None:
+    scene = _make_house(WALLS, CAMERAS)
+    metres, other = _plan(scene), _plan(scene.scaled(1024.0))
+    for a, b in zip(metres.rooms, other.rooms, strict=True):
+        assert np.allclose(a.outline * 1024, b.outline, atol=0.5)
+
+
+def test_a_room_without_a_ceiling_ends_where_its_floor_does() -> None:
+    scene = _make_house(_walls_around(HALL), CAMERAS[2:])
+    open_room = scene.gaussians.select(scene.gaussians.means[:, 1] > -0.8)
+    (room,) = _plan(dataclasses.replace(scene, gaussians=open_room)).rooms
+    assert room.area == pytest.approx(15.6, rel=0.05)
+
+
+def _two_storeys() -> Scene:
+    return _make_house(
+        _walls_around(HALL),
+        [(7, 2), (6.5, 1), (7, 2.5), (7.5, 1)],
+        floors=(0, 0, 3, 3),
+        names=["Hall", "Hall", "Attic", "x<y"],
+    )
+
+
+def _read_svg(path: Path) -> tuple[list[np.ndarray], str]:
+    """Corners of the rooms in metres, and all texts."""
+    root = ElementTree.parse(path).getroot()
+    assert root.get("width").endswith("mm")
+    scale = float(root.get("width")[:-2]) / float(root.get("viewBox").split()[2])
+    assert scale == pytest.approx(20, rel=1e-3), "1:50"
+    rooms = [
+        np.array(re.findall(r"-?[\d.]+", node.get("points")), float).reshape(-1, 2)
+        for node in root.iter()
+        if node.tag.endswith("polygon")
+    ]
+    return rooms, "\n".join(node.text for node in root.iter() if node.tag.endswith("text"))
+
+
+def _area(corners: np.ndarray | Sequence) -> float:
+    x, y = np.array(corners).T
+    return abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1))) / 2
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".dxf"])
+def test_storeys_are_next_to_each_other_in_metres_with_names_and_areas(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"plan{suffix}"
+    plan = write_plan(_two_storeys(), path)
+    if suffix == ".svg":
+        rooms, text = _read_svg(path)
+    else:
+        document = ezdxf.readfile(path)
+        assert not document.audit().has_errors and document.units == ezdxf.units.M
+        space = document.modelspace()
+        rooms = [np.array([point[:2] for point in room]) for room in space.query("LWPOLYLINE[layer=='WALLS']")]
+        text = "\n".join(entity.dxf.text for entity in space.query("TEXT"))
+        assert len(space.query("CIRCLE[layer=='PANORAMAS']")) == 4
+    assert [_area(room) for room in rooms] == pytest.approx([15.6, 15.6], rel=0.02)
+    assert rooms[0][:, 0].max() < rooms[1][:, 0].min(), "the lower storey is on the left"
+    for expected in ("Hall", "Attic / x<y", "15.6 m²", "Hall (2)", *describe_plan(plan)):
+        assert expected in text.split("\n") or any(line.startswith(expected) for line in text.split("\n")), expected
+
+
+def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:
+    scene = _make_house(_walls_around(HALL), CAMERAS[2:])
+    few = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(20)))
+    none = dataclasses.replace(few, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), overlaps=(), names=())
+    for bad in (few, none):
+        with pytest.raises(InputError, match="needed a floor, and walls around"):
+            write_plan(bad, tmp_path / "plan.svg")
+    with pytest.raises(InputError, match="exported with --layers"):
+        write_plan(dataclasses.replace(scene, joint=True), tmp_path / "plan.dxf")
+    with pytest.raises(InputError, match=r"\.svg or \.dxf"):
+        write_plan(scene, tmp_path / "plan.pdf")
+    assert not list(tmp_path.iterdir())
