@@ -58,7 +58,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, tmp_path_factory: pytest.Tem
     """tour.html, split.html with its parts, house.html with a graph, and flat.html with parts."""
     folder = tmp_path_factory.mktemp("pages")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+        patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
         patch.setattr(page_module, "_PART_BYTES", 30_000)
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
