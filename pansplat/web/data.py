@@ -9,6 +9,7 @@ import gzip
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -85,11 +86,7 @@ def pack_gaussians(
     scale = max(float(np.quantile(np.abs(higher), 1 - _CLIPPED)) if higher.size else 0.0, 1e-6)
     quantised = np.clip(np.round(higher * (127.0 / scale)), -127, 127).astype(np.int8).view(np.uint8)
     ends = np.searchsorted(ranks[chosen], np.arange(len(order) + 1))
-    blocks = (
-        plane[start:end].tobytes()
-        for start, end in zip(ends, ends[1:], strict=False)
-        for plane in (*planes, *quantised.T)
-    )
+    blocks = (plane[start:end].tobytes() for start, end in pairwise(ends) for plane in (*planes, *quantised.T))
     content = gzip.compress(b"".join(blocks), 9, mtime=0)
     starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
     return PackedGaussians(content, tuple(order), starts, counts, degree, (low, high), scale)
