@@ -841,18 +841,24 @@
 
   const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
-  // Each part of the data is a script, which calls this. Its text is not needed any more.
+  // A script for each part of the data calls this. In a page of one file the part is the element before: unlike text in a
+  // program, it is not kept.
   let partsArrived = 0;
   window.addPart = (text) => {
-    document.currentScript.remove();
+    const { currentScript: script } = document;
+    if (text === undefined) {
+      text = script.previousElementSibling.textContent;
+      script.previousElementSibling.remove();
+    }
+    script.remove();
     partsArrived += 1;
     bar.value = partsArrived / HEADER.dataParts;
     if (!worker) return;
-    worker.postMessage({ part: text });
+    worker.postMessage({ text });
     if (partsArrived === HEADER.dataParts) worker.postMessage({ end: true });
   };
 
-  // Starts the worker; `onView` gets the Gaussians of each view. Returns promises of the first order, and of the last view.
+  // Starts the worker; `onView` gets the Gaussians of each view. Returns a promise of the first order.
   function load(onView) {
     return new Promise((resolve, reject) => {
       const fails = (error) => sorted ? fail(error) : reject(error);
@@ -861,17 +867,16 @@
         if (data.error) fails(new Error(`The data of the scene cannot be read: ${data.error}`));
         else if (data.order) {
           onSorted(data);
-          if (isSeen()) resolve();
-          else requestSort();
+          resolve();
         } else {
           arrived += 1;
           onView(data);
-          if (!sorted) requestSort();
         }
       };
       worker.onerror = (event) => fails(new Error(`The worker failed: ${event.message}`));
       const { count, degree, views, loading, harmonicsScale, colorRange } = HEADER;
-      worker.postMessage({ header: { count, degree, views, loading, parts, harmonicsScale, colorRange } });
+      const first = { position: [...camera.position], part: currentPart() };
+      worker.postMessage({ header: { count, degree, views, loading, parts, harmonicsScale, colorRange, first } });
       addEventListener("DOMContentLoaded", () => {
         if (partsArrived !== HEADER.dataParts) fails(new Error("A part of the scene is missing. Copy the whole folder."));
       });
@@ -881,11 +886,21 @@
   async function main() {
     placePoster();
     addEventListener("resize", placePoster);
+    if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
+    const linked = parsePose(location.hash);
+    if (linked) Object.assign(camera, cameraFor(linked));
+    settleAt(camera.position);
+    canvas.ariaBusy = true;
+    const received = [];  // kept for a context that is lost
+    const loading = load((data) => {
+      received.push(data);
+      if (renderer) renderer.add(data);
+      if (isComplete()) canvas.ariaBusy = false;
+    });
+    loading.catch(() => {});  // of an error that comes before it is awaited
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser or device does not have.");
-    if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
     headset.gl = gl;
-    const received = [];  // kept for a context that is lost
     const makeRenderer = () => {
       if (gl.isContextLost()) return;
       renderer = new Renderer(gl);
@@ -898,15 +913,7 @@
       try { makeRenderer(); } catch (error) { fail(error); }
     });
     makeRenderer();
-    const linked = parsePose(location.hash);
-    if (linked) Object.assign(camera, cameraFor(linked));
-    settleAt(camera.position);
-    canvas.ariaBusy = true;
-    await load((data) => {
-      received.push(data);
-      if (renderer) renderer.add(data);
-      if (isComplete()) canvas.ariaBusy = false;
-    });
+    await loading;
     while (!renderer) {  // the context is lost
       if (failure) throw failure;
       await wait(50);

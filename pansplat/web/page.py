@@ -454,9 +454,9 @@ def _write_files(
     """Write the page, and its parts if it is split."""
     count = header["count"]
     parts = [base64.b64encode(content[k : k + _PART_BYTES]).decode() for k in range(0, len(content), _PART_BYTES)]
-    scripts = [f'addPart("{part}");\n' for part in parts]
+    scripts = [f'addPart("{part}");\n' for part in parts] if split else []
     folder = path.with_name(f"{path.stem}_files")
-    names = [f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js" for text in scripts] if split else []
+    names = [f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js" for text in scripts]
     tags = [f'<script src="{quote(os.fsencode(folder.name))}/{name}"></script>' for name in names]
     page = _fill_template(
         script_sources="'self' file: blob:" if split else "blob:",
@@ -468,7 +468,9 @@ def _write_files(
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         worker=_to_script("".join(map(_read, _WORKER))),
         programs="\n".join(f"<script>\n{_read(name)}</script>" for name in _PROGRAMS),
-        parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),
+        parts="\n".join(
+            tags or (f'<script type="text/plain">{part}</script><script>addPart()</script>' for part in parts)
+        ),
     ).encode(errors="replace")  # a title from a file name that is not UTF-8
     if len(page) > MAX_FILE_BYTES and not split:
         fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
@@ -487,7 +489,7 @@ def _write_files(
     if split:
         _remove_old_parts(folder, set(names))
     files.insert(0, path)
-    total = len(page) + sum(len(text) for text in scripts[: len(names)])
+    total = len(page) + sum(map(len, scripts))
     return PageFiles(tuple(files), total, count, header["degree"])
 
 

@@ -129,16 +129,19 @@ class Renderer {
     gl.disable(gl.DEPTH_TEST);
     gl.activeTexture(gl.TEXTURE0);
     this.setCamera(camera, width, height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, sum.framebuffer);
-    for (const buffer of [0, 1]) gl.clearBufferfv(gl.COLOR, buffer, [0, 0, 0, 0]);
+    let isFirst = true;
     HEADER.views.forEach(({ start, count }, view) => {
       if (!weights[view] || !count || !this.ready.has(view)) return;
       gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
       layer.textures.forEach((_, buffer) => gl.clearBufferfv(gl.COLOR, buffer, [0, 0, 0, 0]));
       this.drawLayer(start, count);
       gl.bindFramebuffer(gl.FRAMEBUFFER, sum.framebuffer);
-      this.addLayer(layer.textures, weights[view]);
+      this.addLayer(layer.textures, weights[view], isFirst);
+      isFirst = false;
     });
+    if (!isFirst) return;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, sum.framebuffer);
+    for (const buffer of [0, 1]) gl.clearBufferfv(gl.COLOR, buffer, [0, 0, 0, 0]);
   }
 
   // Draws to a viewport (left, bottom, width, height) of a framebuffer, null for the canvas. `camera` has a `position`,
@@ -217,7 +220,7 @@ class Renderer {
     gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(count / BATCH));
   }
 
-  addLayer(textures, weight) {
+  addLayer(textures, weight, isFirst) {
     const gl = this.gl, { program, places } = this.accumulate;
     gl.useProgram(program);
     gl.uniform1f(places.weight, weight);
@@ -228,7 +231,8 @@ class Renderer {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
     });
-    gl.enable(gl.BLEND);
+    if (isFirst) gl.disable(gl.BLEND);
+    else gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE);
     gl.blendEquationSeparate(gl.FUNC_ADD, gl.MAX);
     gl.bindVertexArray(this.screen);

@@ -3,15 +3,17 @@
 // the other. docs/web.md describes the data.
 
 let scene = null, arrived = 0, writer = null;  // arrived: number of views
+let first = null;  // what is sorted as soon as a view of its part has arrived, before the parts that wait
 
 onmessage = ({ data }) => {
   if (data.header) begin(data.header);
-  else if (data.part) writer.write(decode(data.part)).catch(() => {});  // its error is that of the reader
+  else if (data.text) writer.write(decode(data.text)).catch(() => {});  // its error is that of the reader
   else if (data.end) writer.close().catch(() => {});
   else sort(data);
 };
 
 function begin(header) {
+  ({ first } = header);
   const { count, degree } = header, terms = (degree + 1) ** 2 - 1;
   scene = { ...header, terms, means: new Float32Array(3 * count), order: new Uint32Array(count) };
   if (terms) Object.assign(scene, { harmonics: new Int8Array(3 * terms * count), base: new Uint8Array(4 * count), colors: new Uint8ClampedArray(4 * count) });
@@ -44,7 +46,11 @@ async function readViews(reader) {
     const arrays = unpack(planes, view);
     arrived += 1;
     postMessage({ view, ...arrays }, Object.values(arrays).map((array) => array.buffer));
+    if (!first || scene.parts[view] !== first.part || !scene.views[view].count) continue;
+    sort(first);
+    first = null;
   }
+  if (first) sort(first);
 }
 
 // Planes of bytes to texels (shaders/page.vert), and to the arrays of the worker: the inverse of
