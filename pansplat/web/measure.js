@@ -1,7 +1,7 @@
 "use strict";
 // Distances in the picture: the depth at one point, and the distance of two.
 
-const SVG = "http://www.w3.org/2000/svg";
+const SVG = document.getElementById("marks").namespaceURI;
 const NEAREST = 0.02;  // z of the ends of a line, of the distance of its farther end
 
 function draw(tag, attributes, text = "") {
