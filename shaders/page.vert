@@ -2,7 +2,8 @@
 // are slow on many devices.
 #include "splat.glsl"
 
-uniform sampler2D geometry;     // three texels a Gaussian: mean and opacity; quaternion; scales
+uniform usampler2D geometry;    // the file's bits (docs/web.md): x and opacity; y, z, each with a byte of the third scale; quaternion
+uniform usampler2D scales;      // the first two, 16 bits each
 uniform sampler2D colors;
 uniform usampler2D order;       // indices of the Gaussians, view by view, farthest first
 uniform ivec2 segment;          // of the order: first place and count
@@ -46,6 +47,16 @@ bool is_cone_outside(Gaussian gaussian, Footprint f) {
     return false;
 }
 
+// A unit quaternion from the index of its largest component, and the others with 10 bits each.
+vec4 unpack_quat(uint word) {
+    vec3 rest = (vec3(uvec3(word >> 20, word >> 10, word) & 1023u) / 511.0 - 1.0) * 0.70710678;
+    float largest = sqrt(max(1.0 - dot(rest, rest), 0.0));
+    uint index = word >> 30;
+    if (index == 0u) return vec4(largest, rest);
+    if (index == 1u) return vec4(rest.x, largest, rest.yz);
+    return index == 2u ? vec4(rest.xy, largest, rest.z) : vec4(rest, largest);
+}
+
 void main() {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside the image
     v_base = vec2(0.0);
@@ -57,12 +68,13 @@ void main() {
     int width = textureSize(colors, 0).x;
     int index = int(texelFetch(order, ivec2(place % width, place / width), 0).r);
     ivec2 texel = ivec2(index % width, index / width);
-    ivec2 first = ivec2(3 * texel.x, texel.y);
-    vec4 mean_opacity = texelFetch(geometry, first, 0);
-    vec3 scale = texelFetch(geometry, first + ivec2(2, 0), 0).xyz;
-    if (is_ball_outside(mean_opacity.xyz, mean_opacity.w, scale)) return;
-    vec4 quat = texelFetch(geometry, first + ivec2(1, 0), 0);
-    Gaussian gaussian = Gaussian(mean_opacity.xyz, mean_opacity.w, quat, scale);
+    uvec4 words = texelFetch(geometry, texel, 0);
+    uint pair = texelFetch(scales, texel, 0).r;
+    vec3 mean = uintBitsToFloat(words.xyz & 0xffffff00u);
+    vec3 scale = uintBitsToFloat(uvec3(pair & 0xffff0000u, pair << 16, (words.y & 255u) << 24 | (words.z & 255u) << 16));
+    float opacity = float(words.x & 255u) / 255.0;
+    if (is_ball_outside(mean, opacity, scale)) return;
+    Gaussian gaussian = Gaussian(mean, opacity, unpack_quat(words.w), scale);
     Footprint f;
     if (!project_gaussian(gaussian, f) || is_cone_outside(gaussian, f)) return;
     vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0;

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import gzip
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -27,15 +29,19 @@ class PackedGaussians:
     """Gaussians as bytes.
 
     Attributes:
-        content: gzip of planes of bytes.
-        starts: index of the first Gaussian of each view, and the number of all Gaussians.
+        content: gzip of planes of bytes, those of one view after those of another.
+        order: views in the order of their Gaussians.
+        starts: index of the first Gaussian of each view.
+        counts: number of Gaussians of each view.
         degree: of the harmonics.
         color_range: colours of the bytes 0 and 255.
         harmonics_scale: coefficient of the byte 127.
     """
 
     content: bytes
+    order: tuple[int, ...]
     starts: tuple[int, ...]
+    counts: tuple[int, ...]
     degree: int
     color_range: tuple[float, float]
     harmonics_scale: float
@@ -47,22 +53,23 @@ def count_bytes(count: int, degree: int) -> int:
 
 
 def pack_gaussians(
-    gaussians: Gaussians, origin: Float[np.ndarray, "3"], num_views: int, degree: int
+    gaussians: Gaussians, origin: Float[np.ndarray, "3"], order: Sequence[int], degree: int
 ) -> PackedGaussians:
     """Quantise and compress Gaussians.
 
     Args:
-        gaussians: finite numbers, three channels, `views` below `num_views`.
+        gaussians: finite numbers, three channels.
         origin: subtracted from the means.
+        order: all views, in which a page needs them.
         degree: highest degree of harmonics that is kept, at most MAX_DEGREE.
     """
     degree = min(degree, gaussians.degree, MAX_DEGREE)
-    views = gaussians.views.cpu().numpy()
+    ranks = np.argsort(order)[gaussians.views.cpu().numpy()]
     means = (gaussians.means.double().cpu().numpy() - origin).astype(np.float32)
     # Neighbours in the file are neighbours in space, so that equal upper bytes follow each other.
-    order = np.lexsort((_morton_codes(means), views))
-    means, scales = means[order], np.abs(gaussians.scales.float().cpu().numpy()[order])
-    harmonics = gaussians.harmonics.float().cpu().numpy()[order]
+    chosen = np.lexsort((_morton_codes(means), ranks))
+    means, scales = means[chosen], np.abs(gaussians.scales.float().cpu().numpy()[chosen])
+    harmonics = gaussians.harmonics.float().cpu().numpy()[chosen]
     colors = 0.5 + SH_0 * harmonics[:, 0]
     low = (
         min(0.0, float(np.quantile(colors, _CLIPPED))) if degree else 0.0
@@ -71,16 +78,18 @@ def pack_gaussians(
     planes = [
         *(plane for axis in range(3) for plane in _split_floats(means[:, axis], 3)),
         *(plane for axis in range(3) for plane in _split_floats(scales[:, axis], 2)),
-        *_split_words(_pack_quats(gaussians.quats.double().cpu().numpy()[order]), 4),
-        _to_bytes(gaussians.opacities.float().cpu().numpy()[order], 255.0),
+        *_split_words(_pack_quats(gaussians.quats.double().cpu().numpy()[chosen]), 4),
+        _to_bytes(gaussians.opacities.float().cpu().numpy()[chosen], 255.0),
         *(_to_bytes(colors[:, channel] - low, 255.0 / (high - low)) for channel in range(3)),
     ]
     higher = harmonics[:, 1 : (degree + 1) ** 2].reshape(len(means), -1)
     scale = max(float(np.quantile(np.abs(higher), 1 - _CLIPPED)) if higher.size else 0.0, 1e-6)
     quantised = np.clip(np.round(higher * (127.0 / scale)), -127, 127).astype(np.int8).view(np.uint8)
-    content = gzip.compress(b"".join(plane.tobytes() for plane in (*planes, *quantised.T)), 9, mtime=0)
-    starts = np.searchsorted(views[order], np.arange(num_views + 1))
-    return PackedGaussians(content, tuple(starts.tolist()), degree, (low, high), scale)
+    ends = np.searchsorted(ranks[chosen], np.arange(len(order) + 1))
+    blocks = (plane[start:end].tobytes() for start, end in pairwise(ends) for plane in (*planes, *quantised.T))
+    content = gzip.compress(b"".join(blocks), 9, mtime=0)
+    starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
+    return PackedGaussians(content, tuple(order), starts, counts, degree, (low, high), scale)
 
 
 def _morton_codes(points: Float[np.ndarray, "n 3"]) -> np.ndarray:

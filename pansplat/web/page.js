@@ -1,5 +1,5 @@
 "use strict";
-// The page: loads the scene, draws it with WebGL 2, and moves the camera. docs/web.md describes the data.
+// The page: shows the scene while its data arrives, and moves the camera. docs/web.md describes the data.
 // Convention: OpenCV axes (x right, y down, z forward), as everywhere in pansplat. Positions are in the scene's world,
 // moved by its origin. Matrices are arrays of rows.
 
@@ -9,276 +9,20 @@
   const MAX_PITCH = 89.9 * Math.PI / 180;
   const MIN_FOV = 20, MAX_FOV = 110;  // degrees, vertical
   const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
-  const BATCH = HEADER.batch;         // quads of one instance
   const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
   const SOFT = 0.3;                   // of the way to the limit of the camera, in which steps become shorter
   const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
   const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
+  const REST_SECONDS = 4;             // at a panorama, on a tour without flights
+  const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
-  // ---- loading ----
-
-  const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
-
-  // The step of the progress bar becomes visible before the next one starts.
-  const report = (fraction) => {
-    bar.value = fraction;
-    return wait(0);
-  };
-
-  async function load() {
-    const gzip = [];
-    for (let i = 0; i < PARTS.length; i++) {
-      const text = atob(PARTS[i]), bytes = new Uint8Array(text.length);
-      for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
-      gzip.push(bytes);
-      PARTS[i] = null;
-      if (i % 4 === 3) await report(0.7 + 0.1 * i / PARTS.length);
-    }
-    if (PARTS.length !== HEADER.dataParts) throw new Error("A part of the scene is missing. Copy the whole folder.");
-    await report(0.8);
-    const stream = new Blob(gzip).stream().pipeThrough(new DecompressionStream("gzip"));
-    const data = new Uint8Array(await new Response(stream).arrayBuffer());
-    await report(0.9);
-    return unpack(data);
+  // The poster has the scale and the place of the picture that follows.
+  function placePoster() {
+    const { style } = byId("cover").querySelector("img"), tall = tallOf(innerWidth, innerHeight);
+    style.height = `${100 * HEADER.tallest / tall}%`;
   }
 
-  // Planes of bytes to arrays: the inverse of pansplat.web.data.pack_gaussians.
-  function unpack(data) {
-    const count = HEADER.count, plane = (k) => data.subarray(k * count, (k + 1) * count);
-    const word = new DataView(new ArrayBuffer(4));
-    const joined = (k, bytes) => {
-      const out = new Float32Array(count), planes = [...Array(bytes)].map((_, b) => plane(k + b));
-      const bits = new Uint32Array(out.buffer);
-      for (let b = 0; b < bytes; b++) for (let i = 0; i < count; i++) bits[i] |= planes[b][i] << (24 - 8 * b);
-      return out;
-    };
-    const means = new Float32Array(3 * count), geometry = new Float32Array(12 * count);
-    for (let axis = 0; axis < 3; axis++) {
-      const values = joined(3 * axis, 3);
-      for (let i = 0; i < count; i++) means[3 * i + axis] = geometry[12 * i + axis] = values[i];
-    }
-    for (let axis = 0; axis < 3; axis++) {
-      const values = joined(9 + 2 * axis, 2);
-      for (let i = 0; i < count; i++) geometry[12 * i + 8 + axis] = values[i];
-    }
-    const quats = [15, 16, 17, 18].map(plane), colors = new Uint8Array(4 * count);
-    for (let i = 0; i < count; i++) {
-      for (let b = 0; b < 4; b++) word.setUint8(b, quats[b][i]);
-      const packed = word.getUint32(0), largest = packed >>> 30;
-      let rest = 1, shift = 20;
-      for (let k = 0; k < 4; k++) {
-        if (k === largest) continue;
-        const value = (((packed >>> shift) & 1023) / 511 - 1) * Math.SQRT1_2;
-        geometry[12 * i + 4 + k] = value;
-        rest -= value * value;
-        shift -= 10;
-      }
-      geometry[12 * i + 4 + largest] = Math.sqrt(Math.max(rest, 0));
-      geometry[12 * i + 3] = plane(19)[i] / 255;
-      for (let channel = 0; channel < 3; channel++) colors[4 * i + channel] = plane(20 + channel)[i];
-    }
-    const terms = (HEADER.degree + 1) ** 2 - 1;
-    const harmonics = terms ? new Int8Array(3 * terms * count) : null;
-    for (let k = 0; k < 3 * terms; k++) {
-      const values = plane(23 + k);
-      for (let i = 0; i < count; i++) harmonics[3 * terms * i + k] = values[i];
-    }
-    return { means, geometry, colors, harmonics };
-  }
-
-  // ---- drawing ----
-
-  // Draws to a WebGL 2 context: one layer for each view, and their mean by nearness (docs/rendering.md, section 7).
-  class Renderer {
-    constructor(gl, scene) {
-      this.gl = gl;
-      const float = gl.getExtension("EXT_color_buffer_float");
-      const half = float || gl.getExtension("EXT_color_buffer_half_float");
-      this.format = half ? gl.RGBA16F : gl.RGBA8;
-      this.splat = this.link(SHADERS.splat);
-      this.accumulate = this.link(SHADERS.accumulate);
-      this.resolve = this.link(SHADERS.resolve);
-      // WebGL 2 guarantees 2048 texels a side, and `geometry` has three a Gaussian.
-      const largest = gl.getParameter(gl.MAX_TEXTURE_SIZE) || 4096, width = Math.min(1024, Math.floor(largest / 3));
-      const height = Math.ceil(HEADER.count / width);
-      if (height > largest) throw new Error("The scene is too large for this device.");
-      this.rows = [width, height];
-      this.geometry = this.upload(scene.geometry, 3 * width, height, gl.RGBA32F, gl.FLOAT, 12 * width * height);
-      this.colors = this.upload(scene.colors, width, height, gl.RGBA8, gl.UNSIGNED_BYTE, 4 * width * height);
-      this.order = this.makeTexture(width, height, gl.R32UI);
-      this.splats = gl.createVertexArray();
-      this.screen = gl.createVertexArray();
-      gl.bindVertexArray(this.splats);
-      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-      const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
-      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-      this.targets = [];
-      this.size = [0, 0];
-    }
-
-    link([vertex, fragment]) {
-      const gl = this.gl, program = gl.createProgram();
-      for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-        const shader = gl.createShader(kind);
-        gl.shaderSource(shader, source);
-        gl.compileShader(shader);
-        gl.attachShader(program, shader);
-      }
-      gl.linkProgram(program);
-      if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
-        const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
-        throw new Error(["The graphics driver rejects a shader.", gl.getProgramInfoLog(program), ...logs].join(" "));
-      }
-      const places = {};
-      for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); i++) {
-        const { name } = gl.getActiveUniform(program, i);
-        places[name.replace("[0]", "")] = gl.getUniformLocation(program, name);
-      }
-      return { program, places };
-    }
-
-    makeTexture(width, height, format) {
-      const gl = this.gl, texture = gl.createTexture();
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-      for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
-      return texture;
-    }
-
-    upload(values, width, height, format, type, length) {
-      const texture = this.makeTexture(width, height, format);
-      this.write(texture, values, width, height, this.gl.RGBA, type, length);
-      return texture;
-    }
-
-    write(texture, values, width, height, channels, type, length) {
-      const gl = this.gl, padded = new values.constructor(length);
-      padded.set(values);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, channels, type, padded);
-    }
-
-    // Replaces the drawing order, and the colours if they depend on the position.
-    setSorted({ order, colors }) {
-      const gl = this.gl, texels = this.rows[0] * this.rows[1];
-      this.write(this.order, order, ...this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, texels);
-      if (colors) this.write(this.colors, colors, ...this.rows, gl.RGBA, gl.UNSIGNED_BYTE, 4 * texels);
-    }
-
-    // The layer of one view, and the weighted sum of layers with the sum of weights; larger than the image if an earlier
-    // one was larger.
-    resize(...size) {
-      if (size.every((side, i) => side <= this.size[i])) return;
-      const gl = this.gl, [width, height] = this.size = size.map((side, i) => Math.max(side, this.size[i]));
-      for (const { framebuffer, textures } of this.targets) {
-        gl.deleteFramebuffer(framebuffer);
-        textures.forEach((texture) => gl.deleteTexture(texture));
-      }
-      this.targets = [1, 2].map((count) => {
-        const framebuffer = gl.createFramebuffer(), textures = [];
-        gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-        const attachments = [...Array(count)].map((_, i) => gl.COLOR_ATTACHMENT0 + i);
-        for (const attachment of attachments) {
-          textures.push(this.makeTexture(width, height, this.format));
-          gl.framebufferTexture2D(gl.FRAMEBUFFER, attachment, gl.TEXTURE_2D, textures.at(-1), 0);
-        }
-        gl.drawBuffers(attachments);
-        return { framebuffer, textures };
-      });
-    }
-
-    // Draws to a viewport (left, bottom, width, height) of a framebuffer, null for the canvas. `camera` has a `position`,
-    // a `rotation` (camera to world), and the `center` and `half` the size of the image on the image plane.
-    draw(camera, weights, framebuffer, [left, bottom, width, height]) {
-      const gl = this.gl;
-      this.resize(width, height);
-      const [layer, sum] = this.targets;
-      gl.viewport(0, 0, width, height);
-      gl.disable(gl.DEPTH_TEST);
-      gl.activeTexture(gl.TEXTURE0);
-      this.setCamera(camera, width, height);
-      let first = true;
-      HEADER.views.forEach(({ start, count }, view) => {
-        if (!weights[view]) return;
-        gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
-        gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);
-        if (count) this.drawLayer(start, count);
-        gl.bindFramebuffer(gl.FRAMEBUFFER, sum.framebuffer);
-        this.addLayer(layer.textures[0], weights[view], first);
-        first = false;
-      });
-      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-      gl.viewport(left, bottom, width, height);
-      gl.disable(gl.BLEND);
-      const { program, places } = this.resolve;
-      gl.useProgram(program);
-      gl.uniform2i(places.origin, left, bottom);
-      gl.uniform3f(places.background, 0, 0, 0);
-      gl.uniform1i(places.sum_color, 0);
-      gl.uniform1i(places.sum_depth, 1);
-      sum.textures.forEach((texture, unit) => {
-        gl.activeTexture(gl.TEXTURE0 + unit);
-        gl.bindTexture(gl.TEXTURE_2D, texture);
-      });
-      gl.bindVertexArray(this.screen);
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
-    }
-
-    setCamera({ position, rotation, center, half }, width, height) {
-      const gl = this.gl, { program, places } = this.splat;
-      const [[x, y], [w, h]] = [center, half], focal = [0.5 * width / w, 0.5 * height / h];
-      gl.useProgram(program);
-      // GLSL reads columns: the rows of camera-to-world are the columns of its inverse.
-      gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
-      gl.uniform3fv(places.position, position);
-      gl.uniform1f(places.near, HEADER.near);
-      gl.uniform1i(places.exact, 1);
-      gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal[0] * focal[1]));
-      gl.uniform2f(places.half_size, Math.abs(x) + w, Math.abs(y) + h);
-      gl.uniform4f(places.window, x, y, w, h);
-      gl.uniform1f(places.margin, 0.02 / Math.min(...focal));
-      gl.uniform2f(places.principal, 0.5 * width - x * focal[0], 0.5 * height + y * focal[1]);
-      gl.uniform2fv(places.focal, focal);
-      gl.uniform2fv(places.color_range, HEADER.colorRange);
-      const sides = [[-1, 0, w + x], [1, 0, w - x], [0, -1, h + y], [0, 1, h - y]].map((side) => scaled(side, 1 / Math.hypot(...side)));
-      gl.uniform3fv(places.sides, sides.flat());
-      gl.uniform1i(places.geometry, 0);
-      gl.uniform1i(places.colors, 1);
-      gl.uniform1i(places.order, 2);
-    }
-
-    drawLayer(start, count) {
-      const gl = this.gl;
-      gl.useProgram(this.splat.program);
-      [this.geometry, this.colors, this.order].forEach((texture, unit) => {
-        gl.activeTexture(gl.TEXTURE0 + unit);
-        gl.bindTexture(gl.TEXTURE_2D, texture);
-      });
-      gl.enable(gl.BLEND);
-      gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-      gl.bindVertexArray(this.splats);
-      gl.uniform2i(this.splat.places.segment, start, count);
-      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(count / BATCH));
-    }
-
-    addLayer(texture, weight, first) {
-      const gl = this.gl, { program, places } = this.accumulate;
-      gl.useProgram(program);
-      gl.uniform1f(places.weight, weight);
-      gl.uniform1i(places.layer_color, 0);
-      gl.uniform1i(places.layer_depth, 0);
-      gl.uniform1i(places.with_depth, 0);
-      gl.activeTexture(gl.TEXTURE0);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      if (first) gl.disable(gl.BLEND);
-      else gl.enable(gl.BLEND);
-      gl.blendFunc(gl.ONE, gl.ONE);
-      gl.blendEquationSeparate(gl.FUNC_ADD, gl.MAX);
-      gl.bindVertexArray(this.screen);
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
-      gl.blendEquation(gl.FUNC_ADD);
-    }
-  }
+  // ---- weights ----
 
   // Weights of the views of a group at a position: normalised inverse distances (docs/rendering.md, section 7). Other
   // views have weight 0.
@@ -292,12 +36,21 @@
     return weights;
   }
 
-  // The views of the edge at the camera, and for a second after a change also those of the edge before.
+  // The views of the edge at the camera, and for a second after a change also those of the edge before. A view fades in
+  // when it has arrived.
   function blendWeights(position) {
-    const weights = groupWeights(group, position);
-    if (!fade) return weights;
-    const old = groupWeights(fade.group, position);
-    return weights.map((weight, view) => fade.done * weight + (1 - fade.done) * old[view]);
+    const weights = groupWeights(group, position), old = fade ? groupWeights(fade.group, position) : weights;
+    const done = fade ? fade.done : 1;
+    return weights.map((weight, view) => shown[view] * (done * weight + (1 - done) * old[view]));
+  }
+
+  // How far each view has faded in. The first ones are there at once.
+  const shown = HEADER.views.map(() => 0);
+  function showViews(step) {
+    if (!sorted || !sorted.views.some((view) => shown[view] < 1)) return;
+    const isFirst = !sorted.views.some((view) => shown[view] && HEADER.views[view].count);
+    sorted.views.forEach((view) => { shown[view] = isFirst ? 1 : Math.min(shown[view] + step, 1); });
+    changed();
   }
 
   // ---- the edge at the camera ----
@@ -339,14 +92,14 @@
 
   // ---- fades between parts ----
 
-  // The image of the last camera in the old part covers the new one until that is sorted, then it fades out.
+  // The image of the last camera before a jump covers the new one until that is sorted, then it fades out.
   const still = byId("still");
   let frozen = null;
 
   function freeze() {
     if (!renderer || !sorted) return;
     if (headset.session) {  // it fades from black
-      frozen = { began: null, left: 1 };
+      frozen = { began: null, left: 1, position: null };
       return;
     }
     drawAt(canvas.width, canvas.height);  // what a canvas shows can be copied in the task that drew it
@@ -355,14 +108,16 @@
     context.globalAlpha = frozen && isSame ? 1 - frozen.left : 1;
     if (!isSame) [still.width, still.height] = size;
     context.drawImage(canvas, 0, 0, ...size);
-    frozen = { began: null, left: 1 };
+    frozen = { began: null, left: 1, position: null };
     showStill();
     changed();
   }
 
   function updateStill(now) {
     if (!frozen) return;
-    if (frozen.began === null && sorted.part === currentPart()) frozen.began = now;
+    frozen.position = frozen.position || [...camera.position];
+    const isSorted = sorted.part === currentPart() && distanceOf(sorted.position, frozen.position) < HEADER.speed;
+    if (frozen.began === null && isSorted && isSeen()) frozen.began = now;
     if (frozen.began !== null) {
       const t = clamp((now - frozen.began) / FADE_MS, 0, 1);
       frozen.left = 1 - t * t * (3 - 2 * t);
@@ -378,6 +133,9 @@
     still.style.opacity = left;
     byId("spots").style.opacity = 1 - left;
   }
+
+  // Whether a view of the group at the camera is sorted, or all are empty.
+  const isSeen = () => HEADER.groups[group].some((view) => sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
 
   const isWaiting = () => frozen !== null && frozen.began === null;
 
@@ -415,10 +173,8 @@
   }
 
   // Half the height of the image at distance 1. The field of view is that of a landscape image; a portrait one is taller.
-  const tangentOf = (width, height) => {
-    const tall = clamp(Math.sqrt(height / width), 1, 1.5);
-    return tall * Math.tan(0.5 * camera.fov * Math.PI / 180);
-  };
+  const tallOf = (width, height) => clamp(Math.sqrt(height / width), 1, HEADER.tallest);
+  const tangentOf = (width, height) => tallOf(width, height) * Math.tan(0.5 * camera.fov * DEGREE);
 
   function turn(yaw, pitch) {
     camera.yaw += yaw;
@@ -454,6 +210,12 @@
   // turns to the link, goes a step along it, and the image fades; without a link it fades at once.
   let flight = null, touring = false;
   function flyTo(spot) {
+    if (calm.matches) {
+      flight = { spot, legs: [{ from: edges.length ? nearestNode(camera.position) : spot, to: spot }], began: null };
+      if (touring) flight.legs.push({ path: [GRAPH.positions[spot]], rest: REST_SECONDS });
+      changed();
+      return;
+    }
     const way = edges.length ? findWay(GRAPH, camera.position, spot, partOfEdge(GRAPH, followEdge(GRAPH, camera.position, edge))) : [spot];
     const legs = [];
     let path = [[...camera.position]];
@@ -478,8 +240,9 @@
     if (!flight || isWaiting()) return;
     const leg = flight.legs[0];
     if (leg.to !== undefined) {
-      jump(GRAPH.positions[leg.to], arriveAt(leg.to, leg.from));
+      jump(GRAPH.positions[leg.to], isFade(GRAPH, leg.from, leg.to) ? arriveAt(leg.to, leg.from) : camera);
       flight.legs.shift();
+      if (!flight.legs.length) flight = null;
       return;
     }
     if (flight.began === null) beginLeg(leg, now);
@@ -503,7 +266,7 @@
     leg.done = 0;
     leg.turn = leg.yaw === undefined ? [0, 0] : [Math.atan2(Math.sin(leg.yaw - camera.yaw), Math.cos(leg.yaw - camera.yaw)), -camera.pitch];
     const turning = headset.session ? 0 : Math.hypot(...leg.turn) / TURN_SPEED;  // the head turns itself
-    leg.seconds = leg.length ? clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : turning;
+    leg.seconds = leg.rest || leg.length ? leg.rest || clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : turning;
   }
 
   function pointAlong(path, distance) {
@@ -554,7 +317,7 @@
     byId("play").setAttribute("aria-pressed", touring);
     byId("play").querySelector("path").setAttribute("d", touring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
     if (!touring) flight = route = null;
-    else if (HEADER.route.length > 1) {
+    else if (HEADER.route.length > 1 && !calm.matches) {
       flight = null;
       startRoute();
     } else if (!flight) {
@@ -566,9 +329,36 @@
   function goHome() {
     setTouring(false);
     flight = null;
-    const isFar = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, HEADER.start.position)) !== currentPart();
-    if (isFar || headset.session) freeze();
-    place(makeStart());
+    goToPose(makeStart());
+  }
+
+  // Goes to another camera; the image fades, unless the order of the Gaussians is right there too.
+  function goToPose(pose) {
+    const isFar = distanceOf(pose.position, camera.position) > HEADER.speed;
+    const isElsewhere = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
+    if (isFar || isElsewhere || headset.session) freeze();
+    place(pose);
+  }
+
+  // A camera for a pose of share.js, some of whose values may be missing; its position is within the limits.
+  function cameraFor({ position, yaw, pitch, fov }) {
+    const found = { ...camera, position: [...camera.position], roll: 0 };
+    const check = (name, values) => {
+      if (!values.every(Number.isFinite)) throw new Error(`The ${name} of a pose needs finite numbers, got ${JSON.stringify(values)}.`);
+    };
+    if (position !== undefined) {
+      check("position", [0, 1, 2].map((k) => position[k]));
+      const edge = edges.length ? nearestEdge(GRAPH, position) : null;
+      const distances = GRAPH.positions.map((each) => distanceOf(each, position));
+      const from = edge === null ? GRAPH.positions[distances.indexOf(Math.min(...distances))] : closestOnEdge(GRAPH, edge, position);
+      const limit = HEADER.limits[edge === null ? 0 : partOfEdge(GRAPH, edge)], away = distanceOf(position, from);
+      found.position = plus(from, scaled(minus(position, from), Math.min(limit / Math.max(away, 1e-9), 1)));
+    }
+    check("angles", [yaw, pitch, fov].filter((value) => value !== undefined));
+    if (yaw !== undefined) found.yaw = yaw * DEGREE;
+    if (pitch !== undefined) found.pitch = clamp(pitch * DEGREE, -MAX_PITCH, MAX_PITCH);
+    if (fov !== undefined) found.fov = clamp(fov, MIN_FOV, MAX_FOV);
+    return found;
   }
 
   // ---- input ----
@@ -584,10 +374,25 @@
     KeyR: () => goHome(),
     KeyH: () => byId("keys").showModal(),
     KeyL: () => openList(),
+    KeyM: () => { if (HEADER.spots.length > 1) plan.toggle(); },
+    KeyP: () => share.savePicture(),
   };
+  const CLOSES = { KeyH: "keys", KeyL: "list" };  // the dialogs that a key opens and closes
 
   function onKey(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+    const open = document.querySelector("dialog[open]");
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (open) {
+      if (open.id !== CLOSES[event.code] || event.repeat) return;
+      open.close();
+      event.preventDefault();
+      return;
+    }
+    if (event.code === "Escape") {
+      showMore(false);
+      if (measure.isOn) measure.toggle(false);
+    }
+    if (event.code === "Enter" && event.target === canvas && measure.isOn) measure.take(0.5 * innerWidth, 0.5 * innerHeight);
     const onButton = event.target.tagName === "BUTTON" && (event.code === "Space" || event.code === "Enter");
     if (onButton) return;
     const digit = /^(Digit|Numpad)([1-9])$/.exec(event.code);
@@ -681,15 +486,29 @@
     addEventListener("keyup", (event) => { fast = event.shiftKey; held.delete(event.code); });
     addEventListener("blur", () => held.clear());
     addEventListener("resize", changed);
+    addEventListener("hashchange", () => {
+      const pose = parsePose(location.hash);
+      if (pose) setPose(pose);
+    });
+    addEventListener("pointerdown", (event) => { if (!byId("more").parentElement.contains(event.target)) showMore(false); });
+    let pressed = null;  // where the pointer went down, until it moves
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
+      pressed = event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;
       fingers.set(event.pointerId, [event.clientX, event.clientY]);
       canvas.focus({ preventScroll: true });
     });
     canvas.addEventListener("pointermove", onMove);
+    canvas.addEventListener("click", ({ clientX, clientY }) => {
+      if (measure.isOn && pressed && distanceOf(pressed, [clientX, clientY]) < 5) measure.take(clientX, clientY);
+    });
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => {
+      if (!embed.isEngaged) {
+        say("Click the picture to change its field of view by the wheel");
+        return;
+      }
       event.preventDefault();
       const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
       camera.fov = clamp(camera.fov * Math.exp(0.001 * clamp(pixels, -200, 200)), MIN_FOV, MAX_FOV);
@@ -700,12 +519,39 @@
     byId("place").onclick = openList;
     byId("list").onclick = (event) => { if (event.target === byId("list")) byId("list").close(); };  // beside it
     byId("full").onclick = toggleFull;
+    byId("map").onclick = () => plan.toggle();
+    byId("more").onclick = () => showMore(byId("menu").hidden);
+    for (const [id, act] of [["measure", () => measure.toggle()], ["picture", () => share.savePicture()], ["link", () => share.copyLink()]]) {
+      byId(id).onclick = () => {
+        showMore(false);
+        act();
+        canvas.focus({ preventScroll: true });
+      };
+    }
     byId("help").onclick = () => byId("keys").showModal();
     byId("motion").onclick = toggleMotion;
     byId("motion").hidden = !("DeviceOrientationEvent" in window && matchMedia("(pointer: coarse)").matches);
     byId("full").hidden = !document.documentElement.requestFullscreen;
-    byId("play").hidden = byId("place").hidden = HEADER.spots.length < 2;
+    byId("play").hidden = byId("place").hidden = byId("map").hidden = HEADER.spots.length < 2;
     byId("buttons").hidden = false;
+  }
+
+  // A short message, that a screen reader reads too.
+  let spoken = null;
+  function say(text) {
+    byId("status").textContent = text;
+    clearTimeout(spoken);
+    spoken = setTimeout(() => { byId("status").textContent = ""; }, 5000);
+  }
+
+  function explain(text) {
+    byId("notice-text").textContent = text;
+    byId("notice").showModal();
+  }
+
+  function showMore(isOpen) {
+    byId("menu").hidden = !isOpen;
+    byId("more").setAttribute("aria-expanded", isOpen);
   }
 
   // ---- hotspots ----
@@ -844,21 +690,24 @@
   // A frame is drawn only if something changed. While it moves, the scale of the resolution follows the time between
   // frames; at rest the image has the full resolution.
   let renderer = null, rings = [], ringsOf = null, listed = [], here = null, fast = false, dirty = true, scale = 1, lastChange = 0, lastFrame = 0, drawnScale = 0;
-  let sorter = null, sorting = false, sorted = null;
+  let worker = null, sorting = false, sorted = null;
   const changed = () => { dirty = true; lastChange = performance.now(); };
 
+  let arrived = 0;  // number of views
+  const isComplete = () => arrived === HEADER.loading.length;
+
   const isSortedFor = (position, part, tolerance = 0) => {
-    return sorted !== null && sorted.part === part && distanceOf(sorted.position, position) <= tolerance;
+    return sorted !== null && sorted.part === part && sorted.arrived === arrived && distanceOf(sorted.position, position) <= tolerance;
   };
 
   // `tolerance`: distance in metres for which the order of before is kept.
   function requestSort(tolerance) {
     if (sorting || isSortedFor(camera.position, currentPart(), tolerance)) return;
     sorting = true;
-    sorter.postMessage({ position: [...camera.position], part: currentPart() });
+    worker.postMessage({ position: [...camera.position], part: currentPart() });
   }
 
-  function onSorted({ data }) {
+  function onSorted(data) {
     sorting = false;
     sorted = data;
     if (renderer) renderer.setSorted(data);
@@ -885,6 +734,10 @@
     advanceRoute(seconds);
     if (edges.length) updateEdge(now);
     updateStill(now);
+    showViews(1000 * seconds / FADE_MS);
+    const node = nearestNode(camera.position), isMoving = flight !== null || isWaiting();
+    const isThere = !isMoving && distanceOf(GRAPH.positions[node], camera.position) < HEADER.spots[node].radius;
+    embed.follow(isThere ? node : null, isMoving);
   }
 
   function onFrame(now) {
@@ -901,8 +754,45 @@
     if (!renderer || !sorted || !(dirty || wanted > drawnScale)) return;
     dirty = false;
     drawnScale = wanted;
-    placeRings(drawAt(...fullSize().map((side) => Math.max(Math.round(side * wanted), 1))));
+    const rotation = drawAt(...fullSize().map((side) => Math.max(Math.round(side * wanted), 1)));
+    placeRings(rotation);
+    showMarks(rotation);
     showPlace();
+    plan.show();
+  }
+
+  // ---- measuring and pictures ----
+
+  // The place of a point of the window on the image plane, and its direction in the scene.
+  function planeOf(left, top) {
+    const { clientWidth: width, clientHeight: height } = canvas, step = 2 * tangentOf(width, height) / height;
+    return [(left - 0.5 * width) * step, (top - 0.5 * height) * step];
+  }
+
+  function rayOf(left, top) {
+    const ray = [...planeOf(left, top), 1];
+    return scaled(rotationOf(camera).map((row) => dot(row, ray)), 1 / Math.hypot(...ray));
+  }
+
+  // The distance from the camera to what a point of the window shows, or null.
+  function measureAt(left, top) {
+    if (!renderer || !sorted) return null;
+    const [width, height] = fullSize(), tangent = tangentOf(width, height), half = [tangent / height, tangent / height];
+    const seen = { position: camera.position, rotation: rotationOf(camera), center: planeOf(left, top), half };
+    return renderer.measure(seen, blendWeights(camera.position));
+  }
+
+  function showMarks(rotation) {
+    const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
+    const toCamera = (point) => [0, 1, 2].map((k) => dot(column(rotation, k), minus(point, camera.position)));
+    measure.show(toCamera, ([x, y, z]) => [0.5 * width + focal * x / z, 0.5 * height + focal * y / z]);
+  }
+
+  function takePicture() {
+    if (!renderer || !sorted) return null;
+    drawAt(...fullSize());
+    changed();
+    return new Promise((resolve) => { canvas.toBlob(resolve, "image/png"); });
   }
 
   // ---- headset ----
@@ -925,8 +815,20 @@
     get isFlying() { return flight !== null || route !== null; },
   });
 
+  const share = new Share({ camera, say, explain, takePicture });
+  const measure = new Measure({ camera, say, changed, measureAt, rayOf });
+  const plan = new Plan({ camera, changed, goTo, isSingle, get here() { return here; } });
+  const embed = new Embed();
+
+  function setPose(pose) {
+    const next = cameraFor(pose);
+    setTouring(false);
+    goToPose(next);
+  }
+
   let failure = null;
   function fail(error) {
+    if (failure) return;
     failure = error;
     byId("cover").hidden = false;
     byId("cover").className = "failed";
@@ -935,15 +837,74 @@
     console.error(error);
   }
 
+  // ---- loading ----
+
+  const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+
+  // A script for each part of the data calls this. In a page of one file the part is the element before: unlike text in a
+  // program, it is not kept.
+  let partsArrived = 0;
+  window.addPart = (text) => {
+    const { currentScript: script } = document;
+    if (text === undefined) {
+      text = script.previousElementSibling.textContent;
+      script.previousElementSibling.remove();
+    }
+    script.remove();
+    partsArrived += 1;
+    bar.value = partsArrived / HEADER.dataParts;
+    if (!worker) return;
+    worker.postMessage({ text });
+    if (partsArrived === HEADER.dataParts) worker.postMessage({ end: true });
+  };
+
+  // Starts the worker; `onView` gets the Gaussians of each view. Returns a promise of the first order.
+  function load(onView) {
+    return new Promise((resolve, reject) => {
+      const fails = (error) => sorted ? fail(error) : reject(error);
+      worker = new Worker(URL.createObjectURL(new Blob([WORKER])));
+      worker.onmessage = ({ data }) => {
+        if (data.error) fails(new Error(`The data of the scene cannot be read: ${data.error}`));
+        else if (data.order) {
+          onSorted(data);
+          resolve();
+        } else {
+          arrived += 1;
+          onView(data);
+        }
+      };
+      worker.onerror = (event) => fails(new Error(`The worker failed: ${event.message}`));
+      const { count, degree, views, loading, harmonicsScale, colorRange } = HEADER;
+      const first = { position: [...camera.position], part: currentPart() };
+      worker.postMessage({ header: { count, degree, views, loading, parts, harmonicsScale, colorRange, first } });
+      addEventListener("DOMContentLoaded", () => {
+        if (partsArrived !== HEADER.dataParts) fails(new Error("A part of the scene is missing. Copy the whole folder."));
+      });
+    });
+  }
+
   async function main() {
+    placePoster();
+    addEventListener("resize", placePoster);
+    if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
+    const linked = parsePose(location.hash);
+    if (linked) Object.assign(camera, cameraFor(linked));
+    settleAt(camera.position);
+    canvas.ariaBusy = true;
+    const received = [];  // kept for a context that is lost
+    const loading = load((data) => {
+      received.push(data);
+      if (renderer) renderer.add(data);
+      if (isComplete()) canvas.ariaBusy = false;
+    });
+    loading.catch(() => {});  // of an error that comes before it is awaited
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser or device does not have.");
-    if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
     headset.gl = gl;
-    let scene = null;
     const makeRenderer = () => {
-      if (!scene || gl.isContextLost()) return;
-      renderer = new Renderer(gl, scene);
+      if (gl.isContextLost()) return;
+      renderer = new Renderer(gl);
+      received.forEach((data) => renderer.add(data));
       if (sorted) renderer.setSorted(sorted);
       changed();
     };
@@ -951,58 +912,59 @@
     canvas.addEventListener("webglcontextrestored", () => {
       try { makeRenderer(); } catch (error) { fail(error); }
     });
-    scene = await load();
-    sorter = new Worker(URL.createObjectURL(new Blob([SORTER])));
-    const first = new Promise((resolve, reject) => {
-      sorter.onmessage = (event) => { onSorted(event); resolve(); };
-      sorter.onerror = (event) => {
-        const error = new Error(`The sorting failed: ${event.message}`);
-        if (sorted) fail(error);
-        else reject(error);
-      };
-    });
-    const { count, views, harmonicsScale, colorRange: range } = HEADER;
-    const base = scene.harmonics ? scene.colors : null;
-    const { means, harmonics } = scene, moved = [means, harmonics].filter(Boolean).map((array) => array.buffer);
-    sorter.postMessage({ count, views, parts, means, harmonics, base, harmonicsScale, range }, moved);  // not copied
-    settleAt(camera.position);
-    requestSort();
     makeRenderer();
-    await first;
+    await loading;
     while (!renderer) {  // the context is lost
       if (failure) throw failure;
       await wait(50);
     }
-    await report(1);
+    showViews(1);
     listen();
     headset.offer();
     rings = makeRings();
     makeList();
+    embed.listen(canvas, window.pansplat);
     requestAnimationFrame(onFrame);
     byId("cover").className = "done";
     setTimeout(() => { byId("cover").hidden = !failure; }, 700);
   }
 
-  // For scripts: `await pansplat.ready`; `pansplat.camera` is {position, yaw, pitch, roll, fov}; `await
-  // pansplat.render(width, height)` draws the camera's view with an order for its position and returns a PNG's data URL.
-  window.pansplat = {
+  // A panorama by its number in the list, from 1, or its name.
+  function findNode(panorama) {
+    const node = typeof panorama === "number" ? panorama - 1 : HEADER.spots.findIndex(({ name }) => name === panorama);
+    if (!HEADER.spots[node]) throw new Error(`There is no panorama ${JSON.stringify(panorama)}; there are 1 to ${HEADER.spots.length}.`);
+    return node;
+  }
+
+  // For scripts and host pages: docs/web.md, Embedding. An EventTarget.
+  window.pansplat = Object.assign(new EventTarget(), {
     camera,
-    ready: main(),
+    panoramas: HEADER.spots.map(({ name }) => name),
+    getPose: () => poseOf(camera),
+    setPose,
+    async goTo(panorama, { jump = false } = {}) {
+      const node = findNode(panorama);
+      setTouring(false);
+      return embed.await(node, () => jump ? jumpTo(node) : flyTo(node));
+    },
     async render(width, height) {
       await this.ready;
       const place = [...camera.position];
       settleAt(place);
-      while (!renderer || !isSortedFor(place, currentPart())) {
+      while (!renderer || !isComplete() || !isSortedFor(place, currentPart())) {
         if (failure) throw failure;
         await wait(5);
       }
       settleAt(place);
+      sorted.views.forEach((view) => { shown[view] = 1; });
       drawAt(width, height);
       const image = canvas.toDataURL("image/png");
       drawnScale = 0;
       changed();
       return image;
     },
-  };
+  });
+  window.pansplat.ready = main();
   window.pansplat.ready.catch(fail);
+  addEventListener("message", (event) => embed.answer(event));
 })();

@@ -57,19 +57,23 @@ from pansplat.tours.layout import REACH
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
-MAX_GAUSSIANS = 4_000_000  # fit textures of 4096 texels a side; 1.4 million fit the 2048 that every device has
+MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
 MAX_FILE_BYTES = 64_000_000  # of a page in one file
 _TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
 _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
-_POSTER_SIZE = (540, 960)
-_START_FOV = 75.0  # degrees, vertical
+_START_FOV = 75.0  # degrees, vertical, of a landscape image
+_TALLEST = 1.5  # height of a portrait image relative to it; the poster has this height
+_POSTER_SIZE = (810, 960)
 _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 _BATCH = 256  # quads that are drawn together
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
+
+_WORKER = ("unpack.js", "sorter.js")
+_PROGRAMS = ("graph.js", "renderer.js", "xr.js", "share.js", "embed.js", "plan.js", "measure.js", "page.js")
 
 
 @dataclass(frozen=True)
@@ -137,7 +141,7 @@ def write_page(
     report("compressing", 0.6)
     degree = _choose_degree(scene)
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
-    packed = pack_gaussians(scene.gaussians, origin, len(scene.cam2world), degree)
+    packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree)
     report("drawing the poster", 0.8)
     poster = _draw_poster(scene, flights.start)
     report("writing", 0.9)
@@ -211,6 +215,13 @@ def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
         jumps,
         factor * EDGE_HYSTERESIS,
     )
+
+
+def _order_views(scene: Scene, flights: _Flights) -> list[int]:
+    """The views of the part where the page starts, then the others; the nearest first."""
+    distances = (scene.cam2world[:, :3, 3] - flights.start[:3, 3]).norm(dim=1).numpy()
+    parts = np.array(flights.parts)
+    return np.lexsort((distances, parts != parts[distances.argmin()])).tolist()
 
 
 def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: float, pitch: float) -> Tensor:
@@ -314,7 +325,7 @@ def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"]) -> bytes:
             pose,
             size=_POSTER_SIZE,
             layout="pinhole",
-            vertical_fov_degrees=_START_FOV,
+            vertical_fov_degrees=math.degrees(2 * math.atan(_TALLEST * math.tan(math.radians(_START_FOV / 2)))),
         ).color
     pixels = (color.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
     with io.BytesIO() as file:
@@ -349,8 +360,8 @@ def _describe_scene(
     ]
     reaches = _measure_reaches(scene, np.array(flights.parts))
     views_of_page = [
-        {"position": _round(position), "start": start, "count": end - start}
-        for position, start, end in zip(positions, packed.starts, packed.starts[1:], strict=False)
+        {"position": _round(position), "start": start, "count": count}
+        for position, start, count in zip(positions, packed.starts, packed.counts, strict=True)
     ]
     return {
         "count": len(scene.gaussians),
@@ -358,6 +369,7 @@ def _describe_scene(
         "colorRange": packed.color_range,
         "harmonicsScale": packed.harmonics_scale,
         "views": views_of_page,
+        "loading": packed.order,
         "spots": spots,
         "links": _describe_links(tour, positions, heights, level, factor) if flights.edges else [],
         "level": [_round(row) for row in level],
@@ -378,6 +390,8 @@ def _describe_scene(
         "jumps": flights.jumps,
         "batch": _BATCH,
         "near": constants.NEAR,
+        "unit": factor,
+        "tallest": _TALLEST,
         "filterVariance": constants.FILTER_VARIANCE["angular"],
         "speed": _SPEED * float(np.median(reaches)),
         "limits": _limit_parts(reaches, positions, flights, len(tour)),
@@ -451,9 +465,9 @@ def _write_files(
     """Write the page, and its parts if it is split."""
     count = header["count"]
     parts = [base64.b64encode(content[k : k + _PART_BYTES]).decode() for k in range(0, len(content), _PART_BYTES)]
-    scripts = [f'addPart("{part}");\n' for part in parts]
+    scripts = [f'addPart("{part}");\n' for part in parts] if split else []
     folder = path.with_name(f"{path.stem}_files")
-    names = [f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js" for text in scripts] if split else []
+    names = [f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js" for text in scripts]
     tags = [f'<script src="{quote(os.fsencode(folder.name))}/{name}"></script>' for name in names]
     page = _fill_template(
         script_sources="'self' file: blob:" if split else "blob:",
@@ -463,11 +477,11 @@ def _write_files(
         count=f"{count:,}",
         header=_to_script(header | {"dataParts": len(parts)}),
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
-        sorter=_to_script(_read("sorter.js")),
-        parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),
-        graph=_read("graph.js"),
-        headset=_read("xr.js"),
-        program=_read("page.js"),
+        worker=_to_script("".join(map(_read, _WORKER))),
+        programs="\n".join(f"<script>\n{_read(name)}</script>" for name in _PROGRAMS),
+        parts="\n".join(
+            tags or (f'<script type="text/plain">{part}</script><script>addPart()</script>' for part in parts)
+        ),
     ).encode(errors="replace")  # a title from a file name that is not UTF-8
     if len(page) > MAX_FILE_BYTES and not split:
         fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
@@ -486,7 +500,7 @@ def _write_files(
     if split:
         _remove_old_parts(folder, set(names))
     files.insert(0, path)
-    total = len(page) + sum(len(text) for text in scripts[: len(names)])
+    total = len(page) + sum(map(len, scripts))
     return PageFiles(tuple(files), total, count, header["degree"])
 
 

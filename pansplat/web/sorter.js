@@ -1,32 +1,21 @@
 "use strict";
-// A worker: the drawing order and the colours of one camera position, of the views of one part. Neither depends on the
-// camera's rotation. What belongs to other parts is unchanged.
-
-let scene = null, order = null, colors = null;
-
-onmessage = (event) => {
-  if (event.data.means) prepare(event.data);
-  else sort(event.data);
-};
-
-function prepare(data) {
-  scene = data;
-  order = new Uint32Array(scene.count);
-  if (scene.harmonics) colors = new Uint8ClampedArray(4 * scene.count);
-}
+// The worker of unpack.js: the drawing order and the colours of one camera position, of the views of one part. Neither depends on the
+// camera's rotation. What belongs to other parts, and to views that have not arrived, is unchanged.
 
 function sort({ position, part }) {
-  for (const view of scene.views.filter((_, index) => scene.parts[index] === part)) {
-    sortView(view, position);
-    if (colors) evaluateColors(view, position);
+  const { loading, parts, views: all, order, colors } = scene;
+  const views = loading.slice(0, arrived).filter((view) => parts[view] === part);
+  for (const view of views) {
+    sortView(all[view], position);
+    if (colors) evaluateColors(all[view], position);
   }
-  postMessage({ position, part, order, colors: colors && new Uint8Array(colors.buffer) });
+  postMessage({ position, part, views, arrived, order, colors: colors && new Uint8Array(colors.buffer) });
 }
 
 // Writes the Gaussians of a view, farthest first: a stable radix sort of the bits of the squared distances, which
 // are in the order of the numbers.
 function sortView({ start, count }, [x, y, z]) {
-  const { means } = scene;
+  const { means, order } = scene;
   const squared = new Float32Array(count);
   for (let i = 0; i < count; i++) {
     const k = 3 * (start + i), dx = means[k] - x, dy = means[k + 1] - y, dz = means[k + 2] - z;
@@ -47,8 +36,7 @@ function sortView({ start, count }, [x, y, z]) {
 
 // RGB and a padding byte of a view's Gaussians: base colour plus harmonics of degree 1 to 3 (docs/conventions.md).
 function evaluateColors({ start, count }, [x, y, z]) {
-  const { means, base, harmonics, harmonicsScale, range: [low, high] } = scene;
-  const terms = harmonics.length / (3 * scene.count), basis = new Float32Array(terms);
+  const { means, base, harmonics, colors, terms, harmonicsScale, colorRange: [low, high] } = scene, basis = new Float32Array(terms);
   const unit = 255 / (high - low), step = unit * harmonicsScale / 127;
   for (let i = start; i < start + count; i++) {
     let dx = means[3 * i] - x, dy = means[3 * i + 1] - y, dz = means[3 * i + 2] - z;

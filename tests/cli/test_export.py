@@ -97,7 +97,7 @@ def test_options_of_pages_are_for_pages(scene: Path, tmp_path: Path, refusal: Ca
 def test_a_folder_of_three_panoramas_is_exported_as_a_tour(
     tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
     house = write_tour(tmp_path / "house", height=64)
     command = ["export", str(house), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
     assert run([*command, str(tmp_path / "house.html")]) == 0
@@ -116,7 +116,7 @@ def test_a_folder_of_three_panoramas_is_exported_as_a_tour(
 def test_a_pair_is_merged_to_the_limit_of_its_page_before_its_refinement(
     tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
     monkeypatch.setattr(page_module, "_merge", None)  # must not be called
     command = ["export", str(write_tour(tmp_path / "house", height=64)), "--model", "sphere", "--refine", "0.1"]
     out = tmp_path / "page.html"
@@ -128,7 +128,7 @@ def test_a_pair_is_merged_to_the_limit_of_its_page_before_its_refinement(
 def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
     tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
     monkeypatch.setattr(export_module, "_FEW_GAUSSIANS", 300_000)
     first, second = pipeline.load_pairs(write_tour(tmp_path / "house", height=64))
     alone = dataclasses.replace(second.context[1], world=1, title="Attic")

@@ -58,7 +58,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, tmp_path_factory: pytest.Tem
     """tour.html, split.html with its parts, house.html with a graph, and flat.html with parts."""
     folder = tmp_path_factory.mktemp("pages")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+        patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
         patch.setattr(page_module, "_PART_BYTES", 30_000)
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
@@ -76,8 +76,8 @@ class OpenPage:
         page.on("console", lambda message: self.messages.append(message.text))
         page.on("pageerror", lambda error: self.messages.append(str(error.stack)))
 
-    def load(self, path: Path) -> None:
-        self.page.goto(path.as_uri())
+    def load(self, path: Path, fragment: str = "") -> None:
+        self.page.goto(path.as_uri() + fragment)
         assert self.page.evaluate("pansplat.ready.then(() => 'ready', String)") == "ready"
 
     def run(self, program: str, *arguments: Any) -> Any:
@@ -106,13 +106,19 @@ def decode(url: str) -> Float[np.ndarray, "height width 3"]:
 
 @contextmanager
 def opened(
-    chromium: Any, path: Path, *, size: tuple[int, int] = SIZE, script: str = "", **options: Any
+    chromium: Any,
+    path: Path,
+    *,
+    size: tuple[int, int] = SIZE,
+    script: str = "",
+    fragment: str = "",
+    **options: Any,
 ) -> Iterator[OpenPage]:
-    """The loaded page in a context of its own; `script` runs before those of the page."""
+    """The loaded page in a context of its own; `script` runs before those of the page, `fragment` ends its address."""
     context = chromium.new_context(viewport={"width": size[0], "height": size[1]}, **options)
     page = OpenPage(context.new_page())
     page.page.add_init_script(script)
-    page.load(path)
+    page.load(path, fragment)
     yield page
     context.close()
 
@@ -336,18 +342,64 @@ def test_every_load_shows_the_scene(chromium: Any, folder: Path) -> None:
             assert all(url.startswith(("file:", "blob:")) for url in page.requests)
 
 
-def test_the_picture_is_the_same_on_a_device_with_the_smallest_textures(
-    home: OpenPage, chromium: Any, folder: Path
-) -> None:
-    script = """
-      const gl = WebGL2RenderingContext.prototype, { getParameter, texStorage2D } = gl;
-      window.widths = [];
-      gl.getParameter = function (name) { return name === gl.MAX_TEXTURE_SIZE ? 2048 : getParameter.call(this, name); };
-      gl.texStorage2D = function (...values) { window.widths.push(values[3]); texStorage2D.apply(this, values); };"""
-    with opened(chromium, folder / "tour.html", script=script) as page:
-        widths = page.run("widths")
-        assert 3 * 682 in widths and max(widths) <= 2048, "geometry has three texels a Gaussian"
-        assert np.array_equal(page.draw(), home.draw())
+COUNT_TEXTURES = """
+    const gl = WebGL2RenderingContext.prototype, { texStorage2D } = gl;
+    window.textures = [];
+    gl.texStorage2D = function (...values) {
+        window.textures.push(values.slice(2));
+        texStorage2D.apply(this, values);
+    };
+"""
+
+
+def test_a_gaussian_takes_28_bytes_of_textures_that_every_device_has(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "tour.html", script=COUNT_TEXTURES) as page:
+        formats = ("RGBA32UI", "R32UI", "RGBA8", "R32UI")
+        codes = [page.run(f"WebGL2RenderingContext.{name}") for name in formats]
+        rows = math.ceil(page.run("HEADER.count") / 2048)
+        assert page.run("textures.slice(0, 4)") == [[code, 2048, rows] for code in codes]
+        assert rows * 2048 * (16 + 4 + 4 + 4) == 2048 * 2 * 28
+        # A pixel takes 20: colours of the layer and of the sum, and two numbers.
+        targets = [page.run(f"WebGL2RenderingContext.{name}") for name in ("RGBA16F", "RGBA16F", "RG16F")]
+        assert [code for code, *_ in page.run("textures.slice(4, 7)")] == targets
+
+
+HOLD = """
+    held = [], isHolding = () => false;
+    window.Worker = class extends Worker {
+        postMessage(message) {
+            if (isHolding(message)) held.push(message);
+            else super.postMessage(message);
+            window.worker = this;
+        }
+    };
+    release = () => { isHolding = () => false; held.splice(0).forEach((message) => worker.postMessage(message)); };
+"""
+IN_PARTS = "let parts = 0; isHolding = ({ text, end }) => (text && ++parts > 1) || end;"
+
+
+@pytest.mark.parametrize("name", ["tour.html", "split.html"])
+def test_the_page_works_when_the_first_view_has_arrived(chromium: Any, folder: Path, name: str) -> None:
+    record = """
+        window.atob = window.DecompressionStream = class { constructor() { throw new Error("on the main thread"); } };
+    """
+    with opened(chromium, folder / name, script=HOLD + IN_PARTS + record) as page:
+        page.run("drawn = new Set(); draw = Renderer.prototype.drawLayer; 0")
+        page.run(
+            "Renderer.prototype.drawLayer = function (...range) { drawn.add(range[0]); draw.call(this, ...range); }; 0"
+        )
+        page.run("dispatchEvent(new Event('resize'))")
+        page.wait("drawn.size")
+        assert page.run("[...drawn]") == page.run("[HEADER.views[HEADER.loading[0]].start]") == [0]
+        start = page.camera["position"]
+        page.page.keyboard.down("KeyW")
+        page.wait(f"Math.hypot(...pansplat.camera.position.map((x, i) => x - {start}[i])) > 0.02")
+        page.page.keyboard.up("KeyW")
+        assert page.run("document.getElementById('view').ariaBusy") == "true"
+        page.run("release()")
+        page.wait("drawn.size === 3 && document.getElementById('view').ariaBusy === 'false'")
+        assert page.run("document.body.textContent.length < 200000 && !document.querySelector('[type=\"text/plain\"]')")
+        assert page.messages == []
 
 
 def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) -> None:
@@ -357,6 +409,17 @@ def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) ->
     page.goto((tmp_path / "split.html").as_uri())
     page.wait_for_selector("#cover.failed")
     assert "Copy the whole folder" in page.inner_text("#message")
+    context.close()
+
+
+def test_data_that_cannot_be_read_is_reported(chromium: Any, folder: Path, tmp_path: Path) -> None:
+    text = (folder / "tour.html").read_text()
+    (tmp_path / "bad.html").write_text(text.replace(">H4s", ">AAA", 1))
+    context = chromium.new_context()
+    page = context.new_page()
+    page.goto((tmp_path / "bad.html").as_uri())
+    page.wait_for_selector("#cover.failed")
+    assert "cannot be read" in page.inner_text("#message")
     context.close()
 
 
@@ -530,6 +593,340 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         page.page.click("#home")
         assert page.camera == start
         assert page.messages == []
+
+
+@pytest.mark.slow
+def test_the_image_of_another_room_stays_until_the_start_is_sorted(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "house.html", script=HOLD) as page:
+        page.run("HEADER.speed = 0.3; pansplat.goTo(3, { jump: true })")
+        hidden = "document.getElementById('still').hidden"
+        page.wait(f"pansplat.camera.position.every((x, i) => x === HEADER.spots[2].position[i]) && {hidden}")
+        seen = page.draw()
+        page.run("isHolding = ({ position }) => position; 0")
+        page.page.keyboard.press("KeyR")
+        page.wait("held.length")
+        page.run("new Promise((resolve) => setTimeout(resolve, 1500))")
+        assert page.run("document.getElementById('still').style.opacity") == "1" and not page.run(hidden)
+        assert psnr(decode(page.run("document.getElementById('still').toDataURL()")), seen) > 30
+        page.run("release()")
+        page.wait(hidden)
+        page.page.keyboard.press("KeyR")
+        assert page.run(hidden), "at the start there is nothing to hide"
+
+
+# ---- as people use pages ----
+
+
+def test_the_keys_that_open_a_dialog_close_it(home: OpenPage) -> None:
+    for key, dialog in (("h", "#keys"), ("l", "#list")):
+        for shown in (True, False, True):
+            home.page.keyboard.press(key)
+            assert home.page.is_visible(dialog) == shown
+        home.page.keyboard.press("Escape")
+        assert not home.page.is_visible(dialog)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(195, 422), (420, 240), (300, 270)])
+def test_the_poster_is_in_place_of_the_picture(
+    chromium: Any, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
+) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (486, 576))
+    write_page(scene, tmp_path / "page.html")
+    with opened(chromium, tmp_path / "page.html", size=size) as page:
+        page.page.add_style_tag(content="#buttons, #message, #bar, #spots, #status { display: none !important }")
+        page.wait("document.getElementById('cover').hidden")
+        picture = decode(page.run("([width, height]) => pansplat.render(width, height)", list(size)))
+        page.run("cover = document.getElementById('cover'); cover.style.transition = 'none'; cover.className = ''")
+        page.run("cover.hidden = false")
+        with io.BytesIO(page.page.screenshot()) as file:
+            poster = np.asarray(Image.open(file).convert("RGB"), np.float64) / 255
+        assert poster.shape == picture.shape
+        quality = psnr(poster, picture)
+        assert quality > 27 and all(psnr(np.roll(poster, 3, axis), picture) < quality - 3 for axis in (0, 1))
+
+
+HOST = """<!doctype html><style>
+body {{ height: 4000px; margin: 100px 50px }}
+iframe {{ border: 0; width: 320px; height: 240px }}
+</style>
+<iframe src="{page}"></iframe>
+<script>
+told = [];
+addEventListener("message", ({{ data }}) => told.push(data));
+call = (pansplat, ...values) => new Promise((resolve) => {{
+    const id = Math.random();
+    const onAnswer = ({{ data }}) => {{
+        if (data.id !== id) return;
+        removeEventListener("message", onAnswer);
+        resolve(data.error ? "error: " + data.error : data.value);
+    }};
+    addEventListener("message", onAnswer);
+    document.querySelector("iframe").contentWindow.postMessage({{ pansplat, values, id }}, "*");
+}});
+</script>"""
+
+
+@contextmanager
+def in_a_host(chromium: Any, path: Path, folder: Path, **options: Any) -> Iterator[tuple[OpenPage, Any]]:
+    """A page with another one in an <iframe>, and the frame."""
+    (folder / "host.html").write_text(HOST.format(page=path.as_uri()))
+    context = chromium.new_context(viewport={"width": 500, "height": 400}, **options)
+    host = OpenPage(context.new_page())
+    host.page.goto((folder / "host.html").as_uri())
+    host.wait("told.some(({ pansplat }) => pansplat === 'ready')")
+    yield host, host.page.frames[1]
+    context.close()
+
+
+@pytest.mark.slow
+def test_the_wheel_is_the_host_pages_until_a_click(chromium: Any, folder: Path, tmp_path: Path) -> None:
+    with in_a_host(chromium, folder / "tour.html", tmp_path) as (host, frame):
+        mouse, fov = host.page.mouse, frame.evaluate("pansplat.camera.fov")
+        place = (150, 180)
+
+        def scrolls(pixels: int) -> bool:
+            """Whether the wheel scrolls the host, and not the field of view."""
+            before = host.run("scrollY"), frame.evaluate("pansplat.camera.fov")
+            mouse.wheel(0, pixels)
+            host.page.wait_for_timeout(300)
+            moved = host.run("scrollY") != before[0], frame.evaluate("pansplat.camera.fov") != before[1]
+            assert sum(moved) == 1
+            return moved[0]
+
+        mouse.move(*place)
+        assert scrolls(30) and scrolls(-30)
+        assert frame.evaluate("pansplat.camera.fov") == fov and "Click" in frame.inner_text("#status")
+        touch_action = "document.getElementById('view').style.touchAction"
+        assert frame.evaluate(touch_action) == "pan-y", "a finger scrolls the host"
+        mouse.click(*place)
+        assert not scrolls(30) and frame.evaluate(touch_action) == "none"
+        host.page.keyboard.press("Escape")
+        assert scrolls(30) and scrolls(-30)
+        mouse.click(*place)
+        assert not scrolls(30)
+        mouse.move(20, 20)
+        mouse.move(*place)
+        assert scrolls(30)
+
+
+@pytest.mark.slow
+def test_a_host_page_moves_the_camera_and_hears_of_arrivals(chromium: Any, folder: Path, tmp_path: Path) -> None:
+    with in_a_host(chromium, folder / "house.html", tmp_path) as (host, frame):
+        assert host.run("told[0]") == {"pansplat": "ready", "panoramas": ["room 0", "room 1", "room 2"]}
+        frame.evaluate("HEADER.speed *= 100")
+        assert host.run("call('goTo', 'room 2')") is True
+        position = frame.evaluate("HEADER.spots[2].position")
+        assert host.run("call('getPose')")["position"] == position
+        assert host.run("told.filter(({ pansplat }) => pansplat === 'arrive').at(-1)") == {
+            "pansplat": "arrive",
+            "panorama": 3,
+            "name": "room 2",
+        }
+        assert host.run("Promise.all([call('goTo', 1), call('goTo', 2, { jump: true })])") == [False, True]
+        pose = {"position": [0.1, 0.2, 0.3], "yaw": 30, "pitch": -10, "fov": 60}
+        host.run("(pose) => call('setPose', pose)", pose)
+        got = host.run("call('getPose')")
+        assert got.pop("position") == pytest.approx(pose.pop("position")) and got == pytest.approx(pose)
+        host.run("call('setPose', { pitch: 500, position: [1e6, 0, 0] })")
+        got = host.run("call('getPose')")
+        assert got["pitch"] == pytest.approx(89.9) and abs(got["position"][0]) < 20, "within the limits"
+        assert "panorama 9" in host.run("call('goTo', 9)") and "finite" in host.run("call('setPose', { yaw: 'x' })")
+        assert decode(host.run("call('render', 64, 48)")).shape == (48, 64, 3)
+        # Only the host is answered.
+        told = host.run("told.length")
+        frame.evaluate("postMessage({ pansplat: 'getPose', id: 1 }, '*')")
+        host.run("call('getPose')")
+        assert host.run("told.length") == told + 1
+        hear = "pansplat.addEventListener('arrive', ({ detail }) => { heard = detail; })"
+        assert frame.evaluate(f"{hear}; pansplat.goTo(1)") is True
+        assert frame.evaluate("heard") == {"panorama": 1, "name": "room 0"}
+
+
+def test_a_link_opens_its_pose(chromium: Any, folder: Path) -> None:
+    script = "Object.defineProperty(navigator, 'clipboard', {value: {writeText: async (text) => { copied = text; }}});"
+    pose = {"position": [0.25, -0.1, 0.4], "yaw": -123.4, "pitch": 12.5, "fov": 60}
+    with opened(chromium, folder / "tour.html", script=script) as page:
+        start = page.camera
+        page.run("(pose) => pansplat.setPose(pose)", pose)
+        page.page.click("#more")
+        page.page.click("#link")
+        assert "copied" in page.page.inner_text("#status")
+        link = page.run("copied")
+        page.run("navigator.clipboard.writeText = () => Promise.reject(new Error('denied')); 0")
+        page.page.click("#more")
+        page.page.click("#link")
+        page.page.wait_for_selector("#notice[open]")
+        assert page.page.inner_text("#notice-text") == link, "where the clipboard is not allowed"
+    address, fragment = link.split("#")
+    assert address == (folder / "tour.html").as_uri()
+    with opened(chromium, folder / "tour.html", fragment="#" + fragment) as page:
+        got = page.run("pansplat.getPose()")
+        assert got.pop("position") == pytest.approx(pose.pop("position"), abs=1e-3) and got == pytest.approx(pose)
+        for wrong in ("#at=1,2,3", "#at=1,2,3,4,5,e", "#other", "#at=,,,,,"):
+            page.run("(hash) => { location.hash = hash; }", wrong)
+        page.run("new Promise((resolve) => setTimeout(resolve, 50))")
+        assert page.run("pansplat.getPose().yaw") == pytest.approx(-123.4)
+        page.run("location.hash = '#at=0,0,0,10,0,400'")
+        page.wait("Math.abs(pansplat.camera.yaw - 10 * Math.PI / 180) < 1e-9")
+        assert page.camera["fov"] == 110 and page.messages == []
+        assert page.run("HEADER.start.fov") == start["fov"]
+
+
+def test_a_picture_is_saved(home: OpenPage) -> None:
+    for click in (
+        lambda: home.page.keyboard.press("p"),
+        lambda: (home.page.click("#more"), home.page.click("#picture")),
+    ):
+        with home.page.expect_download() as download:
+            click()
+        assert download.value.suggested_filename == "Three rooms.png"
+        image = np.asarray(Image.open(download.value.path()).convert("RGB"), np.float64) / 255
+        assert psnr(image, home.draw()) > 60
+    assert home.page.is_hidden("#menu")
+
+
+def test_rings_on_a_touch_screen_have_names_and_room_for_a_finger(chromium: Any, folder: Path) -> None:
+    options = {"has_touch": True, "is_mobile": True}
+    with opened(chromium, folder / "tour.html", size=(390, 844), **options) as page:
+        page.run("pansplat.setPose({ yaw: 45, pitch: -40 })")
+        page.wait("document.querySelectorAll('#spots button:not([hidden])').length")
+        found = page.run("""Array.from(document.querySelectorAll("#spots button:not([hidden])"), (button) => {
+            const { left, top, width, height } = button.getBoundingClientRect(), label = button.querySelector("span");
+            const [x, y] = [left + width / 2, top + height / 2], { visibility } = getComputedStyle(label);
+            const places = [[20, 0], [-20, 0], [0, 20], [0, -20]];
+            const hit = places.map(([dx, dy]) => document.elementFromPoint(x + dx, y + dy) === button);
+            return { name: visibility === "visible" && label.innerText, size: Math.min(width, height), hit };
+        })""")
+        assert all(ring["name"] in ("room 1", "room 2") for ring in found)
+        assert min(ring["size"] for ring in found) < 40 and any(all(ring["hit"]) for ring in found)
+        right = page.run(
+            "Array.from(document.querySelectorAll('#buttons > :not([hidden])'), (e) => e.getBoundingClientRect().left)"
+        )
+        assert min(right) >= 0
+
+
+@pytest.mark.slow
+def test_distances_are_those_of_the_rasterisers_depth(home: OpenPage, scene: Scene) -> None:
+    places, camera = [(70, 60), (230, 170)], {**home.camera, "pitch": -0.1}
+    home.run("pansplat.camera.pitch = -0.1")
+    home.draw()
+    level, origin = path_poses(scene.cam2world)[0, :3, :3].numpy(), scene.cam2world[:, :3, 3].mean(0).numpy()
+    cy, sy, cp, sp = (f(camera[angle]) for angle in ("yaw", "pitch") for f in (math.cos, math.sin))
+    pose = np.eye(4)
+    pose[:3, :3] = (
+        level @ np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
+    )
+    pose[:3, 3] = camera["position"] + origin
+    options = {"size": SIZE[::-1], "layout": "pinhole", "vertical_fov_degrees": camera["fov"]}
+    depth = pipeline.render(scene, pose, **options).depth.squeeze().numpy()
+    points = []
+    for x, y in places:
+        step = 2 * math.tan(math.radians(camera["fov"] / 2)) / SIZE[1]
+        ray = np.array(((x - SIZE[0] / 2) * step, (y - SIZE[1] / 2) * step, 1))
+        points.append(ray / np.linalg.norm(ray) * depth[y - 1 : y + 1, x - 1 : x + 1].mean())
+    home.page.click("#more")
+    home.page.click("#measure")
+
+    def read(place: tuple[int, int]) -> float:
+        home.page.mouse.click(*place)
+        return float(home.page.inner_text("#status").split(" m ")[0])
+
+    assert read(places[0]) == pytest.approx(np.linalg.norm(points[0]), rel=0.02)
+    between = np.linalg.norm(points[1] - points[0])
+    assert read(places[1]) == pytest.approx(between, rel=0.02)
+    home.wait("document.querySelectorAll('#marks circle').length === 2")
+    shown = home.run(
+        "Array.from(document.querySelectorAll('#marks circle'), (e) => [e.cx, e.cy].map((v) => v.baseVal.value))"
+    )
+    assert np.array(shown) == pytest.approx(np.array(places), abs=0.5)
+    assert float(home.page.text_content("#marks text").split()[0]) == pytest.approx(between, rel=0.02)
+    # A drag measures nothing, and the line stays in the scene.
+    home.page.mouse.move(100, 100)
+    home.page.mouse.down()
+    home.page.mouse.move(140, 100)
+    home.page.mouse.up()
+    home.wait(f"document.querySelector('#marks circle').cx.baseVal.value > {places[0][0] + 20}")
+    home.page.keyboard.press("Escape")
+    assert home.run("document.getElementById('marks').childElementCount") == 0
+    home.page.mouse.click(100, 100)
+    assert home.run("document.getElementById('marks').childElementCount") == 0
+
+
+@pytest.mark.slow
+def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "flat.html", size=(640, 480)) as page:
+        page.page.keyboard.press("m")
+        page.wait("document.querySelectorAll('#plan button').length === 4")
+        boxes = [each.bounding_box() for each in page.page.query_selector_all("#plan button")]
+        centers = np.array([(box["x"] + 12, box["y"] + 12) for box in boxes])
+        level = np.array(page.run("HEADER.level"))
+        places = np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level
+        across, up = (centers[:, 0] - centers[0, 0]), (centers[0, 1] - centers[:, 1])
+        scale = across[3] / (places[3, 0] - places[0, 0])
+        assert scale > 0 and across == pytest.approx(scale * (places[:, 0] - places[0, 0]), abs=0.6)
+        assert up == pytest.approx(scale * (places[:, 2] - places[0, 2]), abs=0.6)
+        assert page.page.locator("#plan .single").count() == 2 and page.page.locator("#plan .link").count() == 2
+        assert page.run("document.querySelector('#plan [aria-current]').ariaLabel") == "Go to room 0"
+        turned = "document.querySelector('#plan path').getAttribute('transform')"
+        page.run("pansplat.setPose({ yaw: 90 })")
+        page.wait(f"{turned}.endsWith('rotate(90)')")
+        box = page.page.query_selector("#plan").bounding_box()
+        x, y = (float(value) for value in page.run(turned)[10:].split(")")[0].split())
+        assert (box["x"] + x, box["y"] + y) == pytest.approx(centers[0], abs=0.6)
+        page.run("HEADER.speed *= 100")
+        page.page.click("#plan button[title='Go to attic']")
+        page.wait("document.querySelector('#plan [aria-current]').ariaLabel === 'Go to attic'")
+        page.page.keyboard.press("m")
+        assert page.page.is_hidden("#plan") and page.messages == []
+
+
+@pytest.mark.slow
+def test_with_reduced_motion_the_camera_jumps(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "house.html", script=FRAMES, reduced_motion="reduce") as page:
+        spots = page.run("HEADER.spots.map((spot) => spot.position)")
+        page.run("passed = []; record()")
+        page.page.keyboard.press("3")
+        page.wait(f"pansplat.camera.position.every((x, i) => x === {spots[2]}[i])")
+        page.wait("passed.length > 30 && document.getElementById('still').hidden")
+        page.page.keyboard.press("Space")
+        for node in (0, 1):
+            page.wait(f"pansplat.camera.position.every((x, i) => x === {spots[node]}[i])")
+        page.page.keyboard.press("Space")
+        frames = page.run("passed")
+        places = {tuple(np.round(frame["position"], 4)) for frame in frames}
+        assert places <= {tuple(np.round(place, 4)) for place in [*spots, page.run("HEADER.start.position")]}
+        assert any(0.2 < frame["left"] < 0.8 for frame in frames), "the image fades"
+
+
+@pytest.mark.slow
+def test_every_control_has_a_name_and_takes_the_focus(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "house.html", size=(640, 480)) as page:
+        page.page.keyboard.press("m")
+        page.page.click("#more")
+        nameless = "#view, dialog, nav, button, progress, [role]"
+        elements = page.run(f"""Array.from(document.querySelectorAll("{nameless}"), (element) => [
+            element.id, element.ariaLabel || element.innerText || element.textContent || element.role])""")
+        assert len(elements) > 20 and all(name and name.strip() for _, name in elements)
+        visible = page.run("""Array.from(document.querySelectorAll("button"), (button) => button.checkVisibility()
+            && (button.id || button.ariaLabel)).filter(Boolean)""")
+        assert {"place", "play", "home", "map", "full", "help", "more", "measure", "picture", "link"} < set(visible)
+        reached = {}
+        page.run("document.getElementById('view').focus()")
+        for _ in range(len(visible) + 2):
+            page.page.keyboard.press("Tab")
+            name, outline = page.run("""(() => {
+                const { activeElement: found } = document, { outlineStyle, outlineWidth } = getComputedStyle(found);
+                return [found.id || found.ariaLabel, outlineStyle !== "none" && parseFloat(outlineWidth) > 0];
+            })()""")
+            reached[name] = outline
+        assert set(visible) <= set(reached)
+        assert all(reached[name] for name in visible if name in ("home", "more", "link"))
+        page.page.focus("#map")
+        page.page.keyboard.press("Enter")
+        assert page.page.is_hidden("#plan") and page.page.get_attribute("#map", "aria-pressed") == "false"
+        page.page.keyboard.press("Escape")
+        assert page.page.is_hidden("#menu") and page.page.get_attribute("#more", "aria-expanded") == "false"
 
 
 # An emulated headset: images of 200x200 pixels with a focal length of 100 pixels, off the optical axis. A frame takes

@@ -27,7 +27,7 @@ from pansplat.web import write_page
 
 @pytest.fixture(autouse=True)
 def small_poster(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -297,7 +297,7 @@ def test_pages_that_cannot_be_drawn_or_written_are_refused(
     with pytest.raises(InputError, match="tour_files: needed a folder"):
         write_page(scene, tmp_path / "tour.html", split=True)
     monkeypatch.undo()
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
     with pytest.raises(InputError, match="existing folder"):
         write_page(scene, tmp_path / "missing" / "tour.html")
     assert [file.name for file in tmp_path.iterdir()] == ["tour_files"]

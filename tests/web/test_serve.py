@@ -25,7 +25,7 @@ from pansplat.web.serve import PageServer, make_certificate
 @pytest.fixture
 def server(plain_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PageServer]:
     """A page in two files beside another file."""
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
     (tmp_path / "secret.html").write_text("not for others")
     with PageServer(write_page(plain_scene, tmp_path / "our home.html", split=True)) as server:
         threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()

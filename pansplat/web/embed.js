@@ -1,0 +1,65 @@
+"use strict";
+// The page in other pages and for scripts (docs/web.md, Embedding): messages, arrivals, and whose the wheel is.
+
+const CALLS = ["goTo", "getPose", "setPose", "render"];  // of window.pansplat, by messages
+
+class Embed {
+  constructor() {
+    this.isFramed = window.parent !== window;
+    this.isEngaged = !this.isFramed;  // whether the wheel and vertical strokes of a finger are the page's
+    this.waiting = null;              // for the end of a goTo
+    this.at = null;
+  }
+
+  // `canvas` takes the wheel after a click; `api` answers messages.
+  listen(canvas, api) {
+    this.api = api;
+    if (!this.isFramed) return;
+    const engage = (value) => {
+      this.isEngaged = value;
+      canvas.style.touchAction = value ? "none" : "pan-y";
+    };
+    engage(false);
+    addEventListener("click", () => engage(true));
+    addEventListener("keydown", (event) => { if (event.code === "Escape") engage(false); });
+    addEventListener("blur", () => engage(false));
+    document.documentElement.addEventListener("pointerleave", ({ pointerType }) => { if (pointerType === "mouse") engage(false); });
+    this.tell("ready", { panoramas: api.panoramas });
+  }
+
+  // Messages to the host. They hold nothing that it could not see itself.
+  tell(name, detail) {
+    if (this.isFramed) window.parent.postMessage({ pansplat: name, ...detail }, "*");
+  }
+
+  async answer({ source, data }) {
+    if (!this.isFramed || source !== window.parent || !data || !CALLS.includes(data.pansplat)) return;
+    const { pansplat: call, id, values = [] } = data;
+    try {
+      await window.pansplat.ready;
+      this.tell("answer", { id, value: await window.pansplat[call](...values) });
+    } catch (error) {
+      this.tell("answer", { id, error: error.message || String(error) });
+    }
+  }
+
+  // A promise of whether the camera arrives at the panorama; `go` starts the way to it.
+  await(node, go) {
+    if (this.waiting) this.waiting.resolve(false);
+    go();
+    return new Promise((resolve) => { this.waiting = { node, resolve }; });
+  }
+
+  // In every frame: the panorama at a camera that has arrived, or null.
+  follow(node, isMoving) {
+    if (node !== null && node !== this.at) {
+      const detail = { panorama: node + 1, name: HEADER.spots[node].name };
+      this.tell("arrive", detail);
+      this.api.dispatchEvent(new CustomEvent("arrive", { detail }));
+    }
+    this.at = node;
+    if (!this.waiting || isMoving) return;
+    this.waiting.resolve(node === this.waiting.node);
+    this.waiting = null;
+  }
+}
