@@ -137,7 +137,7 @@ def serve_page(page: PageFiles) -> None:
     """Print a page's address with a QR code, and serve the page until Ctrl+C or SIGTERM."""
     import segno
 
-    with PageServer(page) as server:
+    with PageServer(page) as server, suppress(KeyboardInterrupt):
         if can_print("█▀▄"):
             segno.make(server.url, micro=False).terminal(sys.stdout, border=2, compact=True)
         print(
@@ -145,6 +145,5 @@ def serve_page(page: PageFiles) -> None:
             "certificate is self-made: choose to go on",
             flush=True,
         )
-        with suppress(KeyboardInterrupt):
-            server.serve_forever()
+        server.serve_forever()
     print("stopped")
