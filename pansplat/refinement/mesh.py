@@ -93,7 +93,7 @@ def _join_at_pole(places: Float[Tensor, "row column 3"], row: int) -> Float[Tens
     return torch.stack((torch.zeros_like(height), height, torch.zeros_like(height)))
 
 
-def _find_points(corners: Int[np.ndarray, "triangle 3"], rows: int) -> Int[np.ndarray, "triangle 3"]:
+def _find_points(corners: Int[np.ndarray, "*shape"], rows: int) -> Int[np.ndarray, "*shape"]:
     """Numbers of the places of vertices. Those on the seam, and at the poles, are several vertices at one place.
 
     The vertices are rows of 2 rows + 1, then 2 rows vertices of the upper pole, and as many of the lower one.
