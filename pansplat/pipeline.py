@@ -547,7 +547,7 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
     report: Progress = progress or (lambda what, fraction: None)
     fused: list[Gaussians] = []
     gains = [(1.0, 1.0, 1.0)] * len(tour)
-    parts = [tuple(np.flatnonzero(np.array(tour.parts) == part).tolist()) for part in range(max(tour.parts) + 1)]
+    parts = tour.list_parts()
     for number, nodes in enumerate(parts):
         part = select_views(scene, nodes)
         if len(nodes) > 1:

@@ -78,7 +78,6 @@ class Export:
         """Write the file and print its size."""
         from pansplat.gaussians.formats import save_scene
         from pansplat.gaussians.ply import save_points
-        from pansplat.gaussians.scene import prune
         from pansplat.tours import write_floor_plan
 
         is_dataset = not self.out.suffix
@@ -107,11 +106,7 @@ class Export:
         if is_mesh:
             self._write_mesh()
             return 0
-        scene = self._open(not is_scene)
-        if self.up is not None:
-            scene = scene.rotated(_rotation_from(self.up))
-        gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
-        scene = dataclasses.replace(scene, gaussians=gaussians)
+        scene = self._edit(self._open(not is_scene))
         if is_page:
             page = self._write_page(scene)
             if self.serve:
@@ -128,12 +123,12 @@ class Export:
             print(f"{self.out}: the floors of {len(scene.cam2world)} panoramas")
         else:
             if self.points:
-                save_points(gaussians, self.out)
+                save_points(scene.gaussians, self.out)
             else:
                 save_scene(scene, self.out)
-            size = self.out.stat().st_size
+            size, count = self.out.stat().st_size, len(scene.gaussians)
             kind = "points" if self.points else "Gaussians"
-            print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
+            print(f"{self.out}: {count:,} {kind}, {size:,} bytes ({size / max(count, 1):.1f} each)")
         return 0
 
     def _open(self, in_layers: bool) -> Scene:
@@ -152,11 +147,19 @@ class Export:
         )
         return fuse_views(scene)
 
+    def _edit(self, scene: Scene) -> Scene:
+        """The scene with its axis up, and the Gaussians and harmonics that are wanted."""
+        from pansplat.gaussians.scene import prune
+
+        if self.up is not None:
+            scene = scene.rotated(_rotation_from(self.up))
+        gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
+        return dataclasses.replace(scene, gaussians=gaussians)
+
     def _write_mesh(self) -> None:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.data.pairs import Pair
         from pansplat.gaussians.mesh_files import save_mesh
-        from pansplat.gaussians.scene import prune
         from pansplat.refinement.mesh import DEFAULT_TRIANGLES, make_mesh
 
         load: Callable[[int], Tensor] | None = None
@@ -172,11 +175,7 @@ class Export:
                     pair = source.make_pair([view])
                 return pair.load_context(min(pair.image_height, _TEXTURE_HEIGHT)).images[0]
 
-        if self.up is not None:
-            scene = scene.rotated(_rotation_from(self.up))
-        gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
-        scene = dataclasses.replace(scene, gaussians=gaussians)
-        mesh = make_mesh(scene, triangles=self.triangles or DEFAULT_TRIANGLES, textures=load)
+        mesh = make_mesh(self._edit(scene), triangles=self.triangles or DEFAULT_TRIANGLES, textures=load)
         files = save_mesh(mesh, self.out)
         size = sum(file.stat().st_size for file in files)
         beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""

@@ -1,7 +1,7 @@
 """Textured triangles, and their files: Wavefront .obj with .mtl and .jpg beside it, and binary glTF (.glb).
 
 Both have y up, as programs expect. Triangles are seen from the side of the camera that showed them: a program that
-culls back faces, as glTF asks for, shows rooms from outside without the ceiling or wall in front: a doll's house.
+culls back faces, as glTF specifies for these materials, shows rooms from outside without the ceiling or wall in front.
 
 Source: the glTF 2.0 specification, sections 3.7 (geometry), 3.8 (textures), 3.9 (materials), and its extension
 KHR_materials_unlit, because the light is in the photographs; Wavefront Technologies, Object Files (.obj).

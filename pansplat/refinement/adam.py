@@ -68,14 +68,15 @@ class ParameterGroup:
             if parameter not in self._states:
                 count = torch.zeros((), dtype=torch.float32, device=parameter.device)
                 self._states[parameter] = torch.zeros_like(parameter), torch.zeros_like(parameter), count
-        tensors = [(parameter.detach(), parameter.grad, *self._states[parameter][:2]) for parameter in moved]
+        gradients = [parameter.grad for parameter in moved if parameter.grad is not None]
+        whole = [[parameter.detach(), *self._states[parameter][:2]] for parameter in moved]
+        parts, indices = whole, []
         if rows:
-            indices = {parameter: mask.nonzero()[:, 0] for parameter, mask in zip(self.parameters, rows, strict=True)}
-            tensors = [
-                [tensor[indices[parameter]] for tensor in values if tensor is not None]
-                for parameter, values in zip(moved, tensors, strict=True)
-            ]
-        values, gradients, means, squares = ([row[k] for row in tensors] for k in range(4))
+            masks = dict(zip(self.parameters, rows, strict=True))
+            indices = [masks[parameter].nonzero()[:, 0] for parameter in moved]
+            gradients = [gradient[index] for gradient, index in zip(gradients, indices, strict=True)]
+            parts = [[tensor[index] for tensor in each] for each, index in zip(whole, indices, strict=True)]
+        values, means, squares = ([each[k] for each in parts] for k in range(3))
         adam(
             values,
             gradients,
@@ -92,8 +93,6 @@ class ParameterGroup:
             eps=self.epsilon,
             maximize=False,
         )
-        for parameter, value, mean, square in zip(moved, values, means, squares, strict=True) if rows else ():
-            for whole, part in zip(
-                (parameter.detach(), *self._states[parameter][:2]), (value, mean, square), strict=True
-            ):
-                whole[indices[parameter]] = part
+        for index, tensors, moved_rows in zip(indices, whole, parts, strict=False):  # without rows there are no indices
+            for tensor, part in zip(tensors, moved_rows, strict=True):
+                tensor[index] = part

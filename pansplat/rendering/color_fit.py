@@ -85,19 +85,22 @@ def _fit(gaussians: Gaussians, photographs: Sequence[tuple[Tensor, Tensor, Tenso
     change = torch.zeros_like(gaussians.harmonics[:, 0])
 
     @functools.lru_cache(_STORED)
-    def compute_weights(number: int) -> BlendingWeights:
+    def look(number: int) -> tuple[BlendingWeights, Tensor]:
+        """The weights in a photograph, and the given colours seen from there."""
         image, pose, _ = photographs[number]
-        return compute_blending_weights(gaussians, pose, (image.shape[-2], image.shape[-1]))
+        weights = compute_blending_weights(gaussians, pose, (image.shape[-2], image.shape[-1]))
+        return weights, _evaluate_colors(gaussians, pose)
 
     coverage = torch.zeros_like(change[:, :1])
     for number, (*_, mask) in enumerate(photographs):
-        coverage += compute_weights(number).accumulate(mask[None].to(change))
+        coverage += look(number)[0].accumulate(mask[None].to(change))
     coverage.clamp_min_(_MIN_COVERAGE)
     for _ in range(config.steps_at(photographs[0][0].shape[-2])):
         total = torch.zeros_like(change)
-        for number, (image, pose, mask) in enumerate(photographs):
-            weights, colors = compute_weights(number), _evaluate_colors(gaussians, pose) + change
-            total += weights.accumulate((image.to(change) - weights.blend(colors.clamp_min(0))) * mask.to(change))
+        for number, (image, _, mask) in enumerate(photographs):
+            weights, colors = look(number)
+            drawn = weights.blend((colors + change).clamp_min(0))
+            total += weights.accumulate((image.to(change) - drawn) * mask.to(change))
         change += config.relaxation * total / coverage
     return gaussians.harmonics[:, 0] + change / SH_0
 

@@ -106,6 +106,11 @@ class TourGraph:
         numbers = {label: number for number, label in enumerate(dict.fromkeys(labels))}
         return tuple(numbers[label] for label in labels)
 
+    def list_parts(self) -> list[Views]:
+        """The nodes of each part."""
+        numbers = np.array(self.parts)
+        return [tuple(np.flatnonzero(numbers == part).tolist()) for part in range(max(self.parts) + 1)]
+
     @cached_property
     def links(self) -> dict[tuple[int, int], Link]:
         """The links by the nodes at which they start and end; of several ones between two nodes, the first."""
@@ -167,8 +172,7 @@ class TourGraph:
         Args:
             max_views: of the predictor.
         """
-        numbers = np.array(self.parts)
-        parts = [tuple(np.flatnonzero(numbers == part).tolist()) for part in range(max(self.parts) + 1)]
+        parts = self.list_parts()
         if max_views > MAX_SCENE_VIEWS and max(map(len, parts)) <= max_views:
             return {part: part for part in parts}
         scenes = sorted(
