@@ -1,4 +1,4 @@
-"""Run-time checks of annotated shapes and types, enabled in tests/conftest.py with -m exhaustive."""
+"""Run-time checks of annotated shapes and types, enabled in tests/conftest.py."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from beartype import BeartypeConf, beartype
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-_CHECKED_CALLS = 100  # of each function in each test; checks of thousands of small tiles take longer than the tests
+_CHECKED_CALLS = 10  # of each function in each test; checks of thousands of small tiles take longer than the tests
 
 _calls: Counter[Callable[..., Any]] = Counter()
 

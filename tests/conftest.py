@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -45,8 +44,9 @@ settings.load_profile("untimed")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 
-# The exhaustive run checks annotated shapes and types in these packages, in all of their tests.
+# All tests check the annotated shapes and types of these packages, which nothing has imported yet.
 _CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predictor", "evaluation", "pipeline")
+install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
 
 
 def _selects(config: pytest.Config, marker: str) -> bool:
@@ -54,23 +54,9 @@ def _selects(config: pytest.Config, marker: str) -> bool:
     return re.search(rf"(?<!not )\b{marker}\b", config.option.markexpr) is not None
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Install the checks of annotations before the packages are imported."""
-    if _selects(config, "exhaustive"):
-        if early := [name for name in _CHECKED if f"pansplat.{name}" in sys.modules]:
-            raise pytest.UsageError(f"run -m exhaustive without a folder: it imports {', '.join(early)} too early")
-        install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the tests of the markers `exhaustive` and `lint` unless -m names the marker."""
-    if _selects(config, "exhaustive"):
-        tests = Path(__file__).parent
-        checked = {name for package in _CHECKED for name in (package, f"test_{package}.py")}
-        for item in items:
-            if item.path.relative_to(tests).parts[0] in checked:
-                item.add_marker("exhaustive")
     hidden = [marker for marker in ("exhaustive", "lint") if not _selects(config, marker)]
     left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in hidden)]
     if left_out:

@@ -329,6 +329,7 @@ def is_alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_and_a_run_is_stopped(
     rooms: Path, tmp_path: Path, small_config: Any, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

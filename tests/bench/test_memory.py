@@ -131,6 +131,7 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_a_child_measures_gradients_and_memory(weights):
     """The tiled case runs in a child process; the plain one in this process, which gives the expected gradients."""

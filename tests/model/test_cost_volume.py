@@ -48,6 +48,7 @@ def small(randomize):
     return randomize(SphericalCostVolume(_SMALL, "fixed"))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 @pytest.mark.shared
 def test_depths_match_the_official_code(run_official, golden, error):

@@ -58,6 +58,7 @@ def test_the_reason_names_the_picture(estimate: PoseEstimate) -> None:
     assert "too little in common" in reasons["other_room"] and ".png" in reasons["other_room"]
 
 
+@pytest.mark.exhaustive
 def test_key_frames_of_a_video_have_poses(tmp_path: Path, render_room) -> None:
     centres = [np.array((0.2 * n - 0.6, 0, 0.08 * n)) for n in range(7)]
     frames = (render_room(2, rotation_exp(np.array((0, 0.08 * n, 0))), c) for n, c in enumerate(centres))

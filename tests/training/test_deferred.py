@@ -35,7 +35,14 @@ def assert_equal_gradients(found: dict[str, torch.Tensor], expected: dict[str, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("style", "mixing"), [("panorama", "joint"), ("cubemap", "by_view"), ("original", "joint")])
+@pytest.mark.parametrize(
+    ("style", "mixing"),
+    [
+        ("cubemap", "by_view"),
+        pytest.param("panorama", "joint", marks=pytest.mark.exhaustive),
+        pytest.param("original", "joint", marks=pytest.mark.exhaustive),
+    ],
+)
 def test_deferred_gradients_equal_plain_ones(style: str, mixing: str, micro: Callable, make_batch: Callable) -> None:
     network, batch = micro(), make_batch()
     set_training_mode(network, ())
@@ -48,6 +55,7 @@ def test_deferred_gradients_equal_plain_ones(style: str, mixing: str, micro: Cal
         assert_equal_gradients(found, expected)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(micro: Callable, make_batch: Callable) -> None:
     network, batch = micro(), make_batch()
@@ -77,6 +85,7 @@ def test_frozen_parts_have_no_gradient_and_keep_their_statistics(micro: Callable
         assert torch.equal(tensor, before[name]), name
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(micro: Callable, make_batch: Callable) -> None:
     network, memory = micro().eval(), MemoryConfig("two-step", 1, "cubemap")
@@ -86,6 +95,7 @@ def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(micro: Callab
     assert separate == pytest.approx(joint, rel=1e-9)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_deferred_gradients_of_the_baseline_equal_plain_ones(make_batch: Callable) -> None:
     network, batch = micro_mvsplat(), make_batch(0, 1)

@@ -122,6 +122,7 @@ def test_pairs_have_the_wanted_baseline(tours):
         assert sorted(heights.tolist()) == pytest.approx([1.4, 1.6])
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_workers_read_the_same_pairs(config):
     first = next(iter(DepthTrainer(config)._batches()))
@@ -130,6 +131,7 @@ def test_workers_read_the_same_pairs(config):
         assert torch.equal(a.images, b.images) and a.names == b.names
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_resumed_run_equals_an_uninterrupted_one(config):
     assert DepthTrainer(config, silent=True).train()
@@ -170,6 +172,7 @@ def test_run_writes_logs_and_a_model(config):
     assert load_guided_sweep(config.out / "model.safetensors").name == "default"
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_training_lowers_the_loss(config):
     trainer = DepthTrainer(dataclasses.replace(config, rate=3e-3, steps=40, decay_steps=1))

@@ -53,6 +53,7 @@ def launched(tmp_path_factory: pytest.TempPathFactory) -> Launched:
     return Launched(folder, messages)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_processes_have_the_gradients_of_one_process_with_the_joint_batch(launched: Launched) -> None:
     spec = importlib.util.spec_from_file_location("distributed_programs", _PROGRAMS)
@@ -70,6 +71,7 @@ def test_processes_have_the_gradients_of_one_process_with_the_joint_batch(launch
         assert all(torch.equal(other[name], first[name]) for other in others)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_every_step_sums_gradients_in_the_same_order(launched: Launched) -> None:
     read = {path.stem: torch.load(path) for path in launched.folder.glob("*.pt")}
@@ -88,6 +90,7 @@ def test_every_step_sums_gradients_in_the_same_order(launched: Launched) -> None
     assert not read["0_0"]["unused.weight"].any()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_only_the_first_process_of_a_run_writes_files_and_messages(launched: Launched) -> None:
     out = launched.folder / "run"

@@ -121,6 +121,7 @@ def test_the_same_command_resumes_a_stopped_run(
     assert "optimizer.steps was 2, now 3" in capsys.readouterr().err
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_ctrl_c_in_a_terminal_saves_without_a_traceback(tmp_path: Path) -> None:
     """A terminal sends the signal to the whole process group, including the data workers."""

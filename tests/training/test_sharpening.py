@@ -41,6 +41,7 @@ def config(tmp_path, monkeypatch):
     )  # fmt: skip
 
 
+@pytest.mark.exhaustive
 def test_a_run_resumes_and_its_weights_are_read(config):
     assert not SharpeningTrainer(dataclasses.replace(config, stop_after_minutes=1e-9), silent=True).train()
     trainer = SharpeningTrainer(config, silent=True)

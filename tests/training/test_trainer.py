@@ -46,7 +46,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("accumulate", [1, 2])
+@pytest.mark.parametrize("accumulate", [pytest.param(1, marks=pytest.mark.exhaustive), 2])
 def test_a_killed_run_resumes_bit_identically(
     accumulate: int, micro_run: Callable, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,6 +60,7 @@ print(image.info.intersections, float(image.alpha.min()), grown)
 """
 
 
+@pytest.mark.exhaustive
 @pytest.mark.hard_case(27)
 @pytest.mark.slow
 def test_gaussians_that_fill_a_large_panorama_need_bounded_memory():
