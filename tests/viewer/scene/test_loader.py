@@ -124,8 +124,12 @@ def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_f
     assert film.entry.views == (0, 1, 2, 3), "a film needs all, so that nothing is predicted twice"
 
 
-def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(monkeypatch, parted_house, load_house):
-    networks = {name: SimpleNamespace(name=name, min_views=n) for name, n in (("pairs", 2), ("default", 1))}
+def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
+    monkeypatch, parted_house, load_house, sphere_predictor
+):
+    networks = {"pairs": sphere_predictor(), "default": sphere_predictor()}
+    for (name, network), least in zip(networks.items(), (2, 1), strict=True):
+        network.name, network.min_views = name, least
     monkeypatch.setattr("pansplat.pipeline.load_model", lambda name="default", **options: networks[name])
     monkeypatch.setattr("pansplat.pipeline.load_pairs", lambda path, **options: pairs)
     pairs = [parted_house.make_pair(views) for views in ((0, 1), (1, 2), (3,))]
