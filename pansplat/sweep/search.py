@@ -2,9 +2,9 @@
 
 The scene's planes are detected first. Three levels of matching follow at 1/4, 1/2 and 1/1 of the height, as in the
 paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres
-and with planes across the scene's axes. It runs twice: the second pass uses the surfaces of the first for occlusion,
-consistency between views, and the support of planes. Each finer level searches a narrow range around the coarser
-surface.
+and with planes across the scene's axes. It runs twice: the first pass, at a smaller size, finds the surfaces which the
+second one uses for occlusion, consistency between views, and the support of planes. Each finer level searches a narrow
+range around the coarser surface.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ class SearchConfig:
     finest_height: int = 512
     """Height of the finest level; larger panoramas are searched at this height."""
     coarse_passes: int = 2
+    first_height: int = 64
+    """Largest height of the passes before the last one."""
     max_candidates: int = 256
     """Largest number of hypotheses of a set at the coarse level."""
     near_margin: float = 0.75
@@ -155,15 +157,15 @@ def search_surfaces(
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         if estimator is not None and surfaces is not None:
             priors = estimator.estimate_from_surfaces(surfaces)
-        level = _SearchLevel(posed, heights[0], planes, depths.limits, config, neighbours, surfaces)
+        rows = heights[0] if n == config.coarse_passes - 1 else min(heights[0], config.first_height)
+        if surfaces is not None:
+            surfaces = _upsample(surfaces, posed.images, rows)
+        level = _SearchLevel(posed, rows, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
-        surfaces = [
-            guided_upsample(s, resize_sphere(image, s.height), resize_sphere(image, height))
-            for s, image in zip(surfaces, posed.images, strict=True)
-        ]
+        surfaces = _upsample(surfaces, posed.images, height)
         level = _SearchLevel(posed, height, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [
             level.refine(view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
@@ -171,6 +173,14 @@ def search_surfaces(
         ]
     assert surfaces is not None
     return surfaces, neighbours
+
+
+def _upsample(surfaces: list[Surface], images: np.ndarray, height: int) -> list[Surface]:
+    """The surfaces at a height, guided by their photographs."""
+    return [
+        s if s.height == height else guided_upsample(s, resize_sphere(image, s.height), resize_sphere(image, height))
+        for s, image in zip(surfaces, images, strict=True)
+    ]
 
 
 def choose_nearest(cam2world: np.ndarray, count: int, least: float) -> list[list[int]]:
