@@ -17,6 +17,7 @@ import re
 import secrets
 import shutil
 import signal
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +33,7 @@ from pansplat.data.folders import find_panorama_folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import SCENE_SUFFIXES, expand_home, read_file
+from pansplat.files import SCENE_SUFFIXES, expand_home, is_portable_name, read_file
 from pansplat.gaussians.scene import Scene
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
@@ -165,7 +166,10 @@ def _read_entry(entry: Any, manifest: Path, source: str) -> Item:
     pair = text_field(content, "pair", source)
     name = text_field(content, "name", source) or (f"{folder.name}-{pair}" if pair else folder.name)
     parts = PurePosixPath(name).parts
-    if not parts or name.startswith("/") or any(part.startswith(".") or len(os.fsencode(part)) > 200 for part in parts):
+    allowed = all(not part.startswith(".") and len(os.fsencode(part)) <= 200 for part in parts)
+    if sys.platform == "win32":
+        allowed = allowed and all(map(is_portable_name, parts))
+    if not parts or name.startswith("/") or not allowed:
         raise InputError(f'{source}: needed a name that can be a folder, got {name[:60]!r}; add another "name".')
     return Item(
         name,
@@ -279,7 +283,7 @@ def _connect(tour: TourGraph, folder: Path) -> tuple[TourGraph, Path, bool]:
     if is_new:
         overlaps = [[*edge, overlap] for edge, overlap in tours.connect(tour).overlaps.items()]
         with replacing(path) as temporary:
-            temporary.write_text(json.dumps({"overlaps": overlaps}))
+            temporary.write_text(json.dumps({"overlaps": overlaps}), "utf-8")
     rows = list_field(require_object(read_json(path), path), "overlaps", path)
     return dataclasses.replace(tour, overlaps={(a, b): overlap for a, b, overlap in rows}), path, is_new
 
@@ -599,16 +603,26 @@ def lock_folder(out: Path) -> Iterator[None]:
     Raises:
         InputError: another batch writes to it, or it cannot be written.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with open(out / ".lock", "a") as file:
-            with contextlib.suppress(ImportError):  # Windows
-                import fcntl
+    out.mkdir(parents=True, exist_ok=True)
+    with open(out / ".lock", "ab") as file:
+        try:
+            _lock(file.fileno())
+        except (BlockingIOError, PermissionError) as error:
+            message = f"--out {out}: needed a folder of its own, got one that another batch writes to"
+            raise InputError(message) from error
+        yield
 
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield
-    except BlockingIOError as error:
-        raise InputError(f"--out {out}: needed a folder of its own, got one that another batch writes to") from error
+
+def _lock(descriptor: int) -> None:
+    """Lock a file until it is closed; a BlockingIOError or, on Windows, a PermissionError if another process has."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def remove_unfinished(items: Sequence[Item], out: Path) -> None:

@@ -119,9 +119,10 @@ def _report(error: BaseException, memory_advice: str) -> int:
 def _report_system_error(error: OSError) -> int:
     """Print one line about an error of the operating system, unless standard output was closed by its reader."""
     reason = error.strerror or str(error) or type(error).__name__
-    if error.filename is None and (error.errno == errno.EPIPE or _is_output_broken()):
+    closed = errno.EINVAL if sys.platform == "win32" else errno.EPIPE  # of a pipe that its reader closed
+    if error.filename is None and (error.errno == closed or _is_output_broken()):
         _discard_output(sys.stdout)
-        if error.errno == errno.EPIPE:
+        if error.errno == closed:
             return CLOSED_PIPE
         print_message("error", f"standard output: needed a place to write, got '{reason}'; free some disk space")
         return BAD_INPUT
@@ -194,7 +195,7 @@ def _catch_signals() -> Iterator[_Signals]:
         lost = isinstance(problem.exc_value, KeyboardInterrupt)
         if lost or (signals.received and isinstance(problem.exc_value, SystemError)):
             number = signals.received[-1] if signals.received else signal.SIGINT
-            again = threading.Timer(_AGAIN, os.kill, (os.getpid(), number))  # after this hook has returned
+            again = threading.Timer(_AGAIN, _send_signal, (number,))  # after this hook has returned
             again.daemon = True
             again.start()
         else:
@@ -213,6 +214,14 @@ def _catch_signals() -> Iterator[_Signals]:
         sys.unraisablehook = previous_hook
         for number in replaced:
             signal.signal(number, defaults[number])
+
+
+def _send_signal(number: int) -> None:
+    """Send a signal to this process, from any of its threads."""
+    if sys.platform == "win32":
+        signal.raise_signal(number)  # `os.kill` would end the process at once
+    else:
+        os.kill(os.getpid(), number)  # also interrupts a system call of the main thread
 
 
 @contextlib.contextmanager
@@ -244,8 +253,8 @@ def _prepare_terminal() -> None:
                 os.fstat(descriptor)
             except OSError:
                 os.open(os.devnull, os.O_RDWR)
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+    sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):
             if stream.errors == "strict":
@@ -261,11 +270,16 @@ def print_message(kind: str, text: object) -> None:
     """Print one line `kind: text` on standard error; `kind` is "error", "interrupted", "note" or "progress"."""
     start = f"{kind}: "
     try:
-        if sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
+        if sys.stderr.isatty() and not os.environ.get("NO_COLOR") and _has_escapes():
             start = f"\x1b[1;{_COLORS[kind]}m{start}\x1b[0m"
         print(start + " ".join(str(text).splitlines()), file=sys.stderr, flush=True)
     except (OSError, ValueError, AttributeError):  # standard error is full or closed
         _discard_output(sys.stderr)
+
+
+def _has_escapes() -> bool:
+    """Whether the terminal interprets ANSI codes. The classic console of Windows prints them."""
+    return sys.platform != "win32" or "WT_SESSION" in os.environ or "TERM" in os.environ
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
 from pathlib import Path
 
@@ -19,6 +20,22 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+
+
+# Names of devices on Windows, with any suffix, and characters that it refuses in names.
+_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d) *(\..*)?", re.IGNORECASE)
+_REFUSED = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[. ]$')
+
+
+def is_portable_name(name: str) -> bool:
+    """Whether a file or folder may have a name on every system."""
+    return bool(name) and not _REFUSED.search(name) and not _DEVICE.fullmatch(name)
+
+
+def make_portable_name(name: str) -> str:
+    """The name of a scene as that of a file or folder on every system; empty if no letter is left."""
+    plain = re.sub(r"[^\w.-]+", "_", name).strip("._")
+    return f"_{plain}" if _DEVICE.fullmatch(plain) else plain
 
 
 def describe_kind(path: Path | str) -> str | None:
@@ -108,6 +125,8 @@ def require_output_folder(option: str, folder: Path) -> None:
         raise InputError(f"{option} {folder}: needed a folder to write into, got '{reason}'; {advice}")
     existing = Path(os.path.abspath(folder))
     while not os.path.lexists(existing):
+        if existing == existing.parent:
+            raise InputError(f"{option} {folder}: needed an existing drive, got {existing}; {advice}")
         existing = existing.parent
     if not existing.is_dir():
         raise InputError(f"{option} {folder}: needed a folder to write into, got the file {existing}; {advice}")

@@ -92,11 +92,13 @@ def measure_peak_memory(call: Callable[[], T], device: torch.device) -> tuple[fl
 
 def reset_resident_peak() -> bool:
     """Return freed memory to the system and restart the high-water mark; False if there is none (not Linux)."""
+    if sys.platform == "win32":  # where the libraries of the process have no common handle
+        return False
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
     if trim is not None:
         trim(0)
     try:
-        _RESET.write_text("5")
+        _RESET.write_text("5", encoding="utf-8")
     except OSError:
         return False
     return True
@@ -113,7 +115,7 @@ def read_resident_memory() -> int:
 
 
 def _read_status_bytes(status: Path, field: str) -> int:
-    found = re.search(rf"{field}:\s+(\d+) kB", status.read_text())
+    found = re.search(rf"{field}:\s+(\d+) kB", status.read_text(encoding="utf-8"))
     return 1024 * int(found[1]) if found else 0  # a process that has just ended has no such line
 
 
@@ -171,7 +173,7 @@ def describe_machine() -> dict[str, object]:
     """The processor with its widest vector extension, the GPU (or None), torch's number of threads, and versions."""
     facts: dict[str, str] = {}
     with contextlib.suppress(OSError):  # Linux only
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             name, _, value = line.partition(":")
             facts.setdefault(name.strip(), value.strip())
     flags = facts.get("flags", facts.get("Features", "")).split()
@@ -210,7 +212,7 @@ def run_child(
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "job.json").write_text(json.dumps({**job, "threads": threads}))
+        (folder / "job.json").write_text(json.dumps({**job, "threads": threads}), "utf-8")
         with open(folder / "log", "wb") as log:
             child = subprocess.Popen(
                 [sys.executable, "-m", module, name],
@@ -226,9 +228,10 @@ def run_child(
         if over_limit:
             raise OverLimitError(f"ended at {limit_gib:g} GiB")
         if child.returncode:
-            raise _make_error(child.returncode, (folder / "log").read_text(errors="replace"))
-        numbers = json.loads((folder / "numbers.json").read_text())
-        return numbers, safetensors.torch.load_file(folder / "tensors.safetensors")
+            raise _make_error(child.returncode, (folder / "log").read_text("utf-8", "replace"))
+        numbers = json.loads((folder / "numbers.json").read_text("utf-8"))
+        # `load_file` would map the file, and Windows cannot remove a mapped one.
+        return numbers, safetensors.torch.load((folder / "tensors.safetensors").read_bytes())
 
 
 def _exceeds_limit(child: subprocess.Popen[bytes], limit_gib: float | None) -> bool:
@@ -258,9 +261,9 @@ def _make_error(status: int, log: str) -> CaseFailedError:
 def serve_job(measure: Callable[[dict[str, Any]], tuple[Mapping[str, object], Mapping[str, Tensor]]]) -> None:
     """Main function of a child process: measure its job and write the result for `run_child`."""
     folder = Path(sys.argv[1])
-    job = json.loads((folder / "job.json").read_text())
+    job = json.loads((folder / "job.json").read_text("utf-8"))
     torch.set_num_threads(job["threads"])
     numbers, tensors = measure(job)
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     safetensors.torch.save_file(contiguous, folder / "tensors.safetensors")
-    (folder / "numbers.json").write_text(json.dumps(numbers))
+    (folder / "numbers.json").write_text(json.dumps(numbers), "utf-8")

@@ -265,7 +265,7 @@ class Report:
             return written
         page, picture = (self._out / f"{self._benchmark.name}{suffix}" for suffix in (".md", ".png"))
         with replacing(page) as partial:
-            partial.write_text(self._benchmark.markdown(self.rows))
+            partial.write_text(self._benchmark.markdown(self.rows), "utf-8")
         figure = self._benchmark.plot(self.rows, self.header)
         if figure is None:
             return [*written, page]

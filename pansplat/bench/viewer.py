@@ -158,7 +158,7 @@ class ViewerBench:
             "tiers": [cases[0].renderer],
             "settings": [case.settings() for case in cases],
         }
-        (folder / "job.json").write_text(json.dumps(job))
+        (folder / "job.json").write_text(json.dumps(job), "utf-8")
         for line in read_viewer_output(folder / "job.json", self._threads):
             times = line["frame_ms"]
             yield (
@@ -179,8 +179,8 @@ def read_viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
     environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # of Mesa's software OpenGL
     command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.draw.timing", str(job)]
     with (
-        tempfile.TemporaryFile("w+") as errors,
-        subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=errors) as program,
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors,
+        subprocess.Popen(command, env=environment, encoding="utf-8", stdout=subprocess.PIPE, stderr=errors) as program,
     ):
         assert program.stdout is not None
         try:

@@ -66,10 +66,10 @@ def list_further_photographs(
         known: files that are no further ones.
         names: that are taken; a panorama of such a name gets the folder's name before its own.
     """
-    files, taken = {file.resolve() for file in known}, set(names)
+    taken = set(names)
     further: list[Panorama] = []
     for folder in folders:
-        panoramas, problems = _read_pictures(_list_others(folder, files), folder)
+        panoramas, problems = _read_pictures(_list_others(folder, known), folder)
         _warn_left_out(problems)
         for panorama in panoramas:
             name = panorama.name if panorama.name not in taken else f"{folder.resolve().name}_{panorama.name}"
@@ -84,8 +84,18 @@ def list_unread_panoramas(folder: Path, known: Collection[Path]) -> list[Path]:
 
 
 def _list_others(folder: Path, known: Collection[Path]) -> list[Path]:
-    """The pictures of a folder other than the known files (resolved), which pansplat has not rendered."""
-    return [image for image in list_panorama_files(folder) if image.resolve() not in known and not _is_rendered(image)]
+    """The pictures of a folder other than the known files, which pansplat has not rendered."""
+    read = {_identify(file) for file in known}
+    return [image for image in list_panorama_files(folder) if _identify(image) not in read and not _is_rendered(image)]
+
+
+def _identify(file: Path) -> object:
+    """What a file has in common under all of its names: on Windows and macOS in other capitals, too."""
+    try:
+        status = file.stat()
+    except OSError:
+        return file.resolve()
+    return (status.st_dev, status.st_ino) if status.st_ino else file.resolve()  # 0 on some network drives
 
 
 def _is_two_to_one(image: Path) -> bool:

@@ -196,8 +196,11 @@ def _convert(content: bytes, source: str, target: str, seconds: float | None = N
         raise _CoderError(f"no result after {seconds:g} s") from None
     if done.returncode == 0:
         return done.stdout
-    lines = done.stderr.decode(errors="replace").strip().splitlines()
-    raise _CoderError(f"gaussforge stopped by signal {-done.returncode}" if done.returncode < 0 else lines[-1][:200])
+    if done.returncode < 0:
+        raise _CoderError(f"gaussforge stopped by signal {-done.returncode}")
+    # On Windows a crash has a positive status and no message.
+    lines = done.stderr.decode(errors="replace").strip().splitlines() or [f"gaussforge stopped, {done.returncode:#x}"]
+    raise _CoderError(lines[-1][:200])
 
 
 def _is_compressed(path: Path) -> bool:

@@ -111,7 +111,8 @@ def load_weights(path: str | Path) -> WeightsFile:
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
+            # Copies: the tensors are maps of the file, which Windows could not replace and a writer would change.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118  # not a dict
     except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # types that torch lacks
         raise InputError(f"{path}: needed a whole .safetensors file, got '{error}'; {_suggest_remedy(path)}") from error
     if not {"pansplat_format", "model", "config", "compat"} <= metadata.keys():

@@ -52,7 +52,7 @@ def write_poses(estimate: PoseEstimate, path: Path) -> None:
     """
     if path.suffix.lower() == ".json":
         folder = path.resolve().parent
-        names = {image: Path(os.path.relpath(image.resolve(), folder)).as_posix() for image in estimate.images}
+        names = {image: _name_from(folder, image.resolve()) for image in estimate.images}
         merged = merge_estimate(path, estimate, names)
         if merged is not None:
             warnings.warn(
@@ -75,9 +75,17 @@ def write_poses(estimate: PoseEstimate, path: Path) -> None:
     _write(path, "\n".join(lines) + "\n")
 
 
+def _name_from(folder: Path, image: Path) -> str:
+    """The path of an image relative to a folder; the whole path on another drive of Windows."""
+    try:
+        return Path(os.path.relpath(image, folder)).as_posix()
+    except ValueError:
+        return image.as_posix()
+
+
 def _write(path: Path, text: str) -> None:
     with replacing(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, "utf-8")
 
 
 def estimate_pairs(

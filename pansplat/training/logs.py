@@ -36,8 +36,8 @@ class CsvTable:
         writer.writeheader()
         writer.writerows(kept)
         with replacing(path) as partial:
-            partial.write_text(text.getvalue())
-        self._file = open(path, "a", newline="")  # noqa: SIM115  # closed by `close`
+            partial.write_text(text.getvalue(), "utf-8")
+        self._file = open(path, "a", encoding="utf-8", newline="")  # noqa: SIM115  # closed by `close`
         self._writer = csv.DictWriter(self._file, self.columns, lineterminator="\n")
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
@@ -51,7 +51,7 @@ class CsvTable:
 
 def read_table(path: Path) -> list[dict[str, str]]:
     """The complete rows of a CSV file; an incomplete last row is ignored."""
-    with open(path, newline="") as file:
+    with open(path, encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return [row for row in rows if (row.get("step") or "").isdecimal() and all(map(_is_number, row.values()))]
 

@@ -59,7 +59,7 @@ class _Logs:
     def open(folder: Path, config: TrainConfig, step: int, validation_step: int) -> _Logs:
         """Write config.json, and open the logs. Rows from `step` or `validation_step` on are removed."""
         with replacing(folder / "config.json") as partial:
-            partial.write_text(as_json(config) + "\n")
+            partial.write_text(as_json(config) + "\n", "utf-8")
         return _Logs(
             CsvTable(folder / "log.csv", _COLUMNS, step),
             CsvTable(folder / "validation.csv", ("height", *MEASURES), validation_step),

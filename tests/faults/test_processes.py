@@ -174,7 +174,8 @@ def test_terminals_and_pipes_end_no_command_with_a_traceback(folder: Path, tmp_p
     for command, status in ((info, 0), ("predict --heigth 3", 2)):
         cases.add(f"{command}: ASCII", command, status, encoding="ascii")
         cases.add(f"{command}: closed errors", command, status, err="closed")
-    cases.add("info: latin-1", info, 0, encoding="latin-1")
+    for encoding in ("latin-1", "cp1252"):
+        cases.add(f"info: {encoding}", info, 0, encoding=encoding)
     cases.add("an error to a full disk", "info no.ply", 2, err=full)
     cases.add("an error to a closed pipe", "info no.ply", 2, err="broken pipe")
     for columns in ("1", "-3", "9" * 30, "\u00b2"):

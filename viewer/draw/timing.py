@@ -41,7 +41,7 @@ _STEP = 1e-4  # metres that the camera moves between frames, so that no layer is
 def main() -> int:
     """Run the job file named on the command line; returns 0, or 2 if the job is invalid or OpenGL is missing."""
     try:
-        for line in run_job(json.loads(Path(sys.argv[1]).read_text())):
+        for line in run_job(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))):
             print(json.dumps(line), flush=True)
     except (InputError, OSError, IndexError, KeyError, TypeError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -6,7 +6,6 @@ are parts of the scene in the file. Imports no torch before it loads.
 """
 
 import contextlib
-import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import is_scene_file
+from pansplat.files import is_scene_file, make_portable_name
 from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ Progress = Callable[[str, float], None]  # task, fraction done
 
 def make_file_name(name: str) -> str:
     """A name of a scene or panorama as a valid name of a file or folder, without separators and leading dots."""
-    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "scene"
+    return make_portable_name(name) or "scene"
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ def write_home(
     """
     poses_file = folder / "poses.json"
     if poses_file.exists():
-        return len(json.loads(poses_file.read_text())["poses"])
+        return len(json.loads(poses_file.read_text("utf-8"))["poses"])
     rng = np.random.default_rng(seed)
     cameras = []
     while len(cameras) < _LEAST:
@@ -50,5 +50,5 @@ def write_home(
             partial.write_bytes(encoded.tobytes())
         poses[f"{number:02d}.jpg"] = pose.tolist()
     with replacing(poses_file) as partial:
-        partial.write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}, indent=1))
+        partial.write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}, indent=1), "utf-8")
     return len(cameras)

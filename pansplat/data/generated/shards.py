@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -139,9 +140,9 @@ def _read_triplet(name: Path, height: int) -> Tour:
     """The tour of a rendered triplet; the height of each camera over the floor is the depth at the nadir."""
     try:
         poses = np.array(read_json(name.with_suffix(".json"))["c2w"], np.float64)
-        images = [cv2.imread(f"{name}_{n}.png", cv2.IMREAD_COLOR)[..., ::-1] for n in range(3)]
-        depths = [cv2.imread(f"{name}_{n}_depth.png", cv2.IMREAD_UNCHANGED) / _MILLIMETRES for n in range(3)]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        images = [_read_png(f"{name}_{n}.png", cv2.IMREAD_COLOR)[..., ::-1] for n in range(3)]
+        depths = [_read_png(f"{name}_{n}_depth.png", cv2.IMREAD_UNCHANGED) / _MILLIMETRES for n in range(3)]
+    except (OSError, ValueError, KeyError, TypeError, cv2.error) as error:
         raise InputError(f"{name}: needed a rendered triplet, got {error!r}; render it again.") from error
     size = (2 * height, height)
     light = linear_from_srgb(np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images]) / 255)
@@ -149,6 +150,11 @@ def _read_triplet(name: Path, height: int) -> Tour:
     depth = np.stack([cv2.resize(d, size, interpolation=cv2.INTER_NEAREST) for d in depths])
     floor = [float(np.median(view[-height // 16 :])) for view in depth]
     return Tour(light.astype(np.float32), depth.astype(np.float32), poses, np.maximum(floor, 0.3))
+
+
+def _read_png(path: str, flags: int) -> Any:
+    """The pixels of a file. `cv2.imread` reads no names outside of the code page of Windows."""
+    return cv2.imdecode(np.fromfile(path, np.uint8), flags)
 
 
 class ShardReader:
@@ -231,10 +237,10 @@ def _claim_folder(folder: Path, settings: TourSettings) -> None:
     """Write the settings into the folder, or check that they are those of its shards."""
     path = folder / "settings.json"
     text = json.dumps({"format": _FORMAT, **settings.__dict__, "furniture": settings.furniture is not None}, indent=1)
-    if path.exists() and path.read_text() != text:
+    if path.exists() and path.read_text("utf-8") != text:
         raise InputError(f"{folder}: needed a folder with shards of the same settings, got others; see {path}.")
     with replacing(path) as partial:
-        partial.write_text(text)
+        partial.write_text(text, "utf-8")
 
 
 def _encode(image: Float[NDArray, "height width *channel"]) -> NDArray[np.uint8]:

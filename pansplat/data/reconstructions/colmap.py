@@ -158,7 +158,7 @@ class _Cursor:
         self.at += struct.calcsize(f"<{kinds}")
         return values
 
-    def read_text(self) -> str:
+    def read_string(self) -> str:
         end = self.data.index(b"\0", self.at, self.at + _MAX_NAME)
         text, self.at = self.data[self.at : end].decode(), end + 1
         return text
@@ -177,7 +177,7 @@ def _read_images_binary(path: Path) -> Iterator[_Image]:
     cursor = _Cursor(path)
     for _ in range(cursor.read("Q")[0]):
         _, *numbers, camera = cursor.read("I7dI")
-        name = cursor.read_text()
+        name = cursor.read_string()
         (count,) = cursor.read("Q")
         cursor.at += 24 * count
         yield numbers[:4], numbers[4:], camera, name

@@ -102,7 +102,7 @@ def write_dataset(
         rigs.append(rig)
     write_colmap(sparse, rigs, points, colors)
     write_nerfstudio(folder / "transforms.json", shots, POINTS if len(points) else None)
-    (folder / "scale.txt").write_text("1\n")  # metres per unit
+    (folder / "scale.txt").write_text("1\n", "utf-8")  # metres per unit
     return len(shots)
 
 

@@ -18,7 +18,7 @@ import torch
 from pansplat.data.cube_images import CubeImage, write_cube
 from pansplat.data.pairs import Link, Panorama, find_mask
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import read_file
+from pansplat.files import make_portable_name, read_file
 
 _T = TypeVar("_T")
 
@@ -179,7 +179,7 @@ def resolve_links(links: Sequence[Link], names: Mapping[str, str], own: str, sou
 
 
 def _safe_name(key: str) -> str:
-    return re.sub(r"[^\w.\-]+", "_", key).strip("._ ")[:_MAX_NAME]
+    return make_portable_name(key)[:_MAX_NAME].rstrip(".")
 
 
 def _unique(name: str, taken: set[str]) -> str:

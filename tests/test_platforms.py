@@ -1,0 +1,191 @@
+"""Windows and macOS, as far as fakes show it: names, locks, signals, drives and consoles."""
+
+import errno
+import json
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import safetensors.torch
+import torch
+
+from pansplat import batch, console
+from pansplat.bench import harness
+from pansplat.data.folders import load_pairs
+from pansplat.errors import InputError
+from pansplat.files import is_portable_name, make_portable_name, require_output_folder
+from pansplat.gaussians import formats
+from pansplat.kernel_cache import choose_kernel_cache
+from pansplat.model.weights import load_weights, pack_weights, save_weights
+from pansplat.poses import files as pose_files
+
+
+@pytest.fixture
+def windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    "name", ["a:b", "a\\b", "a/b", "what?", "end.", "end ", "con", "Aux.jpg", "COM1", "nul .a", "\t", ""]
+)
+def test_names_that_windows_refuses_are_not_portable(name: str) -> None:
+    assert not is_portable_name(name)
+    assert not name.strip() or is_portable_name(make_portable_name(name))
+
+
+@pytest.mark.parametrize("name", ["kitchen", "Küche 2", "console", "com10", "a.b-c_d", ".hidden"])
+def test_usual_names_are_portable(name: str) -> None:
+    assert is_portable_name(name)
+
+
+def test_items_of_a_batch_have_portable_names_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manifest = tmp_path / "all.json"
+    for name in ("a\\..\\..\\b", "ground floor: kitchen", "house/con"):
+        manifest.write_text(json.dumps({"items": [{"path": "room", "name": name}]}))
+        assert [item.name for item in batch.list_items(manifest)] == [name]
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "platform", "win32")
+            with pytest.raises(InputError, match="needed a name that can be a folder"):
+                batch.list_items(manifest)
+
+
+def test_a_picture_that_poses_name_in_other_capitals_is_one_picture(pair_folder: Path) -> None:
+    content = json.loads((pair_folder / "poses.json").read_text())
+    content["poses"]["LEFT.PNG"] = content["poses"].pop("left.png")
+    (pair_folder / "poses.json").write_text(json.dumps(content))
+    os.link(pair_folder / "left.png", pair_folder / "LEFT.PNG")  # as if the file system ignored capitals
+    (pair,) = load_pairs(pair_folder)
+    assert sorted(view.image.name for view in pair.context) == ["LEFT.PNG", "right.png"]
+
+
+def test_poses_name_pictures_on_another_drive_by_their_whole_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> str:
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    assert pose_files._name_from(tmp_path, tmp_path / "a" / "b.jpg") == "a/b.jpg"
+    monkeypatch.setattr(os.path, "relpath", refuse)
+    assert pose_files._name_from(tmp_path, tmp_path / "b.jpg") == (tmp_path / "b.jpg").as_posix()
+
+
+def test_a_drive_that_does_not_exist_ends_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os.path, "lexists", lambda _: False)
+    with pytest.raises(InputError, match="needed an existing drive"):
+        require_output_folder("--out", Path("/nowhere/at/all"))
+    environment = {"XDG_CACHE_HOME": "/nowhere"}
+    choose_kernel_cache("/nowhere", environment)
+    assert "NUMBA_CACHE_DIR" not in environment or Path(environment["NUMBA_CACHE_DIR"]).is_dir()
+
+
+# Files that are in use
+
+
+def test_weights_keep_no_hold_of_their_file(tmp_path: Path, small_config: object) -> None:
+    path, numbers = tmp_path / "model.safetensors", torch.arange(1 << 16).float()
+    save_weights(path, pack_weights("pansplat", small_config, {"weight": numbers}, compat="fixed"))
+    tensors = load_weights(path).tensors
+    with open(path, "r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        file.write(b"\xff" * size)
+    assert torch.equal(tensors["weight"], numbers)
+
+
+def test_results_of_a_child_keep_no_hold_of_its_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(command: list[str], **_: object) -> SimpleNamespace:
+        folder = Path(command[-1])
+        safetensors.torch.save_file({"image": torch.arange(1 << 16)}, folder / "tensors.safetensors")
+        (folder / "numbers.json").write_text('{"ms": 1}')
+        return SimpleNamespace(wait=lambda: 0, kill=lambda: None, returncode=0)
+
+    monkeypatch.setattr(harness.subprocess, "Popen", start)
+    numbers, tensors = harness.run_child("module", {}, threads=1)
+    assert numbers == {"ms": 1} and torch.equal(tensors["image"], torch.arange(1 << 16))
+    if sys.platform == "linux":
+        assert "tensors.safetensors" not in Path("/proc/self/maps").read_text()
+
+
+def test_a_second_batch_is_refused_on_windows(tmp_path: Path, windows: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    locked: list[tuple[int, int]] = []
+
+    def lock(_: int, mode: int, count: int) -> None:
+        if locked:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        locked.append((mode, count))
+
+    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(LK_NBLCK=2, locking=lock))
+    with (
+        batch.lock_folder(tmp_path),
+        pytest.raises(InputError, match="got one that another batch writes to"),
+        batch.lock_folder(tmp_path),
+    ):
+        pass
+    assert locked == [(2, 1)]
+
+
+# Processes
+
+
+def test_an_interrupt_does_not_end_the_process_at_once_on_windows(
+    windows: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    received: list[int] = []
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("`os.kill` ends the process"))
+    signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    thread = threading.Thread(target=console._send_signal, args=(signal.SIGINT,))
+    thread.start()
+    thread.join()
+    assert received == [signal.SIGINT]
+
+
+def test_a_crash_without_a_message_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "_CODER", "import os; os._exit(5)")
+    with pytest.raises(formats._CoderError, match="gaussforge stopped, 0x5"):
+        formats._convert(b"", "ply", "spz")
+
+
+def test_without_a_handle_of_all_libraries_there_is_no_peak_memory(
+    windows: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(harness.ctypes, "CDLL", lambda _: pytest.fail("Windows raises a TypeError"))
+    assert harness.measure_peak_memory(lambda: 3, torch.device("cpu")) == (None, 3)
+
+
+# Consoles
+
+
+def test_a_closed_pipe_ends_a_command_quietly_on_windows(
+    windows: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(console, "_discard_output", lambda _: None)
+
+    def write() -> int:
+        raise OSError(errno.EINVAL, "Invalid argument")
+
+    assert console.run_command(write, memory_advice="", interruption="") == console.CLOSED_PIPE
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("variables", "has_color"), [({}, False), ({"WT_SESSION": "1"}, True), ({"TERM": "x"}, True)])
+def test_the_classic_console_of_windows_gets_no_escape_codes(
+    windows: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    variables: dict[str, str],
+    has_color: bool,
+) -> None:
+    for name in ("WT_SESSION", "TERM", "NO_COLOR"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    console.print_message("error", "text")
+    assert ("\x1b" in capsys.readouterr().err) == has_color
