@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 from pansplat import __version__, pipeline, tours
 from pansplat.atomic import replacing
 from pansplat.console import is_out_of_memory
+from pansplat.data.blur_masks import find_blur_mask
 from pansplat.data.folders import find_panorama_folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import CAMERA_HEIGHT
@@ -276,7 +277,7 @@ def _list_units(item: Item, options: BatchOptions, folder: Path) -> list[_Unit]:
 
 def _connect(tour: TourGraph, folder: Path) -> tuple[TourGraph, Path, bool]:
     """The connected graph of a tour, its file in the folder, and whether the file was written."""
-    panoramas = [[view.name, view.cam2world.tolist(), _hash_file(view.image)] for view in tour.panoramas]
+    panoramas = [[view.name, view.cam2world.tolist(), *_hash_image(view.image)] for view in tour.panoramas]
     key = _join_hash(_LAYOUT, "graph", [panoramas, tour.near, tour.far, list(tour.overlaps)])
     path = folder / f"graph-{key}-{_shorten(tour.name)}.json"
     is_new = not path.exists()
@@ -461,15 +462,21 @@ def _hash_pair(pair: Pair) -> str:
     context = [
         [
             *(view.name, view.title, view.start, view.cam2world.tolist()),
-            *(_hash_file(view.image), view.mask and _hash_file(view.mask)),
+            *(*_hash_image(view.image), view.mask and _hash_file(view.mask)),
         ]
         for view in pair.context
     ]
     heights = [view.camera_height for view in pair.context] if len(pair.context) == 1 else []
     # Static content is detected in the siblings of a panorama without a mask.
     needs_siblings = any(view.mask is None for view in pair.context)
-    siblings = [_hash_file(image) for image in pair.siblings] if needs_siblings else []
+    siblings = [key for image in pair.siblings for key in _hash_image(image)] if needs_siblings else []
     return _join_hash(_LAYOUT, pair.name, [pair.near, pair.far, context, heights, siblings])
+
+
+def _hash_image(image: Path) -> list[str]:
+    """Hashes of a panorama and of its blur mask, if it has one."""
+    blur = find_blur_mask(image)
+    return [_hash_file(image)] + ([] if blur is None else [_hash_file(blur)])
 
 
 @lru_cache(maxsize=4096)

@@ -101,6 +101,7 @@ Seconds = Annotated[float, Range(0, 1e6, "seconds"), REAL]
 Minutes = Annotated[float, Range(0, math.inf, "minutes"), REAL]
 Fraction = Annotated[float, Range(0, 1, below=True), REAL]
 Positive = Annotated[float, Range(0, 1e9, above=True), REAL]
+Real = Annotated[float, Range(-1e12, 1e12), REAL]
 Weight = Annotated[float, Range(0, 1e9), REAL]
 
 

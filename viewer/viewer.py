@@ -1,5 +1,6 @@
 """The viewer without its window: scene, image and panels on any OpenGL context, one frame at a time."""
 
+import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -14,6 +15,7 @@ from imgui_bundle import imgui
 from jaxtyping import Float
 
 from pansplat.errors import InputError
+from pansplat.files import find_scene_suffix
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
 from pansplat.tours import list_starts, plan_route
@@ -28,6 +30,7 @@ from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
 from pansplat_viewer.draw.stereo import StereoRenderer, choose_format, get_eye_size, render_image
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.background import BackgroundWorker, Report
+from pansplat_viewer.scene.cleaning import Cleaned, Cleaner, MaskPainter, measure_bounds
 from pansplat_viewer.scene.key_frames import read_path, write_path
 from pansplat_viewer.scene.loader import LoadedScene, Progress, SceneEntry, SceneLoader, list_panoramas
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
@@ -130,6 +133,9 @@ class Viewer:
         self._tour: TourScenes | None = None
         self._layers = [PhotographLayer(self.presenter), PhotographLayer(self.presenter)]  # of the fade's photographs
         self._placing: Placing | None = None
+        self._cleaner = Cleaner()
+        self._painter: MaskPainter | None = None
+        self._bounds: tuple[Scene, tuple[float, ...]] | None = None  # a scene and its box
         self._last_camera = self.state.camera
 
     @property
@@ -156,7 +162,7 @@ class Viewer:
         """Whether the next frame differs without new input."""
         loading = self.loader.entry is not None or self.loader.is_searching or self._comparer.photographs.is_reading
         loading = loading or self._incoming is not None or self._preparer.progress is not None
-        loading = loading or (self._placing is not None and self._placing.is_busy)
+        loading = loading or (self._placing is not None and self._placing.is_busy) or self._cleaner.progress is not None
         return self.moving or loading or self._films.future is not None
 
     @property
@@ -223,6 +229,7 @@ class Viewer:
         now, size = self._clock(), target.viewport[2:]
         self._take_loaded(now)
         self._take_film(now)
+        self._take_cleaned(now)
         self._watch.look(now)
         self._exchange_scene()
         self.gui.begin(seconds, new_frame)
@@ -230,7 +237,7 @@ class Viewer:
         was_playing = self.state.playing
         panel_commands = self.panels.draw(self.state, self.panel_data, now)
         # The step is limited, so that after a slow frame the camera does not move far.
-        events = self._leave_placing(read_input(min(seconds, _MAX_STEP_SECONDS)))
+        events = self._paint(self._leave_placing(read_input(min(seconds, _MAX_STEP_SECONDS))), size)
         key_commands = apply_input(self.state, events)
         self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
         advance_path(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
@@ -254,6 +261,7 @@ class Viewer:
         """Stop the threads and free every GL object; the context must still be current."""
         self._save_layout(changed=False)
         self._films.close()
+        self._cleaner.close()
         if self._placing is not None:
             self._placing.close()
         self.loader.close()
@@ -342,6 +350,8 @@ class Viewer:
         self._resolution = self._create_resolution()
         self._fade.clear()
         self._comparer.photographs.open(loaded.entry.panoramas)
+        if self._painter is not None and self._painter.panorama not in loaded.entry.panoramas:
+            self._stop_painting()
         self._open_placing(loaded.entry)
         if loaded.entry.tour is None:
             enter_scene(self.state, loaded.scene, at=self._at)
@@ -386,6 +396,90 @@ class Viewer:
         if "escape" in events.pressed:
             placing.stop()
         return replace(events, pressed=events.pressed - {",", ".", "escape"})
+
+    # --- clean up ---
+
+    def _paint(self, events: Input, size: tuple[int, int]) -> Input:
+        """Paint what is to be hidden with the left button, and return the other input: the right one looks around."""
+        painter = self._painter
+        if painter is None:
+            return events
+        if events.pointer is None:
+            painter.lift()
+        else:
+            pixel = events.pointer[0] * size[0], events.pointer[1] * size[1]
+            direction = compute_pixel_ray(self.state.camera, pixel, size)[1]
+            painter.paint(direction, math.radians(self.state.brush_degrees), erase="shift" in events.held)
+        pressed = events.pressed - {"escape"}
+        if pressed != events.pressed:
+            self._stop_painting()
+        return replace(events, pressed=pressed, drag=events.pan, pan=(0.0, 0.0), click=None, pointer=None)
+
+    def _start_painting(self) -> None:
+        """Paint on the photograph of the comparison, which fills the window."""
+        index = self._comparer.choose_photograph(self.state)
+        if index is None:
+            return
+        try:
+            self._painter = MaskPainter(self._comparer.photographs.panoramas[index])
+        except InputError as error:
+            self.panel_data.error = str(error)
+            return
+        state = self.state
+        state.playing = state.path_playing = False
+        state.photograph, state.comparison, state.split = index, "photograph", 0.0
+        state.settings = replace(state.settings, stereo="mono")
+
+    def _stop_painting(self) -> None:
+        if self._painter is not None:
+            self._painter = None
+            self.state.photograph, self.state.comparison, self.state.split = None, "off", ViewerState().split
+
+    def _execute_cleaning(self, commands: Commands, now: float) -> None:
+        scene, painter = self._slot.scene, self._painter
+        if commands.paint:
+            self._start_painting()
+        elif commands.paint is not None:
+            self._stop_painting()
+        if painter is not None and commands.clear_mask:
+            painter.clear()
+        if painter is not None and commands.save_mask:
+            try:
+                self.state.show_message(f"wrote {painter.save()}; Reload predicts the scene again", now)
+            except (InputError, OSError) as error:
+                self.panel_data.error = str(error)
+        if scene is None:
+            return
+        if commands.remove_floaters:
+            self._cleaner.remove_floaters(scene)
+        elif commands.save_scene is not None:
+            path = Path(commands.save_scene).expanduser()
+            try:
+                find_scene_suffix(path)
+            except InputError as error:
+                self.panel_data.error = str(error)
+            else:
+                self._cleaner.save(scene, self.state.settings, path)
+
+    def _take_cleaned(self, now: float) -> None:
+        """Show the scene without floaters, or report the file that is written, or the error."""
+        result = self._cleaner.poll()
+        if isinstance(result, Cleaned):
+            loaded, is_shown = self._loaded, self._tour is None and self._slot.scene is result.given
+            if loaded is not None and is_shown and result.scene is not None:
+                self._incoming, self._refined = replace(loaded, scene=result.scene, is_final=True), None
+            self.state.show_message(result.message, now)
+        elif result is not None:
+            self.panel_data.error = str(result)
+
+    def _measure_bounds(self) -> tuple[float, ...] | None:
+        """The box of the scene; None for tours, whose scenes are parts."""
+        scene = self._slot.scene
+        if self._loaded is None or self._tour is not None or scene is None:
+            return None
+        if self._bounds is None or self._bounds[0] is not scene:
+            self._bounds = scene, measure_bounds(scene)
+        return self._bounds[1]
 
     # --- tours ---
 
@@ -510,6 +604,7 @@ class Viewer:
         if comparer.error is not None:
             data.error, comparer.error = comparer.error, None
         data.panoramas = self._name_panoramas()
+        data.bounds, data.painter, data.cleaning = self._measure_bounds(), self._painter, self._cleaner.progress
         film = self._films.progress
         data.tour, data.film = self._tour, None if film is None else film[1]
         data.hotspots = []
@@ -729,6 +824,7 @@ class Viewer:
                 self.open(self.path, self.entries[current].name)
         elif commands.open is not None:
             self.open(Path(commands.open).expanduser())
+        self._execute_cleaning(commands, now)
         if self._loaded is None:
             return
         self._execute_path(commands, size, now)

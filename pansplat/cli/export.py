@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -21,11 +21,12 @@ from pansplat.files import (
     require_new_folder,
     require_output_file,
 )
-from pansplat.options import WHOLE, Count, Fraction, Range
+from pansplat.options import WHOLE, Count, Fraction, Range, Real
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from pansplat.cleanup import Change
     from pansplat.gaussians.scene import Scene
     from pansplat.web import PageFiles
 
@@ -59,6 +60,13 @@ class Export:
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds."""
     min_opacity: Fraction = 0.0
     """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
+    crop: tuple[Real, Real, Real, Real, Real, Real] | None = None
+    """Keep what is in a box: x, y and z of two opposite corners, metres, in the axes of the poses. Cameras outside are
+    left out."""
+    rooms: tuple[str, ...] = ()
+    """Keep these rooms of the floor plan, by their names or by those of panoramas in them."""
+    floaters: bool = True
+    """Keep isolated Gaussians in free space; --no-floaters leaves them out."""
     up: Literal["y", "z"] | None = None
     """Axis of a given file that points up, if its program did not keep to the axes of the format."""
     layers: bool = False
@@ -100,15 +108,19 @@ class Export:
             raise InputError(f"{names} are for an .html page, got {self.out}; leave them out")
         if self.up is not None and not is_scene_file(self.path):
             raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
+        if is_dataset and (self.crop or self.rooms or not self.floaters):
+            names = "--crop, --rooms and --no-floaters"
+            raise InputError(f"{names} are not for a folder to train from, got {self.out}; leave them out")
         if is_dataset:
             self._write_dataset()
             return 0
         if is_mesh:
             self._write_mesh()
             return 0
-        scene = self._edit(self._open(not is_scene))
+        scene, changes = self._edit(*self._open(not is_scene))
         if is_page:
             page = self._write_page(scene)
+            _print_changes(changes)
             if self.serve:
                 from pansplat.web.serve import serve_page
 
@@ -129,32 +141,50 @@ class Export:
             size, count = self.out.stat().st_size, len(scene.gaussians)
             kind = "points" if self.points else "Gaussians"
             print(f"{self.out}: {count:,} {kind}, {size:,} bytes ({size / max(count, 1):.1f} each)")
+        if not is_page:
+            _print_changes(changes)
         return 0
 
-    def _open(self, in_layers: bool) -> Scene:
-        """The scene of the file, pair or tour; of a file for other programs with each surface once."""
+    def _open(self, in_layers: bool) -> tuple[Scene, Scene | None]:
+        """The scene of the file, pair or tour; of a file for other programs with each surface once.
+
+        Also the scene with all that each panorama shows, if the rooms of one with each surface once are looked for.
+        """
         from pansplat.refinement import fuse_views
 
         joint = not in_layers and not self.layers
         count = self._count_of_page() if self.out.suffix.lower() == _PAGE_SUFFIX else None
-        scene = self.prediction.open_tour(self.path, count, joint=joint)
-        if not joint or not is_scene_file(self.path) or scene.joint or len(scene.cam2world) < 2:
-            return scene
+        if not is_scene_file(self.path):
+            scene, source = self.prediction.open_panoramas(self.path, count, joint=joint)
+            return scene, self.prediction.predict_layers(source) if self.rooms and scene.joint else None
+        scene = self.prediction.open(self.path)
+        if not joint or scene.joint or len(scene.cam2world) < 2:
+            return scene, None
         print(
             f"note: {self.path}: each surface is kept once (--layers keeps all); an export of the folder of the "
             "photographs fits the Gaussians to them, too",
             file=sys.stderr,
         )
-        return fuse_views(scene)
+        return fuse_views(scene), scene
 
-    def _edit(self, scene: Scene) -> Scene:
-        """The scene with its axis up, and the Gaussians and harmonics that are wanted."""
+    def _edit(self, scene: Scene, layers: Scene | None = None) -> tuple[Scene, list[Change]]:
+        """The scene with its axis up, and the Gaussians and harmonics that are wanted, and what is left out.
+
+        `layers` is the scene with all that each panorama shows, if `scene` is not.
+        """
+        from pansplat.cleanup import Cleaning, clean_up
         from pansplat.gaussians.scene import prune
 
         if self.up is not None:
-            scene = scene.rotated(_rotation_from(self.up))
-        gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
-        return dataclasses.replace(scene, gaussians=gaussians)
+            turn = _rotation_from(self.up)
+            scene, layers = scene.rotated(turn), None if layers is None else layers.rotated(turn)
+        cleaning = Cleaning(self.rooms, self.crop, self.floaters, self.min_opacity)
+        try:
+            with progress_bar() as progress:
+                scene, changes = clean_up(scene, cleaning, layers, progress)
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from error
+        return dataclasses.replace(scene, gaussians=prune(scene.gaussians, degree=self.degree)), changes
 
     def _write_mesh(self) -> None:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
@@ -164,18 +194,22 @@ class Export:
 
         load: Callable[[int], Tensor] | None = None
         if is_scene_file(self.path):
-            scene = self.prediction.open(self.path)
+            edited, changes = self._edit(self.prediction.open(self.path))
         else:
             scene, source = self.prediction.open_panoramas(self.path)
+            edited, changes = self._edit(scene)
+            known = scene.cam2world.tolist()
+            views = [known.index(pose) for pose in edited.cam2world.tolist()]  # a crop leaves others out
 
-            def load(view: int) -> Tensor:
+            def load(number: int) -> Tensor:
+                view = views[number]
                 if isinstance(source, Pair):
                     pair = dataclasses.replace(source, context=(source.context[view],))
                 else:
                     pair = source.make_pair([view])
                 return pair.load_context(min(pair.image_height, _TEXTURE_HEIGHT)).images[0]
 
-        mesh = make_mesh(self._edit(scene), triangles=self.triangles or DEFAULT_TRIANGLES, textures=load)
+        mesh = make_mesh(edited, triangles=self.triangles or DEFAULT_TRIANGLES, textures=load)
         files = save_mesh(mesh, self.out)
         size = sum(file.stat().st_size for file in files)
         beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
@@ -184,6 +218,7 @@ class Export:
             f"{self.out}{beside}: {mesh.num_triangles:,} triangles of {count} panorama{'s' if count > 1 else ''}, "
             f"{size / 1e6:.1f} MB"
         )
+        _print_changes(changes)
 
     def _write_dataset(self) -> None:
         """Write cube faces, poses and points to a new folder."""
@@ -251,6 +286,12 @@ class Export:
                 file=sys.stderr,
             )
         return page
+
+
+def _print_changes(changes: Sequence[Change]) -> None:
+    """Print what was left out, and what that changes."""
+    for change in changes:
+        print(change)
 
 
 def _rotation_from(up: Literal["y", "z"]) -> Tensor:

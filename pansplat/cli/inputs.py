@@ -87,22 +87,16 @@ class ScenePrediction:
             return pipeline.load(path)
         return self._predict_pair(choose_pair(path, self.choice), None, joint=False)
 
-    def open_tour(self, path: Path, gaussians: int | None = None, *, joint: bool = False) -> Scene:
-        """The scene of a file, of the chosen pair, or of the first tour of a folder.
-
-        Args:
-            path: the file or folder.
-            gaussians: of a page; see `pansplat.predict_tour`.
-            joint: see `pansplat.predict`; scene files and predictions of networks are returned as they are.
-        """
-        from pansplat import pipeline
-
-        return pipeline.load(path) if is_scene_file(path) else self.open_panoramas(path, gaussians, joint=joint)[0]
-
     def open_panoramas(
         self, path: Path, gaussians: int | None = None, *, joint: bool = False
     ) -> tuple[Scene, Pair | TourGraph]:
-        """The scene of the chosen pair, or of the first tour of a folder, and its panoramas in the scene's order."""
+        """The scene of the chosen pair, or of the first tour of a folder, and its panoramas in the scene's order.
+
+        Args:
+            path: the folder.
+            gaussians: of a page; see `pansplat.predict_tour`.
+            joint: see `pansplat.predict`; predictions of networks are returned as they are.
+        """
         from pansplat import pipeline
         from pansplat.tours import connect, find_tours
 
@@ -131,6 +125,17 @@ class ScenePrediction:
                 progress=progress,
             )
         return scene, tour
+
+    def predict_layers(self, source: Pair | TourGraph) -> Scene:
+        """The unrefined scene of the panoramas of `open_panoramas` with all that each of them shows, from the cache."""
+        from pansplat import pipeline
+        from pansplat.data.pairs import Pair
+
+        model = self.model.load()
+        with progress_bar() as progress:
+            if isinstance(source, Pair):
+                return pipeline.predict(source, model, height=self.predict_height, progress=progress)
+            return pipeline.predict_tour(source, model, height=self.predict_height, progress=progress)
 
     def _predict_pair(self, pair: Pair, gaussians: int | None, joint: bool) -> Scene:
         from pansplat import pipeline

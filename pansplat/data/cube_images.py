@@ -32,6 +32,7 @@ from pansplat.geometry.cubemap import face_of, face_rotations
 from pansplat.strict_json import read_json, require_object
 
 CUBE_SUFFIX = ".cube.json"
+BESIDE = "beside"  # key of a file that stands for a panorama: the folder of what belongs to it, such as masks
 ROW, COLUMN = "{row}", "{column}"  # in the path of a face: numbers of a tile, from 0
 
 Decode = Callable[[Path], UInt8[Array, "rows columns 3"]]
@@ -156,7 +157,7 @@ def write_description(content: dict[str, Any], pictures: Iterable[Path], folder:
     for picture in pictures:
         status = os.stat(picture)
         digest.update(b"%d %d;" % (status.st_size, status.st_mtime_ns))
-    text = json.dumps(content | {"pictures": digest.hexdigest()}).encode()
+    text = json.dumps(content | {BESIDE: str(folder.resolve()), "pictures": digest.hexdigest()}).encode()
     folders = cache_folders(folder)
     for path in (cache / name for cache in folders):
         if path.is_file() and read_file(path) == text:

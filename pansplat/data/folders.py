@@ -20,7 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.images import READABLE_SUFFIXES, list_pictures, require_panorama
+from pansplat.data.blur_masks import find_blur_mask, require_known_masks
+from pansplat.data.images import READABLE_SUFFIXES, list_pictures, require_blur_mask, require_panorama
 from pansplat.data.pairs import (
     FAR,
     FAR_SEQUENCE,
@@ -82,7 +83,24 @@ def load_pairs(
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
         InputError: no known format was found, or a file is missing or invalid.
     """
-    root = expand_home(path)
+    try:
+        pairs = _load_pairs(expand_home(path), convention, near, far)
+    except UnposedPanoramasError as error:
+        _check_blur_masks(error.panoramas)
+        raise
+    _check_blur_masks([view for pair in pairs for view in pair.context + pair.targets])
+    return pairs
+
+
+def _check_blur_masks(panoramas: Sequence[Panorama]) -> None:
+    """Check the masks that hide parts of panoramas: a wrong one would show what it should hide."""
+    images = dict.fromkeys(panorama.image for panorama in panoramas)
+    require_known_masks(images, [panorama.name for panorama in panoramas])
+    for mask in filter(None, map(find_blur_mask, images)):
+        require_blur_mask(mask)
+
+
+def _load_pairs(root: Path, convention: str | None, near: float | None, far: float | None) -> list[Pair]:
     if not root.exists():
         raise InputError(f"{root}: needed a panorama, or a folder of panoramas, got no such path; check it.")
     if root.is_file() and root.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES):

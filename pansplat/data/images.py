@@ -5,6 +5,7 @@ Images are RGB in [0, 1] with the sRGB curve, as in JPG and PNG. EXR files hold 
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import logging
 import struct
@@ -26,6 +27,7 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from pansplat.atomic import replacing
+from pansplat.data.blur_masks import blur_hidden, find_blur_mask, resize_hidden, widen_hidden
 from pansplat.data.cube_images import CUBE_SUFFIX, CubeImage, read_cube
 from pansplat.data.panorama_metadata import Crop, find_crop, find_xmp, make_gpano_xmp, parse_gpano
 from pansplat.data.rig_images import RIG_SUFFIX, RigImage, read_rig
@@ -86,7 +88,8 @@ def read_panorama(
 ) -> tuple[Float[Tensor, "3 height width"], Bool[Tensor, "height width"]]:
     """A panorama at (height, 2 height), and a mask of its opaque pixels. Warns when pixels are transparent.
 
-    The image is resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees.
+    The image is resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees. What its blur mask hides
+    (`pansplat.data.blur_masks`) is blurred before.
 
     Args:
         path: JPG, PNG and TIFF (8 or 16 bit), WebP, HEIC or EXR file, 2:1 or a crop with GPano properties; or a file
@@ -94,7 +97,8 @@ def read_panorama(
         height: pixels.
 
     Raises:
-        InputError: no such file, unknown format, damaged or truncated data, not 2:1, NaN, a dual fisheye picture.
+        InputError: no such file, unknown format, damaged or truncated data, not 2:1, NaN, a dual fisheye picture, or
+            a blur mask that cannot be used.
     """
     decoded = _decode_panorama(path, height)
     image = resize_panorama(decoded.color, height)
@@ -232,7 +236,38 @@ def _is_complete(path: Path) -> bool:
 
 def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height width"]:
     """A panorama at a small size; faster than `read_panorama`, because JPEGs are decoded at reduced size. No alpha."""
-    return resize_panorama(_decode_panorama(path, height, reduced=True).color, height)
+    path = Path(path)
+    return resize_panorama(_decode_panorama(path, height, reduced=find_blur_mask(path) is None).color, height)
+
+
+def require_blur_mask(mask: Path) -> None:
+    """Check that a blur mask is a 2:1 picture that is not damaged.
+
+    Raises:
+        InputError: it is not.
+    """
+    width, height = read_size(mask)
+    if width != 2 * height:
+        raise InputError(
+            f"{mask}: needed a blur mask of the proportions of its panorama, 2:1, got {width}x{height} (width x "
+            "height); draw it on the whole panorama."
+        )
+    require_complete(mask)
+
+
+def read_blur_mask(mask: Path, height: int) -> Bool[Array, "height width"]:
+    """A blur mask at (height, 2 height): every pixel that its white touches, without the margin.
+
+    Raises:
+        InputError: it cannot be read, is not 2:1, or is white everywhere.
+    """
+    require_blur_mask(mask)
+    decoded = _decode(mask)
+    grey = decoded.color.astype(np.float32).mean(axis=2) / (255 if decoded.color.dtype == np.uint8 else 1)
+    white = grey >= 0.5 if decoded.alpha is None else (grey >= 0.5) & (decoded.alpha >= 0.5)
+    if white.all():
+        raise InputError(f"{mask}: needed a blur mask with black where the panorama is shown, got white only; draw it.")
+    return resize_hidden(white, height)
 
 
 def read_pixels(path: Path) -> UInt8[Array, "rows columns 3"]:
@@ -442,9 +477,30 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) -> _DecodedImage:
-    """Pixels of a 2:1 image file. `reduced`: whether a JPEG may be decoded at a smaller size, of at least `height`."""
+    """Pixels of a panorama, blurred where its blur mask hides them.
+
+    `reduced`: whether a JPEG may be decoded at a smaller size, of at least `height`.
+    """
     path = Path(path)
     _check_height(height)
+    decoded, mask = _decode_shown(path, height, reduced=reduced), find_blur_mask(path)
+    if mask is None:
+        return decoded
+    hidden = read_blur_mask(mask, decoded.color.shape[0])
+    if not hidden.any():
+        return decoded
+    hidden = widen_hidden(hidden)
+    if hidden.mean() > 0.5:
+        warnings.warn(
+            f"{mask}: {100 * hidden.mean():.0f}% of the photograph is blurred; white is blurred, black is shown.",
+            category=InputWarning,
+            stacklevel=3,
+        )
+    return dataclasses.replace(decoded, color=blur_hidden(decoded.color, hidden))
+
+
+def _decode_shown(path: Path, height: int, *, reduced: bool) -> _DecodedImage:
+    """Pixels of a 2:1 image file as they are."""
     if is_assembled(path):
         parts = _read_assembled(path)
         if isinstance(parts, CubeImage):

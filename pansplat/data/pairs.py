@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pansplat.data.blur_masks import is_blur_mask
 from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_height, read_mask, read_panorama
 from pansplat.data.masks import lift_black_surfaces, scene_mask_of_files
 from pansplat.data.placements import PLACED, Placement
@@ -361,13 +362,14 @@ def find_mask(image: Path, folder: Path) -> Path | None:
 
 
 def list_panorama_files(folder: Path) -> list[Path]:
-    """Panorama files of a folder, sorted by name; without mask and depth files."""
+    """Panorama files of a folder, sorted by name; without masks and depth files."""
     return [
         path
         for path in sorted(folder.iterdir())
         if path.suffix.lower() in READABLE_SUFFIXES
         and path.stem not in ("mask", "depth")
         and not path.stem.endswith(("_mask", "_depth"))
+        and not is_blur_mask(path)
         and not path.name.startswith(".")
         and path.is_file()
     ]

@@ -15,6 +15,7 @@ import torch
 
 from pansplat.atomic import replacing
 from pansplat.cache_folders import cache_folders, write_cache_file
+from pansplat.data.blur_masks import find_blur_mask
 from pansplat.data.folders import make_names_unique
 from pansplat.data.images import read_thumbnail
 from pansplat.data.pairs import Collection, Pair, Panorama, single_view_pairs
@@ -224,7 +225,8 @@ def _hash_inputs(panoramas: Sequence[Panorama], camera_height: float) -> str:
     for panorama in panoramas:
         links = [(link.target, round(link.yaw, 6)) for link in panorama.links]
         digest.update(os.fsencode(f"{panorama.name} {links};"))
-        for file in (panorama.image, panorama.mask):
+        blur = find_blur_mask(panorama.image)
+        for file in (panorama.image, panorama.mask, *(() if blur is None else (blur,))):
             digest.update(os.fsencode(f"{_stamp(file)};"))
     return digest.hexdigest()
 

@@ -1,6 +1,7 @@
 """`pansplat export`: files, refused arguments."""
 
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -198,6 +199,62 @@ def test_a_folder_is_written_as_triangles_with_its_photographs(
     photographs = [np.asarray(Image.open(room / file).convert("RGB"), float) for file in ("a.png", "b.png")]
     errors = [min(np.abs(np.asarray(t, float) - photo).mean() for photo in photographs) for t in textures]
     assert max(errors) < 60, "random pixels, as JPEG; another photograph differs by 85"
+
+
+def test_a_crop_keeps_the_cameras_in_the_box_and_states_what_it_leaves_out(
+    scene: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], refusal: Callable[..., str]
+) -> None:
+    out, box = tmp_path / "part.ply", ["--crop", "-9", "-9", "-9", "0.5", "9", "9"]
+    assert run(["export", str(scene), "-o", str(out), "--layers", *box]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(
+        r"crop: \d+ of 1,024 Gaussians left out, and 1 of 2 cameras; the picture at the 1 camera ", printed
+    )
+    part = pipeline.load(out)
+    assert part.names == ("a",) and float(part.gaussians.means[:, 0].max()) <= 0.5
+    message = refusal("export", scene, "-o", out, "--layers", "--crop", 50, 50, 50, 60, 60, 60)
+    assert f"{scene}: needed a box with Gaussians, got (50.00" in message
+    assert "--crop must be a number of" in refusal("export", scene, "-o", out, "--crop", "a", 0, 0, 1, 1, 1)
+    message = refusal("export", room, "-o", tmp_path / "set", "--crop", 0, 0, 0, 1, 1, 1)
+    assert "--crop, --rooms and --no-floaters are not for a folder to train from" in message
+
+
+def test_the_mesh_of_a_crop_has_the_photograph_of_the_camera_that_is_left(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["export", str(room), "--model", "sphere", "--refine", "0", "--predict-height", "64", "--mesh"]
+    out, box = tmp_path / "mesh.glb", ["--crop", "0.5", "-9", "-9", "9", "9", "9"]
+    assert run([*command, *box, "--triangles", "5000", "-o", str(out)]) == 0
+    (part,) = trimesh.load(out, process=False).geometry.values()
+    texture = np.asarray(part.visual.material.baseColorTexture.convert("RGB"), float)
+    photographs = [np.asarray(Image.open(room / file).convert("RGB"), float) for file in ("a.png", "b.png")]
+    assert np.abs(texture - photographs[1]).mean() < 60 < np.abs(texture - photographs[0]).mean()
+
+
+def test_rooms_are_kept_by_name_in_layers_and_in_joint_scenes(
+    room: Path, scene: Path, tmp_path: Path, refusal: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "part.ply"
+    command = ["export", str(room), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o", str(out)]
+    for source in (["export", str(scene), "-o", str(out)], command):
+        assert run([*source, "--rooms", "B"]) == 0
+        assert "and 1 of 2 cameras" in capsys.readouterr().out
+        assert pipeline.load(out).names == ("b",)
+    message = refusal("export", scene, "-o", out, "--layers", "--rooms", "attic")
+    assert "needed the name of a room or panorama, got 'attic'; choose from a, b" in message
+
+
+def test_floaters_are_left_out_and_counted(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clean = pipeline.load(scene)
+    added = dataclasses.replace(
+        clean.gaussians.select(torch.arange(1)), means=torch.tensor([[0.2, 0.1, 0.7]]), scales=torch.full((1, 3), 0.03)
+    )
+    dirty = dataclasses.replace(clean, gaussians=Gaussians.cat([clean.gaussians, added]))
+    pipeline.save(dirty, tmp_path / "dirty.ply")
+    out = tmp_path / "out.ply"
+    assert run(["export", str(tmp_path / "dirty.ply"), "-o", str(out), "--layers", "--no-floaters"]) == 0
+    assert "floaters: 1 of 1,025 Gaussians left out; the pictures at the 2 cameras" in capsys.readouterr().out
+    assert torch.equal(pipeline.load(out).gaussians.means, clean.gaussians.means)
 
 
 def test_options_of_meshes_are_for_meshes(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:

@@ -17,10 +17,12 @@ import torch
 from imgui_bundle import imgui
 from PIL import Image
 
+from pansplat.cleanup import find_floaters
 from pansplat.data.folders import load_pairs
-from pansplat.data.images import write_image
+from pansplat.data.images import read_blur_mask, write_image
 from pansplat.data.pairs import Pair, Panorama
 from pansplat.errors import InputError
+from pansplat.gaussians.formats import load_scene
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -78,7 +80,7 @@ OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
     *get_args(Display), *get_args(Comparison),
     "fly", "orbit", "Reset", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
-    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Camera path", "Window", "Reload",
+    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
 }  # fmt: skip
 
 
@@ -325,6 +327,103 @@ def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
         assert file.size == (128, 64)
     user.click("off##stereo")
     assert "eye distance" not in user.panels.items
+
+
+@pytest.fixture
+def cleaning(user: User) -> Iterator[User]:
+    """The user with the section "Clean up" open, and the sections above it closed."""
+    headers = ("Clean up", "Display", "Compare", "Camera", "Gaussians")
+    for header in headers:
+        user.click(header)
+    yield user
+    user.viewer._stop_painting()
+    for header in headers[::-1]:
+        user.click(header)
+
+
+def test_a_box_hides_what_is_outside_and_a_saved_scene_lacks_it(cleaning, small_scene, tmp_path):
+    user = cleaning
+    whole = user.read_image()
+    user.click("crop to a box")
+    user.draw_frames(1)
+    assert user.state.settings.box == pytest.approx(user.data.bounds)
+    assert changed_fraction(whole, user.read_image()) == 0
+    user.slide("x from", 0.4, start=0.01)
+    box = user.state.settings.box
+    assert box is not None and box[0] > user.data.bounds[0] + 0.5
+    cropped = user.read_image()
+    assert changed_fraction(whole, cropped) > 0.05
+    user.panels.cleaning.file = str(tmp_path / "small.ply")
+    user.state.settings = replace(user.state.settings, opacity_threshold=0.5)
+    user.click("Save##clean")
+    user.draw_until(lambda: (tmp_path / "small.ply").exists() and not user.data.cleaning, "saved scene")
+    saved = load_scene(tmp_path / "small.ply")
+    means, opacities = small_scene.gaussians.means, small_scene.gaussians.opacities
+    inside = (means[:, 0] >= box[0]) & (opacities >= 0.5)
+    assert len(saved.gaussians) == int(inside.sum())
+    assert "Gaussians left out" in user.state.message and "small.ply" in user.state.message
+    user.panels.cleaning.file = "small.stl"
+    user.click("Save##clean")
+    user.draw_frames(2)
+    assert "small.stl" in user.data.error
+    user.data.error = None
+    user.click("crop to a box")
+    assert user.state.settings.box is None
+
+
+def test_floaters_are_removed_and_the_box_stays(cleaning, small_scene):
+    user = cleaning
+    user.click("crop to a box")
+    user.click("Remove floaters")
+    user.draw_until(lambda: "floaters:" in user.state.message, "message")
+    count = len(user.viewer._slot.scene.gaussians)
+    expected = len(small_scene.gaussians) - int(find_floaters(small_scene).sum())
+    assert f"{len(small_scene.gaussians) - expected:,} of {len(small_scene.gaussians):,}" in user.state.message
+    user.draw_until(lambda: len(user.viewer._slot.scene.gaussians) == expected, "cleaned scene")
+    assert count >= expected and user.state.settings.box is not None
+    user.show(*user.entries)
+
+
+def test_a_mask_is_painted_on_the_photograph_and_saved(cleaning, pair):
+    user = cleaning
+    mask = pair.folder / "a_blur.png"
+    user.click("paint what to hide")
+    user.draw_frames(2)
+    assert user.state.comparison == "photograph" and user.state.split == 0 and "Save mask" in user.panels.items
+    user.slide("brush", 0.5)
+    before = user.state.camera
+    user.drag((400, 300), (480, 320))
+    assert user.state.camera == before, "the left button paints"
+    painter = user.viewer._painter
+    assert painter is not None and painter.is_changed and 0 < painter.hidden.mean() < 0.2
+    painted = painter.hidden.copy()
+    assert changed_fraction(user.read_screen(), painted_without(user)) > 0, "outlines are drawn"
+    user.click("Save mask")
+    user.draw_frames(2)
+    try:
+        assert np.array_equal(read_blur_mask(mask, 512), painted) and "Reload" in user.state.message
+        user.press(imgui.Key.left_shift)
+        user.click("Clear")
+        assert not painter.hidden.any() and painter.is_changed
+        user.press(imgui.Key.escape)
+        assert user.viewer._painter is None and user.state.comparison == "off" and not user.state.quit
+        user.click("paint what to hide")
+        user.draw_frames(1)
+        assert np.array_equal(user.viewer._painter.hidden, painted), "that of the file"
+        user.click("paint what to hide")
+        assert user.viewer._painter is None
+    finally:
+        mask.unlink()
+
+
+def painted_without(user: User) -> np.ndarray:
+    """The screen without the mask that is painted."""
+    painter, user.viewer._painter = user.viewer._painter, None
+    user.draw_frames(2)
+    screen = user.read_screen()
+    user.viewer._painter = painter
+    user.draw_frames(2)
+    return screen
 
 
 def test_camera_widgets_fly_orbit_and_restore_the_start(user):

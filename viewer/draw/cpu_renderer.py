@@ -295,13 +295,13 @@ class CpuRenderer:
         splats, settings = self._splats, frame.settings
         layer_weights = choose_layer_weights(frame, splats, _MIN_WEIGHT)
         views = tuple(layer_weights)
-        key = (views, settings.levels, settings.opacity_threshold)
+        key = (views, settings.selection)
         if key not in self._groups:
             if len(self._groups) >= _MAX_SELECTIONS:
                 self._groups.clear()
             labels = np.full(len(splats), NO_LAYER, np.int16)
             for layer, view in enumerate(views):
-                labels[splats.select(settings.levels, settings.opacity_threshold, view)] = layer
+                labels[splats.select(settings.selection, view)] = layer
             self._groups[key] = labels, int(np.count_nonzero(labels != NO_LAYER))
         labels, visible = self._groups[key]
         return _Groups(labels, np.array(list(layer_weights.values()), np.float32), visible)

@@ -123,7 +123,7 @@ class Frame:
     def create_layer_key(self, splats: SortedSplats) -> tuple[Hashable, ...]:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
-        key = (splats, self.position, s.preset, s.levels, s.opacity_threshold, s.near)
+        key = (splats, self.position, s.preset, *s.selection, s.near)
         key += (s.footprint, s.splat_colors)
         if self.storage == LayerStorage.IMAGE:
             return (*key, self.rotation.tobytes(), self.focal)
@@ -295,7 +295,7 @@ class LayerPainter:
         self.rasterizer.release()
 
     def _select(self, settings: DrawSettings, view: int | None) -> Bool[np.ndarray, "n"]:
-        key = (settings.levels, settings.opacity_threshold, view)
+        key = (settings.selection, view)
         if key not in self._selections:
             if len(self._selections) > _MAX_SELECTIONS:
                 self._selections.clear()
@@ -411,7 +411,7 @@ class SplatRasterizer:
         if self._gpu is not None:
             for distance in range(4 if len(parts) > 1 else 0):
                 self._ctx.enable_direct(_CLIP_DISTANCE_0 + distance)
-            selection = settings.levels, settings.opacity_threshold, view
+            selection = settings.selection, view
             self._gpu.draw(self._quads, cameras, splats.position, selected, selection, settings, variance)
             for distance in range(4 if len(parts) > 1 else 0):
                 self._ctx.disable_direct(_CLIP_DISTANCE_0 + distance)

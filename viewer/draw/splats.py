@@ -22,6 +22,7 @@ from pansplat.rendering.cpu.runtime import parallel_for_slices
 from pansplat.rendering.cpu.tiling import radix_argsort
 from pansplat_viewer.draw.displays import color_by_property
 from pansplat_viewer.scene.camera import Pinhole
+from pansplat_viewer.scene.settings import GaussianChoice
 
 # Gaussians whose harmonics are evaluated together. Fits the cache, and is below the size at which torch starts threads,
 # which would cost more time than it saves.
@@ -136,9 +137,13 @@ class Splats:
         colors = color_by_property(display, self.means, rows[:, 4:8], rows[:, 8:11], self.levels, self.views, cameras)
         return np.pad(colors, ((0, 0), (0, 1)))
 
-    def select(self, levels: frozenset[int] | None, threshold: float, view: int | None) -> Bool[np.ndarray, "n"]:
-        """Return a mask of the splats that levels, opacity threshold and view select and that can be visible."""
+    def select(self, selection: GaussianChoice, view: int | None) -> Bool[np.ndarray, "n"]:
+        """Return a mask of the splats that a selection and view contain and that can be visible."""
+        levels, threshold, box = selection
         selected = self.reach > 0
+        if box is not None:
+            corners = np.array(box).reshape(2, 3) - self.origin
+            selected &= ((self.means >= corners.min(axis=0)) & (self.means <= corners.max(axis=0))).all(axis=1)
         if threshold > 0:
             selected &= self.opacities >= np.float32(threshold)
         if levels is not None:

@@ -122,6 +122,9 @@ def _select(scene: Scene, settings: DrawSettings) -> Bool[np.ndarray, "n"]:
     selected = gaussians.opacities.numpy() >= settings.opacity_threshold
     if settings.levels is not None:
         selected &= np.isin(gaussians.levels.numpy(), list(settings.levels))
+    if settings.box is not None:
+        corners, means = np.array(settings.box).reshape(2, 3), gaussians.means.numpy()
+        selected &= ((means >= corners.min(axis=0)) & (means <= corners.max(axis=0))).all(axis=1)
     if settings.mode == "view":
         selected &= gaussians.views.numpy() == settings.view
     return selected

@@ -20,6 +20,9 @@ Stereo = Literal["mono", "side-by-side", "top-bottom", "anaglyph"]
 Display = Literal["color", "depth", "opacity", "normals", "levels", "views", "count", "ellipsoids"]
 Comparison = Literal["off", "photograph", "error", "pinned"]
 
+GaussianChoice = tuple[frozenset[int] | None, float, tuple[float, ...] | None]
+"""Levels, least opacity and box of the Gaussians that are drawn."""
+
 _CHOICES = {
     "preset": Preset,
     "mode": Mode,
@@ -68,6 +71,7 @@ class DrawSettings:
     view_weights: tuple[float, ...] = ()
     levels: frozenset[int] | None = None  # pyramid levels to draw; None draws all
     opacity_threshold: float = 0.0  # Gaussians of lower opacity are not drawn
+    box: tuple[float, ...] | None = None  # x, y, z of two corners, metres; Gaussians with centres outside are not drawn
     display: Display = "color"
     display_max: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
@@ -110,6 +114,11 @@ class DrawSettings:
             raise InputError(f"`eye_offset` must be a distance in metres, got {self.eye_offset}")
         if self.face_size is not None and self.face_size < 1:
             raise InputError(f"`face_size` must be at least 1 pixel, got {self.face_size}")
+
+    @property
+    def selection(self) -> GaussianChoice:
+        """What chooses the Gaussians that are drawn, besides the view."""
+        return self.levels, self.opacity_threshold, self.box
 
     @property
     def is_exact(self) -> bool:

@@ -8,6 +8,7 @@ import moderngl
 from imgui_bundle import imgui
 
 from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.cleaning import MaskPainter
 from pansplat_viewer.scene.key_frames import KeyFrame
 from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import Comparison, Display, FrameStats, Preset, Projection
@@ -22,6 +23,7 @@ from pansplat_viewer.scene.state import (
     toggle_play,
 )
 from pansplat_viewer.scene.tour import Hotspot, TourScenes
+from pansplat_viewer.ui.cleaning import CleaningSection, draw_mask
 from pansplat_viewer.ui.minimap import SIZE, Minimap, describe_panorama, describe_panoramas, is_probable
 from pansplat_viewer.ui.overlays import (
     FIXED,
@@ -85,6 +87,9 @@ class PanelData:
     background: tuple[str, float] | None = None  # work of the loader on the tour, and the fraction done
     notes: tuple[str, ...] = ()  # what was not used or not placed at the path of the scene, and why
     placing: Placing | None = None  # the photographs and their poses; None if nothing is known of these
+    bounds: tuple[float, ...] | None = None  # of the scene, metres; None if it cannot be cropped
+    painter: MaskPainter | None = None  # the mask that is painted; None if none is
+    cleaning: tuple[str, float] | None = None  # work on the scene, and the fraction done
 
 
 class Panels:
@@ -95,11 +100,13 @@ class Panels:
         path, path_file: texts of the fields of scenes and of the camera path.
         minimap: the plan of a tour.
         placing: the window in which a photograph is placed.
+        cleaning: the section "Clean up".
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.items: dict[str, Rectangle] = {}
         self.minimap, self.placing = Minimap(ctx), PlacingWindow(ctx)
+        self.cleaning = CleaningSection(self._slider, self._check, self._button, self._record_rectangle)
         self.path, self.path_file = "", "path.json"
 
     def draw(self, state: ViewerState, data: PanelData, now: float) -> Commands:
@@ -114,6 +121,8 @@ class Panels:
             self._draw_divider(state)
         if data.stats.total:
             draw_legends(state)
+        if data.painter is not None:
+            draw_mask(data.painter, state.camera, state.brush_degrees)
         if state.overlay and state.points:
             draw_points(state)
         if state.overlay and data.tour is not None:
@@ -229,6 +238,7 @@ class Panels:
             self._section("Camera", self._draw_camera, state, data.panoramas)
             self._section("Screenshot", self._draw_screenshot, commands)
             self._section("Drawing", self._draw_settings, state, data.stats, opened=False)
+            self._section("Clean up", self._draw_cleaning, state, data, commands, opened=False)
             self._section("Camera path", self._draw_path, state, data, commands, opened=False)
             self._section("Window", self._draw_window, data, commands, opened=False)
             imgui.pop_item_width()
@@ -236,6 +246,17 @@ class Panels:
 
     def _draw_photographs(self, placing: Placing, commands: Commands) -> None:
         commands.reload |= draw_photographs(placing, self._button)
+
+    def _draw_cleaning(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
+        self.cleaning.draw(
+            state,
+            commands,
+            data.bounds,
+            data.painter,
+            data.cleaning,
+            refining=data.refinement is not None and data.refinement < 1,
+            can_paint=bool(data.photographs),
+        )
 
     def _draw_scene(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
         if data.entries:

@@ -54,6 +54,7 @@ class Input:
     Attributes:
         drag: pointer movement over the image with the left button held, pixels (right, down).
         click: place of a click on the image without a drag, as fractions of width and height; None without a click.
+        pointer: place of the pointer over the image while the left button is held, in the same unit; else None.
         sticks: of a gamepad, -1 to 1: fly right, up and forward, turn right and up.
     """
 
@@ -65,6 +66,7 @@ class Input:
     scroll: float = 0.0  # wheel steps; positive is scrolling up
     height: int = 720  # of the window, pixels
     click: tuple[float, float] | None = None
+    pointer: tuple[float, float] | None = None
     sticks: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -91,6 +93,11 @@ class Commands:
     theme: Theme | None = None  # choose these colours
     reset_layout: bool = False  # restore the default layout of the panels
     visit: int | None = None  # fly to this panorama of the tour
+    remove_floaters: bool = False
+    save_scene: str | None = None  # write the scene without what is hidden to this file
+    paint: bool | None = None  # start or end to paint a mask
+    clear_mask: bool = False
+    save_mask: bool = False
     save_path: str | None = None
     open_path: str | None = None
     film: bool = False  # write the film of the path
@@ -162,9 +169,11 @@ def read_input(seconds: float) -> Input:
     modifiers = {"shift": io.key_shift, "alt": io.key_alt, "ctrl": io.key_ctrl}
     held |= {name for name, down in modifiers.items() if down}
     drag = pan = (0.0, 0.0)
-    scroll, click = 0.0, None
+    scroll, click, pointer = 0.0, None, None
     if not io.want_capture_mouse:
         moved = (float(io.mouse_delta.x), float(io.mouse_delta.y))
+        place = (io.mouse_pos.x / max(io.display_size.x, 1), io.mouse_pos.y / max(io.display_size.y, 1))
+        pointer = place if imgui.is_mouse_down(0) else None
         if imgui.is_mouse_down(0) and not imgui.is_mouse_clicked(0):
             drag = moved
         elif imgui.is_mouse_down(1) or imgui.is_mouse_down(2):
@@ -172,9 +181,11 @@ def read_input(seconds: float) -> Input:
         scroll = float(io.mouse_wheel)
         moved_since_click = imgui.get_mouse_drag_delta(0, 0.0)
         if imgui.is_mouse_released(0) and max(abs(moved_since_click.x), abs(moved_since_click.y)) < _CLICK_PIXELS:
-            click = (io.mouse_pos.x / io.display_size.x, io.mouse_pos.y / io.display_size.y)
+            click = place
     height = int(io.display_size.y)
-    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click, _read_sticks())
+    return Input(
+        seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click, pointer, _read_sticks()
+    )
 
 
 def apply_input(state: ViewerState, events: Input) -> Commands:

@@ -89,7 +89,7 @@ def draw(rasterizer: SplatRasterizer, target, splats: Splats, camera: Pinhole, s
 def test_the_order_and_the_culling_are_the_processors(make_rasterizer, target, splats, pose, preset):
     camera = Pinhole(pose[:3, :3], tuple(pose[:3, 3]), 60.0, 64, 48)
     settings = DrawSettings(preset=preset)
-    selected = splats.select(None, 0.0, None) & (np.arange(len(splats)) % 3 > 0)
+    selected = splats.select((None, 0.0, None), None) & (np.arange(len(splats)) % 3 > 0)
     variance = compute_filter_variance(settings, camera.focal)
     expected = sort_splats(splats, camera.position)
     seen = expected.cull(camera, selected, variance, bounded=settings.is_exact)

@@ -1,0 +1,140 @@
+"""People, plates and other things that are hidden in photographs by masks that a user has drawn.
+
+The mask of `STEM.jpg` is `STEM_blur.png` beside it, white where the photograph is hidden. Every read of a panorama
+(`pansplat.data.images`) replaces these pixels first, so that nothing else contains them. They become a blur of what is
+around them: no hidden pixel has an influence on it, so that nothing of it can be computed back.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pansplat.data.cube_images import BESIDE, CUBE_SUFFIX
+from pansplat.data.rig_images import RIG_SUFFIX
+from pansplat.errors import InputError
+from pansplat.strict_json import read_json, require_object
+
+BLUR_SUFFIX = "_blur"  # of the stem of a mask
+
+_ROWS = 256  # at most, in which the surroundings are blurred
+_MARGIN = 1 / 128  # of the height; a JPEG mixes pixels within blocks of 16
+_LEAST_SHARE = 0.25  # of a cell that is not hidden, for a colour of its own
+
+
+def name_blur_mask(image: Path) -> Path:
+    """The file of the blur mask of a panorama, which need not exist."""
+    for suffix in (CUBE_SUFFIX, RIG_SUFFIX):
+        if image.name.endswith(suffix):
+            folder = require_object(read_json(image), image).get(BESIDE, image.parent)
+            return Path(folder) / f"{image.name.removesuffix(suffix)}{BLUR_SUFFIX}.png"
+    return image.with_name(f"{image.stem}{BLUR_SUFFIX}.png")
+
+
+def find_blur_mask(image: Path) -> Path | None:
+    """The file of the blur mask of a panorama; None if there is none."""
+    mask = name_blur_mask(image)
+    return mask if mask.is_file() else None
+
+
+def is_blur_mask(path: Path) -> bool:
+    """Whether a file is a blur mask by its name."""
+    return path.stem.endswith(BLUR_SUFFIX) and path.suffix.lower() == ".png"
+
+
+def require_known_masks(images: Iterable[Path], names: Iterable[str]) -> None:
+    """Check that each blur mask beside panoramas is one of a picture there.
+
+    Args:
+        images: files of panoramas.
+        names: of panoramas; those of several pictures have no file of their name.
+
+    Raises:
+        InputError: a mask has no picture, or is no PNG: what it should hide would be shown.
+    """
+    known = set(names)
+    for folder in dict.fromkeys(name_blur_mask(image).parent for image in images):
+        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        stems = known | {path.stem for path in files if not is_blur_mask(path)}
+        for mask in (path for path in files if path.stem.endswith(BLUR_SUFFIX)):
+            name = mask.stem.removesuffix(BLUR_SUFFIX)
+            if mask.suffix.lower() == ".png" and name not in stems:
+                close = difflib.get_close_matches(name, stems, n=1)
+                suggestion = f" (did you mean {close[0]}{BLUR_SUFFIX}.png?)" if close else ""
+                raise InputError(
+                    f"{mask}: needed the name of a panorama before {BLUR_SUFFIX}.png, got {name!r}{suggestion}; rename "
+                    "or remove the mask."
+                )
+            if mask.suffix.lower() != ".png" and name in stems:
+                raise InputError(f"{mask}: needed a blur mask as PNG, got {mask.suffix}; save it as {name}_blur.png.")
+
+
+def resize_hidden(white: Bool[NDArray[Any], "rows columns"], height: int) -> Bool[NDArray[Any], "height width"]:
+    """A mask at (height, 2 height): every pixel that a white pixel touches."""
+    if white.shape[0] == height:
+        return white
+    method = cv2.INTER_AREA if white.shape[0] > height else cv2.INTER_LINEAR
+    return cv2.resize(white.astype(np.float32), (2 * height, height), interpolation=method) > 0
+
+
+def widen_hidden(hidden: Bool[NDArray[Any], "height width"]) -> Bool[NDArray[Any], "height width"]:
+    """What is hidden and a margin of 1.4 degrees around it: a photograph shows traces of a thing beside it."""
+    margin = max(round(_MARGIN * hidden.shape[0]), 1)
+    padded = np.pad(hidden.astype(np.uint8), ((0, 0), (margin, margin)), mode="wrap")
+    return cv2.dilate(padded, np.ones((2 * margin + 1, 2 * margin + 1), np.uint8))[:, margin:-margin] > 0
+
+
+def blur_hidden(color: NDArray[Any], hidden: Bool[NDArray[Any], "height width"]) -> NDArray[Any]:
+    """A panorama whose hidden pixels are a blur of the others, across the seam at +-180 degrees, too.
+
+    Hidden colours have no influence. Surroundings are averaged in cells of a pyramid, from fine to coarse ("pull"), and
+    interpolated back ("push"). Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.4.
+
+    Args:
+        color: (height, width, 3), uint8 or float32.
+        hidden: not all of the pixels.
+    """
+    if not hidden.any():
+        return color
+    result = color.copy()
+    result[hidden] = 0
+    height, width = hidden.shape
+    rows = 1 << min(_ROWS.bit_length() - 1, height.bit_length() - 1)  # at most the height, a power of two
+    size = (2 * rows, rows)
+    mean = cv2.resize(result, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    share = cv2.resize((~hidden).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    blurred = np.pad(_pull_and_push(mean, share), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    blurred[:, 0], blurred[:, -1] = blurred[:, -2].copy(), blurred[:, 1].copy()
+    y, x = np.nonzero(hidden)
+    places = (y + 0.5) * rows / height + 0.5, (x + 0.5) * 2 * rows / width + 0.5
+    for channel in range(3):
+        values = ndimage.map_coordinates(blurred[..., channel], places, order=1)
+        result[y, x, channel] = np.rint(values) if color.dtype == np.uint8 else values
+    return result
+
+
+def _pull_and_push(
+    sums: Float[NDArray[Any], "rows columns 3"], share: Float[NDArray[Any], "rows columns"]
+) -> Float[NDArray[Any], "rows columns 3"]:
+    """Colours of all cells from the sums of those of which a share is known."""
+    is_known = share > _LEAST_SHARE
+    known = np.where(is_known[..., None], sums / np.maximum(share, _LEAST_SHARE)[..., None], 0)
+    if is_known.all():
+        return known
+    rows, columns = share.shape
+    if rows == 1:
+        return np.where(is_known[..., None], known, sums.sum(axis=(0, 1)) / max(float(share.sum()), 1e-6))
+    coarse_sums = sums.reshape(rows // 2, 2, columns // 2, 2, 3).mean(axis=(1, 3))
+    coarse_share = share.reshape(rows // 2, 2, columns // 2, 2).mean(axis=(1, 3))
+    coarse = _pull_and_push(coarse_sums, coarse_share)
+    wrapped = np.concatenate((coarse[:, -1:], coarse, coarse[:, :1]), axis=1)
+    fine = cv2.resize(wrapped, (columns + 4, rows), interpolation=cv2.INTER_LINEAR)[:, 2:-2]
+    return np.where(is_known[..., None], known, fine)

@@ -1,0 +1,89 @@
+"""A part of a scene: some Gaussians, and the cameras that go with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+
+Box = tuple[float, float, float, float, float, float]
+"""Two opposite corners: x, y and z of one, then of the other, metres in world axes."""
+
+
+def keep_gaussians(scene: Scene, kept: Bool[Tensor, "n"], views: Sequence[int] | None = None) -> Scene:
+    """The scene of some Gaussians and views; the views are numbered anew.
+
+    Args:
+        scene: a scene.
+        kept: of its Gaussians.
+        views: in ascending order; by default those that have Gaussians. For deferred blending, Gaussians of other views
+            are left out. For joint drawing, they belong to the nearest one of these.
+    """
+    gaussians, count = scene.gaussians, len(scene.cam2world)
+    if not count:
+        return dataclasses.replace(scene, gaussians=gaussians.select(kept))
+    own = gaussians.views.long()
+    chosen = own[kept].unique().tolist() if views is None else list(views)
+    number = torch.full((count,), -1)
+    number[chosen] = torch.arange(len(chosen))
+    number = number.to(own.device)
+    if scene.joint and chosen:
+        centers = scene.cam2world[chosen, :3, 3].to(gaussians.means)
+        lost = (kept & (number[own] < 0)).nonzero()[:, 0]
+        nearest = torch.cdist(gaussians.means[lost], centers).argmin(dim=1)
+        own = own.clone()
+        own[lost] = torch.tensor(chosen, device=own.device)[nearest]
+    kept = kept & (number[own] >= 0)
+    part = gaussians.select(kept)
+    new = {old: index for index, old in enumerate(chosen)}
+    edges = {(new[a], new[b]): overlap for a, b, overlap in scene.overlaps if a in new and b in new}
+    if scene.overlaps:
+        joined = {view for edge in edges for view in edge}
+        edges |= {(view, view): 1.0 for view in range(len(chosen)) if view not in joined}
+    return dataclasses.replace(
+        scene,
+        gaussians=dataclasses.replace(part, views=number[own[kept]].to(gaussians.views)),
+        cam2world=scene.cam2world[chosen],
+        names=tuple(scene.names[view] for view in chosen if view < len(scene.names)),
+        gains=tuple(scene.gains[view] for view in chosen) if scene.gains else (),
+        overlaps=tuple((a, b, overlap) for (a, b), overlap in edges.items()),
+        links=tuple((new[a], new[b], *rest) for a, b, *rest in scene.links if a in new and b in new),
+        starts=tuple(scene.starts[view] for view in chosen) if scene.starts else (),
+    )
+
+
+def crop(scene: Scene, box: Box) -> Scene:
+    """The part of a scene whose Gaussians have their centres in a box.
+
+    Cameras outside are left out with their layers; if all are outside, those stay that have Gaussians in the box.
+
+    Raises:
+        InputError: nothing is in the box.
+    """
+    corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
+    low, high = corners.amin(dim=0), corners.amax(dim=0)
+    is_inside = _are_between(scene.gaussians.means, low, high)
+    views = _are_between(scene.cam2world[:, :3, 3], low, high).nonzero()[:, 0].tolist()
+    cropped = keep_gaussians(scene, is_inside, views or None)
+    if not len(cropped.gaussians):
+        finite = scene.gaussians.means[torch.isfinite(scene.gaussians.means).all(dim=1)]
+        found = "no Gaussian" if not len(finite) else f"a scene from {_list(finite.amin(0))} to {_list(finite.amax(0))}"
+        raise InputError(
+            f"needed a box with Gaussians, got {_list(low)} to {_list(high)} m and {found}; choose another"
+        )
+    return cropped
+
+
+def _are_between(points: Float[Tensor, "n 3"], low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Bool[Tensor, "n"]:
+    points = points.double().cpu()
+    return ((points >= low) & (points <= high)).all(dim=1).to(points.device)
+
+
+def _list(point: Tensor) -> str:
+    return "(" + ", ".join(f"{value:.2f}" for value in point.tolist()) + ")"

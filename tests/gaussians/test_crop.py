@@ -1,0 +1,90 @@
+"""Parts of scenes keep Gaussians, views and cameras consistent."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.gaussians.crop import crop, keep_gaussians
+from pansplat.gaussians.scene import Gaussians, Scene
+
+
+def _make_row(*, joint: bool = False) -> Scene:
+    """Three cameras in a row, 4 m apart along x, each with Gaussians at distances of 1 and 3 m before and behind it."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.tensor((0.0, 4.0, 8.0))
+    offsets = torch.tensor((-3.0, -1.0, 1.0, 3.0))
+    means = torch.zeros(12, 3)
+    means[:, 0] = (poses[:, 0, 3, None] + offsets).flatten()
+    gaussians = Gaussians(
+        means,
+        torch.full((12, 3), 0.1),
+        torch.tensor((1.0, 0, 0, 0)).expand(12, 4),
+        torch.linspace(0.1, 1, 12),
+        torch.zeros(12, 1, 3),
+        torch.zeros(12, dtype=torch.uint8),
+        torch.arange(3).repeat_interleave(4).to(torch.uint8),
+    )
+    gains, starts = ((1.0, 1.0, 1.0), (2.0, 2.0, 2.0), (3.0, 3.0, 3.0)), (None, (0.5, 0.0), (1.0, 0.0))
+    links = ((0, 1, 0.1, 0.0, "on"), (1, 2, 0.2, 0.0, "on"), (2, 1, 0.3, 0.0, "back"))
+    edges = ((0, 1, 0.4), (1, 2, 0.3))
+    names = ("a", "b", "c")
+    return Scene(
+        gaussians, poses, 0.5, 9.0, names, gains=gains, overlaps=edges, links=links, starts=starts, joint=joint
+    )
+
+
+@pytest.mark.parametrize("order", [(2.0, -1, -1, 12, 1, 1), (12.0, 1, -1, 2, -1, 1)])
+def test_a_crop_keeps_the_cameras_in_the_box_and_numbers_them_anew(order: tuple[float, ...]) -> None:
+    cropped = crop(_make_row(), order)
+    assert cropped.names == ("b", "c") and cropped.cam2world[:, 0, 3].tolist() == [4, 8]
+    assert cropped.gaussians.means[:, 0].tolist() == [3, 5, 7, 5, 7, 9, 11], "1 and 3 m around b and c, from x = 2 on"
+    assert cropped.gaussians.views.tolist() == [0, 0, 0, 1, 1, 1, 1]
+    assert cropped.gaussians.views.dtype == torch.uint8
+    assert cropped.gains == ((2.0, 2.0, 2.0), (3.0, 3.0, 3.0)) and cropped.starts == ((0.5, 0.0), (1.0, 0.0))
+    assert cropped.overlaps == ((0, 1, 0.3),)
+    assert cropped.links == ((0, 1, 0.2, 0.0, "on"), (1, 0, 0.3, 0.0, "back"))
+
+
+def test_a_joint_crop_keeps_what_cameras_outside_have_seen() -> None:
+    cropped = crop(_make_row(joint=True), (2.0, -1, -1, 12, 1, 1))
+    assert sorted(cropped.gaussians.means[:, 0].tolist()) == [3, 3, 5, 5, 7, 7, 9, 11]
+    assert cropped.gaussians.views[cropped.gaussians.means[:, 0] == 3].tolist() == [0, 0]
+
+
+def test_a_box_without_cameras_keeps_those_that_have_gaussians_in_it() -> None:
+    cropped = crop(_make_row(), (4.5, -1, -1, 6, 1, 1))
+    assert cropped.names == ("b", "c") and cropped.gaussians.means[:, 0].tolist() == [5, 5]
+
+
+def test_a_panorama_without_neighbours_has_an_edge_to_itself() -> None:
+    scene = _make_row()
+    part = keep_gaussians(scene, torch.ones(12, dtype=torch.bool), (0, 2))
+    assert part.overlaps == ((0, 0, 1.0), (1, 1, 1.0)) and part.links == ()
+
+
+def test_a_crop_around_everything_changes_nothing(make_scene: Callable[..., Scene]) -> None:
+    scene = make_scene()
+    cropped = crop(scene, (-1e5, -1e5, -1e5, 1e5, 1e5, 1e5))
+    assert torch.equal(cropped.gaussians.means, scene.gaussians.means)
+    assert torch.equal(cropped.gaussians.views, scene.gaussians.views) and torch.equal(
+        cropped.cam2world, scene.cam2world
+    )
+    for name in ("names", "gains", "overlaps", "links", "starts"):
+        assert getattr(cropped, name) == getattr(scene, name)
+
+
+def test_a_scene_without_cameras_is_cropped(make_scene: Callable[..., Scene]) -> None:
+    scene = make_scene()
+    foreign = replace(scene, cam2world=scene.cam2world[:0], names=(), gains=(), overlaps=(), links=(), starts=())
+    cropped = crop(foreign, (0, -9, -9, 9, 9, 9))
+    assert 0 < len(cropped.gaussians) < 40 and bool((cropped.gaussians.means[:, 0] >= 0).all())
+    assert torch.equal(cropped.gaussians.views, scene.gaussians.views[scene.gaussians.means[:, 0] >= 0])
+
+
+def test_an_empty_box_is_refused_with_the_size_of_the_scene() -> None:
+    message = r"needed a box with Gaussians, got \(20\.00, .* and a scene from \(-3\.00, 0\.00, 0\.00\) to \(11\.00, "
+    with pytest.raises(InputError, match=message):
+        crop(_make_row(), (20, 0, 0, 30, 1, 1))
