@@ -208,8 +208,8 @@ def find_floaters(scene: Scene) -> Bool[Tensor, "n"]:
 
     A Gaussian is isolated if hardly any of those beside it, in the directions of its camera, is as far, and if no other
     camera has one at its place. A thin thing, such as a wire, has neighbours along itself. What has no surface behind
-    it, such as a distant tree before the sky, is kept. In a scene without input cameras, Gaussians float whose neighbours
-    are far, relative to the neighbours' own ones and to their size.
+    it, such as a distant tree before the sky, is kept. In a scene without input cameras, Gaussians float whose
+    neighbours are far, relative to the neighbours' own ones and to their size.
     """
     scene = scene.scaled(working_factor(scene.near))  # the rasterisers have thresholds in metres
     gaussians = scene.gaussians
