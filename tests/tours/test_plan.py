@@ -137,7 +137,7 @@ def test_rooms_have_their_areas_angles_and_corners(noise: float) -> None:
 
 @pytest.mark.parametrize("suffix", [".svg", ".dxf"])
 def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Path, suffix: str) -> None:
-    scene = _make_house(WALLS, CAMERAS, names=("living room", "living room", "hall"), count=8000)
+    scene = _make_house(WALLS, CAMERAS, names=("living room", "living room", "hall"), count=20000)
     file = tmp_path / f"plan{suffix}"
     assert [room.name for room in write_plan(scene, file).rooms] == ["living room", "hall"]
     if suffix == ".svg":
