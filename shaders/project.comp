@@ -21,7 +21,8 @@ void main() {
     uint entry = visible[total - 1u - uint(first) - slot], index = entry & 0x1FFFFFFFu;
     part = int(entry >> 29);
     StoredGaussian stored = gaussians[index];
-    Gaussian gaussian = Gaussian(stored.mean_opacity.xyz, stored.mean_opacity.w, stored.quat, stored.scale.xyz);
+    vec4 mean = stored.mean_opacity, scale = stored.scale;
+    Gaussian gaussian = Gaussian(mean.xyz, mean.w, stored.quat, scale.xyz, int(scale.w));
     Footprint f;
     Record record = Record(vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
     if (project_gaussian(gaussian, f)) {

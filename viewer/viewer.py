@@ -30,7 +30,9 @@ from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
 from pansplat_viewer.draw.stereo import StereoRenderer, choose_format, get_eye_size, render_image
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.background import BackgroundWorker, Report
+from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.cleaning import Cleaned, Cleaner, MaskPainter, measure_bounds
+from pansplat_viewer.scene.doll_house import DollHouse
 from pansplat_viewer.scene.key_frames import read_path, write_path
 from pansplat_viewer.scene.loader import LoadedScene, Progress, SceneEntry, SceneLoader, list_panoramas
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
@@ -38,6 +40,8 @@ from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
 from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot, keep_largest
 from pansplat_viewer.scene.state import (
+    GLIDE_SECONDS,
+    Glide,
     ViewerState,
     adapt_settings,
     advance_flight,
@@ -45,6 +49,7 @@ from pansplat_viewer.scene.state import (
     enter_scene,
     enter_tour,
     fit_settings,
+    leave_doll_house,
 )
 from pansplat_viewer.scene.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_clicked, find_hotspots
 from pansplat_viewer.ui.compare import Comparer
@@ -113,6 +118,7 @@ class Viewer:
         self._fade = CrossFade()
         self._scene_slot: int = 0  # that of the scene that was shown last, and its panoramas in a tour
         self._scene_views: tuple[int, ...] = ()
+        self._doll_house: tuple[DollHouse, SceneSlot, Camera] | None = None  # with the first camera
         self._slots = [SceneSlot(StereoRenderer(create_renderer(ctx, renderer), ctx))]
         self._preparer = ScenePreparer(self.renderer.prepare)
         self._incoming: LoadedScene | None = None  # shown when it is prepared
@@ -136,6 +142,8 @@ class Viewer:
         self._cleaner = Cleaner()
         self._painter: MaskPainter | None = None
         self._bounds: tuple[Scene, tuple[float, ...]] | None = None  # a scene and its box
+        self._doll_houses: BackgroundWorker[DollHouse | None] = BackgroundWorker("doll-house")
+        self._inside = self.state.camera  # before the doll's house
         self._last_camera = self.state.camera
 
     @property
@@ -150,20 +158,21 @@ class Viewer:
 
     @property
     def _slot(self) -> SceneSlot:
-        return self._slots[self._scene_slot]
+        return self._slots[self._scene_slot] if self._doll_house is None else self._doll_house[1]
 
     @property
     def _shows_photograph(self) -> bool:
         """Whether a photograph is shown, because there is no scene of the camera's place yet."""
-        return isinstance(self._fade.contents[self._fade.front], int)
+        return self._doll_house is None and isinstance(self._fade.contents[self._fade.front], int)
 
     @property
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
         loading = self.loader.entry is not None or self.loader.is_searching or self._comparer.photographs.is_reading
         loading = loading or self._incoming is not None or self._preparer.progress is not None
-        loading = loading or (self._placing is not None and self._placing.is_busy) or self._cleaner.progress is not None
-        return self.moving or loading or self._films.future is not None
+        loading = loading or (self._placing is not None and self._placing.is_busy)
+        working = self._films.future is not None or self._doll_houses.future is not None
+        return self.moving or loading or working or self._cleaner.progress is not None
 
     @property
     def moving(self) -> bool:
@@ -187,7 +196,7 @@ class Viewer:
     @property
     def _is_animated(self) -> bool:
         fading = self._fade.compute_weight(self._clock()) < 1
-        return fading or self.state.path_playing or self.state.playing
+        return fading or self.state.path_playing or self.state.playing or self.state.glide is not None
 
     def open(self, path: Path, name: str | None = None) -> None:
         """Look for the scenes at a path and show one; for an invalid path, show an error and keep the scene.
@@ -230,6 +239,7 @@ class Viewer:
         self._take_loaded(now)
         self._take_film(now)
         self._take_cleaned(now)
+        self._take_doll_house(size, now)
         self._watch.look(now)
         self._exchange_scene()
         self.gui.begin(seconds, new_frame)
@@ -239,6 +249,7 @@ class Viewer:
         # The step is limited, so that after a slow frame the camera does not move far.
         events = self._paint(self._leave_placing(read_input(min(seconds, _MAX_STEP_SECONDS))), size)
         key_commands = apply_input(self.state, events)
+        self._update_doll_house(min(seconds, 2 * _MAX_STEP_SECONDS))
         self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
         advance_path(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
         self._update_tour(now)
@@ -262,6 +273,8 @@ class Viewer:
         self._save_layout(changed=False)
         self._films.close()
         self._cleaner.close()
+        self._doll_houses.close()
+        self._close_doll_house()
         if self._placing is not None:
             self._placing.close()
         self.loader.close()
@@ -336,6 +349,8 @@ class Viewer:
         """Show the refined scene or the prediction, whichever is chosen, while the camera stands still."""
         if self._loaded is None or self._refined is None or self._incoming is not None or self.moving:
             return
+        if self._doll_house is not None:
+            return
         scene = self._refined if self.state.refined else self._loaded.scene
         if scene is self._slot.scene or not self._preparer.is_ready(scene):
             return
@@ -345,6 +360,9 @@ class Viewer:
     def _enter(self, loaded: LoadedScene, now: float) -> None:
         photograph = self._fade.contents[self._fade.front] if self._loaded is None else None
         remaining = self._list_remaining() if self._loaded is None else ()
+        if self._doll_house is not None:
+            self.state.camera = self._inside
+        self._close_doll_house()
         self._loaded, self._refined, self._tour = loaded, None, None
         self._shown = self.entries, self.panel_data.current, self.path
         self._resolution = self._create_resolution()
@@ -473,9 +491,9 @@ class Viewer:
             self.panel_data.error = str(result)
 
     def _measure_bounds(self) -> tuple[float, ...] | None:
-        """The box of the scene; None for tours, whose scenes are parts."""
+        """The box of the scene; None for tours, whose scenes are parts, and in the doll's house."""
         scene = self._slot.scene
-        if self._loaded is None or self._tour is not None or scene is None:
+        if self._loaded is None or self._tour is not None or self._doll_house is not None or scene is None:
             return None
         if self._bounds is None or self._bounds[0] is not scene:
             self._bounds = scene, measure_bounds(scene)
@@ -506,9 +524,10 @@ class Viewer:
         if tour is None:
             return
         route = state.route if state.playing else None
-        tour.move(np.asarray(state.camera.position), route, state.flight)
-        self._show_place(tour, now)
-        self._fade.move(state.camera.cam2world, tour.part)
+        if not state.doll_house:
+            tour.move(np.asarray(state.camera.position), route, state.flight)
+            self._show_place(tour, now)
+            self._fade.move(state.camera.cam2world, tour.part)
         if self._loaded is None or self._is_other_requested():
             return
         request = tour.choose_request(tour.list_next(route, state.flight), self.loader.entry)
@@ -577,11 +596,95 @@ class Viewer:
 
     def _visit(self, place: tuple[float, float]) -> bool:
         """Fly to the panorama whose hotspot is at a place of the window; returns whether there is one."""
-        if not (self.state.hotspots and self.state.overlay):
+        if not (self.state.hotspots and self.state.overlay) or self.state.glide is not None:
             return False
         size = imgui.get_io().display_size
         self.state.target = find_clicked(self.panel_data.hotspots, (place[0] * size.x, place[1] * size.y))
         return self.state.target is not None
+
+    # --- the doll's house ---
+
+    def _toggle_doll_house(self, now: float) -> None:
+        """Make the doll's house of the part and the storey of the camera, or fly back into it."""
+        state, loaded = self.state, self._loaded
+        if self._doll_houses.cancel() or loaded is None or state.glide is not None:
+            return
+        node = self._find_nearest_panorama(self._inside if self._doll_house else state.camera)
+        if self._doll_house is not None:
+            state.target = node
+        elif node is None:
+            state.show_message("there are no panoramas", now)
+        else:
+            labels, tour = self._name_panoramas(), self._tour
+            if tour is not None:
+                labels = [panorama.label for panorama in tour.tour.panoramas]
+            scene = self._slot.scene
+            gather = None if tour is None else tour.gather_part()
+
+            def make(report: Report) -> DollHouse | None:
+                gathered = scene if gather is None else gather()
+                assert gathered is not None
+                report()
+                return DollHouse.make(gathered, labels, node)
+
+            self._doll_houses.start(make)
+
+    def _find_nearest_panorama(self, camera: Camera) -> int | None:
+        """The panorama nearest to a camera, in a tour one of the edge at the camera; None if there is none."""
+        if self._tour is not None:
+            return self._tour.find_nearest(np.asarray(camera.position))
+        distances = np.linalg.norm(self.state.context[:, :3, 3] - camera.position, axis=1)
+        return int(distances.argmin()) if len(distances) else None
+
+    def _take_doll_house(self, size: tuple[int, int], now: float) -> None:
+        """Show the doll's house that was made, and fly out of the rooms."""
+        made = self._doll_houses.future
+        is_done = made is not None and made.done()
+        found = self._doll_houses.poll()
+        if not is_done or self._loaded is None:
+            return
+        if not isinstance(found, DollHouse):
+            self.state.show_message("no room is known here" if found is None else f"no doll's house: {found}", now)
+            return
+        state, slot = self.state, SceneSlot(StereoRenderer(create_renderer(self.ctx, self._choice), self.ctx))
+        if self._upload(slot, found.scene, self._loaded.entry) is not None:
+            slot.renderer.release()
+            return
+        first = found.frame(state.camera, get_eye_size(size, state.settings.stereo))
+        self._doll_house, self._inside = (found, slot, first), state.camera
+        state.playing = state.path_playing = False
+        state.doll_house, state.glide, state.points = True, Glide(state.camera, first, is_entry=False), []
+        self._resolution = self._create_resolution()
+
+    def _update_doll_house(self, seconds: float) -> None:
+        """Move the camera outside of the rooms, and back into the panorama that is chosen."""
+        if self._doll_house is None:
+            return
+        state, (house, _, first) = self.state, self._doll_house
+        if state.doll_house and state.target is not None:
+            if state.target in house.nodes:
+                end = house.enter(state.camera, state.target, self._inside)
+                state.glide, state.target = Glide(state.camera, end, is_entry=True), None
+            else:  # of another part or storey
+                state.camera = self._inside
+                leave_doll_house(state)
+        if state.glide is not None:
+            state.glide = replace(state.glide, seconds=state.glide.seconds + seconds)
+            state.camera = state.glide.camera
+            if state.glide.seconds >= GLIDE_SECONDS:
+                if state.glide.is_entry:
+                    leave_doll_house(state)
+                state.glide = None
+        elif state.doll_house:
+            state.camera = house.limit(state.camera, first)
+        if not state.doll_house:
+            self._close_doll_house()
+
+    def _close_doll_house(self) -> None:
+        if self._doll_house is not None:
+            self._doll_house[1].renderer.release()
+            self._doll_house = None
+            self._resolution = self._create_resolution()
 
     # --- frames ---
 
@@ -609,7 +712,14 @@ class Viewer:
         data.tour, data.film = self._tour, None if film is None else film[1]
         data.hotspots = []
         self._update_placing()
-        if self._tour is not None:
+        knows_rooms = self._loaded is not None and len(self.state.context) > 0
+        is_making = self._doll_houses.future is not None
+        data.doll_house = (self._doll_house is not None or is_making) if knows_rooms else None
+        if self._doll_house is not None and get_eye_size(size, self.state.settings.stereo) == size:
+            points = imgui.get_io().display_size
+            if self.state.glide is None:
+                data.hotspots = self._doll_house[0].find_marks(self.state.camera, (int(points.x), int(points.y)))
+        elif self._tour is not None:
             has_arrived = self._fade.parts[self._fade.front] == self._tour.part
             if has_arrived and get_eye_size(size, self.state.settings.stereo) == size:
                 # Panels are drawn in points of the window, of which a screen of high resolution has fewer than pixels.
@@ -700,6 +810,9 @@ class Viewer:
 
     def _draw_image(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
         camera, plan = self.state.camera, self._plan_resolution(size, now)
+        if self._doll_house is not None:
+            self._draw_doll_house(self._doll_house[1], size, target, plan)
+            return
         weight, front = self._fade.compute_weight(now), self._fade.front
         image, milliseconds = self._draw_content(front, size, plan)
         fading = None
@@ -725,6 +838,23 @@ class Viewer:
         mono = settings.stereo == "mono"
         right = self._comparer.get_right_side(self.state, draw_pinned) if mono else None
         self.presenter.draw(image, target, camera, right=right, fading=fading, weight=weight)
+
+    def _draw_doll_house(
+        self, slot: SceneSlot, size: tuple[int, int], target: moderngl.Framebuffer, plan: ResolutionPlan
+    ) -> None:
+        camera = self.state.camera
+        milliseconds = self._render(slot, camera.cam2world, size, self.state.draw_settings, plan)
+        if milliseconds > 0:
+            timed = slot.renderer.stats.timed
+            self._resolution.record(
+                plan if timed is None else ResolutionPlan(timed.scale, cached=timed.cached), milliseconds
+            )
+        self.panel_data.size = slot.renderer.stats.size
+        if slot.image is None:
+            target.use()
+            self.ctx.clear(*self.state.settings.background)
+        else:
+            self.presenter.draw(slot.image, target, camera)
 
     def _draw_content(
         self, slot: int, size: tuple[int, int], plan: ResolutionPlan
@@ -778,13 +908,15 @@ class Viewer:
 
     def _pick(self, place: tuple[float, float], size: tuple[int, int], now: float) -> None:
         """Show the point of the scene at a place of the window, as fractions of width and height."""
-        if self._visit(place) or self._slot.scene is None or self._shows_photograph:
+        if self._visit(place) or self._slot.scene is None or self._shows_photograph or self.state.glide is not None:
             return
         eye_size = get_eye_size(size, self.state.settings.stereo)
         pixel = place[0] * size[0] % eye_size[0], place[1] * size[1] % eye_size[1]
         origin, direction = compute_pixel_ray(self.state.camera, pixel, eye_size)
         point = pick_point(self._slot.scene, origin, direction, self.state.settings)
-        if point is None:
+        if point is not None and self.state.doll_house:
+            self.state.target = point.view
+        elif point is None:
             self.state.points = []
             self.state.show_message("no Gaussian there", now)
         else:
@@ -814,6 +946,8 @@ class Viewer:
             self.loader.cancel()
         if commands.visit is not None:
             self.state.target = commands.visit
+        if commands.doll_house:
+            self._toggle_doll_house(now)
         if commands.choose is not None and commands.choose != self.panel_data.current:
             self.show(self.entries, commands.choose, self.path)
         elif commands.reload:

@@ -49,6 +49,7 @@ from pansplat.data.placements import Placement, is_by_hand, judge, read_rejected
 from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.data.reconstructions import find_reconstruction, read_reconstruction
 from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
+from pansplat.data.web_tours.entries import plain_text
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import expand_home, read_file
 from pansplat.strict_json import list_field, number_field, read_json, require_object
@@ -495,7 +496,7 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
     """One entry of poses.json. `is_stated`: whether `convention` comes from the file."""
     source = f"{folder / _POSES}, {name!r}"
     image = folder / name
-    matrix, mask, depth, world = entry, None, None, 0
+    matrix, mask, depth, world, room = entry, None, None, 0, ""
     if isinstance(entry, dict):
         key = next((key for key in _MATRIX_KEYS if key in entry), None)
         if key is None:
@@ -508,9 +509,9 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
         matrix = entry[key]
         mask, depth = (_optional_file(folder, entry, key, source) for key in ("mask", "depth"))
         stated = number_field(entry, "world", source, low=0, high=_MAX_WORLD, whole=True, needed="a whole number")
-        world = int(stated or 0)
+        world, room = int(stated or 0), plain_text(entry.get("room"))
     cam2world = to_cam2world(rigid_matrix(matrix, source), convention)
-    return Panorama(image.stem, image, cam2world, mask or find_mask(image, folder), depth, world=world)
+    return Panorama(image.stem, image, cam2world, mask or find_mask(image, folder), depth, world=world, title=room)
 
 
 def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -> Path | None:

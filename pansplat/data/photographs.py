@@ -196,7 +196,7 @@ def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Pa
         raise InputError(f'{source}: needed [yaw, pitch] as "start", got {str(start)[:40]}; correct it.')
     return dataclasses.replace(
         panorama,
-        title=plain_text(content.get("title")),
+        title=plain_text(content.get("title")) or panorama.title,
         links=resolve_links(links, names, panorama.name, source),
         start=(wrap_angle(finite_number(start[0], "start")), finite_number(start[1], "start")) if start else None,
     )

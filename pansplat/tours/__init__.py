@@ -5,6 +5,7 @@ from its two panoramas and a third one that overlaps with both. Panoramas withou
 self-edge and the scene of a single view. Between parts the image fades.
 """
 
+from pansplat.tours.doll_house import Rooms, find_fronts, find_rooms, fit_box, measure_box
 from pansplat.tours.floor import (
     FloorOutline,
     FloorPlan,
@@ -42,6 +43,7 @@ __all__ = [
     "Edge",
     "FloorOutline",
     "FloorPlan",
+    "Rooms",
     "Route",
     "TourGraph",
     "Views",
@@ -52,13 +54,17 @@ __all__ = [
     "find_camera_height",
     "find_floor_outline",
     "find_floor_outlines",
+    "find_fronts",
     "find_link_ring",
     "find_other_storeys",
+    "find_rooms",
     "find_storeys",
     "find_tours",
     "find_way_along_link",
+    "fit_box",
     "list_starts",
     "make_graph",
+    "measure_box",
     "merge_scenes",
     "paint_floor_plan",
     "plan_route",

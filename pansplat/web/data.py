@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
@@ -36,6 +36,7 @@ class PackedGaussians:
         degree: of the harmonics.
         color_range: colours of the bytes 0 and 255.
         harmonics_scale: coefficient of the byte 127.
+        rooms: (camera, index of the first Gaussian, count) of the Gaussians that the doll's house view draws.
     """
 
     content: bytes
@@ -45,6 +46,7 @@ class PackedGaussians:
     degree: int
     color_range: tuple[float, float]
     harmonics_scale: float
+    rooms: tuple[tuple[int, int, int], ...]
 
 
 def count_bytes(count: int, degree: int) -> int:
@@ -53,7 +55,11 @@ def count_bytes(count: int, degree: int) -> int:
 
 
 def pack_gaussians(
-    gaussians: Gaussians, origin: Float[np.ndarray, "3"], order: Sequence[int], degree: int
+    gaussians: Gaussians,
+    origin: Float[np.ndarray, "3"],
+    order: Sequence[int],
+    degree: int,
+    cameras: Int[np.ndarray, "n"] | None = None,
 ) -> PackedGaussians:
     """Quantise and compress Gaussians.
 
@@ -62,12 +68,14 @@ def pack_gaussians(
         origin: subtracted from the means.
         order: all views, in which a page needs them.
         degree: highest degree of harmonics that is kept, at most MAX_DEGREE.
+        cameras: that saw each Gaussian; negative for those that the doll's house view leaves out. By default of all.
     """
     degree = min(degree, gaussians.degree, MAX_DEGREE)
     ranks = np.argsort(order)[gaussians.views.cpu().numpy()]
     means = (gaussians.means.double().cpu().numpy() - origin).astype(np.float32)
     # Neighbours in the file are neighbours in space, so that equal upper bytes follow each other.
-    chosen = np.lexsort((_morton_codes(means), ranks))
+    cameras = np.full(len(means), -1) if cameras is None else cameras
+    chosen = np.lexsort((_morton_codes(means), -cameras, ranks))
     means, scales = means[chosen], np.abs(gaussians.scales.float().cpu().numpy()[chosen])
     harmonics = gaussians.harmonics.float().cpu().numpy()[chosen]
     colors = 0.5 + SH_0 * harmonics[:, 0]
@@ -89,7 +97,16 @@ def pack_gaussians(
     blocks = (plane[start:end].tobytes() for start, end in pairwise(ends) for plane in (*planes, *quantised.T))
     content = gzip.compress(b"".join(blocks), 9, mtime=0)
     starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
-    return PackedGaussians(content, tuple(order), starts, counts, degree, (low, high), scale)
+    rooms = _list_runs(ranks[chosen], cameras[chosen])
+    return PackedGaussians(content, tuple(order), starts, counts, degree, (low, high), scale, rooms)
+
+
+def _list_runs(ranks: Int[np.ndarray, "n"], cameras: Int[np.ndarray, "n"]) -> tuple[tuple[int, int, int], ...]:
+    """(camera, first, count) of each run of one view and one camera, without negative cameras."""
+    starts = np.flatnonzero(np.diff(ranks, prepend=-1) | np.diff(cameras, prepend=-2))
+    counts = np.diff([*starts, len(ranks)])
+    runs = zip(cameras[starts].tolist(), starts.tolist(), counts.tolist(), strict=True)
+    return tuple(run for run in runs if run[0] >= 0)
 
 
 def _morton_codes(points: Float[np.ndarray, "n 3"]) -> np.ndarray:

@@ -39,6 +39,7 @@
   // The views of the edge at the camera, and for a second after a change also those of the edge before. A view fades in
   // when it has arrived.
   function blendWeights(position) {
+    if (doll.isOn) return null;
     const weights = groupWeights(group, position), old = fade ? groupWeights(fade.group, position) : weights;
     const done = fade ? fade.done : 1;
     return weights.map((weight, view) => shown[view] * (done * weight + (1 - done) * old[view]));
@@ -116,7 +117,7 @@
   function updateStill(now) {
     if (!frozen) return;
     frozen.position = frozen.position || [...camera.position];
-    const isSorted = sorted.part === currentPart() && distanceOf(sorted.position, frozen.position) < HEADER.speed;
+    const isSorted = isSortedAs() && distanceOf(sorted.position, frozen.position) < HEADER.speed;
     if (frozen.began === null && isSorted && isSeen()) frozen.began = now;
     if (frozen.began !== null) {
       const t = clamp((now - frozen.began) / FADE_MS, 0, 1);
@@ -135,7 +136,7 @@
   }
 
   // Whether a view of the group at the camera is sorted, or all are empty.
-  const isSeen = () => HEADER.groups[group].some((view) => sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
+  const isSeen = () => doll.isOn || HEADER.groups[group].some((view) => sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
 
   const isWaiting = () => frozen !== null && frozen.began === null;
 
@@ -154,6 +155,7 @@
   }
 
   function place(pose) {
+    if (doll.isOn) doll.setOn(false);  // before the pose, which may have a field of view
     Object.assign(camera, pose);
     headset.turnTo(camera.yaw);
     settleAt(camera.position);
@@ -174,7 +176,7 @@
 
   // Half the height of the image at distance 1. The field of view is that of a landscape image; a portrait one is taller.
   const tallOf = (width, height) => clamp(Math.sqrt(height / width), 1, HEADER.tallest);
-  const tangentOf = (width, height) => tallOf(width, height) * Math.tan(0.5 * camera.fov * DEGREE);
+  const tangentOf = (width, height, fov = camera.fov) => tallOf(width, height) * Math.tan(0.5 * fov * DEGREE);
 
   function turn(yaw, pitch) {
     camera.yaw += yaw;
@@ -185,6 +187,7 @@
   // Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part, or
   // near the panoramas of a scene without edges; steps away from them become shorter near the limit.
   function walk(right, up, forward) {
+    if (doll.isOn) return;
     const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
     const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
     const target = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
@@ -206,10 +209,17 @@
     return distances.indexOf(Math.min(...distances));
   }
 
+  // The panorama at the camera, or that from which it looked at the doll's house.
+  const nodeHere = () => doll.isOn ? doll.node : nearestNode(camera.position);
+
   // A smooth flight to a panorama along the edges; the direction of view stays the user's. To another part, the camera
   // turns to the link, goes a step along it, and the image fades; without a link it fades at once.
   let flight = null, touring = false;
   function flyTo(spot) {
+    if (doll.isOn) {
+      doll.visit(spot);
+      return;
+    }
     if (calm.matches) {
       flight = { spot, legs: [{ from: edges.length ? nearestNode(camera.position) : spot, to: spot }], began: null };
       if (touring) flight.legs.push({ path: [GRAPH.positions[spot]], rest: REST_SECONDS });
@@ -314,6 +324,7 @@
 
   function setTouring(value) {
     touring = value && HEADER.spots.length > 1;
+    if (touring && doll.isOn) jumpTo(doll.node);
     byId("play").setAttribute("aria-pressed", touring);
     byId("play").querySelector("path").setAttribute("d", touring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
     if (!touring) flight = route = null;
@@ -375,6 +386,7 @@
     KeyH: () => byId("keys").showModal(),
     KeyL: () => openList(),
     KeyM: () => { if (HEADER.spots.length > 1) plan.toggle(); },
+    KeyO: () => doll.toggle(),
     KeyP: () => share.savePicture(),
   };
   const CLOSES = { KeyH: "keys", KeyL: "list" };  // the dialogs that a key opens and closes
@@ -410,7 +422,8 @@
   function walkByKeys(seconds, fast) {
     const step = [0, 0, 0];
     for (const code of held) MOVES[code].forEach((value, i) => { step[i] += value; });
-    if (step.some((value) => value)) walk(...scaled(step, seconds * HEADER.speed * (fast ? 3 : 1)));
+    if (doll.isOn) doll.move(step, seconds);
+    else if (step.some((value) => value)) walk(...scaled(step, seconds * HEADER.speed * (fast ? 3 : 1)));
   }
 
   // One finger or the mouse turns: the scene follows the pointer. Two fingers pull the scene: sideways, and forward by
@@ -424,11 +437,13 @@
     if (before.length === 1) {
       const { clientWidth, clientHeight } = canvas;
       const radians = 2 * tangentOf(clientWidth, clientHeight) / clientHeight;
-      turn(-moved[0] * radians, moved[1] * radians);
+      if (doll.isOn) doll.orbit(2 * Math.PI * moved[0] / clientWidth, -Math.PI * moved[1] / clientHeight);
+      else turn(-moved[0] * radians, moved[1] * radians);
     } else if (before.length === 2) {
       const apart = ([a, b]) => distanceOf(a, b);
       const metres = 2 * HEADER.speed / Math.min(canvas.clientWidth, canvas.clientHeight);
       const pinch = apart([...fingers.values()]) - apart(before);
+      if (doll.isOn) doll.zoom(apart(before) / Math.max(apart([...fingers.values()]), 1));
       setTouring(false);
       walk(-0.5 * moved[0] * metres, 0, (0.5 * moved[1] + pinch) * metres);
     }
@@ -437,7 +452,7 @@
   // Look around by the device's motion: its axes in the earth's (east, north, up), turned by the screen's angle.
   let motion = null;
   function onOrientation({ alpha, beta, gamma }) {
-    if (alpha === null || beta === null || gamma === null) return;
+    if (alpha === null || beta === null || gamma === null || doll.isOn) return;
     const [ca, sa, cb, sb, cg, sg] = [alpha, beta, gamma].map((degrees) => degrees * Math.PI / 180)
       .flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
     const toEarth = multiply([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]],
@@ -500,7 +515,9 @@
     });
     canvas.addEventListener("pointermove", onMove);
     canvas.addEventListener("click", ({ clientX, clientY }) => {
-      if (measure.isOn && pressed && distanceOf(pressed, [clientX, clientY]) < 5) measure.take(clientX, clientY);
+      if (!pressed || distanceOf(pressed, [clientX, clientY]) >= 5) return;
+      if (measure.isOn) measure.take(clientX, clientY);
+      else if (doll.isOn) doll.take(clientX, clientY);
     });
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
@@ -511,7 +528,9 @@
       }
       event.preventDefault();
       const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
-      camera.fov = clamp(camera.fov * Math.exp(0.001 * clamp(pixels, -200, 200)), MIN_FOV, MAX_FOV);
+      const factor = Math.exp(0.001 * clamp(pixels, -200, 200));
+      if (doll.isOn) doll.zoom(factor);
+      else camera.fov = clamp(camera.fov * factor, MIN_FOV, MAX_FOV);
       changed();
     }, { passive: false });
     byId("play").onclick = () => setTouring(!touring);
@@ -520,6 +539,8 @@
     byId("list").onclick = (event) => { if (event.target === byId("list")) byId("list").close(); };  // beside it
     byId("full").onclick = toggleFull;
     byId("map").onclick = () => plan.toggle();
+    byId("doll").onclick = () => doll.toggle();
+    byId("doll").hidden = !doll.isPossible;
     byId("more").onclick = () => showMore(byId("menu").hidden);
     for (const [id, act] of [["measure", () => measure.toggle()], ["picture", () => share.savePicture()], ["link", () => share.copyLink()]]) {
       byId(id).onclick = () => {
@@ -565,7 +586,7 @@
   // Goes to a panorama without a flight.
   function jumpTo(node) {
     setTouring(false);
-    const isSame = parts[node] === currentPart(), from = edges.length ? nearestNode(camera.position) : node;
+    const isSame = parts[node] === currentPart(), from = edges.length ? nodeHere() : node;
     jump(GRAPH.positions[node], isSame ? camera : arriveAt(node, from));
   }
 
@@ -612,6 +633,7 @@
   // Those of chooseRings without that at the camera.
   function findRings() {
     chooseRings();
+    if (doll.isOn) return rings.filter(({ link, node }) => !link && doll.shows(node));
     const isAtCamera = (ring) => ring.camera !== null && distanceOf(ring.camera, camera.position) < 2 * ring.radius;
     return rings.filter((ring) => ring.isNext && !isAtCamera(ring));
   }
@@ -676,7 +698,7 @@
 
   // Names the panorama at the camera.
   function showPlace() {
-    const node = nearestNode(camera.position);
+    const node = nodeHere();
     if (node === here) return;
     if (listed[here]) listed[here].removeAttribute("aria-current");
     here = node;
@@ -696,15 +718,18 @@
   let arrived = 0;  // number of views
   const isComplete = () => arrived === HEADER.loading.length;
 
+  // Whether the order is that of the part, and of the doll's house view or of panoramas, as the page shows it.
+  const isSortedAs = (part = currentPart()) => sorted.part === part && (sorted.ranges !== null) === doll.isOn;
+
   const isSortedFor = (position, part, tolerance = 0) => {
-    return sorted !== null && sorted.part === part && sorted.arrived === arrived && distanceOf(sorted.position, position) <= tolerance;
+    return sorted !== null && isSortedAs(part) && sorted.arrived === arrived && distanceOf(sorted.position, position) <= tolerance;
   };
 
   // `tolerance`: distance in metres for which the order of before is kept.
   function requestSort(tolerance) {
     if (sorting || isSortedFor(camera.position, currentPart(), tolerance)) return;
     sorting = true;
-    worker.postMessage({ position: [...camera.position], part: currentPart() });
+    worker.postMessage({ position: [...camera.position], part: currentPart(), ranges: doll.ranges });
   }
 
   function onSorted(data) {
@@ -732,11 +757,12 @@
   function advance(now, seconds) {
     advanceFlight(now);
     advanceRoute(seconds);
-    if (edges.length) updateEdge(now);
+    doll.advance(now);
+    if (edges.length && !doll.isOn) updateEdge(now);
     updateStill(now);
     showViews(1000 * seconds / FADE_MS);
-    const node = nearestNode(camera.position), isMoving = flight !== null || isWaiting();
-    const isThere = !isMoving && distanceOf(GRAPH.positions[node], camera.position) < HEADER.spots[node].radius;
+    const node = nodeHere(), isMoving = flight !== null || doll.flight !== null || isWaiting();
+    const isThere = !isMoving && !doll.isOn && distanceOf(GRAPH.positions[node], camera.position) < HEADER.spots[node].radius;
     embed.follow(isThere ? node : null, isMoving);
   }
 
@@ -810,6 +836,7 @@
   // What the headset needs of the page.
   const headset = new Headset({
     camera, advance, walk, goTo, jumpTo, goHome, setTouring, requestSort, blendWeights, findRings, findSpot, floorPoint, changed,
+    leaveDollHouse: () => { if (doll.isOn) jumpTo(doll.node); },
     get renderer() { return sorted && renderer; },
     get black() { return frozen ? frozen.left : 0; },
     get isFlying() { return flight !== null || route !== null; },
@@ -817,6 +844,12 @@
 
   const share = new Share({ camera, say, explain, takePicture });
   const measure = new Measure({ camera, say, changed, measureAt, rayOf });
+  const doll = new DollHouse({
+    camera, changed, ease, freeze, jump, jumpTo, measureAt, nearestNode, rayOf, setTouring, tangentOf,
+    get isCalm() { return calm.matches; },
+    get isWaiting() { return isWaiting(); },
+    get isInHeadset() { return headset.session !== null; },
+  });
   const plan = new Plan({ camera, changed, goTo, isSingle, get here() { return here; } });
   const embed = new Embed();
 
@@ -875,7 +908,7 @@
       };
       worker.onerror = (event) => fails(new Error(`The worker failed: ${event.message}`));
       const { count, degree, views, loading, harmonicsScale, colorRange } = HEADER;
-      const first = { position: [...camera.position], part: currentPart() };
+      const first = { position: [...camera.position], part: currentPart(), ranges: null };
       worker.postMessage({ header: { count, degree, views, loading, parts, harmonicsScale, colorRange, first } });
       addEventListener("DOMContentLoaded", () => {
         if (partsArrived !== HEADER.dataParts) fails(new Error("A part of the scene is missing. Copy the whole folder."));

@@ -42,14 +42,17 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.shaders import load_shader
 from pansplat.tours import (
     EDGE_HYSTERESIS,
+    Rooms,
     Route,
     TourGraph,
     choose_camera_height,
     find_angles,
     find_camera_height,
     find_link_ring,
+    find_rooms,
     find_way_along_link,
     make_graph,
+    measure_box,
     plan_route,
     select_views,
 )
@@ -69,11 +72,12 @@ _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 _BATCH = 256  # quads that are drawn together
+_MAX_CAMERAS = 1024  # of a doll's house; their number has 10 bits (page.vert)
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
 
 _WORKER = ("unpack.js", "sorter.js")
-_PROGRAMS = ("graph.js", "renderer.js", "xr.js", "share.js", "embed.js", "plan.js", "measure.js", "page.js")
+_PROGRAMS = ("graph.js", "renderer.js", "xr.js", "share.js", "embed.js", "plan.js", "doll.js", "measure.js", "page.js")
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,7 @@ def write_page(
         scene = dataclasses.replace(scene, overlaps=(), links=(), starts=())
     factor = working_factor(scene.near)
     tour, has_cameras = make_graph(scene), len(scene.cam2world) > 0
+    rooms = find_rooms(scene.scaled(factor)) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
     scene = _prepare(scene, factor)
     flights = _plan_flights(scene, tour, factor)
     if len(scene.gaussians) > gaussians:
@@ -141,11 +146,15 @@ def write_page(
     report("compressing", 0.6)
     degree = _choose_degree(scene)
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
-    packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree)
+    cameras = None if rooms is None else _find_cameras(scene, rooms)
+    packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree, cameras)
     report("drawing the poster", 0.8)
     poster = _draw_poster(scene, flights.start)
     report("writing", 0.9)
     header = _describe_scene(scene, packed, origin, flights, tour, factor)
+    header["doll"] = None
+    if rooms is not None and cameras is not None:
+        header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
     return _write_files(path, header, packed.content, poster, split, title or path.stem)
 
 
@@ -396,6 +405,37 @@ def _describe_scene(
         "speed": _SPEED * float(np.median(reaches)),
         "limits": _limit_parts(reaches, positions, flights, len(tour)),
     }
+
+
+def _find_cameras(scene: Scene, rooms: Rooms) -> Int[np.ndarray, "n"]:
+    """The camera that saw each Gaussian in a room, -1 for others; the nearest in a joint scene, which has no labels.
+
+    Args:
+        scene: of `_prepare`.
+        rooms: in its unit.
+    """
+    gaussians = scene.gaussians
+    cameras = gaussians.views.long()
+    if len(scene.cam2world) > 1 and not cameras.any():
+        cameras = torch.cdist(gaussians.means.double(), scene.cam2world[:, :3, 3]).argmin(dim=1)
+    inside = rooms.find_inside(dataclasses.replace(gaussians, views=cameras))
+    return torch.where(inside, cameras, -1).numpy()
+
+
+def _describe_rooms(
+    scene: Scene,
+    packed: PackedGaussians,
+    cameras: Int[np.ndarray, "n"],
+    storeys: tuple[int, ...],
+    origin: Float[np.ndarray, "3"],
+    level: Float[np.ndarray, "3 3"],
+) -> dict[str, Any] | None:
+    """The doll's house: ranges of its Gaussians, and the storeys and boxes of the views; None without Gaussians."""
+    boxes: list[list[list[float]] | None] = [None] * len(scene.cam2world)
+    for camera in np.unique(cameras[cameras >= 0]).tolist():
+        means = scene.gaussians.means[torch.from_numpy(cameras == camera)].double() - torch.from_numpy(origin)
+        boxes[camera] = [_round(corner) for corner in measure_box(means, level)]
+    return {"ranges": packed.rooms, "storeys": storeys, "boxes": boxes} if any(boxes) else None
 
 
 def _describe_links(

@@ -21,6 +21,10 @@ class Renderer {
     this.scales = this.makeTexture(width, height, gl.R32UI);
     this.colors = this.makeTexture(width, height, gl.RGBA8);
     this.order = this.makeTexture(width, height, gl.R32UI);
+    this.cameras = this.makeTexture(HEADER.spots.length, 1, gl.RGBA32F);
+    const centers = Float32Array.from(HEADER.spots.flatMap(({ position }) => [...position, 0]));
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, HEADER.spots.length, 1, gl.RGBA, gl.FLOAT, centers);
+    this.together = 0;  // number of Gaussians in an order of all views together
     this.ready = new Set();  // views that have an order
     this.splats = gl.createVertexArray();
     this.screen = gl.createVertexArray();
@@ -82,9 +86,10 @@ class Renderer {
     this.write(this.colors, colors, 4, start, gl.RGBA, gl.UNSIGNED_BYTE);
   }
 
-  // Replaces the drawing order, and the colours if they depend on the position.
-  setSorted({ views, order, colors }) {
+  // Replaces the drawing order, and the colours if they depend on the position. `count`: of an order of all views together.
+  setSorted({ views, order, colors, count }) {
     const gl = this.gl;
+    this.together = count;
     this.write(this.order, order, 1, 0, gl.RED_INTEGER, gl.UNSIGNED_INT);
     if (colors) this.write(this.colors, colors, 4, 0, gl.RGBA, gl.UNSIGNED_BYTE);
     views.forEach((view) => this.ready.add(view));
@@ -122,7 +127,7 @@ class Renderer {
     this.targets = this.makeTargets(...this.size, false);
   }
 
-  // Adds up the layers of the views in targets of `makeTargets`.
+  // Adds up the layers of the views in targets of `makeTargets`; without weights, the one layer of the doll's house view.
   addLayers(camera, weights, [layer, sum], width, height) {
     const gl = this.gl;
     gl.viewport(0, 0, width, height);
@@ -130,13 +135,17 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0);
     this.setCamera(camera, width, height);
     let isFirst = true;
-    HEADER.views.forEach(({ start, count }, view) => {
-      if (!weights[view] || !count || !this.ready.has(view)) return;
+    const isReady = (view) => weights[view] && HEADER.views[view].count && this.ready.has(view);
+    const views = weights === null ? [] : [...HEADER.views.keys()].filter(isReady);
+    const layers = views.map((view) => ({ ...HEADER.views[view], weight: weights[view] }));
+    if (weights === null && this.together) layers.push({ start: 0, count: this.together, weight: 1 });
+    gl.uniform1i(this.splat.places.outside, weights === null);
+    layers.forEach(({ start, count, weight }) => {
       gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
       layer.textures.forEach((_, buffer) => gl.clearBufferfv(gl.COLOR, buffer, [0, 0, 0, 0]));
       this.drawLayer(start, count);
       gl.bindFramebuffer(gl.FRAMEBUFFER, sum.framebuffer);
-      this.addLayer(layer.textures, weights[view], isFirst);
+      this.addLayer(layer.textures, weight, isFirst);
       isFirst = false;
     });
     if (!isFirst) return;
@@ -204,12 +213,13 @@ class Renderer {
     gl.uniform1i(places.colors, 1);
     gl.uniform1i(places.order, 2);
     gl.uniform1i(places.scales, 3);
+    gl.uniform1i(places.cameras, 4);
   }
 
   drawLayer(start, count) {
     const gl = this.gl;
     gl.useProgram(this.splat.program);
-    [this.geometry, this.colors, this.order, this.scales].forEach((texture, unit) => {
+    [this.geometry, this.colors, this.order, this.scales, this.cameras].forEach((texture, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
     });

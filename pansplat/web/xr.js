@@ -72,6 +72,7 @@ class Headset {
   }
 
   start(session) {
+    this.page.leaveDollHouse();
     this.heading = this.headYaw = 0;
     this.head = this.origin = this.left = this.floor = this.hovered = null;
     this.last = performance.now();

@@ -488,6 +488,18 @@ def test_links_of_a_posed_folder_are_kept(tmp_path: Path) -> None:
         assert [view.label for view in pair.context] == ["left", "Kitchen"]
 
 
+def test_rooms_of_poses_are_titles_unless_links_state_others(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    content = json.loads((folder / "poses.json").read_text())
+    for name, pose in content["poses"].items():
+        content["poses"][name] = (pose if isinstance(pose, dict) else {"cam2world": pose}) | {"room": " living\nroom"}
+    content["poses"]["right.png"]["room"] = ["no text"]
+    (folder / "poses.json").write_text(json.dumps(content))
+    assert [view.label for view in load_pairs(folder)[0].context] == ["living room", "right"]
+    (folder / "links.json").write_text(json.dumps({"left.png": {"title": "Kitchen"}}))
+    assert load_pairs(folder)[0].context[0].label == "Kitchen"
+
+
 def test_a_faulty_web_tour_gives_way_to_the_pictures_of_the_folder(tmp_path: Path) -> None:
     (tmp_path / "tour.json").write_text("<html>404</html>")
     with pytest.raises(InputError, match=r"tour\.json: needed a tour of Pannellum .* got an HTML page"):

@@ -136,6 +136,20 @@ def test_rooms_have_their_areas_angles_and_corners(noise: float) -> None:
     assert plan.camera_height == pytest.approx(CAMERA_HEIGHT, rel=0.01)
 
 
+@pytest.mark.parametrize("suffix", [".svg", ".dxf"])
+def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Path, suffix: str) -> None:
+    scene = _make_house(WALLS, CAMERAS, names=("living room", "living room", "hall"), count=20000)
+    file = tmp_path / f"plan{suffix}"
+    assert [room.name for room in write_plan(scene, file).rooms] == ["living room", "hall"]
+    if suffix == ".svg":
+        texts = [element.text for element in ElementTree.parse(file).iter() if element.tag.endswith("}text")]
+    else:
+        texts = [entity.dxf.text for entity in ezdxf.readfile(file).modelspace().query("TEXT[layer=='ROOMS']")]
+    for name, area in (("living room", 24.0), ("hall", 15.6)):
+        label = texts[texts.index(name) + 1]
+        assert float(label.split()[0]) == pytest.approx(area, rel=0.05) and "m²" in label
+
+
 def test_an_oblique_wall_stays_oblique() -> None:
     corners = [(0.0, 0.0), (5.0, 0.0), (5.0, 2.0), (3.0, 4.0), (0.0, 4.0)]
     (room,) = _plan(_make_house(_walls_around(corners), [(2.0, 1.8)])).rooms

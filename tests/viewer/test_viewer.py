@@ -79,7 +79,7 @@ INITIAL_SETTINGS = {
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
     *get_args(Display), *get_args(Comparison),
-    "fly", "orbit", "Reset", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
+    "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
     "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
 }  # fmt: skip
 
@@ -1175,6 +1175,51 @@ def fly(user: User, seconds: float = 1 / 5) -> list[float]:
 
     user.draw_until(has_ended, "end of the flight", seconds)
     return steps
+
+
+def enter_doll_house(user: User) -> None:
+    user.press(imgui.Key.o)
+    user.draw_until(lambda: user.state.doll_house and user.state.glide is None, "doll's house", 1 / 5)
+
+
+def test_o_flies_out_to_the_dolls_house_and_a_click_on_a_mark_flies_in(user):
+    inside, image = user.state.camera, user.read_image()
+    enter_doll_house(user)
+    assert np.degrees(user.state.camera.pitch_radians) == pytest.approx(-45)
+    outside = user.read_image()
+    assert changed_fraction(image, outside) > 0.3 and (outside[0] < 20).all()
+    user.drag((430, 500), (470, 480))
+    turned = user.state.camera
+    assert turned.yaw_radians != 0 and np.linalg.norm(turned.orbit_center - inside.position) < 3
+    user.drag((430, 300), (430, 880))  # the camera stays above the floor
+    assert user.state.camera.pitch_radians < 0
+    beside = np.asarray(turned.position) - 1.2 * turned.rotation[:, 0]  # the mark is right of the panel
+    user.state.camera = replace(turned, position=tuple(beside.tolist()))
+    user.draw_frames(2)
+    (mark,) = [mark for mark in user.data.hotspots if mark.node == 1]
+    user.click_at(*mark.center)
+    user.draw_until(lambda: not user.state.doll_house, "end of the flight", 1 / 5)
+    assert user.state.camera.position == (0, 0, 0.5)
+    assert user.state.camera.vertical_fov_degrees == inside.vertical_fov_degrees and user.viewer._doll_house is None
+
+
+def test_the_dolls_house_has_a_widget_and_the_start_leaves_it(user):
+    user.click("doll's house")
+    user.draw_until(lambda: user.state.doll_house and user.state.glide is None, "doll's house", 1 / 5)
+    user.press(imgui.Key.r)
+    assert not user.state.doll_house and user.state.camera == user.state.home and user.viewer._doll_house is None
+
+
+def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titles(tour_user):
+    user = tour_user
+    user.draw_until(lambda: len(user.viewer._tour.loaded) == 3, "all scenes")
+    enter_doll_house(user)
+    house = user.viewer._doll_house[0]
+    assert house.nodes == (0, 1, 2, 3) and set(house.scene.gaussians.views.tolist()) == {0, 1, 2, 3}
+    assert {mark.label for mark in user.data.hotspots} <= {"room0", "room1", "room2", "room3"}
+    user.press(imgui.Key._4)
+    user.draw_until(lambda: not user.state.doll_house, "end of the flight", 1 / 5)
+    assert find_node(user) == 3
 
 
 def find_node(user: User) -> int:

@@ -1,6 +1,7 @@
 """The page in headless Chromium with WebGL 2 on the processor: pictures, input, loading."""
 
 import base64
+import dataclasses
 import io
 import math
 import os
@@ -23,7 +24,7 @@ from pansplat import pipeline
 from pansplat.data.pairs import Link, Panorama
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import path_poses
-from pansplat.tours import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
+from pansplat.tours import EDGE_HYSTERESIS, TourGraph, find_fronts, find_rooms, make_graph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.web import PageFiles, write_page
 from pansplat.web import page as page_module
@@ -172,6 +173,43 @@ def test_the_picture_is_that_of_the_rasteriser(
     assert reference.std() > 0.05
     assert psnr(image, reference) > 42
     assert psnr(image[:, ::-1], reference) < 25 and psnr(image[::-1], reference) < 25
+
+
+def test_the_dolls_house_is_the_picture_of_the_fronts_in_the_rooms_and_a_click_goes_back_inside(
+    home: OpenPage, scene: Scene
+) -> None:
+    start = home.camera
+    home.page.emulate_media(reduced_motion="reduce")
+    home.page.keyboard.press("KeyO")
+    home.wait("pansplat.camera.fov === 45")
+    camera = home.camera
+    assert camera["pitch"] == pytest.approx(-math.pi / 4)
+    assert min(abs(camera["yaw"] - start["yaw"] - turn) for turn in (0, 0.5 * math.pi)) < 1e-6
+    assert home.page.get_attribute("#doll", "aria-pressed") == "true"
+    image = home.draw()
+    level, origin = path_poses(scene.cam2world)[0, :3, :3].numpy(), scene.cam2world[:, :3, 3].mean(0).numpy()
+    positions, gaussians = scene.cam2world[:, :3, 3], scene.gaussians
+    shown = find_rooms(scene).find_inside(gaussians)
+    shown &= find_fronts(gaussians, positions, torch.from_numpy(camera["position"] + origin))
+    assert 0.1 < shown.double().mean() < 0.7
+    joint = dataclasses.replace(scene, gaussians=gaussians.select(shown), joint=True)
+    reference = draw_reference(joint, level, origin, camera)
+    assert reference.std() > 0.05 and (reference[[0, -1]] < 0.05).all()  # the whole house is in the picture
+    assert psnr(image, reference) > 42
+    left, top = SIZE[0] // 2, SIZE[1] // 2
+    home.page.mouse.move(left, top)
+    home.page.mouse.down()
+    home.page.mouse.move(left + 40, top)
+    home.page.mouse.up()
+    turned = home.camera
+    assert turned["yaw"] == pytest.approx(camera["yaw"] + math.pi / 4)
+    home.page.mouse.wheel(0, -200)
+    home.wait(f"Math.abs(pansplat.camera.position[1] - {turned['position'][1]}) > 0.1")
+    home.draw()
+    home.page.mouse.click(left, top)
+    home.wait("HEADER.spots.some((s) => s.position.every((x, i) => x === pansplat.camera.position[i]))")
+    assert home.camera["fov"] == start["fov"] and home.page.get_attribute("#doll", "aria-pressed") == "false"
+    home.page.emulate_media(reduced_motion="no-preference")
 
 
 def test_the_page_loads_without_network_or_messages(page: OpenPage, folder: Path) -> None:
@@ -361,8 +399,9 @@ def test_a_gaussian_takes_28_bytes_of_textures_that_every_device_has(chromium: A
         assert rows * 2048 * (16 + 4 + 4 + 4) == 2048 * 2 * 28
         # A pixel takes 20: colours of the layer and of the sum, and two numbers.
         targets = [page.run(f"WebGL2RenderingContext.{name}") for name in ("RGBA16F", "RGBA16F", "RG16F")]
-        page.wait("textures.length >= 7")  # the first picture
-        assert [code for code, *_ in page.run("textures.slice(4, 7)")] == targets
+        page.wait("textures.length >= 8")  # the first picture, after the centres of the cameras
+        assert page.run("textures[4]") == [page.run("WebGL2RenderingContext.RGBA32F"), 3, 1]
+        assert [code for code, *_ in page.run("textures.slice(5, 8)")] == targets
 
 
 HOLD = """

@@ -20,7 +20,7 @@ from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.refinement.budget import merge_to
-from pansplat.tours import find_camera_height, select_views
+from pansplat.tours import find_camera_height, find_rooms, select_views
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
@@ -53,8 +53,9 @@ def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: Path) -> None:
-    write_page(house, tmp_path / "tour.html")
+    write_page(dataclasses.replace(house, names=("hall", "hall", "bath")), tmp_path / "tour.html")
     header = read_header(tmp_path / "tour.html")
+    assert [spot["name"] for spot in header["spots"]] == ["hall", "hall", "bath"], "rooms of poses.json"
     assert header["groups"] == [[0, 1], [1, 2]] and header["edges"] == [[0, 1, 0], [1, 2, 1]]
     assert header["next"] == [[0, 1, 1], [0, 1, 2], [1, 1, 2]]
     positions, route = np.array([view["position"] for view in header["views"]]), np.array(header["route"])
@@ -71,6 +72,10 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     header = read_header(tmp_path / "tour.html")
     assert header["parts"] == [0, 0, 1, 2] and header["edges"] == [[0, 1, 0], [2, 2, 1], [3, 3, 2]]
     assert header["groups"] == [[0, 1], [2], [3]]
+    doll, views = header["doll"], header["views"]
+    assert [view for view, *_ in doll["ranges"]] == header["loading"] and len(doll["boxes"]) == 4
+    assert all(start == views[view]["start"] for view, start, _ in doll["ranges"]), "those in rooms come first"
+    assert all(100 < count < views[view]["count"] for view, _, count in doll["ranges"]), "others have ceilings"
     start, spots, level = header["start"], header["spots"], np.array(header["level"])
     assert start["position"] == pytest.approx(spots[0]["position"], abs=1e-5)
     assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
@@ -88,6 +93,15 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     assert distances.min(axis=0).max() < 0.2, "it passes all panoramas"
     steps = np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1)
     assert len(jumps) == 3 and steps[jumps].min() > 10 and np.delete(steps, jumps).max() < 1.05 / header["routeRate"]
+
+
+def test_the_dolls_house_of_a_scene_without_views_has_the_nearest_cameras(scene: Scene) -> None:
+    views = torch.zeros_like(scene.gaussians.views)
+    merged = dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, views=views), joint=True)
+    cameras = page_module._find_cameras(merged, find_rooms(scene))
+    distances = torch.cdist(scene.gaussians.means.double(), scene.cam2world[:, :3, 3]).numpy()
+    inside = cameras >= 0
+    assert 0.2 < inside.mean() < 0.95 and (cameras == distances.argmin(axis=1))[inside].all()
 
 
 def test_links_have_the_same_lengths_in_a_page_of_another_unit(flat: Scene, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from pansplat_viewer.scene.settings import DrawSettings
 
 _MAX_CACHED_FACE_SIZE = 2048  # pixels; six faces take 200 MB at 16 bits
 _MAX_SELECTIONS = 8
+_CAMERAS_UNIT = 9  # texture unit
 _CLIP_DISTANCE_0 = 0x3000  # GL_CLIP_DISTANCE0
 _CHUNK_SIZE = 1 << 20  # records that are made and drawn together; limits their memory to 100 MB
 
@@ -124,7 +125,7 @@ class Frame:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
         key = (splats, self.position, s.preset, *s.selection, s.near)
-        key += (s.footprint, s.splat_colors)
+        key += (s.footprint, s.splat_colors, s.outside)
         if self.storage == LayerStorage.IMAGE:
             return (*key, self.rotation.tobytes(), self.focal)
         return (*key, self.faces_to_world.tobytes())
@@ -346,6 +347,9 @@ class SplatRasterizer:
         self._colors = keep(ctx.buffer(reserve=max(16 * len(splats), 16), dynamic=True))
         if splats.base_colors is not None:
             self.write_colors(splats.base_colors)
+        cameras = np.zeros((max(len(splats.view_positions), 1), 4), np.float32)
+        cameras[: len(splats.view_positions), :3] = splats.view_positions - splats.origin
+        self._cameras = keep(ctx.texture((len(cameras), 1), 4, cameras, dtype="f4"))
         self._records = keep(ctx.buffer(reserve=RECORD_BYTES * self._capacity, dynamic=True))
         self._quads = keep(ctx.vertex_array(programs.splat(), [(self._records, "4f " * len(RECORD) + "/i", *RECORD)]))
         if self.tier == "gl43":
@@ -451,7 +455,10 @@ class SplatRasterizer:
             filter_variance=compute_filter_variance(settings, camera.focal),
             half_size=camera.half_size,
             margin=0.02 / camera.focal,
+            outside=settings.outside,
+            cameras=_CAMERAS_UNIT,
         )
+        self._cameras.use(_CAMERAS_UNIT)
         set_uniforms(
             self._programs.splat(),
             half_size=camera.half_size,

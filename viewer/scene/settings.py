@@ -56,6 +56,8 @@ class DrawSettings:
             the left eye. `CpuRenderer` only.
         stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, the left above the right,
             or the left in red and the right in green and blue.
+        outside: the doll's house view: Gaussians that show their back to the camera are not drawn (docs/rendering.md,
+            section 10).
         face_size: side of a cube face in pixels. None matches the resolution at the panorama's equator
             (2 height / pi), or at the centre of a pinhole image that is drawn from cached faces.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
@@ -81,6 +83,7 @@ class DrawSettings:
     eye_offset: float = 0.0
     stereo: Stereo = "mono"
     eye_distance: float = EYE_DISTANCE  # metres
+    outside: bool = False
     face_size: int | None = None
     cached: bool = False
     scale: float = 1.0

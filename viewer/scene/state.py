@@ -16,11 +16,43 @@ from pansplat_viewer.scene.picking import PickedPoint
 from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Projection
 
 FLIGHT_SECONDS = 6.0
+GLIDE_SECONDS = 1.6
 COUNT_MAX = 300.0  # Gaussians per pixel with the last colour, by default
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
 _MAX_SAMPLES = 100_000  # Gaussians that percentiles are measured on
+
+
+@dataclass(frozen=True)
+class Glide:
+    """A flight of the camera straight to another place.
+
+    Attributes:
+        start, end: cameras.
+        is_entry: whether it ends in a panorama.
+        seconds: that have passed.
+    """
+
+    start: Camera
+    end: Camera
+    is_entry: bool
+    seconds: float = 0.0
+
+    @property
+    def camera(self) -> Camera:
+        """The camera now."""
+        t = min(self.seconds / GLIDE_SECONDS, 1.0)
+        part = t * t * t * (t * (6 * t - 15) + 10)
+        a, b = self.start, self.end
+        x, y, z = (p + part * (q - p) for p, q in zip(a.position, b.position, strict=True))
+        return replace(
+            b,
+            position=(x, y, z),
+            yaw_radians=a.yaw_radians + part * (b.yaw_radians - a.yaw_radians),
+            pitch_radians=a.pitch_radians + part * (b.pitch_radians - a.pitch_radians),
+            vertical_fov_degrees=a.vertical_fov_degrees + part * (b.vertical_fov_degrees - a.vertical_fov_degrees),
+        )
 
 
 @dataclass
@@ -37,6 +69,8 @@ class ViewerState:
     camera: Camera = field(default_factory=Camera)  # the current camera; `home` is the camera that R restores
     home: Camera = field(default_factory=Camera)
     orbiting: bool = False  # whether the camera orbits (True) or flies (False)
+    doll_house: bool = False  # whether the rooms are seen from outside; the camera orbits then
+    glide: Glide | None = None  # the flight out of the rooms or into one, which input does not stop
     settings: DrawSettings = field(default_factory=DrawSettings)  # draw settings; the field of view is the camera's
     flight: float = 0.0  # fraction of the flight between the panoramas in [0, 1]; `playing` while it is played
     playing: bool = False
@@ -73,7 +107,8 @@ class ViewerState:
     @property
     def draw_settings(self) -> DrawSettings:
         """The settings of the next frame, with the camera's field of view."""
-        return replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
+        settings = replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
+        return replace(settings, mode="joint", outside=True) if self.doll_house else settings
 
     def show_message(self, message: str, now: float) -> None:
         """Show a message for four seconds."""
@@ -86,6 +121,7 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     In a scene of the same cameras as the one before, the camera stays where it is.
     """
     before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
+    leave_doll_house(state)
     adapt_settings(state, scene, keep_levels=False)
     state.settings = replace(state.settings, near=NEAR, box=None if before is None else state.settings.box)
     state.context = scene.cam2world.double().numpy()
@@ -156,7 +192,7 @@ def jump_to_view(state: ViewerState, view: int) -> None:
     """
     if view >= len(state.context):
         return
-    if state.route is not None:
+    if state.route is not None or state.doll_house:
         state.target = view
         return
     up = up_direction(torch.from_numpy(state.context))
@@ -166,8 +202,20 @@ def jump_to_view(state: ViewerState, view: int) -> None:
     state.flight = view / max(len(state.context) - 1, 1)
 
 
+def go_home(state: ViewerState) -> None:
+    """Move the camera to the start of the scene."""
+    leave_doll_house(state)
+    state.playing, state.camera = False, state.home
+
+
+def leave_doll_house(state: ViewerState) -> None:
+    """Show the scene from inside; the camera stays where it is."""
+    state.doll_house, state.glide = False, None
+
+
 def fly_to(state: ViewerState, fraction: float) -> None:
     """Move the camera to a fraction of the flight."""
+    leave_doll_house(state)
     state.flight = min(max(fraction, 0.0), 1.0)
     if state.route is not None:
         state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
@@ -210,6 +258,7 @@ def add_key_frame(state: ViewerState) -> None:
 
 def show_path(state: ViewerState, seconds: float) -> None:
     """Move the camera to a time of the path."""
+    leave_doll_house(state)
     state.playing, state.path_seconds = False, max(seconds, 0.0)
     if len(state.path):
         state.camera = state.path.interpolate(state.path_seconds, state.camera, state.tour)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -102,6 +102,39 @@ class TourScenes:
         if edges:  # else it is a prediction of a part
             scenes.edge, scenes._is_placed = max(edges, key=lambda edge: entry.start in edge), True
         return scenes
+
+    def gather_part(self) -> Callable[[], Scene]:
+        """A function, for any thread, that makes one scene of the panoramas of the part whose Gaussians are in memory.
+
+        It has the cameras and edges of the whole tour. The Gaussians of a panorama are from the prediction that is made
+        for it, or from any other one.
+        """
+        tour, sources = self.tour, {}
+        every = [loaded for scenes in (self._loaded, self._selected) for loaded in scenes.values()]
+        for node in tour.list_parts()[self.part]:
+            of_node = [loaded for loaded in every if node in loaded.entry.views]
+            provider = self._loaded.get(self._providers.get(node, ()))
+            if provider is not None or of_node:
+                sources[node] = provider or of_node[0]
+
+        def gather() -> Scene:
+            parts = []
+            for node, loaded in sources.items():
+                gaussians = loaded.scene.gaussians
+                part = gaussians.select(gaussians.views == loaded.entry.views.index(node))
+                parts.append(replace(part, views=torch.full_like(part.views, node, dtype=torch.int64)))
+            return replace(
+                every[0].scene,
+                gaussians=Gaussians.cat(parts),
+                cam2world=tour.cam2world,
+                names=tuple(panorama.label for panorama in tour.panoramas),
+                overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
+                gains=(),
+                links=(),
+                starts=(),
+            )
+
+        return gather
 
     def copy(self) -> TourScenes:
         """The same scenes in memory, for a film in another thread."""
@@ -383,8 +416,7 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
     They share an edge with those near the camera, or a link leads to them from there, to another part.
     """
     tour, position = scenes.tour, np.asarray(camera.position)
-    right, down, forward = np.asarray(camera.level).T
-    below = scenes.camera_height * down
+    below = scenes.camera_height * np.asarray(camera.level)[:, 1]
     feet = {
         node: (tour.positions[node] + below, tour.panoramas[node].label)
         for node in tour.list_reachable(scenes.edge)
@@ -398,17 +430,31 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
                     feet[node] = (tour.positions[first] + ring, link.text or tour.panoramas[node].label)
     found = []
     for node, (foot, label) in feet.items():
-        angles = np.arange(24) * (2 * np.pi / 24)
-        circle = foot + _HOTSPOT_RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
-        center = project_point(camera, tuple(foot), size)
-        ring = [project_point(camera, tuple(corner), size) for corner in circle]
-        if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):
-            continue
-        radius = max(np.ptp([corner[0] for corner in ring]) / 2, _MIN_HOTSPOT_PIXELS)
-        is_fade = tour.is_fade(scenes.edge[0], node)
-        hotspot = Hotspot(node, label, center, float(radius), tuple(ring), is_fade)
-        found.append((float(np.linalg.norm(foot - position)), hotspot))
+        hotspot = make_hotspot(camera, size, node, label, foot, is_fade=tour.is_fade(scenes.edge[0], node))
+        if hotspot is not None:
+            found.append((float(np.linalg.norm(foot - position)), hotspot))
     return [hotspot for _, hotspot in sorted(found, key=lambda item: -item[0])]
+
+
+def make_hotspot(
+    camera: Camera,
+    size: tuple[int, int],
+    node: int,
+    label: str,
+    foot: Float[np.ndarray, "3"],
+    *,
+    is_fade: bool = False,
+) -> Hotspot | None:
+    """The hotspot of a panorama around a place on the floor; None if it is not in an image of this size."""
+    right, _, forward = np.asarray(camera.level).T
+    angles = np.arange(24) * (2 * np.pi / 24)
+    circle = foot + _HOTSPOT_RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
+    center = project_point(camera, tuple(foot), size)
+    ring = [project_point(camera, tuple(corner), size) for corner in circle]
+    if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):
+        return None
+    radius = max(np.ptp([corner[0] for corner in ring]) / 2, _MIN_HOTSPOT_PIXELS)
+    return Hotspot(node, label, center, float(radius), tuple(ring), is_fade)
 
 
 def find_clicked(hotspots: Sequence[Hotspot], pixel: tuple[float, float]) -> int | None:

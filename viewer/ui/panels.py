@@ -18,6 +18,7 @@ from pansplat_viewer.scene.state import (
     add_key_frame,
     choose_display,
     fly_to,
+    go_home,
     jump_to_view,
     show_path,
     toggle_play,
@@ -83,7 +84,8 @@ class PanelData:
     preferences: Preferences = field(default_factory=Preferences)  # the remembered values
     film: float | None = None  # fraction of the film that is written; None if none is being written
     tour: TourScenes | None = None  # the scenes of the tour that is shown; None for other scenes
-    hotspots: list[Hotspot] = field(default_factory=list)  # places of its panoramas in the image
+    hotspots: list[Hotspot] = field(default_factory=list)  # places of panoramas in the image
+    doll_house: bool | None = None  # whether the doll's house is shown or prepared; None if there is no scene for it
     background: tuple[str, float] | None = None  # work of the loader on the tour, and the fraction done
     notes: tuple[str, ...] = ()  # what was not used or not placed at the path of the scene, and why
     placing: Placing | None = None  # the photographs and their poses; None if nothing is known of these
@@ -125,9 +127,9 @@ class Panels:
             draw_mask(data.painter, state.camera, state.brush_degrees)
         if state.overlay and state.points:
             draw_points(state)
+        if state.overlay and state.hotspots:
+            draw_hotspots(data.hotspots)
         if state.overlay and data.tour is not None:
-            if state.hotspots:
-                draw_hotspots(data.hotspots)
             self._draw_tour(state, data, data.tour, commands)
         if state.overlay and data.placing is not None and data.placing.node is not None:
             commands.reload |= self.placing.draw(data.placing, self._button, self._record_rectangle)
@@ -235,7 +237,7 @@ class Panels:
                 self._section("Gaussians", self._draw_gaussians, state)
             self._section("Display", self._draw_display, state)
             self._section("Compare", self._draw_comparison, state, data, commands)
-            self._section("Camera", self._draw_camera, state, data.panoramas)
+            self._section("Camera", self._draw_camera, state, data, commands)
             self._section("Screenshot", self._draw_screenshot, commands)
             self._section("Drawing", self._draw_settings, state, data.stats, opened=False)
             self._section("Clean up", self._draw_cleaning, state, data, commands, opened=False)
@@ -355,7 +357,7 @@ class Panels:
         state.settings = settings
         state.adaptive = self._check("coarser while moving", state.adaptive)
 
-    def _draw_camera(self, state: ViewerState, names: list[str]) -> None:
+    def _draw_camera(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
         if self._radio("fly", not state.orbiting):
             state.orbiting = False
         imgui.same_line()
@@ -363,7 +365,11 @@ class Panels:
             state.orbiting = True
         imgui.same_line()
         if self._button("Reset"):
-            state.playing, state.camera = False, state.home
+            go_home(state)
+        if data.doll_house is not None:
+            imgui.same_line()
+            if self._check("doll's house", data.doll_house) != data.doll_house:
+                commands.doll_house = True
         fov = state.camera.vertical_fov_degrees
         chosen = self._slider("field of view", fov, cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES, "%.0f deg")
         if chosen != fov:
@@ -372,7 +378,7 @@ class Panels:
         if not len(state.context):
             return
         if state.tour is None:  # which has a list of its own
-            self._draw_panoramas(state, names)
+            self._draw_panoramas(state, data.panoramas)
         if self._button("Stop" if state.playing else "Fly"):
             toggle_play(state)
         imgui.same_line()

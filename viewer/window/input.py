@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.state import ViewerState, add_key_frame, jump_to_view, step_flight, toggle_play
+from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, step_flight, toggle_play
 from pansplat_viewer.window.preferences import Theme
 
 FLY_SPEED = 1.0  # metres per second
@@ -34,6 +34,7 @@ HELP = (
     ("PgDn, PgUp", "the next or previous panorama"),
     ("Space", "play the flight between them"),
     ("M", "floor plan and hotspots of a tour"),
+    ("O", "doll's house: all rooms from outside"),
     (", .", "step along the flight (placing: turn)"),
     ("C", "compare with the nearest photograph"),
     ("X", "pin the image, to compare others with it"),
@@ -98,6 +99,7 @@ class Commands:
     paint: bool | None = None  # start or end to paint a mask
     clear_mask: bool = False
     save_mask: bool = False
+    doll_house: bool = False  # go out of the rooms, or back into the last panorama
     save_path: str | None = None
     open_path: str | None = None
     film: bool = False  # write the film of the path
@@ -108,7 +110,7 @@ class Commands:
 
 
 _KEYS = {
-    **{letter: letter for letter in "wasdqevfhprcbmkx"},
+    **{letter: letter for letter in "wasdqevfhprcbmkxo"},
     **{digit: f"_{digit}" for digit in "123456789"},
     "space": "space",
     ",": "comma",
@@ -194,13 +196,15 @@ def apply_input(state: ViewerState, events: Input) -> Commands:
         state.quit = state.quit or "q" in events.pressed
         return Commands()
     _apply_pressed(state, events.pressed)
-    _move_camera(state, events)
+    if state.glide is None:
+        _move_camera(state, events)
     shift, screenshot = "shift" in events.held, "p" in events.pressed
     return Commands(
         png=screenshot and not shift,
         exr=screenshot and shift,
         focus="f" in events.pressed,
         pin="x" in events.pressed,
+        doll_house="o" in events.pressed,
         pick=events.click,
     )
 
@@ -224,7 +228,7 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
         toggle_play(state)
     if "r" in pressed:
         state.points = []
-        state.playing, state.camera = False, state.home
+        go_home(state)
     for view in range(9):
         if str(view + 1) in pressed:
             jump_to_view(state, view)
@@ -251,9 +255,9 @@ def _move_camera(state: ViewerState, events: Input) -> None:
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
     turn = np.array(events.sticks[3:]) * TURN_SPEED * events.seconds
-    if turn.any() and not state.orbiting:
+    if turn.any() and not (state.orbiting or state.doll_house):
         camera = cameras.turn(camera, *turn)
-    if state.orbiting:
+    if state.orbiting or state.doll_house:
         pixels = ORBIT_KEY_PIXELS * events.seconds * factor * events.height / 1000
         across = axes[:2] + events.sticks[3:]
         if across.any():

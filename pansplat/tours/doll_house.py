@@ -1,0 +1,172 @@
+"""The doll's house view: what is drawn of a scene for a camera outside of its rooms.
+
+The Gaussians of a view lie on surfaces that its camera saw. From outside, two things hide the rooms: what is around
+them (ceilings, gardens behind windows, and what a camera saw of places far away), and the backs of the near walls.
+`find_rooms` bounds the rooms, whatever the camera; `find_fronts` leaves out backs, for each position of the camera.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+import torch
+from jaxtyping import Bool, Float
+from shapely.geometry import Polygon
+from torch import Tensor
+
+from pansplat.constants import FRONT_COSINE
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.pose import rotations_from_quats
+from pansplat.tours.floor import (
+    assign_storeys,
+    choose_camera_height,
+    find_camera_height,
+    find_ceiling,
+    find_floor_outline,
+    locate_surfaces,
+)
+from pansplat.tours.graph import make_graph
+from pansplat.tours.plan import make_plan
+
+_CEILING = 0.88  # of its height over the camera; above that nothing is drawn
+_FLOOR = 1.12  # of the height of the camera; below that nothing is drawn
+_USUAL_CEILING = 0.65  # height over the camera of one that is not seen, in heights of the camera
+_WALL = 0.15  # how far behind the outline of a room its walls are drawn, in heights of the camera
+_BEYOND = 0.4  # the same around a floor without walls, where furniture may stand
+_NEAREST = 2.0  # a Gaussian is drawn up to this multiple of the distance to the nearest camera from its own camera
+_COARSEST = 1  # pyramid level; coarser Gaussians lie behind the surfaces
+_SHOWN = 0.9  # of the surfaces of a view without walls and floor
+_OUTLIERS = 0.005  # of the Gaussians on each side of the box around the rooms
+_MARGIN = 1.05  # of the distance from which a box fills the image
+_SAMPLES = 20_000  # Gaussians of each view that the rooms are found by
+
+
+@dataclass(frozen=True, eq=False)
+class Rooms:
+    """The rooms of a scene.
+
+    Attributes:
+        level: right, down and forward (columns) of a level camera.
+        positions: of the cameras of all views.
+        floors, ceilings: their distances below and above the camera of each view, metres.
+        shape: the rooms from above, in plan coordinates.
+        parts, storeys: of each view.
+    """
+
+    level: Float[np.ndarray, "3 3"]
+    positions: Float[np.ndarray, "view 3"]
+    floors: Float[np.ndarray, "view"]
+    ceilings: Float[np.ndarray, "view"]
+    shape: shapely.Geometry
+    parts: tuple[int, ...]
+    storeys: tuple[int, ...]
+
+    def list_level(self, view: int) -> tuple[int, ...]:
+        """The views of the part and the storey of a view."""
+        keys = list(zip(self.parts, self.storeys, strict=True))
+        return tuple(other for other, key in enumerate(keys) if key == keys[view])
+
+    def find_inside(self, gaussians: Gaussians) -> Bool[Tensor, "n"]:
+        """Whether each Gaussian is on a surface in a room, below its ceiling, and its camera is near enough."""
+        views, means = gaussians.views.long().cpu(), gaussians.means.cpu()
+        positions = torch.from_numpy(self.positions)
+        origin = positions.mean(dim=0)  # float32 is accurate around it
+        means, positions = (means - origin.to(means)).float(), (positions - origin).float()
+        offsets = means - positions[views]
+        nearest = torch.full((len(means),), torch.inf)
+        for position in positions:
+            nearest = torch.minimum(nearest, (means - position).square().sum(dim=1))
+        level = torch.from_numpy(self.level).float()
+        down = offsets @ level[:, 1]
+        floors, ceilings = torch.from_numpy(self.floors).float(), torch.from_numpy(self.ceilings).float()
+        inside = (down > -_CEILING * ceilings[views]) & (down < _FLOOR * floors[views])
+        inside &= offsets.square().sum(dim=1) <= _NEAREST**2 * nearest
+        inside &= gaussians.levels.cpu() <= _COARSEST
+        places = (means[inside].double() + origin).numpy() @ self.level[:, (0, 2)]
+        inside[inside.clone()] = torch.from_numpy(shapely.contains_xy(self.shape, places[:, 0], places[:, 1]))
+        return inside
+
+
+def find_fronts(gaussians: Gaussians, positions: Float[Tensor, "view 3"], eye: Float[Tensor, "3"]) -> Bool[Tensor, "n"]:
+    """Whether a camera sees each Gaussian from the side from which the camera of its view saw it.
+
+    Both cameras are on one side of its plane, which is at right angles to its shortest axis, and the rays from them are
+    at an angle with a cosine of at least `FRONT_COSINE`: axes are inaccurate (docs/rendering.md, section 10).
+
+    Args:
+        gaussians: of the views.
+        positions: of the cameras of the views, in the world.
+        eye: position of the camera.
+    """
+    means = gaussians.means.double()
+    ray, seen = means - eye.to(means), means - positions.to(means)[gaussians.views.long()]
+    shortest = gaussians.scales.abs().argmin(dim=1)
+    axes = rotations_from_quats(gaussians.quats.double())
+    normal = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
+    is_same_side = (ray * normal).sum(dim=1) * (seen * normal).sum(dim=1) >= 0
+    return is_same_side & ((ray * seen).sum(dim=1) >= FRONT_COSINE * ray.norm(dim=1) * seen.norm(dim=1))
+
+
+def find_rooms(scene: Scene) -> Rooms:
+    """The rooms of a scene with input cameras: those of the floor plan, and the floors of panoramas without walls.
+
+    Where a view shows neither, most of its surfaces are.
+    """
+    tour, gaussians = make_graph(scene), scene.gaussians
+    level, count = tour.level_axes, len(tour)
+    step = max(len(gaussians) // (_SAMPLES * max(count, 1)), 1)
+    gaussians = gaussians.select(torch.arange(0, len(gaussians), step)).to(device="cpu")
+    gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
+    scene = dataclasses.replace(scene, gaussians=gaussians)
+    heights = [find_camera_height(scene, view, level) for view in range(count)]
+    unit = choose_camera_height(heights, scene.far)
+    ceilings = [find_ceiling(locate_surfaces(scene, view, level)) for view in range(count)]
+    rooms = make_plan(scene, tour).rooms
+    shapes = [Polygon(room.outline).buffer(_WALL * unit, join_style="mitre") for room in rooms]
+    enclosed = {view for room in rooms for view in room.panoramas}
+    for view in set(range(count)) - enclosed:
+        outline = find_floor_outline(scene, view, level)
+        if outline is not None:
+            shapes.append(shapely.make_valid(Polygon(outline.corners)).buffer(_BEYOND * unit))
+        elif len(places := locate_surfaces(scene, view, level)):
+            reach = float(np.quantile(np.hypot(places[:, 0], places[:, 2]), _SHOWN))
+            shapes.append(shapely.Point(tour.positions[view] @ level[:, (0, 2)]).buffer(reach))
+    return Rooms(
+        level,
+        tour.positions,
+        np.array([height or unit for height in heights]),
+        np.array([ceiling or _USUAL_CEILING * unit for ceiling in ceilings]),
+        shapely.union_all(shapes),
+        tour.parts if tour.overlaps else (0,) * count,
+        tuple(assign_storeys(tour)),
+    )
+
+
+def measure_box(
+    means: Float[Tensor, "n 3"], level: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """The least and the greatest coordinates, along level axes, of nearly all of some Gaussians."""
+    places = means.double().cpu().numpy() @ level
+    return np.quantile(places, _OUTLIERS, axis=0), np.quantile(places, 1 - _OUTLIERS, axis=0)
+
+
+def fit_box(
+    low: Float[np.ndarray, "3"],
+    high: Float[np.ndarray, "3"],
+    rotation: Float[np.ndarray, "3 3"],
+    tangents: tuple[float, float],
+) -> float:
+    """The distance from the middle of a box at which it fills the image of a camera.
+
+    Args:
+        low, high: corners of the box.
+        rotation: of the camera, to the axes of the box.
+        tangents: half the width and the height of the image at distance 1.
+    """
+    signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), axis=-1).reshape(-1, 3)
+    corners = signs * (high - low) @ rotation
+    across = np.abs(corners[:, :2]) / tangents
+    return _MARGIN * float((across.max(axis=1) - corners[:, 2]).max())
