@@ -537,12 +537,11 @@
     byId("home").onclick = goHome;
     byId("place").onclick = openList;
     byId("list").onclick = (event) => { if (event.target === byId("list")) byId("list").close(); };  // beside it
-    byId("full").onclick = toggleFull;
     byId("map").onclick = () => plan.toggle();
     byId("doll").onclick = () => doll.toggle();
     byId("doll").hidden = !doll.isPossible;
     byId("more").onclick = () => showMore(byId("menu").hidden);
-    for (const [id, act] of [["measure", () => measure.toggle()], ["picture", () => share.savePicture()], ["link", () => share.copyLink()]]) {
+    for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", () => share.savePicture()], ["link", () => share.copyLink()]]) {
       byId(id).onclick = () => {
         showMore(false);
         act();
