@@ -12,11 +12,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
+from pansplat.rendering.cpu.runtime import thread_count
 from pansplat.sweep.matching import (
     AggregationConfig,
     DepthRange,
@@ -133,23 +135,35 @@ def search_surfaces(
     # One view, or views at one place: nothing can be matched.
     if posed.measure_baseline(range(len(posed.images))) < 1e-3 * posed.near:
         return _place_unmatched(posed, finest, depths, estimator), neighbours
-    priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
         neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
-        priors = estimator.estimate_by_matching(detection.views, neighbours, (low, high), config.matching)
+
+    def find_planes() -> list[ScenePlanes]:
+        by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
+        pairs = list_best_pairs(neighbours)
+        for pair in set(pairs):
+            poses = posed.cam2world[list(pair)]
+            start = empty
+            if len(posed.images) > len(pair):
+                own = estimate_axes([small[n] for n in pair], poses[:, :3, :3])
+                start = dataclasses.replace(empty, axes=own[match_axes(own, axes)])
+            rays = [axis_components(start.axes, pose[:3, :3], detection.height) for pose in poses]
+            views = [detection.views[n] for n in pair]
+            by_pair[pair] = detect_planes(views, rays, poses, start, depths, MIN_FLOOR * posed.near, config.matching)
+        return [by_pair[pair] for pair in pairs]
+
+    def estimate_priors() -> Sequence[Sequence[DepthPrior]]:
+        if estimator is None:
+            return [()] * len(posed.images)
+        return estimator.estimate_by_matching(detection.views, neighbours, (low, high), config.matching)
+
     report("finding planes", 0.05)
-    by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
-    pairs = list_best_pairs(neighbours)
-    for pair in set(pairs):
-        poses = posed.cam2world[list(pair)]
-        start = empty
-        if len(posed.images) > len(pair):
-            own = estimate_axes([small[n] for n in pair], poses[:, :3, :3])
-            start = dataclasses.replace(empty, axes=own[match_axes(own, axes)])
-        rays = [axis_components(start.axes, pose[:3, :3], detection.height) for pose in poses]
-        views = [detection.views[n] for n in pair]
-        by_pair[pair] = detect_planes(views, rays, poses, start, depths, MIN_FLOOR * posed.near, config.matching)
-    planes = [by_pair[pair] for pair in pairs]
+    if thread_count() > 1:  # half of each is work of one thread
+        with ThreadPoolExecutor(1) as pool:
+            estimated = pool.submit(estimate_priors)
+            planes, priors = find_planes(), estimated.result()
+    else:
+        planes, priors = find_planes(), estimate_priors()
     pixel = math.pi / heights[0] / (high - low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
     counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]
