@@ -41,7 +41,7 @@ CHECKPOINT_SUFFIXES = (".ckpt", ".pt", ".pth")
 WEIGHTS_SUFFIXES = (".safetensors", *CHECKPOINT_SUFFIXES)
 COMPATS: dict[str, Compat] = {"official": "official", "fixed": "fixed"}
 
-ModelName = Literal["pansplat", "mvsplat", "depth"]
+ModelName = Literal["pansplat", "mvsplat", "depth", "depth_sharpening"]
 
 _T = TypeVar("_T")
 _Layer = tuple[str, str, tuple[str, ...]]  # official name, our name, tensors
