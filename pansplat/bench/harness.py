@@ -56,20 +56,24 @@ def time_call(call: Callable[[], T], device: torch.device) -> tuple[Timing, T]:
 
 @torch.inference_mode()
 def time_workload() -> float:
-    """Seconds of a fixed workload on torch's threads, so that times of different machines compare: median of five.
+    """Seconds of a fixed workload on torch's threads, so that times of different machines compare: median of 51.
 
-    It is a convolution (1.2 GFLOP) and the exponentials of 4 million numbers, on the CPU.
+    It is a convolution (1.2 GFLOP) and the exponentials of 4 million numbers, on the CPU, after half a second of the
+    same: the first calls wait for memory and sleeping threads.
     """
     maps = torch.linspace(-1, 1, 32 * 256 * 512).reshape(1, 32, 256, 512)
     weights = torch.linspace(-0.1, 0.1, 16 * 32 * 9).reshape(16, 32, 3, 3)
+    values = torch.empty_like(maps)
 
     def work() -> None:
         torch.nn.functional.conv2d(maps, weights, padding=1)
-        maps.exp()
+        torch.exp(maps, out=values)
 
     cpu = torch.device("cpu")
-    work()
-    return statistics.median(time_call(work, cpu)[0].wall for _ in range(5))
+    end = time.perf_counter() + 0.5
+    while time.perf_counter() < end:
+        work()
+    return statistics.median(time_call(work, cpu)[0].wall for _ in range(51))
 
 
 def measure_peak_memory(call: Callable[[], T], device: torch.device) -> tuple[float | None, T]:
