@@ -819,10 +819,7 @@ class Viewer:
         if weight < 1:
             fading, more = self._draw_content(1 - front, size, plan)
             milliseconds += more
-        if milliseconds > 0:  # else the image is not new, or not finished
-            timed = self.renderer.stats.timed
-            timed_plan = plan if timed is None else ResolutionPlan(timed.scale, cached=timed.cached)
-            self._resolution.record(timed_plan, milliseconds)
+        self._record_time(plan, milliseconds)
         if image is None:  # the first one of a large scene is not finished
             image, fading = fading, None
         if image is None:
@@ -839,16 +836,18 @@ class Viewer:
         right = self._comparer.get_right_side(self.state, draw_pinned) if mono else None
         self.presenter.draw(image, target, camera, right=right, fading=fading, weight=weight)
 
+    def _record_time(self, plan: ResolutionPlan, milliseconds: float) -> None:
+        if milliseconds > 0:  # else the image is not new, or not finished
+            timed = self.renderer.stats.timed
+            timed_plan = plan if timed is None else ResolutionPlan(timed.scale, cached=timed.cached)
+            self._resolution.record(timed_plan, milliseconds)
+
     def _draw_doll_house(
         self, slot: SceneSlot, size: tuple[int, int], target: moderngl.Framebuffer, plan: ResolutionPlan
     ) -> None:
         camera = self.state.camera
         milliseconds = self._render(slot, camera.cam2world, size, self.state.draw_settings, plan)
-        if milliseconds > 0:
-            timed = slot.renderer.stats.timed
-            self._resolution.record(
-                plan if timed is None else ResolutionPlan(timed.scale, cached=timed.cached), milliseconds
-            )
+        self._record_time(plan, milliseconds)
         self.panel_data.size = slot.renderer.stats.size
         if slot.image is None:
             target.use()

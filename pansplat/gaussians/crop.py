@@ -66,23 +66,30 @@ def crop(scene: Scene, box: Box) -> Scene:
     Raises:
         InputError: nothing is in the box.
     """
-    corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
-    low, high = corners.amin(dim=0), corners.amax(dim=0)
-    is_inside = _are_between(scene.gaussians.means, low, high)
-    views = _are_between(scene.cam2world[:, :3, 3], low, high).nonzero()[:, 0].tolist()
+    is_inside = are_in_box(scene.gaussians.means, box)
+    views = are_in_box(scene.cam2world[:, :3, 3], box).nonzero()[:, 0].tolist()
     cropped = keep_gaussians(scene, is_inside, views or None)
     if not len(cropped.gaussians):
         finite = scene.gaussians.means[torch.isfinite(scene.gaussians.means).all(dim=1)]
         found = "no Gaussian" if not len(finite) else f"a scene from {_list(finite.amin(0))} to {_list(finite.amax(0))}"
+        low, high = _sort_corners(box)
         raise InputError(
             f"needed a box with Gaussians, got {_list(low)} to {_list(high)} m and {found}; choose another"
         )
     return cropped
 
 
-def _are_between(points: Float[Tensor, "n 3"], low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Bool[Tensor, "n"]:
-    points = points.double().cpu()
-    return ((points >= low) & (points <= high)).all(dim=1).to(points.device)
+def are_in_box(points: Float[Tensor, "n 3"], box: Box) -> Bool[Tensor, "n"]:
+    """Whether points are in a box, its faces included; NaN is outside."""
+    low, high = _sort_corners(box)
+    points = points.double()
+    return ((points >= low.to(points.device)) & (points <= high.to(points.device))).all(dim=1)
+
+
+def _sort_corners(box: Box) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """The least and the greatest corner."""
+    corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
+    return corners.amin(dim=0), corners.amax(dim=0)
 
 
 def _list(point: Tensor) -> str:

@@ -442,25 +442,26 @@ def test_the_page_works_when_the_first_view_has_arrived(chromium: Any, folder: P
         assert page.messages == []
 
 
-def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) -> None:
-    shutil.copy(folder / "split.html", tmp_path)
+def read_failure(chromium: Any, path: Path) -> str:
+    """The message over the poster of a page that fails."""
     context = chromium.new_context()
     page = context.new_page()
-    page.goto((tmp_path / "split.html").as_uri())
+    page.goto(path.as_uri())
     page.wait_for_selector("#cover.failed")
-    assert "Copy the whole folder" in page.inner_text("#message")
+    message = page.inner_text("#message")
     context.close()
+    return message
+
+
+def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "split.html", tmp_path)
+    assert "Copy the whole folder" in read_failure(chromium, tmp_path / "split.html")
 
 
 def test_data_that_cannot_be_read_is_reported(chromium: Any, folder: Path, tmp_path: Path) -> None:
     text = (folder / "tour.html").read_text()
     (tmp_path / "bad.html").write_text(text.replace(">H4s", ">AAA", 1))
-    context = chromium.new_context()
-    page = context.new_page()
-    page.goto((tmp_path / "bad.html").as_uri())
-    page.wait_for_selector("#cover.failed")
-    assert "cannot be read" in page.inner_text("#message")
-    context.close()
+    assert "cannot be read" in read_failure(chromium, tmp_path / "bad.html")
 
 
 def test_the_graph_of_the_page_is_that_of_the_tour(page: OpenPage) -> None:

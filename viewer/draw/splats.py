@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt
 
+from pansplat.gaussians.crop import are_in_box
 from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering.cpu.display import NO_LAYER, Selection, mark_in_view
@@ -142,8 +143,8 @@ class Splats:
         levels, threshold, box = selection
         selected = self.reach > 0
         if box is not None:
-            corners = np.array(box).reshape(2, 3) - self.origin
-            selected &= ((self.means >= corners.min(axis=0)) & (self.means <= corners.max(axis=0))).all(axis=1)
+            moved = tuple((np.reshape(box, (2, 3)) - self.origin).ravel().tolist())
+            selected &= are_in_box(torch.from_numpy(self.means), moved).numpy()
         if threshold > 0:
             selected &= self.opacities >= np.float32(threshold)
         if levels is not None:

@@ -8,7 +8,15 @@ from jaxtyping import Float
 
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.path import find_direction, fly_pose, level_pose, look_pose, path_poses, up_direction
+from pansplat.geometry.path import (
+    ease_in_out,
+    find_direction,
+    fly_pose,
+    level_pose,
+    look_pose,
+    path_poses,
+    up_direction,
+)
 from pansplat.tours import Route, TourGraph
 from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
@@ -42,8 +50,7 @@ class Glide:
     @property
     def camera(self) -> Camera:
         """The camera now."""
-        t = min(self.seconds / GLIDE_SECONDS, 1.0)
-        part = t * t * t * (t * (6 * t - 15) + 10)
+        part = ease_in_out(self.seconds / GLIDE_SECONDS)
         a, b = self.start, self.end
         x, y, z = (p + part * (q - p) for p, q in zip(a.position, b.position, strict=True))
         return replace(
