@@ -34,12 +34,14 @@ class Pose:
     """Two of the files and their distance in metres, instead of the camera's height."""
     frames: Count = 24
     """Largest number of key frames of a video."""
+    overwrite: bool = False
+    """Replace poses, trajectories and pictures that pansplat did not write; the old poses.json stays as .bak."""
 
     def run(self) -> int:
         """Estimate, print the table and write the file."""
         from pansplat.data.folders import VIDEO_FILES
         from pansplat.poses.estimate import estimate_poses
-        from pansplat.poses.files import SUFFIXES, write_poses
+        from pansplat.poses.files import SUFFIXES, require_replaceable, write_poses
 
         if not self.paths:
             raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
@@ -48,15 +50,18 @@ class Pose:
             require_output_folder("--out", self.out)
         elif self.out is not None:
             require_output_file("--out", self.out, SUFFIXES)
+        out = self.out / "poses.json" if is_video and self.out is not None else self.out
+        images = [] if is_video else _list_images(self.paths)
+        if out is not None:
+            require_replaceable(out, images, overwrite=self.overwrite)
         with progress_bar() as progress:
-            images = self._extract_frames(progress) if is_video else _list_images(self.paths)
+            images = self._extract_frames(progress) if is_video else images
             estimate = estimate_poses(
                 images, camera_height=self.camera_height, baseline=self.baseline, progress=progress
             )
         _print_estimate(estimate)
-        out = self.out / "poses.json" if is_video and self.out is not None else self.out
         if out is not None:
-            write_poses(estimate, out)
+            write_poses(estimate, out, overwrite=self.overwrite)
             print(out)
         return 0
 
@@ -65,18 +70,20 @@ class Pose:
 
         if self.out is None:
             raise InputError("--out must name a folder for the key frames of a video, got none")
-        return extract_key_frames(self.paths[0], self.out, self.frames, progress)
+        return extract_key_frames(self.paths[0], self.out, self.frames, progress, overwrite=self.overwrite)
 
 
 def _list_images(paths: tuple[Path, ...]) -> list[Path]:
-    """The files, and those in the folders."""
-    from pansplat.data.pairs import list_panorama_files
+    """The files, and the photographs in the folders, as other commands find them."""
+    from pansplat.data.images import is_assembled
+    from pansplat.data.photographs import list_photographs
 
     images: list[Path] = []
     for path in paths:
         if not path.exists():
             raise InputError(f"{path}: needed a folder of panoramas or a file, got no such path; check it.")
-        images += list_panorama_files(path) if path.is_dir() else [path]
+        found = [view.image for view in list_photographs(path)] if path.is_dir() else [path]
+        images += [image for image in found if not is_assembled(image)]
     if len(images) < 2:
         raise InputError(f"{paths[0]}: needed two or more panoramas, got {len(images)}; add the others.")
     return images

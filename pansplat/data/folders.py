@@ -60,9 +60,10 @@ _RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree came
 _TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # that may hold poses
 _CAMERA_POSES = "camera_pose.json"  # of 360Loc
 
+_REJECTED = "rejected by hand"
 _MAX_WORLD = 9999  # of poses.json
 _MAX_DEPTH = 4  # levels of nested folders that are searched
-_MATRIX_KEYS = ("cam2world", "world2cam", "pose")
+MATRIX_KEYS = ("cam2world", "world2cam", "pose")
 _IMAGE_FOLDERS = ("image", "images", "panos", "frames", ".")  # of a sequence
 _Z_UP = torch.tensor(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)), dtype=torch.float64)
 
@@ -398,9 +399,14 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
         raise InputError(f"{source}: needed poses of one or more panoramas, got none; add them or remove the file.")
     panoramas = tuple(_judge_entries(content, panoramas, source))
     folders = tuple(dict.fromkeys((folder, *(view.image.parent for view in panoramas))))
-    unposed = _explain_unposed(content, _list_further(source, folders, panoramas), source)
+    reasons = _read_reasons(content)
+    unposed = [_explain_unposed(view, reasons, source) for view in _list_further(source, folders, panoramas, reasons)]
     linked = add_links([*panoramas, *unposed], folder)
-    near, far = (number_field(content, key, source, needed="a number in metres") for key in ("near", "far"))
+    ranges = _read_ranges(content, source)
+    near, far = (
+        default if (stated := number_field(content, key, source, needed="a number in metres")) is None else stated
+        for key, default in zip(("near", "far"), ranges.pop(0, (NEAR, FAR)), strict=True)
+    )
     groups = _read_groups(folder / _PAIRS, list(entries)) if (folder / _PAIRS).is_file() else None
     if groups is not None:
         groups = _drop_groups_of_several_worlds(folder / _PAIRS, groups, panoramas)
@@ -411,9 +417,9 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
         source,
         tuple(linked[: len(panoramas)]),
         groups,
-        near=NEAR if near is None else near,
-        far=FAR if far is None else far,
-        ranges=_read_ranges(content, source),
+        near=near,
+        far=far,
+        ranges=ranges,
         name=folder.resolve().name if is_single else None,
         unposed=tuple(linked[len(panoramas) :]),
         folders=folders,
@@ -437,20 +443,19 @@ def _judge_entries(content: dict[str, Any], panoramas: Sequence[Panorama], sourc
     ]
 
 
-def _explain_unposed(content: dict[str, Any], panoramas: Sequence[Panorama], source: Path) -> list[Panorama]:
-    """The panoramas beside those of poses.json, with the reasons that it states."""
-    estimate, rejected = content.get("estimate"), read_rejected(content)
+def _read_reasons(content: dict[str, Any]) -> dict[str, str]:
+    """Why panoramas have no pose, by the names of their files, as poses.json states it."""
+    estimate = content.get("estimate")
     reasons = estimate.get("unplaced") if isinstance(estimate, dict) else None
-    reasons = reasons if isinstance(reasons, dict) else {}
-    explained = []
-    for panorama in panoramas:
-        name = panorama.image.name
-        if any(name in poses for poses in rejected):
-            placement = Placement("not placed", "rejected by hand", source, is_rejected=True)
-        else:
-            placement = Placement("not placed", str(reasons.get(name, f"{_POSES} has no pose of it")), source)
-        explained.append(dataclasses.replace(panorama, placement=placement))
-    return explained
+    rejected = [name for poses in read_rejected(content) for name in poses]
+    return (reasons if isinstance(reasons, dict) else {}) | dict.fromkeys(rejected, _REJECTED)
+
+
+def _explain_unposed(panorama: Panorama, reasons: dict[str, str], source: Path) -> Panorama:
+    """A panorama beside those of poses.json, with the reason that it states."""
+    reason = str(reasons.get(panorama.image.name, f"{_POSES} has no pose of it"))
+    placement = Placement("not placed", reason, source, is_rejected=reason == _REJECTED)
+    return dataclasses.replace(panorama, placement=placement)
 
 
 def _drop_groups_of_several_worlds(
@@ -479,10 +484,12 @@ def _read_ranges(content: dict[str, Any], source: Path) -> dict[int, tuple[float
     return ranges
 
 
-def _list_further(source: Path, folders: Sequence[Path], panoramas: Sequence[Panorama]) -> list[Panorama]:
+def _list_further(
+    source: Path, folders: Sequence[Path], panoramas: Sequence[Panorama], stated: Iterable[str] = ()
+) -> list[Panorama]:
     """The panoramas of folders that have no pose, with a warning that names them."""
     files = [file for view in panoramas for file in (view.image, view.mask, view.depth) if file is not None]
-    unposed = list_further_photographs(folders, files, [view.name for view in panoramas])
+    unposed = list_further_photographs(folders, files, [view.name for view in panoramas], set(stated))
     if unposed:
         warnings.warn(
             f"{source} has no pose of {list_names([view.image for view in unposed])}; each is a scene of its own.",
@@ -498,7 +505,7 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
     image = folder / name
     matrix, mask, depth, world, room = entry, None, None, 0, ""
     if isinstance(entry, dict):
-        key = next((key for key in _MATRIX_KEYS if key in entry), None)
+        key = next((key for key in MATRIX_KEYS if key in entry), None)
         if key is None:
             raise InputError(f'{source}: needed a pose, got only {sorted(entry)}; add its 4x4 matrix as "cam2world".')
         if is_stated and key in ("cam2world", "world2cam") and not convention.startswith(key):

@@ -328,7 +328,7 @@ def write_image(
     image: Tensor | NDArray[Any],
     *,
     depth: Tensor | NDArray[Any] | None = None,
-    panorama: bool | None = None,
+    panorama: bool | Literal["photograph"] | None = None,
 ) -> None:
     """Write an image atomically; the suffix selects PNG, JPG, WebP (8 bit) or EXR (linear float).
 
@@ -337,7 +337,7 @@ def write_image(
         image: a tensor (3 H W) or an array (H W 3), sRGB in [0, 1] (clipped); an array may be uint8.
         depth: (H W) metres, written as channel Z of an EXR.
         panorama: whether the file is marked as an equirectangular panorama (GPano, in an EXR a latitude-longitude
-            map); by default if it is 2:1.
+            map); by default if it is 2:1. Other than photographs, it counts as a rendering.
 
     Raises:
         InputError: NaN, unknown suffix, depth for a format that cannot hold it, folder missing.
@@ -382,7 +382,7 @@ def write_depth(path: Path | str, depth: Tensor | NDArray[Any], *, panorama: boo
 
 
 def _encode(
-    path: Path, image: Image.Image, options: dict[str, Any], panorama: bool | None, description: str = ""
+    path: Path, image: Image.Image, options: dict[str, Any], panorama: bool | str | None, description: str = ""
 ) -> None:
     """Write an image by Pillow with its metadata."""
     suffix = path.suffix.lower()
@@ -390,7 +390,7 @@ def _encode(
     if description:
         chunks.add_text("Description", description)
     if image.width == 2 * image.height if panorama is None else panorama:
-        xmp = make_gpano_xmp(image.width, image.height)
+        xmp = make_gpano_xmp(image.width, image.height, is_photograph=panorama == "photograph")
         options = options | {"xmp": xmp}
         chunks.add_itxt("XML:com.adobe.xmp", xmp.decode())
     if suffix == ".png":
@@ -421,7 +421,9 @@ def _as_pixels(path: Path, image: Tensor | NDArray[Any]) -> NDArray[Any]:
     return pixels
 
 
-def _write_exr(path: Path, pixels: NDArray[Any], depth: Tensor | NDArray[Any] | None, panorama: bool | None) -> None:
+def _write_exr(
+    path: Path, pixels: NDArray[Any], depth: Tensor | NDArray[Any] | None, panorama: bool | str | None
+) -> None:
     import OpenEXR
 
     srgb = pixels.astype(np.float32) / np.float32(255) if pixels.dtype == np.uint8 else pixels

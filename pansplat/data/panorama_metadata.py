@@ -43,25 +43,26 @@ _RDF = (
 )
 
 
-def make_gpano_xmp(width: int, height: int) -> bytes:
-    """XMP of a full equirectangular panorama of a size in pixels."""
+def make_gpano_xmp(width: int, height: int, *, is_photograph: bool = False) -> bytes:
+    """XMP of a full equirectangular panorama of a size in pixels; a rendering names pansplat as its software."""
     properties = {
         "UsePanoramaViewer": "True",
         "ProjectionType": "equirectangular",
-        "StitchingSoftware": "pansplat",
         "FullPanoWidthPixels": width,
         "FullPanoHeightPixels": height,
         "CroppedAreaImageWidthPixels": width,
         "CroppedAreaImageHeightPixels": height,
         "CroppedAreaLeftPixels": 0,
         "CroppedAreaTopPixels": 0,
-        "PoseHeadingDegrees": 0,
     }
+    if not is_photograph:  # of which the heading is unknown
+        properties |= {"StitchingSoftware": "pansplat", "PoseHeadingDegrees": 0}
     attributes = " ".join(f'GPano:{name}="{value}"' for name, value in properties.items())
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-        f'<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {attributes}/>'
+        '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+        f'xmlns:xmp="http://ns.adobe.com/xap/1.0/" xmp:CreatorTool="pansplat" {attributes}/>'
         '</rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
     ).encode()
 

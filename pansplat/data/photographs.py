@@ -55,21 +55,22 @@ def list_photographs(folder: Path) -> list[Panorama]:
 
 
 def list_further_photographs(
-    folders: Sequence[Path], known: Collection[Path], names: Collection[str]
+    folders: Sequence[Path], known: Collection[Path], names: Collection[str], stated: Collection[str] = ()
 ) -> list[Panorama]:
     """The panoramas of folders other than the known files, without links.
 
-    Pictures that pansplat rendered do not count. Warns about pictures that are no panoramas.
+    Pictures that pansplat rendered count only if they are stated. Warns about pictures that are no panoramas.
 
     Args:
         folders: each once.
         known: files that are no further ones.
         names: that are taken; a panorama of such a name gets the folder's name before its own.
+        stated: names of files that are photographs.
     """
     taken = set(names)
     further: list[Panorama] = []
     for folder in folders:
-        panoramas, problems = _read_pictures(_list_others(folder, known), folder)
+        panoramas, problems = _read_pictures(_list_others(folder, known, stated), folder)
         _warn_left_out(problems)
         for panorama in panoramas:
             name = panorama.name if panorama.name not in taken else f"{folder.resolve().name}_{panorama.name}"
@@ -83,10 +84,11 @@ def list_unread_panoramas(folder: Path, known: Collection[Path]) -> list[Path]:
     return [image for image in _list_others(folder, known) if _is_two_to_one(image)]
 
 
-def _list_others(folder: Path, known: Collection[Path]) -> list[Path]:
-    """The pictures of a folder other than the known files, which pansplat has not rendered."""
+def _list_others(folder: Path, known: Collection[Path], stated: Collection[str] = ()) -> list[Path]:
+    """The pictures of a folder other than the known files, which are stated, or which pansplat has not rendered."""
     read = {_identify(file) for file in known}
-    return [image for image in list_panorama_files(folder) if _identify(image) not in read and not _is_rendered(image)]
+    others = [image for image in list_panorama_files(folder) if _identify(image) not in read]
+    return [image for image in others if image.name in stated or not _is_rendered(image)]
 
 
 def _identify(file: Path) -> object:

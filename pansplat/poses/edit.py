@@ -7,7 +7,8 @@ file counts. Other entries and fields of the file stay as they are. Each change 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.atomic import replacing
+from pansplat.data.folders import MATRIX_KEYS
 from pansplat.data.images import list_pictures
 from pansplat.data.pairs import Panorama
 from pansplat.data.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties
@@ -26,8 +28,16 @@ from pansplat.errors import InputError
 from pansplat.files import read_file
 from pansplat.poses.estimate import PoseEstimate
 from pansplat.poses.placing import Place, Suggestion
-from pansplat.poses.pose_file import format_pose_file, make_pose_content, make_pose_file
-from pansplat.strict_json import MAX_BYTES, read_json, require_object
+from pansplat.poses.pose_file import (
+    format_pose_file,
+    make_pose_content,
+    make_pose_file,
+    make_range,
+    mark_worlds,
+    matrix_of,
+    world_of,
+)
+from pansplat.strict_json import MAX_BYTES, list_field, number_field, read_json, require_object
 
 POSES = "poses.json"
 
@@ -91,9 +101,7 @@ class PoseEditor:
             InputError: the file cannot be read.
         """
         if self.file.exists():
-            content = require_object(read_json(self.file), self.file)
-            require_object(content.get("poses"), f"{self.file}, poses")
-            return content
+            return read_pose_content(self.file)
         (source,) = self._sources
         return _convert(require_object(read_json(source), source), self._names, self._by_name)
 
@@ -129,11 +137,12 @@ class PoseEditor:
         if world is None:
             world = _find_free_world(content)
             if unit is not None:
-                worlds = content.setdefault("worlds", [])
-                worlds += [{} for _ in range(world + 1 - len(worlds))]
-                worlds[world] = worlds[world] | {"unit": round(unit, 4)}
+                _list_worlds(content, world)[world]["unit"] = round(unit, 4)
         for image, pose in poses.items():
-            _put(content, self._names[image], pose, world, self.file, {"placed": BY_HAND})
+            name = self._names[image]
+            if name in (rejected := _find_rejected(content)):
+                content["poses"].setdefault(name, copy.deepcopy(rejected[name]))
+            _put(content, name, pose, world, self.file, {"placed": BY_HAND})
         self._write(content)
 
     def reject(self, image: Path) -> None:
@@ -151,7 +160,7 @@ class PoseEditor:
         ties: tuple[Tie, ...] = ()
         members: tuple[str, ...] = (name,)
         if not is_by_hand(poses[name]):
-            names = [other for other in poses if _world_of(poses[other]) == _world_of(poses[name])]
+            names = [other for other in poses if world_of(poses[other]) == world_of(poses[name])]
             by_hand = [other for other in names if is_by_hand(poses[other])]
             hold = find_holds(names, read_ties(content.get("estimate")), by_hand).get(name)
             if hold is None:
@@ -188,7 +197,7 @@ class PoseEditor:
             raise InputError(f"{self.file}: needed a rejected panorama, got {name}.")
         record, poses = found[-1], content["poses"]
         for member, entry in record["poses"].items():
-            if member not in poses or ("world" in record and _world_of(poses[member]) == record["world"]):
+            if member not in poses or ("world" in record and world_of(poses[member]) == record["world"]):
                 poses[member] = entry
         if record.get("pairs"):
             content.setdefault("estimate", {}).setdefault("pairs", []).extend(record["pairs"])
@@ -218,58 +227,92 @@ class PoseEditor:
         self._undo.pop()
 
     def _write(self, content: Content) -> None:
-        before, after = _read(self.file), format_pose_file(content).encode()
-        _replace(self.file, after)
-        self._undo.append((before, after))
+        self._undo.append(write_pose_file(self.file, content, backup=not self._undo))
 
 
-def merge_estimate(file: Path, estimate: PoseEstimate, names: Mapping[Path, str]) -> tuple[Content, int] | None:
-    """The content of a poses.json with changes by hand, and the poses that an estimate adds; also their number.
+def read_pose_content(file: Path) -> Content:
+    """The content of a poses.json; an InputError if it cannot be read, or a pose or world is invalid."""
+    content = require_object(read_json(file), file)
+    _convention_of(content, file)
+    for number, world in enumerate(list_field(content, "worlds", file)):
+        require_object(world, f"{file}, worlds {number}")
+    for name, entry in require_object(content.get("poses"), f"{file}, poses").items():
+        _read_pose(content, name, file)
+        if isinstance(entry, dict):
+            number_field(entry, "world", f"{file}, {name!r}", low=0, whole=True, needed="a whole number")
+    return content
 
-    All poses of the file are kept. A panorama without one is placed where the estimate has it, relative to the nearest
-    panorama of the file in its group.
+
+def find_kept(content: Content, file: Path, read: Collection[str], replaced: Collection[str] = ()) -> set[str]:
+    """The names in a poses.json whose poses an estimate leaves as they are.
+
+    An estimate replaces poses that are `replaced` in any case, and worlds that an estimate wrote, that nobody has
+    changed since, and whose panoramas it has all read, as far as they are there: poses are relative to their world.
+    """
+    poses, free, folder = content["poses"], _find_own_worlds(content), file.resolve().parent
+    free -= {world_of(poses[name]) for name in set(poses) - set(read) if (folder / name).exists()}
+    return {name for name in set(poses) - set(replaced) if world_of(poses[name]) not in free}
+
+
+def merge_estimate(
+    file: Path, estimate: PoseEstimate, names: Mapping[Path, str], *, overwrite: bool = False
+) -> tuple[Content, list[str]]:
+    """The content of a poses.json with the poses of an estimate, and the names that it would place but leaves.
+
+    Poses that stay (`find_kept`) and other fields are as before. A panorama is placed where the estimate has it,
+    relative to the nearest panorama of its group that stays; a group without such gets a world of its own.
 
     Args:
-        file: the poses.json; it need not exist.
-        estimate: of the folder.
+        file: the poses.json.
+        estimate: of panoramas.
         names: of the files in it.
-
-    Returns:
-        None if there are no changes by hand.
+        overwrite: whether all poses are replaced that the estimate has, but for rejected ones.
     """
-    if not file.exists():
-        return None
-    content = require_object(read_json(file), file)
-    poses = content.get("poses")
-    rejected = {name for entries in read_rejected(content) for name in entries}
-    if not isinstance(poses, dict) or not (rejected or any(map(is_by_hand, poses.values()))):
-        return None
-    known, added = set(poses), 0
+    content = read_pose_content(file)
+    poses, own, rejected = content["poses"], _find_own_worlds(content), set(_find_rejected(content))
+    placed = {names[image] for group in estimate.groups for image in group.poses}
+    kept = find_kept(content, file, names.values(), placed - rejected if overwrite else ())
+    former = {name: poses.pop(name) for name in list(poses) if name not in kept}
     for group in estimate.groups:
-        own = {image: names[image] for image in group.poses}
-        new = [image for image, name in own.items() if name not in known | rejected]
-        anchors = [image for image, name in own.items() if name in known]
-        world = None if anchors else _find_free_world(content)
-        for image in new:
+        new = {image: names[image] for image in group.poses if names[image] not in kept | rejected}
+        anchors = {image: names[image] for image in group.poses if names[image] in kept - rejected}
+        world = None if anchors else _find_free_world(content, [former[n] for n in new.values() if n in former])
+        if new and world is not None:
+            worlds, made = _list_worlds(content, world), make_range(group)
+            worlds[world] = worlds[world] | made if world in own else made | worlds[world] | {"unit": made["unit"]}
+            own.add(world)
+        for image, name in new.items():
             pose = group.poses[image]
             if anchors:
                 nearest = min(anchors, key=lambda a: float(np.linalg.norm(group.poses[a][:3, 3] - pose[:3, 3])))
-                world = _world_of(poses[own[nearest]])
+                world = world_of(poses[anchors[nearest]])
                 motion = np.linalg.inv(group.poses[nearest]) @ pose
                 motion[:3, 3] *= (_find_unit(content, world) or group.unit) / group.unit
-                pose = _read_pose(content, own[nearest], file) @ motion
+                pose = _read_pose(content, anchors[nearest], file) @ motion
             assert world is not None
-            _put(content, own[image], pose, world, file, {})
-            added += 1
-    fresh = make_pose_content(estimate, names)["estimate"]
-    old = content.get("estimate") if isinstance(content.get("estimate"), dict) else {}
+            poses[name] = former.pop(name, {})
+            _put(content, name, pose, world, file, {})
+    for name, entry in former.items():  # the estimate has no pose of it
+        if set(_as_object(entry, content, file)) - {*MATRIX_KEYS, "world"}:
+            poses[name] = entry | {"world": _find_free_world(content)}
+    fresh, old = make_pose_content(estimate, names)["estimate"], _read_estimate(content)
+    read, files = set(names.values()), {image.name for image in names}
     apart = {frozenset(tie[:2]) for record in content.get("rejected") or () for tie in read_ties(record)}
-    kept = [pair for pair in _list_pairs(old) if set(pair["between"]) <= known]
-    pairs = [
-        pair for pair in fresh["pairs"] if not set(pair["between"]) <= known and frozenset(pair["between"]) not in apart
+    pairs = [pair for pair in _list_pairs(old) if set(pair["between"]) <= kept]
+    pairs += [
+        pair for pair in fresh["pairs"] if not set(pair["between"]) <= kept and frozenset(pair["between"]) not in apart
     ]
-    content["estimate"] = {**old, **fresh, "pairs": kept + pairs}
-    return content, added
+    unplaced = old["unplaced"].items() if isinstance(old.get("unplaced"), dict) else ()
+    content["estimate"] = {
+        **old,
+        **fresh,
+        "pairs": pairs,
+        "suggestions": [pair for pair in _list_pairs(old, "suggestions") if not set(pair["between"]) <= read]
+        + fresh["suggestions"],
+        "unplaced": {name: reason for name, reason in unplaced if name not in files} | fresh["unplaced"],
+        "written": " ".join(mark for world, mark in mark_worlds(content).items() if world in own),
+    }
+    return content, [name for name in poses if name in kept & placed]
 
 
 def _name_in(folder: Path, panorama: Panorama) -> str:
@@ -307,10 +350,6 @@ def _is_row(row: Any) -> bool:
     return is_list and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in row)
 
 
-def _world_of(entry: Any) -> int:
-    return int(entry.get("world") or 0) if isinstance(entry, dict) else 0
-
-
 def _find_unit(content: Content, world: int) -> float | None:
     worlds = content.get("worlds")
     entry = worlds[world] if isinstance(worlds, list) and 0 <= world < len(worlds) else None
@@ -318,9 +357,34 @@ def _find_unit(content: Content, world: int) -> float | None:
     return float(unit) if isinstance(unit, (int, float)) and not isinstance(unit, bool) and unit > 0 else None
 
 
-def _find_free_world(content: Content) -> int:
-    used = {_world_of(entry) for entry in content["poses"].values()}
-    return next(number for number in range(len(used) + 1) if number not in used)
+def _find_free_world(content: Content, former: Sequence[Any] = ()) -> int:
+    """The first world without panoramas, those of former entries first."""
+    used = set(map(world_of, content["poses"].values()))
+    return next(world for world in (*map(world_of, former), *range(len(used) + 1)) if world not in used)
+
+
+def _list_worlds(content: Content, world: int) -> list[Content]:
+    """What the file states of the worlds, at least up to one; changes of the list are changes of the file."""
+    worlds = content["worlds"] = content.get("worlds") or []
+    worlds += [{} for _ in range(world + 1 - len(worlds))]
+    return worlds
+
+
+def _read_estimate(content: Content) -> Content:
+    estimate = content.get("estimate")
+    return estimate if isinstance(estimate, dict) else {}
+
+
+def _find_own_worlds(content: Content) -> set[int]:
+    """The worlds whose poses are as an estimate wrote them."""
+    marks = str(_read_estimate(content).get("written")).split()
+    return {world for world, mark in mark_worlds(content).items() if mark in marks}
+
+
+def _find_rejected(content: Content) -> Content:
+    """The entries of panoramas that were rejected, and not placed by hand since."""
+    entries = {name: entry for record in read_rejected(content) for name, entry in record.items()}
+    return {name: entry for name, entry in entries.items() if not is_by_hand(content["poses"].get(name))}
 
 
 def _convention_of(content: Content, file: Path) -> str:
@@ -334,11 +398,7 @@ def _as_object(entry: Any, content: Content, file: Path) -> Content:
 
 def _read_pose(content: Content, name: str, file: Path) -> Float[Array, "4 4"]:
     entry = content["poses"][name]
-    matrix = next((entry[key] for key in _KEYS if key in entry), None) if isinstance(entry, dict) else entry
-    return to_cam2world(rigid_matrix(matrix, f"{file}, {name!r}"), _convention_of(content, file)).numpy()
-
-
-_KEYS = ("cam2world", "world2cam", "pose")
+    return to_cam2world(rigid_matrix(matrix_of(entry), f"{file}, {name!r}"), _convention_of(content, file)).numpy()
 
 
 def _put(
@@ -347,12 +407,13 @@ def _put(
     """Set the pose of an entry in the convention of the file; other fields of the entry are kept."""
     convention = _convention_of(content, file)
     entry = _as_object(content["poses"].get(name, {}), content, file)
-    key = next((key for key in _KEYS if key in entry), convention.split()[0])
+    key = next((key for key in MATRIX_KEYS if key in entry), convention.split()[0])
     matrix = from_cam2world(torch.from_numpy(np.asarray(pose, np.float64)), convention)
+    entry.pop("placed", None)
     entry |= {key: np.round(matrix.numpy(), 9).tolist(), **fields}
     if world or "world" in entry:
         entry["world"] = world
-    content["poses"][name] = entry
+    content["poses"][name] = entry[key] if set(entry) == {convention.split()[0]} else entry
 
 
 def _take_pairs(content: Content, ties: Sequence[Tie]) -> list[Content]:
@@ -363,14 +424,24 @@ def _take_pairs(content: Content, ties: Sequence[Tie]) -> list[Content]:
     return taken
 
 
-def _list_pairs(estimate: Content) -> list[Content]:
-    """The valid pairs of an estimate, as the file has them."""
-    pairs = estimate.get("pairs")
+def _list_pairs(estimate: Content, key: str = "pairs") -> list[Content]:
+    """The valid pairs of an estimate, or its "suggestions", as the file has them."""
+    pairs = estimate.get(key)
     return [pair for pair in pairs if read_ties({"pairs": [pair]})] if isinstance(pairs, list) else []
 
 
 def _read(file: Path) -> bytes | None:
     return read_file(file, limit=MAX_BYTES) if file.exists() else None
+
+
+def write_pose_file(file: Path, content: Content, *, backup: bool = True) -> tuple[bytes | None, bytes]:
+    """Write a poses.json, of which another content may stay as NAME.bak, NAME.bak1 and so on; returns both contents."""
+    before, after = _read(file), format_pose_file(content).encode()
+    if backup and before not in (None, after):
+        backups = (file.with_name(f"{file.name}.bak{number or ''}") for number in itertools.count())
+        _replace(next(path for path in backups if _read(path) in (None, before)), before)
+    _replace(file, after)
+    return before, after
 
 
 def _replace(file: Path, data: bytes) -> None:

@@ -22,13 +22,13 @@ from pansplat.data.pairs import Collection, Pair, Panorama, single_view_pairs
 from pansplat.data.placements import Placement, judge, read_ties
 from pansplat.data.poses import rigid_matrix, to_cam2world
 from pansplat.data.views import CAMERA_HEIGHT
+from pansplat.descriptions import list_first
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
-from pansplat.poses.edit import merge_estimate
+from pansplat.poses.edit import find_kept, merge_estimate, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
 from pansplat.poses.pose_file import (
     CONVENTION,
-    format_pose_file,
     list_pairs,
     list_suggestions,
     make_pose_content,
@@ -41,27 +41,45 @@ _FORMAT = "8"  # version of the estimate and of its cached file; part of the cac
 SUFFIXES = (".json", ".tum", ".kitti")
 
 
-def write_poses(estimate: PoseEstimate, path: Path) -> None:
+def require_replaceable(path: Path, images: Sequence[Path], *, overwrite: bool) -> None:
+    """Check, before the estimate, the file that `write_poses` is to write; it need not exist.
+
+    Raises:
+        InputError: a faulty poses.json; or without `overwrite` a trajectory, or poses of all images that stay.
+    """
+    is_kept = path.exists()
+    if is_kept and path.suffix.lower() == ".json":
+        content, names = read_pose_content(path), set(_name_images(path, images).values())
+        is_kept = bool(names) and names <= find_kept(content, path, names)
+    if is_kept and not overwrite:
+        raise InputError(
+            f"{path}: needed a new file, or poses that pansplat wrote, got others; add --overwrite to replace them."
+        )
+
+
+def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) -> None:
     """Write the poses as a poses.json, or those of the largest group in the TUM or KITTI format by the suffix.
 
-    Names in a poses.json are relative to its folder; each group is a world. If the file exists and has changes by hand
-    (`pansplat.poses.edit`), its poses are kept. A trajectory has one line for each
+    Names in a poses.json are relative to its folder; each group is a world. If the file exists, the poses are merged
+    into it (`pansplat.poses.edit.merge_estimate`), and it stays as NAME.bak. A trajectory has one line for each
     panorama of the largest group, in the order of the names; the timestamps of TUM are the panoramas' numbers.
 
     Raises:
         InputError: another suffix, or the file cannot be written.
     """
     if path.suffix.lower() == ".json":
-        folder = path.resolve().parent
-        names = {image: _name_from(folder, image.resolve()) for image in estimate.images}
-        merged = merge_estimate(path, estimate, names)
-        if merged is not None:
+        names = _name_images(path, estimate.images)
+        content, kept = make_pose_content(estimate, names), []
+        if path.exists():
+            content, kept = merge_estimate(path, estimate, names, overwrite=overwrite)
+        if kept:
             warnings.warn(
-                f"{path} has poses placed or rejected by hand: all its poses are kept, and {merged[1]} are added.",
+                f"{path} keeps its poses of {list_first(kept)}: pansplat did not write all poses of their world; "
+                "`--overwrite` replaces them.",
                 InputWarning,
                 stacklevel=2,
             )
-        _write(path, format_pose_file(make_pose_content(estimate, names) if merged is None else merged[0]))
+        write_pose_file(path, content)
         return
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: needed a name ending in {', '.join(SUFFIXES)}, got {path.suffix!r}; rename it.")
@@ -73,7 +91,13 @@ def write_poses(estimate: PoseEstimate, path: Path) -> None:
             w, x, y, z = quats_from_rotations(torch.from_numpy(pose[:3, :3])).tolist()
             numbers = [float(estimate.images.index(image)), *pose[:3, 3], x, y, z, w]
         lines.append(" ".join(f"{number:.9g}" for number in numbers))
-    _write(path, "\n".join(lines) + "\n")
+    with replacing(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def _name_images(path: Path, images: Sequence[Path]) -> dict[Path, str]:
+    """The names of images in a poses.json."""
+    return {image: _name_from(path.resolve().parent, image.resolve()) for image in images}
 
 
 def _name_from(folder: Path, image: Path) -> str:
@@ -82,11 +106,6 @@ def _name_from(folder: Path, image: Path) -> str:
         return Path(os.path.relpath(image, folder)).as_posix()
     except ValueError:
         return image.as_posix()
-
-
-def _write(path: Path, text: str) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(text, "utf-8")
 
 
 def estimate_pairs(

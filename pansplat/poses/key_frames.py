@@ -10,8 +10,11 @@ from jaxtyping import UInt8
 from numpy import ndarray as Array
 
 from pansplat.data.images import write_image
+from pansplat.data.panorama_metadata import read_xmp
 from pansplat.data.video import open_video
+from pansplat.descriptions import list_first
 from pansplat.errors import InputError
+from pansplat.files import make_portable_name
 from pansplat.poses.axes import NO_PRIOR
 from pansplat.poses.features import Features, detect_features, match_features
 from pansplat.poses.two_view import estimate_relative_pose
@@ -22,14 +25,16 @@ _SMALL, _FEATURES, _MATCHES = 512, 2000, 300  # to measure parallax: height of t
 _MIN_PARALLAX = 0.05  # radians between key frames
 
 
-def extract_key_frames(path: Path, folder: Path, count: int, progress: Progress | None = None) -> list[Path]:
-    """Write at most `count` key frames of a video as PNG files, and return them.
+def extract_key_frames(
+    path: Path, folder: Path, count: int, progress: Progress | None = None, *, overwrite: bool = False
+) -> list[Path]:
+    """Write at most `count` key frames of a video as VIDEO_NUMBER.png, and return them.
 
     The video is divided into intervals of equal length. The sharpest of some frames of each interval is a candidate; it
     is left out if its parallax to the last key frame is small.
 
     Raises:
-        InputError: not a 2:1 video, or the camera did not move.
+        InputError: not a 2:1 video, the camera did not move, or other pictures are in the way without `overwrite`.
     """
     video = open_video(path)
     if video.width != 2 * video.height:
@@ -37,6 +42,13 @@ def extract_key_frames(path: Path, folder: Path, count: int, progress: Progress 
     if count < 2:
         raise InputError(f"`count` must be at least 2 key frames, got {count}")
     numbers = np.unique(np.linspace(0, len(video.stamps) - 1, count * _CANDIDATES_PER_FRAME).round().astype(int))
+    files = {int(n): folder / f"{make_portable_name(path.stem) or 'frame'}_{n:06d}.png" for n in numbers}
+    others = [file.name for file in files.values() if file.exists() and b'CreatorTool="pansplat"' not in read_xmp(file)]
+    if others and not overwrite:
+        raise InputError(
+            f"{folder}: needed free names for key frames, got pictures that pansplat did not write, "
+            f"{list_first(others)}; choose another folder, or add --overwrite to replace them."
+        )
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     last: Features | None = None
@@ -57,8 +69,8 @@ def extract_key_frames(path: Path, folder: Path, count: int, progress: Progress 
             if len(relation.indices) >= 20 and relation.parallax < _MIN_PARALLAX:
                 continue
         last = features
-        written.append(folder / f"frame_{number:06d}.png")
-        write_image(written[-1], frame)
+        written.append(files[number])
+        write_image(written[-1], frame, panorama="photograph")
     if len(written) < 2:
         raise InputError(f"{path}: needed a moving camera, got no parallax between its frames; give another video.")
     return written

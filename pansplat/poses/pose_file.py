@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from pansplat.data.folders import MATRIX_KEYS
+from pansplat.data.placements import is_by_hand
 from pansplat.poses.estimate import PoseEstimate, PoseGroup, Suggestions
 
 CONVENTION = "cam2world opencv"
@@ -36,8 +39,30 @@ def make_pose_file(worlds: Sequence[Mapping[str, Any]], estimate: Mapping[str, A
         for name, pose in world["poses"].items():
             poses[name] = {"cam2world": pose, "world": number} if number else pose
     ranges = [{key: world[key] for key in ("near", "far", "unit")} for world in worlds]
-    first = {key: ranges[0][key] for key in ("near", "far")} if ranges else {}
-    return {"convention": CONVENTION, **first, "worlds": ranges, "poses": poses, "estimate": dict(estimate)}
+    content = {"convention": CONVENTION, "worlds": ranges, "poses": poses}
+    return content | {"estimate": {**estimate, "written": " ".join(mark_worlds(content).values())}}
+
+
+def world_of(entry: Any) -> int:
+    """The world of an entry."""
+    return int(entry.get("world") or 0) if isinstance(entry, dict) else 0
+
+
+def matrix_of(entry: Any) -> Any:
+    """The matrix of an entry; None if it has none."""
+    return next((entry[key] for key in MATRIX_KEYS if key in entry), None) if isinstance(entry, dict) else entry
+
+
+def mark_worlds(content: Mapping[str, Any]) -> dict[int, str]:
+    """A hash of the poses and the range of each world, by which those that an estimate wrote are recognised."""
+    ranges = [[world.get("near"), world.get("far")] for world in content.get("worlds") or ()]
+    states: dict[int, list[Any]] = {}
+    for name, entry in sorted(content["poses"].items()):
+        state = states.setdefault(world_of(entry), [content["convention"], ranges[world_of(entry) :][:1]])
+        state.append((name, matrix_of(entry), is_by_hand(entry)))
+    return {
+        world: hashlib.blake2b(json.dumps(state).encode(), digest_size=8).hexdigest() for world, state in states.items()
+    }
 
 
 def list_pairs(estimate: PoseEstimate, names: Mapping[Path, str]) -> list[dict[str, Any]]:
@@ -69,9 +94,9 @@ def _join_lines(match: re.Match[str]) -> str:
 
 
 def make_world(group: PoseGroup, names: Mapping[Path, str]) -> dict[str, Any]:
-    return {
-        "near": round(group.near, 3),
-        "far": round(group.far, 3),
-        "unit": round(group.unit, 4),
-        "poses": {names[image]: np.round(pose, 9).tolist() for image, pose in group.poses.items()},
-    }
+    poses = {names[image]: np.round(pose, 9).tolist() for image, pose in group.poses.items()}
+    return make_range(group) | {"poses": poses}
+
+
+def make_range(group: PoseGroup) -> dict[str, float]:
+    return {"near": round(group.near, 3), "far": round(group.far, 3), "unit": round(group.unit, 4)}

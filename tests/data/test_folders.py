@@ -363,6 +363,18 @@ def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path,
     assert attic.siblings == tuple(folder / name for name in names), "in file order"
 
 
+def test_pictures_that_poses_name_are_panoramas_whoever_made_them(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    for name in ("frame.png", "taken.png", "view.png"):
+        _write_panorama(folder / name)  # with the metadata of an own rendering
+    content = json.loads((folder / "poses.json").read_text())
+    content |= {"estimate": {"unplaced": {"frame.png": "no door"}}, "rejected": [{"poses": {"taken.png": []}}]}
+    (folder / "poses.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"poses\.json has no pose of frame\.png, taken\.png; each is a scene"):
+        _, frame, taken = load_pairs(folder)
+    assert [pair.context[0].placement.reason for pair in (frame, taken)] == ["no door", "rejected by hand"]
+
+
 def test_panoramas_beside_posed_ones_in_subfolders_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
     names = ("up/hall.png", "up/bath.png", "down/cellar.png")
     folder = _folder(tmp_path / "house", names)

@@ -11,7 +11,7 @@ from av.sidedata.sidedata import Type
 from PIL import Image
 
 from pansplat.data.images import read_depth, read_panorama, write_depth, write_image
-from pansplat.data.panorama_metadata import mark_spherical_video
+from pansplat.data.panorama_metadata import mark_spherical_video, parse_gpano, read_xmp
 from pansplat.data.spherical_webm import mark_spherical_webm
 from pansplat.data.video import open_video, write_video
 from pansplat.errors import InputError
@@ -32,6 +32,15 @@ def test_panoramas_have_gpano_properties(tmp_path: Path, suffix: str) -> None:
     assert b"GPano" not in path.read_bytes()
     write_image(path, np.zeros((16, 30, 3), np.uint8))
     assert b"GPano" not in path.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_photographs_are_panoramas_of_no_known_heading_and_no_renderings(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    write_image(path, np.zeros((16, 32, 3), np.uint8), panorama="photograph")
+    tags = parse_gpano(read_xmp(path))
+    assert (tags["ProjectionType"], tags["FullPanoWidthPixels"]) == ("equirectangular", "32")
+    assert not {"StitchingSoftware", "PoseHeadingDegrees"} & set(tags)
 
 
 def frames() -> Iterator[np.ndarray]:

@@ -18,6 +18,7 @@ from pansplat.poses.placing import Place, Suggestion
 from pansplat.poses.two_view import RelativePose
 
 NAMES = "abcdef"
+EYE = np.eye(4).tolist()
 
 
 def _relation(log_odds: float) -> RelativePose:
@@ -37,7 +38,7 @@ def _estimate(images, **options) -> PoseEstimate:
         tuple(images),
         (PoseGroup(poses, 0.4, 8.0, 0.0, "a test", 1.6),),
         {images[5]: "no door"} if len(images) > 5 else {},
-        {pair: _relation(value) for pair, value in odds.items()},
+        {pair: _relation(value) for pair, value in odds.items() if max(pair) < len(images)},
         (),
         {(images[0], images[5]): (Suggestion(Place(1.0, 2.0, 0.5), -1.5),)} if len(images) > 5 else {},
     )
@@ -262,7 +263,7 @@ def test_a_new_estimate_keeps_the_poses_by_hand_and_adds_others_beside_them(fold
     del content["poses"]["c.png"]
     content["worlds"][0]["unit"] = 3.2  # metres, twice those of the new estimate
     (folder / "poses.json").write_text(json.dumps(content))
-    with pytest.warns(UserWarning, match="placed or rejected by hand: all its poses are kept, and 1 are added"):
+    with pytest.warns(UserWarning, match=r"keeps its poses of a\.png, b\.png, d\.png: .*`--overwrite` replaces them"):
         write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
     views = _load(folder)
     assert np.allclose(views["b"].cam2world.numpy(), pose) and views["b"].placement.state == "by hand"
@@ -278,3 +279,194 @@ def test_all_groups_of_an_estimate_are_written(folder: Path):
     pairs = pansplat.load_pairs(folder)
     assert [[view.world for view in pair.context] for pair in pairs[:2]] == [[0, 0], [1, 1]]
     assert [(pair.near, pair.far) for pair in pairs[:2]] == [(0.3, 8), (1.3, 9)]
+
+
+def _scaled(factor: float, images: list[Path], start: int = 0) -> PoseEstimate:
+    """As `_estimate` with another scale; the first panoramas are not placed."""
+    found = _estimate(images)
+    poses = {image: pose.copy() for image, pose in list(found.poses.items())[start:]}
+    for pose in poses.values():
+        pose[:3, 3] *= factor
+    group = PoseGroup(poses, round(0.4 * factor, 3), 8.0 * factor, 0.0, "a test", 1.6 * factor)
+    unplaced = found.unplaced | dict.fromkeys(images[:start], "no wall")
+    return PoseEstimate(found.images, (group,), unplaced, found.relations, (), found.suggestions)
+
+
+def _write_edited(folder: Path, change) -> dict:
+    """The content of an estimated poses.json after a change by its user, who writes it with other spaces."""
+    write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    content = _content(folder)
+    change(content)
+    (folder / "poses.json").write_text(json.dumps(content, indent=4))
+    return content
+
+
+def test_what_a_user_adds_to_estimated_poses_stays_and_the_poses_are_estimated_anew(folder: Path):
+    cv2.imwrite(str(folder / "own.jpg"), np.full((8, 16, 3), 255, np.uint8))
+
+    def change(content: dict) -> None:
+        content |= {"near": 0.2, "far": 5, "author": {"name": "me"}}
+        content["worlds"][0]["note"] = 7
+        content["poses"]["b.png"] = {
+            "cam2world": content["poses"]["b.png"], "room": "Bath", "mask": "own.jpg", "note": 3,
+        }  # fmt: skip
+
+    old = _write_edited(folder, change)
+    before, images = (folder / "poses.json").read_bytes(), sorted(folder.glob("*.png"))
+    write_poses(_scaled(2, images), folder / "poses.json")
+    content, views = _content(folder), _load(folder)
+    assert [views[name].cam2world[0, 3].item() for name in "abcde"] == [0, 2, 4, 6, 8]
+    assert {name: content[name] for name in ("near", "far", "author")} == {
+        "near": 0.2,
+        "far": 5,
+        "author": old["author"],
+    }
+    assert (views["b"].title, views["b"].mask) == ("Bath", folder / "own.jpg")
+    assert content["poses"]["b.png"]["note"] == 3
+    assert (content["worlds"][0]["unit"], content["worlds"][0]["note"]) == (3.2, 7)
+    assert (folder / "poses.json.bak").read_bytes() == before
+    pair = pansplat.load_pairs(folder)[0]
+    assert (pair.near, pair.far) == (0.2, 5)
+
+
+def test_a_range_that_was_estimated_is_estimated_anew(folder: Path):
+    images = sorted(folder.glob("*.png"))
+    for factor in (1, 2):
+        write_poses(_scaled(factor, images), folder / "poses.json")
+        assert [(pair.near, pair.far) for pair in pansplat.load_pairs(folder)][:1] == [(0.4 * factor, 8 * factor)]
+
+
+def test_near_and_far_of_a_world_that_a_user_states_stay(folder: Path):
+    images = sorted(folder.glob("*.png"))
+    _write_edited(folder, lambda content: content["worlds"][0].update(near=0.2, far=5))
+    for overwrite in (False, True):
+        write_poses(_scaled(2, images), folder / "poses.json", overwrite=overwrite)
+        assert [(pair.near, pair.far) for pair in pansplat.load_pairs(folder)][:1] == [(0.2, 5)]
+    assert _load(folder)["e"].cam2world[0, 3] == 8
+
+
+def test_the_same_estimate_changes_no_file(folder: Path):
+    images = sorted(folder.glob("*.png"))
+    for _ in range(2):
+        write_poses(_estimate(images), folder / "poses.json")
+        assert not (folder / "poses.json.bak").exists()
+
+
+def test_backups_are_not_replaced(folder: Path):
+    images, written = sorted(folder.glob("*.png")), []
+    for factor in (1, 2, 3):
+        write_poses(_scaled(factor, images), folder / "poses.json")
+        written.append((folder / "poses.json").read_bytes())
+    assert [(folder / f"poses.json.bak{number}").read_bytes() for number in ("", 1)] == written[:2]
+
+
+def _measure(content: dict) -> None:
+    content["poses"]["b.png"][0][3] = 1.25
+
+
+def test_measured_poses_hold_their_world_and_overwrite_replaces_them(folder: Path):
+    _write_edited(folder, _measure)
+    images = sorted(folder.glob("*.png"))
+    with pytest.warns(UserWarning, match=r"keeps its poses of a\.png, b\.png, .*`--overwrite` replaces them"):
+        write_poses(_scaled(2, images), folder / "poses.json")
+    assert [_load(folder)[name].cam2world[0, 3].item() for name in "abcde"] == [0, 1.25, 2, 3, 4]
+    before = (folder / "poses.json").read_bytes()
+    write_poses(_scaled(2, images), folder / "poses.json", overwrite=True)
+    assert [_load(folder)[name].cam2world[0, 3].item() for name in "abcde"] == [0, 2, 4, 6, 8]
+    assert before in [file.read_bytes() for file in folder.glob("poses.json.bak*")]
+
+
+def test_poses_of_a_file_of_another_program_are_kept_in_its_convention(folder: Path):
+    pose = np.diag((1.0, -1, -1, 1))
+    pose[:3, 3] = 7, 0, 0
+    stated = {"convention": "cam2world opengl", "poses": {"a.png": pose.tolist()}, "rooms": 3}
+    (folder / "poses.json").write_text(json.dumps(stated))
+    write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    content = _content(folder)
+    assert content["rooms"] == 3 and content["poses"]["a.png"] == stated["poses"]["a.png"]
+    views = _load(folder)
+    assert np.allclose([views[name].cam2world[0, 3].item() for name in "abcde"], (7, 8, 9, 10, 11))
+    assert len({views[name].world for name in "abcde"}) == 1
+
+
+def test_what_cannot_be_placed_beside_replaced_poses_keeps_its_own_in_another_world(folder: Path):
+    """a was measured with b, and is not placed now: with --overwrite it stays as it is, where nothing else is."""
+    _write_edited(folder, lambda content: (_measure(content), content["poses"]["a.png"][2].__setitem__(3, 0.5)))
+    write_poses(_scaled(2, sorted(folder.glob("*.png")), start=1), folder / "poses.json", overwrite=True)
+    views = _load(folder)
+    assert views["a"].cam2world[2, 3] == 0.5 and views["a"].world != views["b"].world
+    assert [views[name].cam2world[0, 3].item() for name in "bcde"] == [2, 4, 6, 8]
+
+
+def test_an_estimated_pose_that_is_not_found_again_goes_and_its_room_stays(folder: Path):
+    def change(content: dict) -> None:
+        content["poses"]["a.png"] = {"cam2world": content["poses"]["a.png"], "room": "Hall"}
+
+    _write_edited(folder, change)
+    write_poses(_scaled(2, sorted(folder.glob("*.png")), start=2), folder / "poses.json")
+    views = _load(folder)
+    assert "b.png" not in _content(folder)["poses"]
+    assert views["a"].title == "Hall" and views["b"].placement.reason == "no wall"
+    assert len({views[name].world for name in "ac"}) == 2
+
+
+def test_poses_of_panoramas_that_are_not_read_stay_and_hold_the_others(folder: Path):
+    images = sorted(folder.glob("*.png"))
+    write_poses(_estimate(images[:4]), folder / "poses.json")
+    write_poses(_scaled(1, images[2:]), folder / "poses.json")  # c is at the origin here
+    views = _load(folder)
+    assert [views[name].cam2world[0, 3].item() for name in "abcdef"] == [0, 1, 2, 3, 4, 5]
+    assert len({view.world for view in views.values()}) == 1
+    assert _content(folder)["estimate"]["pairs"][0]["between"] == ["a.png", "b.png"]
+
+
+def test_a_panorama_that_was_removed_does_not_hold_the_others(folder: Path):
+    images = sorted(folder.glob("*.png"))
+    write_poses(_estimate(images), folder / "poses.json")
+    images[4].unlink()
+    write_poses(_scaled(2, images[:4]), folder / "poses.json")
+    assert [_load(folder)[name].cam2world[0, 3].item() for name in "abcd"] == [0, 2, 4, 6]
+    assert "e.png" not in _content(folder)["poses"]
+
+
+def test_a_rejected_pose_that_is_placed_by_hand_keeps_its_room_and_mask(folder: Path):
+    cv2.imwrite(str(folder / "own.jpg"), np.full((8, 16, 3), 255, np.uint8))
+
+    def change(content: dict) -> None:
+        content["poses"]["e.png"] = {"cam2world": content["poses"]["e.png"], "room": "Hall", "mask": "own.jpg"}
+
+    _write_edited(folder, change)
+    editor = _edit(folder)
+    editor.reject(folder / "e.png")
+    editor.place({folder / "e.png": np.eye(4)}, 0)
+    assert (_load(folder)["e"].title, _load(folder)["e"].mask) == ("Hall", folder / "own.jpg")
+
+
+def test_the_first_change_by_hand_keeps_the_old_file(folder: Path):
+    _write_edited(folder, _measure)
+    before, editor = (folder / "poses.json").read_bytes(), _edit(folder)
+    for name in "bc":
+        editor.place({folder / f"{name}.png": np.eye(4)}, 0)
+    assert [file.read_bytes() for file in folder.glob("poses.json.bak*")] == [before]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"poses": {}}, 'needed a pose "convention"'),
+        ({"convention": "cam2world opencv"}, "poses: needed a JSON object"),
+        (
+            {"convention": "cam2world opencv", "poses": {"a.png": {"pose": EYE, "world": "x"}}},
+            "a.png.*needed a whole number",
+        ),
+        ({"convention": "cam2world opencv", "poses": {}, "worlds": 3}, 'needed a list as "worlds"'),
+        ({"convention": "cam2world opencv", "poses": {}, "worlds": [3]}, "worlds.*needed a JSON object"),
+        ({"convention": "cam2world opencv", "poses": {"a.png": {"room": "x"}}}, "a.png.*needed a pose"),
+    ],
+)
+def test_a_faulty_file_is_named_and_kept(folder: Path, content: dict, message: str):
+    text = json.dumps(content)
+    (folder / "poses.json").write_text(text)
+    with pytest.raises(InputError, match=message):
+        write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    assert (folder / "poses.json").read_text() == text and not (folder / "poses.json.bak").exists()
