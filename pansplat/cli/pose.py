@@ -70,6 +70,7 @@ class Pose:
 
 def _list_images(paths: tuple[Path, ...]) -> list[Path]:
     """The files, and those in the folders."""
+    from pansplat.data.folders import require_known_masks
     from pansplat.data.pairs import list_panorama_files
 
     images: list[Path] = []
@@ -77,6 +78,7 @@ def _list_images(paths: tuple[Path, ...]) -> list[Path]:
         if not path.exists():
             raise InputError(f"{path}: needed a folder of panoramas or a file, got no such path; check it.")
         images += list_panorama_files(path) if path.is_dir() else [path]
+        require_known_masks(path)
     if len(images) < 2:
         raise InputError(f"{paths[0]}: needed two or more panoramas, got {len(images)}; add the others.")
     return images

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
+from pansplat.data.folders import require_known_masks
 from pansplat.data.images import write_image
 from pansplat.data.video import open_video
 from pansplat.errors import InputError
@@ -32,6 +33,7 @@ def extract_key_frames(path: Path, folder: Path, count: int, progress: Progress 
         InputError: not a 2:1 video, or the camera did not move.
     """
     video = open_video(path)
+    require_known_masks(path.parent)
     if video.width != 2 * video.height:
         raise InputError(f"{path}: needed a 2:1 equirectangular video, got {video.width}x{video.height}; convert it.")
     if count < 2:
