@@ -95,14 +95,13 @@ def name_blur_mask(image: Path) -> Path:
 
 
 def resize_hidden(
-    white: Bool[NDArray[Any], "rows columns"], height: int, width: int | None = None
+    white: Bool[NDArray[Any], "rows columns"], height: int, width: int
 ) -> Bool[NDArray[Any], "height width"]:
-    """A mask at (height, width), by default 2:1: every pixel that a white pixel touches."""
-    size = (2 * height if width is None else width, height)
-    if white.shape[::-1] == size:
+    """A mask at another size: every pixel that a white pixel touches."""
+    if white.shape == (height, width):
         return white
     method = cv2.INTER_AREA if white.shape[0] > height else cv2.INTER_LINEAR
-    return cv2.resize(white.astype(np.float32), size, interpolation=method) > 0
+    return cv2.resize(white.astype(np.float32), (width, height), interpolation=method) > 0
 
 
 def widen_hidden(hidden: Bool[NDArray[Any], "height width"]) -> Bool[NDArray[Any], "height width"]:

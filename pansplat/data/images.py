@@ -295,57 +295,55 @@ def _require_fit(mask: Path, size: tuple[int, int], picture: tuple[int, int]) ->
         )
 
 
-def read_hidden(path: Path, height: int) -> Bool[Array, "height width"]:
+def read_hidden(path: Path, height: int, kind: str = BLUR_SUFFIX) -> Bool[Array, "height width"]:
     """What the blur masks of a panorama and of its pictures hide, at (height, 2 height), without the margin.
 
-    Raises:
-        InputError: a mask cannot be used.
-    """
-    own = find_masks(path, BLUR_SUFFIX).get(path)
-    hidden = _resample_masks(path, BLUR_SUFFIX, height)
-    return hidden if own is None else hidden | read_blur_mask(own, height)
-
-
-def read_blur_mask(mask: Path, height: int) -> Bool[Array, "height width"]:
-    """The blur mask of a panorama at (height, 2 height): every pixel that its white touches, without the margin.
+    Args:
+        path: file of the panorama.
+        height: pixels.
+        kind: with `MASK_SUFFIX`, what the scene masks of its pictures mask.
 
     Raises:
-        InputError: it cannot be read, is not 2:1, or is white everywhere.
+        InputError: a mask cannot be used, or is white everywhere.
     """
-    hidden = _read_covered(mask, BLUR_SUFFIX, (height, 2 * height))
-    if hidden.all():
-        raise InputError(f"{mask}: needed a blur mask with black where the panorama is shown, got white only; draw it.")
-    return hidden
-
-
-def _read_covered(mask: Path, kind: str, size: tuple[int, int]) -> Bool[Array, "height width"]:
-    """Every pixel that a mask covers: those that white of a blur mask touches, or black of another mask."""
-    decoded = _decode(mask)
-    _require_fit(mask, decoded.color.shape[1::-1], size[::-1])
-    grey = decoded.color.astype(np.float32).mean(axis=2) / (255 if decoded.color.dtype == np.uint8 else 1)
-    covered = grey >= 0.5 if kind == BLUR_SUFFIX else grey < 0.5
-    if kind == BLUR_SUFFIX and decoded.alpha is not None:
-        covered &= decoded.alpha >= 0.5
-    return resize_hidden(covered, *size)
-
-
-def _resample_masks(path: Path, kind: str, height: int) -> Bool[Array, "height width"]:
-    """What the masks of single pictures cover in the panorama that is joined from them, resampled as they are."""
-    masks = {file: mask for file, mask in find_masks(path, kind).items() if file != path}
-    covered = np.zeros((height, 2 * height), bool)
+    masks = find_masks(path, kind)
+    own = masks.pop(path, None)
+    hidden = np.zeros((height, 2 * height), bool)
+    if own is not None and kind == BLUR_SUFFIX:
+        hidden = read_blur_mask(own, height)
+        if hidden.all():
+            needed = "a blur mask with black where the panorama is shown"
+            raise InputError(f"{own}: needed {needed}, got white only; draw it.")
     if not masks:
-        return covered
+        return hidden
 
     def decode(file: Path) -> UInt8[Array, "rows columns 3"]:
         width, rows = read_size(file)
-        part = _read_covered(masks[file], kind, (rows, width)) if file in masks else np.zeros((rows, width), bool)
+        part = read_blur_mask(masks[file], rows, width, kind) if file in masks else np.zeros((rows, width), bool)
         return np.where(part[..., None], np.uint8(255), np.uint8(0)).repeat(3, axis=2)
 
     parts = _read_assembled(path)
     for level in parts.levels if isinstance(parts, CubeImage) else (None,):  # a mask of a tile covers it at all levels
         one = parts if level is None else dataclasses.replace(parts, levels=(level,))
-        covered |= one.read(height, decode)[0].max(axis=2) > 0
-    return covered
+        hidden = hidden | (one.read(height, decode)[0].max(axis=2) > 0)
+    return hidden
+
+
+def read_blur_mask(
+    mask: Path, height: int, width: int | None = None, kind: str = BLUR_SUFFIX
+) -> Bool[Array, "height width"]:
+    """A mask at (height, width), by default 2:1: every pixel that its white touches, or its black if of another kind.
+
+    Raises:
+        InputError: it cannot be read, or has other proportions.
+    """
+    decoded, width = _decode(mask), 2 * height if width is None else width
+    _require_fit(mask, decoded.color.shape[1::-1], (width, height))
+    grey = decoded.color.astype(np.float32).mean(axis=2) / (255 if decoded.color.dtype == np.uint8 else 1)
+    hidden = grey >= 0.5 if kind == BLUR_SUFFIX else grey < 0.5
+    if kind == BLUR_SUFFIX and decoded.alpha is not None:
+        hidden &= decoded.alpha >= 0.5
+    return resize_hidden(hidden, height, width)
 
 
 def read_pixels(path: Path) -> UInt8[Array, "rows columns 3"]:
@@ -585,10 +583,10 @@ def _decode_shown(path: Path, height: int, *, reduced: bool) -> _DecodedImage:
             pixels = read_pixels(file)
             if file not in masks:
                 return pixels
-            return np.where(_read_covered(masks[file], BLUR_SUFFIX, pixels.shape[:2])[..., None], np.uint8(0), pixels)
+            return np.where(read_blur_mask(masks[file], *pixels.shape[:2])[..., None], np.uint8(0), pixels)
 
         color, shown = _read_assembled(path).read(height, decode)
-        masked = _resample_masks(path, MASK_SUFFIX, height)
+        masked = read_hidden(path, height, MASK_SUFFIX)
         if masked.any():
             shown = np.float32(~masked) if shown is None else shown * ~masked
         return _DecodedImage(color, shown, hole="is in no picture; these pixels are masked")

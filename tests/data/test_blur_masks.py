@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import unicodedata
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from pansplat.cli.pose import Pose
 from pansplat.data.blur_masks import blur_hidden, find_blur_mask, resize_hidden, widen_hidden
 from pansplat.data.cube_images import CubeImage, CubeLevel, write_cube
 from pansplat.data.folders import UnposedPanoramasError, load_pairs
-from pansplat.data.images import read_blur_mask, read_panorama, read_thumbnail, write_image
+from pansplat.data.images import read_blur_mask, read_hidden, read_panorama, read_thumbnail, write_image
 from pansplat.data.pairs import Pair, Panorama
 from pansplat.data.reconstructions.colmap import write_colmap
 from pansplat.data.reconstructions.dataset import PosedPanorama, write_dataset
@@ -91,7 +92,7 @@ def test_the_blur_is_the_colour_around_it_across_the_seam() -> None:
 
 @pytest.mark.parametrize("height", [16, 64, 100])
 def test_a_mask_of_another_size_hides_every_pixel_that_it_touches(height: int) -> None:
-    resized = resize_hidden(HIDDEN, height)
+    resized = resize_hidden(HIDDEN, height, 2 * height)
     assert resized.shape == (height, 2 * height)
     rows, columns = np.nonzero(HIDDEN)
     for offset in (0.01, 0.5, 0.99):
@@ -122,7 +123,7 @@ def test_every_read_of_a_photograph_is_blurred(tmp_path: Path, suffix: str) -> N
         path = tmp_path / f"{person}" / f"a{suffix}"
         path.parent.mkdir()
         # JPEG mixes pixels within blocks of 16: these are hidden as a whole.
-        mask = resize_hidden(HIDDEN, 4).repeat(16, axis=0).repeat(16, axis=1)
+        mask = resize_hidden(HIDDEN, 4, 8).repeat(16, axis=0).repeat(16, axis=1)
         if suffix == ".jpg":
             Image.fromarray(_make_photograph(person)).save(path, quality=90)
         else:
@@ -595,6 +596,38 @@ def test_a_mask_beside_a_rig_is_that_of_its_panorama(tmp_path: Path, color_face:
     panoramas = load_pairs(folder)[0].context
     assert panoramas[0].mask == folder / "0000_a_mask.png" and panoramas[1].mask is None
     assert find_blur_mask(panoramas[1].image) == folder / "0001_A_Blur.PNG"
+
+
+def _link(path: Path, target: Path) -> None:
+    try:
+        path.symlink_to(target)
+    except OSError:
+        pytest.skip("no links here")
+
+
+def test_masks_beside_a_link_are_applied_and_those_beside_its_file_are_refused(
+    tmp_path: Path, color_face: Callable
+) -> None:
+    folder = _write_set(tmp_path / "set", color_face, 1)
+    file = folder / "images" / "0000_a_front.png"
+    (tmp_path / "store").mkdir()
+    moved = file.rename(tmp_path / "store" / file.name)
+    _link(file, moved)
+    mask = _draw_mask(folder / "images" / "0000_a_front_blur.png", COVER)
+    assert read_hidden(_load_first(folder).image, 64).any()
+    mask.rename(moved.with_name(mask.name))
+    with pytest.raises(InputError, match=r"store/0000_a_front_blur\.png: needed the name of a panorama"):
+        load_pairs(folder)
+
+
+@pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
+def test_a_name_has_its_mask_in_both_forms_of_unicode(tmp_path: Path, forms: tuple[str, str]) -> None:
+    """Copies from macOS have accents as characters of their own."""
+    picture, name = (unicodedata.normalize(form, "K\u00fcche") for form in forms)  # type: ignore[arg-type]
+    _write(tmp_path / f"{picture}.png", 1, None)
+    mask = _draw_mask(tmp_path / f"{name}_blur.png")
+    found = find_blur_mask(_load_first(tmp_path).image)
+    assert found is not None and found.samefile(mask)
 
 
 def test_scenes_and_caches_depend_on_masks_of_pictures(
