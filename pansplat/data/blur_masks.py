@@ -51,7 +51,7 @@ def list_mask_files(folder: Path, kind: str) -> Iterator[tuple[str, Path]]:
     """The masks of a kind in a folder, with the stems of their pictures; none if the folder cannot be listed."""
     for path in (folder / name for name in sorted(next(os.walk(folder), ("", [], []))[2]) if kind[1:] in name.lower()):
         found = split_mask_name(path)
-        if found is not None and found[1] == kind and path.suffix.lower() == ".png":
+        if found is not None and found[1] == kind and path.suffix.lower() == ".png" and path.is_file():
             yield found[0], path
 
 

@@ -61,6 +61,7 @@ VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
 _RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
 _TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # that may hold poses
 _CAMERA_POSES = "camera_pose.json"  # of 360Loc
+_PICTURES = (*READABLE_SUFFIXES, ".bmp", ".gif")  # that may be masks
 
 _MAX_WORLD = 9999  # of poses.json
 _MAX_DEPTH = 4  # levels of nested folders that are searched
@@ -120,9 +121,10 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
         folders |= dict.fromkeys(folder for file in places for folder in (file.parent, file.resolve().parent))
         used |= {mask.resolve() for mask in (view.mask, *list_masks(image, check=True)) if mask is not None}
         names[fold_name(view.name)] = places[-1]
-    files = [file for folder in folders for file in _list_visible_files(folder)]
+    listed = ((folder, name) for folder in folders for name in sorted(next(os.walk(folder), ("", [], []))[2]))
+    files = [folder / name for folder, name in listed if not name.startswith(".")]
     masks = {file: name for file in files if (name := split_mask_name(file)) and file.resolve() not in used}
-    pictures = [file for file in files if _is_picture(file) and split_mask_name(file) is None]
+    pictures = [file for file in files if file.suffix.lower() in _PICTURES and not split_mask_name(file)]
     names |= {fold_name(picture.stem): picture for picture in pictures}
     for mask, (stem, kind) in masks.items():
         own = [
@@ -131,7 +133,9 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
         is_named = bool(own) or (mask.parent == root and not stem)
         # Pictures that are not read have masks, too, and poses.json may state another mask of the scene.
         is_spare = kind == MASK_SUFFIX or (stem and read.isdisjoint(file.resolve() for file in own))
-        if (is_named and is_spare and mask.suffix.lower() == ".png") or not (is_named or _is_picture(mask)):
+        if (is_named and is_spare and mask.suffix.lower() == ".png") or not (
+            is_named or mask.suffix.lower() in _PICTURES
+        ):
             continue
         near = [names[name] for name in difflib.get_close_matches(fold_name(stem), names, n=1)]
         paths = [file.with_name(f"{file.stem}{kind}.png") for file in near]
@@ -140,15 +144,6 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
             f"{mask}: needed the name of a panorama before {kind}.png, got {mask.name!r}{''.join(suggestions)}; "
             "rename, convert or remove the mask."
         )
-
-
-def _is_picture(file: Path) -> bool:
-    return file.suffix.lower() in (*READABLE_SUFFIXES, ".bmp", ".gif")
-
-
-def _list_visible_files(folder: Path) -> list[Path]:
-    """The files of a folder, sorted; none if it cannot be listed."""
-    return [folder / name for name in sorted(next(os.walk(folder), ("", [], []))[2]) if not name.startswith(".")]
 
 
 def _list_folders(folder: Path, depth: int) -> Iterator[Path]:

@@ -298,13 +298,7 @@ def _require_fit(mask: Path, size: tuple[int, int], picture: tuple[int, int]) ->
 def read_hidden(path: Path, height: int, kind: str = BLUR_SUFFIX) -> Bool[Array, "height width"]:
     """What the blur masks of a panorama and of its pictures hide, at (height, 2 height), without the margin.
 
-    Args:
-        path: file of the panorama.
-        height: pixels.
-        kind: with `MASK_SUFFIX`, what the scene masks of its pictures mask.
-
-    Raises:
-        InputError: a mask cannot be used, or is white everywhere.
+    With the kind `MASK_SUFFIX`, what the scene masks of its pictures mask. An InputError if a mask cannot be used.
     """
     masks = find_masks(path, kind)
     own = masks.pop(path, None)
@@ -312,8 +306,7 @@ def read_hidden(path: Path, height: int, kind: str = BLUR_SUFFIX) -> Bool[Array,
     if own is not None and kind == BLUR_SUFFIX:
         hidden = read_blur_mask(own, height)
         if hidden.all():
-            needed = "a blur mask with black where the panorama is shown"
-            raise InputError(f"{own}: needed {needed}, got white only; draw it.")
+            raise InputError(f"{own}: needed a blur mask with black where the panorama is shown, got white only.")
     if not masks:
         return hidden
 
