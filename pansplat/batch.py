@@ -29,8 +29,8 @@ from typing import TYPE_CHECKING, Any
 from pansplat import __version__, pipeline, tours
 from pansplat.atomic import replacing
 from pansplat.console import is_out_of_memory
-from pansplat.data.blur_masks import find_blur_mask
 from pansplat.data.folders import find_panorama_folders
+from pansplat.data.images import list_masks
 from pansplat.data.pairs import Pair
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
@@ -474,9 +474,8 @@ def _hash_pair(pair: Pair) -> str:
 
 
 def _hash_image(image: Path) -> list[str]:
-    """Hashes of a panorama and of its blur mask, if it has one."""
-    blur = find_blur_mask(image)
-    return [_hash_file(image)] + ([] if blur is None else [_hash_file(blur)])
+    """Hashes of a panorama and of its masks."""
+    return [_hash_file(file) for file in (image, *list_masks(image))]
 
 
 @lru_cache(maxsize=4096)

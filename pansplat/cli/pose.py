@@ -75,6 +75,7 @@ class Pose:
 
 def _list_images(paths: tuple[Path, ...]) -> list[Path]:
     """The files, and the photographs in the folders, as other commands find them."""
+    from pansplat.data.folders import require_known_masks
     from pansplat.data.images import is_assembled
     from pansplat.data.photographs import list_photographs
 
@@ -84,6 +85,7 @@ def _list_images(paths: tuple[Path, ...]) -> list[Path]:
             raise InputError(f"{path}: needed a folder of panoramas or a file, got no such path; check it.")
         found = [view.image for view in list_photographs(path)] if path.is_dir() else [path]
         images += [image for image in found if not is_assembled(image)]
+        require_known_masks(path)
     if len(images) < 2:
         raise InputError(f"{paths[0]}: needed two or more panoramas, got {len(images)}; add the others.")
     return images

@@ -1,14 +1,16 @@
 """People, plates and other things that are hidden in photographs by masks that a user has drawn.
 
-The mask of `STEM.jpg` is `STEM_blur.png` beside it, white where the photograph is hidden. Every read of a panorama
-(`pansplat.data.images`) replaces these pixels first, so that nothing else contains them. They become a blur of what is
-around them: no hidden pixel has an influence on it, so that nothing of it can be computed back.
+The mask of `STEM.jpg` is `STEM_blur.png` beside it, in any case, white where the photograph is hidden. Every read of a
+panorama (`pansplat.data.images`) replaces these pixels first, so that nothing else contains them. They become a blur of
+what is around them: no hidden pixel has an influence on it, so that nothing of it can be computed back.
 """
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
+import os
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,66 +25,83 @@ from pansplat.data.rig_images import RIG_SUFFIX
 from pansplat.errors import InputError
 from pansplat.strict_json import read_json, require_object
 
-BLUR_SUFFIX = "_blur"  # of the stem of a mask
+BLUR_SUFFIX, MASK_SUFFIX = "_blur", "_mask"  # of the stem of a mask
 
+_MASK_NAME = re.compile(r"(?:(.*)_)?(blur|mask)(?:\.\w+)*", re.IGNORECASE | re.DOTALL)
 _ROWS = 256  # at most, in which the surroundings are blurred
 _MARGIN = 1 / 128  # of the height; a JPEG mixes pixels within blocks of 16
 _LEAST_SHARE = 0.25  # of a cell that is not hidden, for a colour of its own
 
 
-def name_blur_mask(image: Path) -> Path:
-    """The file of the blur mask of a panorama, which need not exist."""
+def split_mask_name(path: Path) -> tuple[str, str] | None:
+    """The stem of the picture of a mask and the suffix of its kind, by its name in any case; None for other files.
+
+    The stem is empty for the mask of a whole folder, mask.png.
+    """
+    found = _MASK_NAME.fullmatch(path.name)
+    return None if found is None else (found[1] or "", f"_{found[2].lower()}")
+
+
+def fold_name(name: str) -> str:
+    """A name as file systems compare it that do not distinguish capitals, and accents of one or two characters."""
+    return unicodedata.normalize("NFC", name.casefold())
+
+
+def list_mask_files(folder: Path, kind: str) -> Iterator[tuple[str, Path]]:
+    """The masks of a kind in a folder, with the stems of their pictures; none if the folder cannot be listed."""
+    for path in (folder / name for name in sorted(next(os.walk(folder), ("", [], []))[2]) if kind[1:] in name.lower()):
+        found = split_mask_name(path)
+        if found is not None and found[1] == kind and path.suffix.lower() == ".png" and path.is_file():
+            yield found[0], path
+
+
+def find_masks_beside(pictures: Iterable[Path], kind: str) -> dict[Path, Path]:
+    """The masks of a kind beside pictures, which need not exist, by picture.
+
+    Raises:
+        InputError: a picture has several.
+    """
+    pictures, masks, found = list(pictures), {}, {}
+    for folder in {picture.parent for picture in pictures}:
+        for stem, mask in list_mask_files(folder, kind):
+            masks.setdefault((folder, fold_name(stem)), []).append(mask)
+    for picture in pictures:
+        found[picture] = masks.get((picture.parent, fold_name(picture.stem)), [])
+        if len(found[picture]) > 1:
+            names = ", ".join(mask.name for mask in found[picture])
+            raise InputError(f"{picture}: needed one mask {kind}, got {names}; keep the right one.")
+    return {picture: files[0] for picture, files in found.items() if files}
+
+
+def locate_panorama(image: Path) -> Path:
+    """The path beside which the masks of a panorama are: its file, or where a file of its name would be."""
     for suffix in (CUBE_SUFFIX, RIG_SUFFIX):
         if image.name.endswith(suffix):
             folder = require_object(read_json(image), image).get(BESIDE, image.parent)
-            return Path(folder) / f"{image.name.removesuffix(suffix)}{BLUR_SUFFIX}.png"
-    return image.with_name(f"{image.stem}{BLUR_SUFFIX}.png")
+            return Path(folder) / f"{image.name.removesuffix(suffix)}.png"
+    return image
 
 
 def find_blur_mask(image: Path) -> Path | None:
     """The file of the blur mask of a panorama; None if there is none."""
-    mask = name_blur_mask(image)
-    return mask if mask.is_file() else None
+    place = locate_panorama(image)
+    return find_masks_beside([place], BLUR_SUFFIX).get(place)
 
 
-def is_blur_mask(path: Path) -> bool:
-    """Whether a file is a blur mask by its name."""
-    return path.stem.endswith(BLUR_SUFFIX) and path.suffix.lower() == ".png"
+def name_blur_mask(image: Path) -> Path:
+    """The file of the blur mask of a panorama, which need not exist."""
+    place = locate_panorama(image)
+    return find_blur_mask(image) or place.with_name(f"{place.stem}{BLUR_SUFFIX}.png")
 
 
-def require_known_masks(images: Iterable[Path], names: Iterable[str]) -> None:
-    """Check that each blur mask beside panoramas is one of a picture there.
-
-    Args:
-        images: files of panoramas.
-        names: of panoramas; those of several pictures have no file of their name.
-
-    Raises:
-        InputError: a mask has no picture, or is no PNG: what it should hide would be shown.
-    """
-    known = set(names)
-    for folder in dict.fromkeys(name_blur_mask(image).parent for image in images):
-        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-        stems = known | {path.stem for path in files if not is_blur_mask(path)}
-        for mask in (path for path in files if path.stem.endswith(BLUR_SUFFIX)):
-            name = mask.stem.removesuffix(BLUR_SUFFIX)
-            if mask.suffix.lower() == ".png" and name not in stems:
-                close = difflib.get_close_matches(name, stems, n=1)
-                suggestion = f" (did you mean {close[0]}{BLUR_SUFFIX}.png?)" if close else ""
-                raise InputError(
-                    f"{mask}: needed the name of a panorama before {BLUR_SUFFIX}.png, got {name!r}{suggestion}; rename "
-                    "or remove the mask."
-                )
-            if mask.suffix.lower() != ".png" and name in stems:
-                raise InputError(f"{mask}: needed a blur mask as PNG, got {mask.suffix}; save it as {name}_blur.png.")
-
-
-def resize_hidden(white: Bool[NDArray[Any], "rows columns"], height: int) -> Bool[NDArray[Any], "height width"]:
-    """A mask at (height, 2 height): every pixel that a white pixel touches."""
-    if white.shape[0] == height:
+def resize_hidden(
+    white: Bool[NDArray[Any], "rows columns"], height: int, width: int
+) -> Bool[NDArray[Any], "height width"]:
+    """A mask at another size: every pixel that a white pixel touches."""
+    if white.shape == (height, width):
         return white
     method = cv2.INTER_AREA if white.shape[0] > height else cv2.INTER_LINEAR
-    return cv2.resize(white.astype(np.float32), (2 * height, height), interpolation=method) > 0
+    return cv2.resize(white.astype(np.float32), (width, height), interpolation=method) > 0
 
 
 def widen_hidden(hidden: Bool[NDArray[Any], "height width"]) -> Bool[NDArray[Any], "height width"]:

@@ -125,14 +125,14 @@ class CubeImage:
         """All pictures."""
         return (self.folder / file for level in self.levels for file in level.list_files())
 
-    def read(self, height: int, decode: Decode) -> UInt8[Array, "height width 3"]:
-        """The equirectangular panorama at (height, 2 height).
+    def read(self, height: int, decode: Decode) -> tuple[UInt8[Array, "height width 3"], None]:
+        """The equirectangular panorama at (height, 2 height); None, as the pictures show all of it.
 
         Raises:
             InputError: a picture is missing or cannot be read.
         """
         level = next((level for level in self.levels if level.size >= _ENOUGH * height), self.levels[-1])
-        return equirect_from_faces(level.read(self.folder, decode), height)
+        return equirect_from_faces(level.read(self.folder, decode), height), None
 
 
 def write_cube(cube: CubeImage, folder: Path, name: str) -> Path:

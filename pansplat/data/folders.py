@@ -7,11 +7,13 @@ message names the file and the entry.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
+import os
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.blur_masks import find_blur_mask, require_known_masks
-from pansplat.data.images import READABLE_SUFFIXES, list_pictures, require_blur_mask, require_panorama
+from pansplat.data.blur_masks import MASK_SUFFIX, fold_name, locate_panorama, split_mask_name
+from pansplat.data.images import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
 from pansplat.data.pairs import (
     FAR,
     FAR_SEQUENCE,
@@ -59,6 +61,7 @@ VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
 _RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
 _TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # that may hold poses
 _CAMERA_POSES = "camera_pose.json"  # of 360Loc
+_PICTURES = (*READABLE_SUFFIXES, ".bmp", ".gif")  # that may be masks
 
 _REJECTED = "rejected by hand"
 _MAX_WORLD = 9999  # of poses.json
@@ -85,21 +88,71 @@ def load_pairs(
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
         InputError: no known format was found, or a file is missing or invalid.
     """
+    root = expand_home(path)
     try:
-        pairs = _load_pairs(expand_home(path), convention, near, far)
+        pairs = _load_pairs(root, convention, near, far)
     except UnposedPanoramasError as error:
-        _check_blur_masks(error.panoramas)
+        require_known_masks(root, error.panoramas)
         raise
-    _check_blur_masks([view for pair in pairs for view in pair.context + pair.targets])
+    require_known_masks(root, [view for pair in pairs for view in pair.context + pair.targets])
     return pairs
 
 
-def _check_blur_masks(panoramas: Sequence[Panorama]) -> None:
-    """Check the masks that hide parts of panoramas: a wrong one would show what it should hide."""
-    images = dict.fromkeys(panorama.image for panorama in panoramas)
-    require_known_masks(images, [panorama.name for panorama in panoramas])
-    for mask in filter(None, map(find_blur_mask, images)):
-        require_blur_mask(mask)
+def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
+    """Check that every mask is applied: another one would show what it should hide.
+
+    Args:
+        root: a file, or a folder that is searched as by `load_pairs`.
+        panoramas: that were read there.
+
+    Raises:
+        InputError: a mask belongs to no picture, is no PNG, or cannot be used; or a panorama is a mask by its name.
+    """
+    views = {view.image: view for view in panoramas}
+    for image in (*views, *([root] if root.is_file() else ())):
+        if split_mask_name(image) is not None:
+            raise InputError(f"{image}: needed a panorama, got the mask of another by its name; rename or remove it.")
+    folders = dict.fromkeys(_list_folders(root, _MAX_DEPTH) if root.is_dir() else [root.parent])
+    read: set[Path] = set()  # pictures
+    used: set[Path] = set()
+    names: dict[str, Path] = {}  # pictures by their names
+    for image, view in views.items():
+        places = *list_pictures(image), locate_panorama(image)
+        read |= {picture.resolve() for picture in places}
+        folders |= dict.fromkeys(folder for file in places for folder in (file.parent, file.resolve().parent))
+        used |= {mask.resolve() for mask in (view.mask, *list_masks(image, check=True)) if mask is not None}
+        names[fold_name(view.name)] = places[-1]
+    listed = ((folder, name) for folder in folders for name in sorted(next(os.walk(folder), ("", [], []))[2]))
+    files = [folder / name for folder, name in listed if not name.startswith(".")]
+    masks = {file: name for file in files if (name := split_mask_name(file)) and file.resolve() not in used}
+    pictures = [file for file in files if file.suffix.lower() in _PICTURES and not split_mask_name(file)]
+    names |= {fold_name(picture.stem): picture for picture in pictures}
+    for mask, (stem, kind) in masks.items():
+        own = [
+            file for file in pictures if file.parent == mask.parent and fold_name(stem) in ("", fold_name(file.stem))
+        ]
+        is_named = bool(own) or (mask.parent == root and not stem)
+        # Pictures that are not read have masks, too, and poses.json may state another mask of the scene.
+        is_spare = kind == MASK_SUFFIX or (stem and read.isdisjoint(file.resolve() for file in own))
+        if (is_named and is_spare and mask.suffix.lower() == ".png") or not (
+            is_named or mask.suffix.lower() in _PICTURES
+        ):
+            continue
+        near = [names[name] for name in difflib.get_close_matches(fold_name(stem), names, n=1)]
+        paths = [file.with_name(f"{file.stem}{kind}.png") for file in near]
+        suggestions = [f" (did you mean {path.name if path.parent == mask.parent else path}?)" for path in paths]
+        raise InputError(
+            f"{mask}: needed the name of a panorama before {kind}.png, got {mask.name!r}{''.join(suggestions)}; "
+            "rename, convert or remove the mask."
+        )
+
+
+def _list_folders(folder: Path, depth: int) -> Iterator[Path]:
+    """A folder and those below it that can be searched."""
+    yield folder
+    with contextlib.suppress(OSError):
+        for sub in _list_subfolders(folder, depth):
+            yield from _list_folders(sub, depth - 1)
 
 
 def _load_pairs(root: Path, convention: str | None, near: float | None, far: float | None) -> list[Pair]:
@@ -127,6 +180,7 @@ def _load_pairs(root: Path, convention: str | None, near: float | None, far: flo
     if unposed:
         return _make_unposed_pairs(root, unposed, near, far)
     if not collections:
+        require_known_masks(root)
         raise _nothing_found(root)
     collections = [(folder, _leave_out_damaged(collection)) for folder, collection in collections]
     pairs = [pair for folder, collection in collections for pair in collection.pairs(folder, near, far)]

@@ -21,8 +21,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pansplat.data.blur_masks import find_blur_mask
-from pansplat.data.images import read_thumbnail
+from pansplat.data.images import list_masks, read_thumbnail
 from pansplat.errors import InputError
 
 Array = NDArray[Any]
@@ -107,7 +106,7 @@ def scene_mask_of_files(paths: tuple[Path, ...], height: int) -> Bool[Tensor, "h
     """
     if len(paths) > _MAX_IMAGES:
         paths = tuple(paths[i] for i in np.linspace(0, len(paths) - 1, _MAX_IMAGES).round().astype(int))
-    stamped = tuple((path, _stamp(path), _stamp(find_blur_mask(path))) for path in paths if path.is_file())
+    stamped = tuple((path, _stamp(path), tuple(map(_stamp, list_masks(path)))) for path in paths if path.is_file())
     scene = _cached_mask(stamped)
     if scene.all():
         return torch.ones(height, 2 * height, dtype=torch.bool)
@@ -115,8 +114,8 @@ def scene_mask_of_files(paths: tuple[Path, ...], height: int) -> Bool[Tensor, "h
     return torch.from_numpy(resized >= 0.5)
 
 
-def _stamp(path: Path | None) -> tuple[int, int] | None:
-    return None if path is None else (path.stat().st_mtime_ns, path.stat().st_size)
+def _stamp(path: Path) -> tuple[int, int]:
+    return path.stat().st_mtime_ns, path.stat().st_size
 
 
 @lru_cache(maxsize=32)

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.data.blur_masks import is_blur_mask
-from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_height, read_mask, read_panorama
+from pansplat.data.blur_masks import MASK_SUFFIX, list_mask_files, locate_panorama, split_mask_name
+from pansplat.data.images import READABLE_SUFFIXES, find_masks, read_depth, read_height, read_mask, read_panorama
 from pansplat.data.masks import lift_black_surfaces, scene_mask_of_files
 from pansplat.data.placements import PLACED, Placement
 from pansplat.data.views import CAMERA_HEIGHT, Views
@@ -355,10 +355,10 @@ def list_names(files: Sequence[Path]) -> str:
 
 def find_mask(image: Path, folder: Path) -> Path | None:
     """The mask file of an image: STEM_mask.png or mask.png in the image's folder, or mask.png in `folder`."""
-    for mask in (image.with_name(f"{image.stem}_mask.png"), image.with_name("mask.png"), folder / "mask.png"):
-        if mask.is_file():
-            return mask
-    return None
+    own = find_masks(image, MASK_SUFFIX).get(image)
+    places = dict.fromkeys((locate_panorama(image).parent, folder))
+    of_folders = (mask for place in places for stem, mask in list_mask_files(place, MASK_SUFFIX) if not stem)
+    return own or next(of_folders, None)
 
 
 def list_panorama_files(folder: Path) -> list[Path]:
@@ -367,9 +367,8 @@ def list_panorama_files(folder: Path) -> list[Path]:
         path
         for path in sorted(folder.iterdir())
         if path.suffix.lower() in READABLE_SUFFIXES
-        and path.stem not in ("mask", "depth")
-        and not path.stem.endswith(("_mask", "_depth"))
-        and not is_blur_mask(path)
+        and not f"_{path.stem}".lower().endswith("_depth")
+        and split_mask_name(path) is None
         and not path.name.startswith(".")
         and path.is_file()
     ]

@@ -13,7 +13,7 @@ import torch
 
 from pansplat.data.cube_faces import find_layout, group_faces
 from pansplat.data.cube_images import CubeImage, write_cube
-from pansplat.data.images import read_size, require_complete, require_two_to_one
+from pansplat.data.images import is_two_to_one, read_size, require_complete, require_two_to_one
 from pansplat.data.pairs import Link, Panorama, find_mask, list_panorama_files
 from pansplat.data.panorama_metadata import read_xmp
 from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links
@@ -81,7 +81,7 @@ def list_further_photographs(
 
 def list_unread_panoramas(folder: Path, known: Collection[Path]) -> list[Path]:
     """The 2:1 pictures of a folder other than the known files, which pansplat has not rendered; no pixels are read."""
-    return [image for image in _list_others(folder, known) if _is_two_to_one(image)]
+    return [image for image in _list_others(folder, known) if is_two_to_one(image)]
 
 
 def _list_others(folder: Path, known: Collection[Path], stated: Collection[str] = ()) -> list[Path]:
@@ -98,14 +98,6 @@ def _identify(file: Path) -> object:
     except OSError:
         return file.resolve()
     return (status.st_dev, status.st_ino) if status.st_ino else file.resolve()  # 0 on some network drives
-
-
-def _is_two_to_one(image: Path) -> bool:
-    try:
-        width, height = read_size(image)
-    except InputError:
-        return False
-    return width == 2 * height
 
 
 def _warn_left_out(problems: Sequence[str]) -> None:
@@ -146,8 +138,7 @@ def _read_picture(image: Path) -> Path | CubeImage:
 
 def _make_panorama(name: str, picture: Path | CubeImage, folder: Path) -> Panorama:
     image = picture if isinstance(picture, Path) else write_cube(picture, folder, name)
-    mask = find_mask(folder / f"{name}.jpg" if isinstance(picture, CubeImage) else picture, folder)
-    return Panorama(name, image, torch.eye(4, dtype=torch.float64), mask)
+    return Panorama(name, image, torch.eye(4, dtype=torch.float64), find_mask(image, folder))
 
 
 def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:

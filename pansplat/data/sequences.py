@@ -13,10 +13,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.folders import VIDEO_FILES, find_trajectory, is_loc360_sequence, read_loc360_sequence
+from pansplat.data.folders import (
+    VIDEO_FILES,
+    find_trajectory,
+    is_loc360_sequence,
+    read_loc360_sequence,
+    require_known_masks,
+)
 from pansplat.data.images import read_mask, resize_panorama
 from pansplat.data.masks import lift_black_surfaces
-from pansplat.data.pairs import FAR_SEQUENCE, NEAR, Pair, Panorama
+from pansplat.data.pairs import FAR_SEQUENCE, NEAR, Pair, Panorama, find_mask
 from pansplat.data.poses import read_number, read_trajectory
 from pansplat.data.video import VideoFile, open_video
 from pansplat.data.views import Sample, Views, select_views
@@ -189,6 +195,7 @@ def read_loc360(root: Path | str, stage: Stage) -> list[ImageSequence]:
             )
         for folder in folders:
             collection = read_loc360_sequence(folder)
+            require_known_masks(folder, collection.panoramas)
             name = f"{location}-{folder.name}"
             sequences.append(ImageSequence(name, collection.panoramas, collection.near, collection.far))
     return sequences
@@ -241,13 +248,13 @@ def read_video_folder(folder: Path) -> VideoSequence:
         frames = _frames_by_time(source, video)
     else:
         frames = _frames_in_order(source, video, len(trajectory.poses))
-    mask = folder / "mask.png"
+    require_known_masks(folder)
     return VideoSequence(
         folder.resolve().name,
         video,
         frames,
         trajectory.scaled_poses(_read_scale(folder)),
-        mask if mask.is_file() else None,
+        find_mask(video.path, folder),
     )
 
 

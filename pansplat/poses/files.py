@@ -15,9 +15,8 @@ import torch
 
 from pansplat.atomic import replacing
 from pansplat.cache_folders import cache_folders, write_cache_file
-from pansplat.data.blur_masks import find_blur_mask
 from pansplat.data.folders import make_names_unique
-from pansplat.data.images import read_thumbnail
+from pansplat.data.images import list_masks, read_thumbnail
 from pansplat.data.pairs import Collection, Pair, Panorama, single_view_pairs
 from pansplat.data.placements import Placement, judge, read_ties
 from pansplat.data.poses import rigid_matrix, to_cam2world
@@ -244,8 +243,7 @@ def _hash_inputs(panoramas: Sequence[Panorama], camera_height: float) -> str:
     for panorama in panoramas:
         links = [(link.target, round(link.yaw, 6)) for link in panorama.links]
         digest.update(os.fsencode(f"{panorama.name} {links};"))
-        blur = find_blur_mask(panorama.image)
-        for file in (panorama.image, panorama.mask, *(() if blur is None else (blur,))):
+        for file in dict.fromkeys((panorama.image, panorama.mask, *list_masks(panorama.image))):
             digest.update(os.fsencode(f"{_stamp(file)};"))
     return digest.hexdigest()
 

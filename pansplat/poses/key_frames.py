@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
+from pansplat.data.folders import require_known_masks
 from pansplat.data.images import write_image
 from pansplat.data.panorama_metadata import read_xmp
 from pansplat.data.video import open_video
@@ -37,6 +38,7 @@ def extract_key_frames(
         InputError: not a 2:1 video, the camera did not move, or other pictures are in the way without `overwrite`.
     """
     video = open_video(path)
+    require_known_masks(path.parent)
     if video.width != 2 * video.height:
         raise InputError(f"{path}: needed a 2:1 equirectangular video, got {video.width}x{video.height}; convert it.")
     if count < 2:

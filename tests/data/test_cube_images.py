@@ -71,7 +71,7 @@ def test_the_smallest_level_that_is_enough_is_read(cube: CubeImage, check_colors
 
     for height, level in ((8, "16"), (25, "16"), (26, "40"), (200, "40")):
         read.clear()
-        panorama = cube.read(height, decode)
+        panorama, _ = cube.read(height, decode)
         assert set(read) == {level}
         check_colors(torch.from_numpy(panorama).permute(2, 0, 1) / 255)
 

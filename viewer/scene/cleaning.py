@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from pansplat.data.blur_masks import find_blur_mask, name_blur_mask
-from pansplat.data.images import read_blur_mask, write_image
+from pansplat.data.blur_masks import name_blur_mask
+from pansplat.data.images import read_hidden, write_image
 from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -108,10 +108,7 @@ class MaskPainter:
     def __init__(self, panorama: Panorama) -> None:
         """Start with the mask of the photograph, if it has one; raises an InputError if that cannot be used."""
         self.panorama = panorama
-        file = find_blur_mask(panorama.image)
-        self.hidden: Bool[np.ndarray, "height width"] = (
-            np.zeros((_ROWS, 2 * _ROWS), bool) if file is None else read_blur_mask(file, _ROWS).copy()
-        )
+        self.hidden: Bool[np.ndarray, "height width"] = read_hidden(panorama.image, _ROWS)
         self.is_changed = False
         self._rotation = panorama.cam2world[:3, :3].double().numpy()
         self._last: Float[np.ndarray, "3"] | None = None  # of the stroke

@@ -65,15 +65,14 @@ class SceneEntry:
         source = self.tour or self.pair
         if self.file is not None or source is None:
             return () if self.file is None else (self.file,)
-        from pansplat.data.blur_masks import find_blur_mask
         from pansplat.data.folders import list_stated_files
-        from pansplat.data.images import list_pictures
+        from pansplat.data.images import list_masks, list_pictures
 
         files = dict.fromkeys(list_stated_files(source.folder))
         folders = {source.folder: None}
         for panorama in self.panoramas:
             pictures = list_pictures(panorama.image)
-            files |= dict.fromkeys((panorama.image, *pictures, panorama.mask, find_blur_mask(panorama.image)))
+            files |= dict.fromkeys((panorama.image, *pictures, panorama.mask, *list_masks(panorama.image)))
             folders |= {} if len(pictures) > 1 else {panorama.image.parent: None}
         return (*(file for file in files if file is not None), *folders)
 

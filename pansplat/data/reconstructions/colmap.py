@@ -92,8 +92,7 @@ def read_colmap(source: Path, folder: Path, convention: str | None = None) -> Re
         matrix[:3, :3] = rotations_from_quats(torch.tensor(quat, dtype=torch.float64))
         matrix[:3, 3] = torch.tensor(translation, dtype=torch.float64)
         pose = to_cam2world(rigid_matrix(matrix.tolist(), where), convention or CONVENTION)
-        mask = find_picture(folder / "masks", f"{name}.png")
-        shots.append(Shot(name, image, pose, _make_lens(cameras[camera], where), mask))
+        shots.append(Shot(name, image, pose, _make_lens(cameras[camera], where)))
     if not images:
         raise InputError(f"{source}: needed posed pictures, got none; export the model again.")
     points = points.reshape(-1, 3)

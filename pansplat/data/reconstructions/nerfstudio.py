@@ -77,9 +77,12 @@ def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstructi
             continue
         pose = to_cam2world(rigid_matrix(frame.get("transform_matrix"), where), convention or CONVENTION)
         pose[:3, 3] /= scale
-        mask = text_field(frame, "mask_path", where)
+        stated = text_field(frame, "mask_path", where)
+        mask = None if stated is None else find_picture(folder, stated)
+        if stated is not None and mask is None:
+            raise InputError(f'{where}: needed the mask {stated}, got no such file; correct or remove "mask_path".')
         lens = _read_lens({**content, **frame}, image, where)
-        shots.append(Shot(name, image, undo @ pose, lens, None if mask is None else find_picture(folder, mask)))
+        shots.append(Shot(name, image, undo @ pose, lens, mask))
     points = _read_points(content, source)
     points = (points / scale) @ undo[:3, :3].T.numpy() + undo[:3, 3].numpy()
     return Reconstruction(source, folder, shots, points, missing=missing)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import re
 import warnings
@@ -18,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pansplat.data.blur_masks import fold_name
 from pansplat.data.images import READABLE_SUFFIXES
 from pansplat.data.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
 from pansplat.data.poses import read_number
@@ -118,7 +120,7 @@ def make_collection(found: Reconstruction) -> Collection:
             InputWarning,
             stacklevel=4,
         )
-    panoramas, partial = _join_shots(found)
+    panoramas, partial = _join_shots(replace(found, shots=_add_masks(found)))
     if not panoramas:
         raise InputError(
             f"{found.source}: needed 360-degree panoramas, got {len(partial)} perspective pictures that show at most "
@@ -172,6 +174,34 @@ def _find_range(
     return (_BASELINES[0] * baseline, _BASELINES[1] * baseline) if baseline > 0 else (NEAR, FAR)
 
 
+def _add_masks(found: Reconstruction) -> list[Shot]:
+    """The pictures with the masks of the folder masks/, which have their names with or without the suffix, and ".png".
+
+    Raises:
+        InputError: a mask belongs to no picture: what it hides would be shown.
+    """
+    folder = found.folder / "masks"
+    files = [file for file in folder.rglob("*") if file.suffix.lower() in READABLE_SUFFIXES and file.is_file()]
+    names = {file: file.relative_to(folder).with_suffix("").as_posix() for file in files}
+    masks = {fold_name(name): file for file, name in names.items()}
+    shots: list[Shot] = []
+    for shot in found.shots:
+        parts = fold_name(shot.name.replace("\\", "/")).split("/")
+        ends = ["/".join(parts[start:]) for start in range(len(parts))]
+        keys = (*ends, *(end.rsplit(".", 1)[0] for end in ends))
+        shots.append(replace(shot, mask=shot.mask or next((masks[key] for key in keys if key in masks), None)))
+    used = {shot.mask.resolve() for shot in shots if shot.mask is not None}
+    unmasked, folders = {s.image for s in shots if s.mask is None}, {s.image.parent for s in shots}
+    for mask in (file for file in files if file.resolve() not in used):
+        if find_picture(found.folder, names[mask], *folders) in (None, *unmasked):
+            close = difflib.get_close_matches(names[mask], [shot.name for shot in shots], n=1)
+            raise InputError(
+                f"{mask}: needed the name of a picture before {mask.suffix}, got {names[mask]!r}"
+                f"{''.join(f' (did you mean {name}?)' for name in close)}; rename or remove the mask."
+            )
+    return shots
+
+
 def _join_shots(found: Reconstruction) -> tuple[list[Panorama], dict[str, float]]:
     """The panoramas, and the pictures that are no part of one, with the share of the sphere around their cameras."""
     panoramas: list[Panorama] = []
@@ -180,7 +210,7 @@ def _join_shots(found: Reconstruction) -> tuple[list[Panorama], dict[str, float]
     for shots in _group_by_place(found.shots):
         names = [shot.name for shot in shots]
         if shots[0].lens is None:
-            image, pose, mask = shots[0].image, shots[0].cam2world, shots[0].mask
+            image, pose = shots[0].image, shots[0].cam2world
             name = image.stem
         else:
             rig, pose = _make_rig(shots)
@@ -189,12 +219,11 @@ def _join_shots(found: Reconstruction) -> tuple[list[Panorama], dict[str, float]
                 partial |= dict.fromkeys(names, coverage)
                 continue
             name = _make_unique(_find_common_name(names), taken)
-            image, mask = write_rig(rig, found.folder, name), None
+            image = write_rig(rig, found.folder, name)
         name = _make_unique(name, taken)
         taken.add(name)
-        if shots[0].lens is None:
-            mask = mask or find_mask(image, found.folder)
-        panoramas.append(Panorama(name, image, pose, mask))
+        stated = shots[0].mask if shots[0].lens is None else None
+        panoramas.append(Panorama(name, image, pose, stated or find_mask(image, found.folder)))
     return panoramas, partial
 
 

@@ -154,7 +154,7 @@ def make_panoramas(entries: Sequence[Entry], source: Path) -> list[Panorama]:
     panoramas = []
     for name, entry in kept:
         image = entry.picture if isinstance(entry.picture, Path) else write_cube(entry.picture, folder, name)
-        mask = find_mask(folder / f"{name}.jpg" if isinstance(entry.picture, CubeImage) else image, folder)
+        mask = find_mask(image, folder)
         pose = torch.eye(4, dtype=torch.float64)
         title = "" if entry.title == name else entry.title
         links = resolve_links(entry.links, names, name, source)

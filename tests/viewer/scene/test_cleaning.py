@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat.data.folders import load_pairs
 from pansplat.data.images import read_blur_mask, write_image
 from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
@@ -85,3 +86,19 @@ def test_bounds_are_those_of_the_finite_gaussians(random_scene) -> None:
     assert bounds == pytest.approx((*rest.amin(0).tolist(), *rest.amax(0).tolist()))
     nothing = replace(scene, gaussians=scene.gaussians.select(torch.arange(0)))
     assert measure_bounds(nothing) == (-1, -1, -1, 1, 1, 1)
+
+
+def test_painting_goes_on_with_masks_of_pictures_and_of_other_capitals(tmp_path: Path) -> None:
+    for face in "frblud":
+        write_image(tmp_path / f"hall_{face}.png", np.full((48, 48, 3), 99, np.uint8))
+    white = np.zeros((48, 48, 3), np.uint8)
+    white[16:32, 16:32] = 255
+    write_image(tmp_path / "hall_f_blur.png", white)
+    white = np.zeros((64, 128, 3), np.uint8)
+    white[50:] = 255
+    write_image(tmp_path / "hall_Blur.PNG", white)
+    panorama = load_pairs(tmp_path)[0].context[0]
+    painter = MaskPainter(panorama)
+    assert painter.hidden[256, 512] and painter.hidden[420].all() and not painter.hidden[256, 700]
+    assert painter.save() == tmp_path / "hall_Blur.PNG", "one mask of the panorama"
+    assert np.array_equal(MaskPainter(panorama).hidden, painter.hidden)
