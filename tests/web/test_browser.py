@@ -9,7 +9,10 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -54,16 +57,55 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves a folder and prints nothing."""
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class Sites:
+    """A folder that three servers on this machine show, each with an origin of its own.
+
+    Attributes:
+        pages: origin from which pages come that are embedded.
+        host: origin that embedded.html states.
+        stranger: an origin that no page states.
+    """
+
+    folder: Path
+    pages: str
+    host: str
+    stranger: str
+
+
 @pytest.fixture(scope="module")
-def folder(scene: Scene, house: Scene, flat: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """tour.html, split.html with its parts, house.html with a graph, and flat.html with parts."""
+def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sites]:
     folder = tmp_path_factory.mktemp("pages")
+    (folder / "host.html").write_text(HOST)
+    with ExitStack() as stack:
+        origins = []
+        for _ in range(3):
+            handler = partial(QuietHandler, directory=str(folder))
+            server = stack.enter_context(ThreadingHTTPServer(("127.0.0.1", 0), handler))
+            Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+            stack.callback(server.shutdown)
+            origins.append(f"http://127.0.0.1:{server.server_port}")
+        yield Sites(folder, *origins)
+
+
+@pytest.fixture(scope="module")
+def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites) -> Path:
+    """tour.html, split.html with its parts, house.html with a graph, embedded.html with a host, and flat.html with parts."""
+    folder = sites.folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
         patch.setattr(page_module, "_PART_BYTES", 30_000)
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
         write_page(house, folder / "house.html")
+        write_page(house, folder / "embedded.html", embed=[sites.host, "https://example.com"])
         write_page(flat, folder / "flat.html")
     return folder
 
@@ -688,41 +730,79 @@ def test_the_poster_is_in_place_of_the_picture(
 
 
 HOST = """<!doctype html><style>
-body {{ height: 4000px; margin: 100px 50px }}
-iframe {{ border: 0; width: 320px; height: 240px }}
+body { height: 4000px; margin: 100px 50px }
+iframe { border: 0; width: 320px; height: 240px }
 </style>
-<iframe src="{page}"></iframe>
+<iframe></iframe>
 <script>
+const frame = document.querySelector("iframe");
+frame.src = location.hash.slice(1);
 told = [];
-addEventListener("message", ({{ data }}) => told.push(data));
-call = (pansplat, ...values) => new Promise((resolve) => {{
+addEventListener("message", ({ data }) => told.push(data));
+send = (message) => frame.contentWindow.postMessage(message, new URL(frame.src).origin);
+call = (pansplat, ...values) => new Promise((resolve) => {
     const id = Math.random();
-    const onAnswer = ({{ data }}) => {{
+    const onAnswer = ({ data }) => {
         if (data.id !== id) return;
         removeEventListener("message", onAnswer);
         resolve(data.error ? "error: " + data.error : data.value);
-    }};
+    };
     addEventListener("message", onAnswer);
-    document.querySelector("iframe").contentWindow.postMessage({{ pansplat, values, id }}, "*");
-}});
+    send({ pansplat, values, id });
+});
 </script>"""
 
 
 @contextmanager
-def in_a_host(chromium: Any, path: Path, folder: Path, **options: Any) -> Iterator[tuple[OpenPage, Any]]:
-    """A page with another one in an <iframe>, and the frame."""
-    (folder / "host.html").write_text(HOST.format(page=path.as_uri()))
+def in_a_host(chromium: Any, origin: str, page: str, **options: Any) -> Iterator[tuple[OpenPage, Any]]:
+    """A page of an origin with the page at another address in an <iframe>, and the loaded frame."""
     context = chromium.new_context(viewport={"width": 500, "height": 400}, **options)
     host = OpenPage(context.new_page())
-    host.page.goto((folder / "host.html").as_uri())
-    host.wait("told.some(({ pansplat }) => pansplat === 'ready')")
-    yield host, host.page.frames[1]
+    host.page.goto(f"{origin}/host.html#{page}")
+    frame = host.page.frames[1]
+    frame.evaluate("pansplat.ready")
+    yield host, frame
     context.close()
 
 
 @pytest.mark.slow
-def test_the_wheel_is_the_host_pages_until_a_click(chromium: Any, folder: Path, tmp_path: Path) -> None:
-    with in_a_host(chromium, folder / "tour.html", tmp_path) as (host, frame):
+@pytest.mark.parametrize(("name", "is_stated"), [("house.html", True), ("house.html", False), ("embedded.html", False)])
+def test_a_host_that_the_page_does_not_state_is_told_nothing_and_moves_nothing(
+    chromium: Any, sites: Sites, folder: Path, name: str, is_stated: bool
+) -> None:
+    origin = sites.host if is_stated else sites.stranger
+    with in_a_host(chromium, origin, f"{sites.pages}/{name}") as (host, frame):
+        pose = frame.evaluate("pansplat.getPose()")
+        frame.evaluate("heard = 0; addEventListener('message', () => { heard += 1; })")
+        for values in ("['goTo', [3, { jump: true }]]", "['getPose', []]", "['setPose', [{ yaw: 50 }]]"):
+            host.run(f"(([pansplat, values]) => send({{ pansplat, values, id: 1 }}))({values})")
+        host.run("send({ pansplat: 'render', values: [64, 48], id: 2 })")
+        while frame.evaluate("heard") < 4:
+            host.page.wait_for_timeout(10)
+        assert frame.evaluate("pansplat.getPose()") == pose
+        assert frame.evaluate("pansplat.goTo(2, { jump: true })") is True, "an arrival of which no host hears"
+        frame.evaluate("parent.postMessage('last', '*')")  # messages arrive in the order in which they are sent
+        host.wait("told.includes('last')")
+        assert host.run("told") == ["last"]
+
+
+@pytest.mark.slow
+def test_a_served_page_is_framed_by_stated_origins_only(chromium: Any, sites: Sites, folder: Path) -> None:
+    with PageServer(PageFiles((folder / "embedded.html",), 0, 0, 0, (sites.host,))) as server:
+        Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        with in_a_host(chromium, sites.host, server.url, ignore_https_errors=True) as (host, _):
+            assert host.run("call('goTo', 2)") is True
+        page = chromium.new_context(ignore_https_errors=True).new_page()
+        with page.expect_event("requestfailed", lambda request: request.url == server.url) as failed:
+            page.goto(f"{sites.stranger}/host.html#{server.url}")
+        assert failed.value.failure == "net::ERR_BLOCKED_BY_RESPONSE"
+        page.context.close()
+        server.shutdown()
+
+
+@pytest.mark.slow
+def test_the_wheel_is_the_host_pages_until_a_click(chromium: Any, sites: Sites, folder: Path) -> None:
+    with in_a_host(chromium, sites.host, f"{sites.pages}/tour.html") as (host, frame):
         mouse, fov = host.page.mouse, frame.evaluate("pansplat.camera.fov")
         place = (150, 180)
 
@@ -752,8 +832,9 @@ def test_the_wheel_is_the_host_pages_until_a_click(chromium: Any, folder: Path, 
 
 
 @pytest.mark.slow
-def test_a_host_page_moves_the_camera_and_hears_of_arrivals(chromium: Any, folder: Path, tmp_path: Path) -> None:
-    with in_a_host(chromium, folder / "house.html", tmp_path) as (host, frame):
+def test_a_stated_host_moves_the_camera_and_hears_of_arrivals(chromium: Any, sites: Sites, folder: Path) -> None:
+    with in_a_host(chromium, sites.host, f"{sites.pages}/embedded.html") as (host, frame):
+        host.wait("told.length")
         assert host.run("told[0]") == {"pansplat": "ready", "panoramas": ["room 0", "room 1", "room 2"]}
         frame.evaluate("HEADER.speed *= 100")
         assert host.run("call('goTo', 'room 2')") is True
