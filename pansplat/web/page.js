@@ -14,6 +14,7 @@
   const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
   const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
   const REST_SECONDS = 4;             // at a panorama, on a tour without flights
+  const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later";  // that have all that the page uses
   const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
   // The poster has the scale and the place of the picture that follows.
@@ -915,10 +916,12 @@
     });
   }
 
+  const lack = (what) => new Error(`This page needs ${what}, which is in ${BROWSERS}, unless the device lacks it.`);
+
   async function main() {
     placePoster();
     addEventListener("resize", placePoster);
-    if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
+    if (!window.DecompressionStream) throw lack("DecompressionStream");
     const linked = parsePose(location.hash);
     if (linked) Object.assign(camera, cameraFor(linked));
     settleAt(camera.position);
@@ -931,7 +934,7 @@
     });
     loading.catch(() => {});  // of an error that comes before it is awaited
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
-    if (!gl) throw new Error("This page needs WebGL 2, which this browser or device does not have.");
+    if (!gl) throw lack("WebGL 2");
     headset.gl = gl;
     const makeRenderer = () => {
       if (gl.isContextLost()) return;
