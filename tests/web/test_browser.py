@@ -97,7 +97,7 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sites]:
 
 @pytest.fixture(scope="module")
 def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites) -> Path:
-    """tour.html, split.html with its parts, house.html with a graph, embedded.html with a host, and flat.html with parts."""
+    """tour.html, split.html with files, house.html with a graph, flat.html with parts; embedded.html has a host."""
     folder = sites.folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
@@ -402,14 +402,29 @@ def test_a_sorter_that_ends_is_reported_and_rejects_pictures(chromium: Any, fold
         assert "no memory" in page.run("pansplat.camera.position[0] += 0.1; pansplat.render(64, 48).catch(String)")
 
 
-def test_without_webgl_the_page_says_so_over_its_poster(chromium: Any, folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("script", "needed"),
+    [
+        ("HTMLCanvasElement.prototype.getContext = () => null", "WebGL 2"),
+        ("delete window.DecompressionStream", "DecompressionStream"),
+    ],
+)
+def test_what_the_browser_lacks_is_named_over_the_poster_with_browsers_that_have_it(
+    chromium: Any, folder: Path, script: str, needed: str
+) -> None:
     context = chromium.new_context()
     page = context.new_page()
-    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.add_init_script(script)
     page.goto((folder / "tour.html").as_uri())
     page.wait_for_selector("#cover.failed img")
-    assert "WebGL 2" in page.inner_text("#message")
+    message = page.inner_text("#message")
     context.close()
+    assert message.startswith(f"This page needs {needed}")
+    versions = message[message.index("Chrome") : message.index(" or later")]
+    root = Path(__file__).resolve().parents[2]
+    for document in ("README.md", "docs/web.md"):
+        text = " ".join((root / document).read_text("utf-8").split())
+        assert f"with WebGL 2 and `DecompressionStream` ({versions} or later)" in text
 
 
 @pytest.mark.slow
@@ -903,6 +918,7 @@ def test_a_picture_is_saved(home: OpenPage) -> None:
         with home.page.expect_download() as download:
             click()
         assert download.value.suggested_filename == "Three rooms.png"
+        assert home.page.inner_text("#status") == "Picture saved"
         image = np.asarray(Image.open(download.value.path()).convert("RGB"), np.float64) / 255
         assert psnr(image, home.draw()) > 60
     assert home.page.is_hidden("#menu")
@@ -1368,17 +1384,42 @@ def test_a_served_page_may_use_webxr(chromium: Any, folder: Path) -> None:
         server.shutdown()
 
 
+SCALED = """
+    XRView.prototype.requestViewportScale = function (value) { scale = value; };
+    const getViewport = XRWebGLLayer.prototype.getViewport;
+    XRWebGLLayer.prototype.getViewport = function (view) {
+        const { x, width, height } = getViewport.call(this, view);
+        return { x, y: 0, width: Math.round(scale * width), height: Math.round(scale * height) };
+    };
+"""
+
+
+@pytest.mark.slow
+def test_perfect_frames_of_a_headset_that_states_no_rate_keep_the_resolution(
+    chromium: Any, folder: Path, iwer: str
+) -> None:
+    unstated = "Object.defineProperty(XRSession.prototype, 'frameRate', { value: undefined }); step = 1000 / 60;"
+    with in_headset(chromium, folder / "tour.html", iwer, SCALED + unstated) as page:
+        page.wait("frames > 240")
+        assert page.run("scale") == 1
+        page.run("step = 25")
+        page.wait("scale < 1")
+        page.run("step = 1000 / 60")
+        page.wait("scale === 1")
+
+
+@pytest.mark.slow
+def test_a_headset_that_states_no_rate_and_is_late_from_the_first_frame_lowers_the_resolution(
+    chromium: Any, folder: Path, iwer: str
+) -> None:
+    unstated = "Object.defineProperty(XRSession.prototype, 'frameRate', { value: undefined }); step = 33;"
+    with in_headset(chromium, folder / "tour.html", iwer, SCALED + unstated) as page:
+        page.wait("scale === 0.4")
+
+
 @pytest.mark.slow
 def test_the_resolution_follows_the_time_between_frames(chromium: Any, folder: Path, iwer: str) -> None:
-    scaled = """
-        XRView.prototype.requestViewportScale = function (value) { scale = value; };
-        const getViewport = XRWebGLLayer.prototype.getViewport;
-        XRWebGLLayer.prototype.getViewport = function (view) {
-            const { x, width, height } = getViewport.call(this, view);
-            return { x, y: 0, width: Math.round(scale * width), height: Math.round(scale * height) };
-        };
-    """
-    with in_headset(chromium, folder / "tour.html", iwer, scaled) as page:
+    with in_headset(chromium, folder / "tour.html", iwer, SCALED) as page:
         sharp = see(page, (0.1, 1.6, -0.2), 0.2, 0.6)
         page.run("step = 40")
         page.wait("scale === 0.4")
@@ -1409,4 +1450,23 @@ def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(
     assert frame.evaluate("origin") == "null"
     assert frame.evaluate("document.getElementById('name').innerText") in plain_scene.names
     assert messages == []
+    page.close()
+
+
+def test_a_picture_is_saved_from_the_frame_of_a_notebook(chromium: Any, plain_scene: Scene, tmp_path: Path) -> None:
+    from pansplat.notebook import _bundle_scene
+
+    file = tmp_path / "cell.html"
+    file.write_text(f"<!doctype html><meta charset=utf-8>{_bundle_scene(plain_scene)['text/html']}")
+    page = chromium.new_page(viewport={"width": 640, "height": 560})
+    page.goto(file.as_uri())
+    (frame,) = page.main_frame.child_frames
+    assert frame.evaluate("pansplat.ready.then(() => 'ready', String)") == "ready"
+    with page.expect_download() as download:
+        frame.click("#more")
+        frame.click("#picture")
+    assert download.value.suggested_filename == "scene.png"
+    assert "if the page around this frame allows" in frame.inner_text("#status")
+    with Image.open(download.value.path()) as image:
+        assert np.asarray(image.convert("RGB")).std() > 10
     page.close()
