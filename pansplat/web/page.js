@@ -739,6 +739,13 @@
     dirty = true;
   }
 
+  // Whether the picture is final: all data is there and sorted for the camera, nothing moves or fades, and it is drawn.
+  function isSettled() {
+    const isDrawn = headset.session !== null || !dirty && drawnScale === 1, tolerance = headset.session ? SORT_DISTANCE : 0;
+    const isMoving = [flight, route, doll.flight, fade, frozen].some((each) => each !== null);
+    return isDrawn && !isMoving && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) && sorted.views.every((view) => shown[view] === 1);
+  }
+
   // Of the canvas at the full resolution.
   function fullSize() {
     const { clientWidth, clientHeight } = canvas, ratio = Math.min(devicePixelRatio || 1, 2);
@@ -977,6 +984,7 @@
     panoramas: HEADER.spots.map(({ name }) => name),
     getPose: () => poseOf(camera),
     setPose,
+    isSettled,
     async goTo(panorama, { jump = false } = {}) {
       const node = findNode(panorama);
       setTouring(false);
