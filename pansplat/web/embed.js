@@ -1,6 +1,6 @@
 "use strict";
-// The page in other pages and for scripts (docs/web.md, Embedding): messages, arrivals, and whose the wheel is. A page may show
-// what only its visitor can open. So messages go to the origins that the page states (HEADER.embed), and come from them.
+// The page in other pages and for scripts (docs/web.md, Embedding): messages, arrivals, and whose the wheel is.
+// A page may show what only its visitor can open, so messages are exchanged with stated origins only (HEADER.embed).
 
 const CALLS = ["goTo", "getPose", "setPose", "render"];  // of window.pansplat, by messages
 

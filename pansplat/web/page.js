@@ -15,6 +15,7 @@
   const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
   const REST_SECONDS = 4;             // at a panorama, on a tour without flights
   const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later";  // that have all that the page uses
+  const lack = (what) => new Error(`This page needs ${what}, which is in ${BROWSERS}, unless the device lacks it.`);
   const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
   // The poster has the scale and the place of the picture that follows.
@@ -922,8 +923,6 @@
       });
     });
   }
-
-  const lack = (what) => new Error(`This page needs ${what}, which is in ${BROWSERS}, unless the device lacks it.`);
 
   async function main() {
     placePoster();

@@ -562,14 +562,14 @@ def parse_origins(texts: Sequence[str]) -> tuple[str, ...]:
     origins = []
     for text in texts:
         found = _ORIGIN.fullmatch(text.lower()) if text.isascii() else None
+        scheme, host, port = found.groups() if found else ("", "", None)
+        number = int(port or _DEFAULT_PORTS.get(scheme, 0))
         try:
-            scheme, host, port = found.groups() if found else ("", "", None)
-            number = int(port) if port else _DEFAULT_PORTS[scheme]
-            if number > 65535:
+            if not 0 < number < 1 << 16:
                 raise ValueError("no port")
             if host.rpartition(".")[2].isdigit():
                 ipaddress.IPv4Address(host)
-        except (LookupError, ValueError):
+        except ValueError:
             raise InputError(
                 "`embed` must hold origins such as https://example.com or http://localhost:8000, without a path, got "
                 f"{text!r}; give the scheme and the host of the page with the frame"

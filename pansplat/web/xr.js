@@ -14,8 +14,7 @@ const MIN_POINTING = 0.06;          // radians between a ray and the centre of a
 const RAY_LENGTH = 3;               // metres
 const FLOOR_SPEED = 5;              // of the way to the height of a new floor, a second
 const HEIGHT_RATIO = 1.5;           // of the head to the panorama's camera, both over their floors
-const MIN_RATE = 72;                // frames a second, if the device has a choice
-const LOWEST_RATE = 60;             // of devices
+const MIN_RATE = 72, LOWEST_RATE = 60;  // frames a second: if the device has a choice, and of any device
 const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30;  // of the resolution, after so many frames
 const BUTTONS = { 4: "goHome", 5: "leave" };  // A and X, B and Y
 
