@@ -83,7 +83,8 @@ def _bundle_scene(scene: Scene, gaussians: int = DISPLAY_GAUSSIANS, height: int 
     size = f"{min(gaussians, len(scene.gaussians)):,} of {len(scene.gaussians):,} Gaussians, {len(page) / 1e6:.1f} MB"
     # Scripts of the frame have an origin of their own, and cannot reach the notebook.
     frame = (
-        f'<iframe srcdoc="{html.escape(page)}" title="scene" sandbox="allow-scripts allow-pointer-lock" '
+        f'<iframe srcdoc="{html.escape(page)}" title="scene" '
+        f'sandbox="allow-scripts allow-downloads allow-pointer-lock" '
         f'allow="fullscreen; accelerometer; gyroscope; xr-spatial-tracking" '
         f'style="width: 100%; height: {height}px; border: 0"></iframe>'
         f"<div><small>{size}; drag to look around, W A S D to walk, H for help</small></div>"

@@ -78,6 +78,9 @@ class Export:
     """For .html: write the data to a folder beside the page, for scenes that are large for one file."""
     serve: bool = False
     """For .html: then show the page to headsets and phones in the local network, by https, until Ctrl+C."""
+    embed: tuple[str, ...] = ()
+    """For .html: origins, such as https://example.com, of pages that may move the camera of this one in a frame; with
+    --serve only they may show it in a frame."""
     title: str | None = None
     """For .html: title of the page; by default the name of the scene."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
@@ -87,6 +90,7 @@ class Export:
         from pansplat.gaussians.formats import save_scene
         from pansplat.gaussians.ply import save_points
         from pansplat.tours import write_floor_plan
+        from pansplat.web import parse_origins
 
         is_dataset = not self.out.suffix
         if is_dataset:
@@ -103,9 +107,11 @@ class Export:
         is_scene = not (is_page or is_picture or is_drawing or is_dataset or is_mesh)
         if self.points and not (is_scene and find_scene_suffix(self.out) == ".ply"):
             raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
-        if not is_page and (self.gaussians is not None or self.split or self.serve or self.title is not None):
-            names = "--gaussians, --split, --serve and --title"
+        of_page = (self.gaussians is not None, self.split, self.serve, self.embed, self.title is not None)
+        if not is_page and any(of_page):
+            names = "--gaussians, --split, --serve, --embed and --title"
             raise InputError(f"{names} are for an .html page, got {self.out}; leave them out")
+        parse_origins(self.embed)
         if self.up is not None and not is_scene_file(self.path):
             raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
         if is_dataset and (self.crop or self.rooms or not self.floaters):
@@ -268,9 +274,8 @@ class Export:
 
         title = self.title or self.path.resolve().stem.replace("_", " ")
         with progress_bar() as progress:
-            page = write_page(
-                scene, self.out, gaussians=self._count_of_page(), split=self.split, title=title, progress=progress
-            )
+            options = {"gaussians": self._count_of_page(), "split": self.split, "title": title, "embed": self.embed}
+            page = write_page(scene, self.out, **options, progress=progress)
         beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if self.split else ""
         print(
             f"{self.out}{beside}: {page.num_gaussians:,} Gaussians, {page.num_bytes / 1e6:.1f} MB; open it in a browser"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import logging
+import math
 import struct
 import warnings
 from collections.abc import Iterator
@@ -50,6 +51,7 @@ _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MAX_BYTES = 1 << 31
+_MAX_PIXELS = 178_956_970  # of Pillow: twice Image.MAX_IMAGE_PIXELS
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _JPEG_MAGIC, _JPEG_END, _PNG_MAGIC = b"\xff\xd8", b"\xff\xd9", b"\x89PNG"
 _TAIL = 4096  # bytes at the end of a file that are read to find the end of a JPEG
@@ -668,7 +670,10 @@ def _open_with_pillow(
             f"(it starts with {data[:8]!r}); convert it."
         ) from error
     except Image.DecompressionBombError as error:
-        raise InputError(f"{path}: needed at most about 13000x6500 pixels, got more ({error}); shrink it.") from error
+        rows, megapixels = math.isqrt(_MAX_PIXELS // 2), _MAX_PIXELS / 1e6
+        raise InputError(
+            f"{path}: needed at most {megapixels:.0f} megapixels ({2 * rows}x{rows}), got more ({error}); shrink it."
+        ) from error
     except InputError:
         raise
     except _DAMAGED as error:

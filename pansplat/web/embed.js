@@ -1,11 +1,13 @@
 "use strict";
 // The page in other pages and for scripts (docs/web.md, Embedding): messages, arrivals, and whose the wheel is.
+// A page may show what only its visitor can open, so messages are exchanged with stated origins only (HEADER.embed).
 
 const CALLS = ["goTo", "getPose", "setPose", "render"];  // of window.pansplat, by messages
 
 class Embed {
   constructor() {
     this.isFramed = window.parent !== window;
+    this.hosts = this.isFramed ? HEADER.embed : [];
     this.isEngaged = !this.isFramed;  // whether the wheel and vertical strokes of a finger are the page's
     this.waiting = null;              // for the end of a goTo
     this.at = null;
@@ -27,13 +29,14 @@ class Embed {
     this.tell("ready", { panoramas: api.panoramas });
   }
 
-  // Messages to the host. They hold nothing that it could not see itself.
+  // The browser delivers a message only if the host has the origin.
   tell(name, detail) {
-    if (this.isFramed) window.parent.postMessage({ pansplat: name, ...detail }, "*");
+    for (const origin of this.hosts) window.parent.postMessage({ pansplat: name, ...detail }, origin);
   }
 
-  async answer({ source, data }) {
-    if (!this.isFramed || source !== window.parent || !data || !CALLS.includes(data.pansplat)) return;
+  async answer({ source, origin, data }) {
+    if (source !== window.parent || !this.hosts.includes(origin) || !data || !CALLS.includes(data.pansplat)) return;
+    this.hosts = [origin];
     const { pansplat: call, id, values = [] } = data;
     try {
       await window.pansplat.ready;

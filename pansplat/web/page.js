@@ -14,6 +14,8 @@
   const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
   const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
   const REST_SECONDS = 4;             // at a panorama, on a tour without flights
+  const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later";  // that have all that the page uses
+  const lack = (what) => new Error(`This page needs ${what}, which is in ${BROWSERS}, unless the device lacks it.`);
   const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
   // The poster has the scale and the place of the picture that follows.
@@ -738,6 +740,13 @@
     dirty = true;
   }
 
+  // Whether the picture is final: all data is there and sorted for the camera, nothing moves or fades, and it is drawn.
+  function isSettled() {
+    const isDrawn = headset.session !== null || !dirty && drawnScale === 1, tolerance = headset.session ? SORT_DISTANCE : 0;
+    const isMoving = [flight, route, doll.flight, fade, frozen].some((each) => each !== null);
+    return isDrawn && !isMoving && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) && sorted.views.every((view) => shown[view] === 1);
+  }
+
   // Of the canvas at the full resolution.
   function fullSize() {
     const { clientWidth, clientHeight } = canvas, ratio = Math.min(devicePixelRatio || 1, 2);
@@ -918,7 +927,7 @@
   async function main() {
     placePoster();
     addEventListener("resize", placePoster);
-    if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
+    if (!window.DecompressionStream) throw lack("DecompressionStream");
     const linked = parsePose(location.hash);
     if (linked) Object.assign(camera, cameraFor(linked));
     settleAt(camera.position);
@@ -931,7 +940,7 @@
     });
     loading.catch(() => {});  // of an error that comes before it is awaited
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
-    if (!gl) throw new Error("This page needs WebGL 2, which this browser or device does not have.");
+    if (!gl) throw lack("WebGL 2");
     headset.gl = gl;
     const makeRenderer = () => {
       if (gl.isContextLost()) return;
@@ -974,6 +983,7 @@
     panoramas: HEADER.spots.map(({ name }) => name),
     getPose: () => poseOf(camera),
     setPose,
+    isSettled,
     async goTo(panorama, { jump = false } = {}) {
       const node = findNode(panorama);
       setTouring(false);

@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import html
 import io
+import ipaddress
 import json
 import math
 import os
@@ -76,6 +77,9 @@ _MAX_CAMERAS = 1024  # of a doll's house; their number has 10 bits (page.vert)
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
 
+_ORIGIN = re.compile(r"(https?)://([a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::([0-9]{1,5}))?/?")
+_DEFAULT_PORTS = {"http": 80, "https": 443}
+
 _WORKER = ("unpack.js", "sorter.js")
 _PROGRAMS = ("graph.js", "renderer.js", "xr.js", "share.js", "embed.js", "plan.js", "doll.js", "measure.js", "page.js")
 
@@ -89,12 +93,14 @@ class PageFiles:
         num_bytes: of all files.
         num_gaussians: in the page.
         degree: of its harmonics.
+        embed: origins of the pages that may frame it and exchange messages with it.
     """
 
     files: tuple[Path, ...]
     num_bytes: int
     num_gaussians: int
     degree: int
+    embed: tuple[str, ...] = ()
 
 
 @with_progress_bar
@@ -105,6 +111,7 @@ def write_page(
     gaussians: int = DEFAULT_GAUSSIANS,
     split: bool = False,
     title: str | None = None,
+    embed: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> PageFiles:
     """Write a scene as a web page.
@@ -117,12 +124,14 @@ def write_page(
         gaussians: largest number of Gaussians; similar neighbours are merged.
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
+        embed: origins of host pages that move the camera by messages (docs/web.md, Embedding).
         progress: called with a description of the current work and the completed fraction.
 
     Raises:
-        InputError: the scene has no visible Gaussians, the page would be too large, or it cannot be written.
+        InputError: the scene has no visible Gaussians, the page would be too large, `embed` holds no origins, or the
+            page cannot be written.
     """
-    path = Path(path)
+    path, embed = Path(path), parse_origins(embed)
     report: Progress = progress or (lambda what, fraction: None)
     if not 1 <= gaussians <= MAX_GAUSSIANS:
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
@@ -152,7 +161,7 @@ def write_page(
     poster = _draw_poster(scene, flights.start)
     report("writing", 0.9)
     header = _describe_scene(scene, packed, origin, flights, tour, factor)
-    header["doll"] = None
+    header |= {"embed": embed, "doll": None}
     if rooms is not None and cameras is not None:
         header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
     return _write_files(path, header, packed.content, poster, split, title or path.stem)
@@ -541,7 +550,32 @@ def _write_files(
         _remove_old_parts(folder, set(names))
     files.insert(0, path)
     total = len(page) + sum(map(len, scripts))
-    return PageFiles(tuple(files), total, count, header["degree"])
+    return PageFiles(tuple(files), total, count, header["degree"], header["embed"])
+
+
+def parse_origins(texts: Sequence[str]) -> tuple[str, ...]:
+    """Origins as browsers write them: in lower case, without the default port.
+
+    Raises:
+        InputError: a text is not an origin.
+    """
+    origins = []
+    for text in texts:
+        found = _ORIGIN.fullmatch(text.lower()) if text.isascii() else None
+        scheme, host, port = found.groups() if found else ("", "", None)
+        number = int(port or _DEFAULT_PORTS.get(scheme, 0))
+        try:
+            if not 0 < number < 1 << 16:
+                raise ValueError("no port")
+            if host.rpartition(".")[2].isdigit():
+                ipaddress.IPv4Address(host)
+        except ValueError:
+            raise InputError(
+                "`embed` must hold origins such as https://example.com or http://localhost:8000, without a path, got "
+                f"{text!r}; give the scheme and the host of the page with the frame"
+            ) from None
+        origins.append(f"{scheme}://{host}" + (f":{number}" if number != _DEFAULT_PORTS[scheme] else ""))
+    return tuple(dict.fromkeys(origins))
 
 
 def _make_folder(folder: Path) -> None:

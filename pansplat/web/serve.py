@@ -43,6 +43,7 @@ class PageServer(socketserver.ThreadingMixIn, socketserver.TCPServer):
         folder = page.files[0].parent
         self.files = {b"/" + os.fsencode(file.relative_to(folder).as_posix()): file for file in page.files}
         self.files[b"/"] = page.files[0]
+        self.ancestors = " ".join(page.embed) or "'none'"
         address = find_address()
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         with tempfile.TemporaryDirectory() as temporary:
@@ -89,6 +90,12 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     do_HEAD = do_GET
+
+    def end_headers(self) -> None:
+        """Of every answer: only stated origins may frame it, and its type is the stated one."""
+        self.send_header("Content-Security-Policy", f"frame-ancestors {self.server.ancestors}")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        super().end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
         """Print nothing."""

@@ -51,6 +51,6 @@ class Share {
     link.download = `${document.title}.png`;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 60000);
-    this.page.say("Picture saved");
+    this.page.say(window.parent === window ? "Picture saved" : "Picture saved, if the page around this frame allows downloads");
   }
 }

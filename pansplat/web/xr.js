@@ -14,7 +14,7 @@ const MIN_POINTING = 0.06;          // radians between a ray and the centre of a
 const RAY_LENGTH = 3;               // metres
 const FLOOR_SPEED = 5;              // of the way to the height of a new floor, a second
 const HEIGHT_RATIO = 1.5;           // of the head to the panorama's camera, both over their floors
-const MIN_RATE = 72;                // frames a second, if the device has a choice
+const MIN_RATE = 72, LOWEST_RATE = 60;  // frames a second: if the device has a choice, and of any device
 const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30;  // of the resolution, after so many frames
 const BUTTONS = { 4: "goHome", 5: "leave" };  // A and X, B and Y
 
@@ -79,7 +79,7 @@ class Headset {
     this.motion = 0;  // strength of the vignette
     this.pressed = new Map();
     this.isTurned = false;
-    Object.assign(this, { scale: 1, times: [], calm: 0, patience: 1, isRaised: false });
+    Object.assign(this, { scale: 1, times: [], interval: null, calm: 0, patience: 1, isRaised: false });
     session.updateRenderState({ baseLayer: this.makeLayer(session) });
     const rate = (session.supportedFrameRates || []).find((each) => each >= MIN_RATE);
     if (rate && rate !== session.frameRate) session.updateTargetFrameRate(rate).catch(() => {});
@@ -270,9 +270,14 @@ class Headset {
   adaptScale(elapsed) {
     const { session, scale, times } = this;
     times.push(elapsed);
-    if (times.length < FRAMES) return;
-    const mean = times.reduce((a, b) => a + b) / FRAMES, isLate = mean > 1.15 * 1000 / (session.frameRate || MIN_RATE);
+    const sum = times.reduce((a, b) => a + b), isKnown = session.frameRate || this.interval;
+    if (isKnown ? times.length < FRAMES : sum < 1000) return;
     this.times = [];
+    if (!isKnown) {  // the device states no rate: the median of the first second, which may be late
+      this.interval = Math.min(times.sort((a, b) => a - b)[times.length >> 1], 1000 / LOWEST_RATE);
+      return;
+    }
+    const mean = sum / FRAMES, isLate = mean > 1.15 * (session.frameRate ? 1000 / session.frameRate : this.interval);
     this.calm = isLate ? 0 : this.calm + FRAMES * mean / 1000;
     if (isLate) {
       this.scale = Math.max(scale * SCALE_STEP, MIN_SCALE);

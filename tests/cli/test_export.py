@@ -85,11 +85,19 @@ def test_a_web_page_is_written(scene: Path, tmp_path: Path, capsys: pytest.Captu
     out = tmp_path / "tour.html"
     assert run(["export", str(scene), "-o", str(out), "--gaussians", "100", "--title", "Our home"]) == 0
     assert "Gaussians" in capsys.readouterr().out
-    assert "<title>Our home</title>" in out.read_text()
+    assert "<title>Our home</title>" in out.read_text() and '"embed": []' in out.read_text()
+    assert (
+        run(["export", str(scene), "-o", str(out), "--gaussians", "100", "--embed", "https://a.org", "http://b:80"])
+        == 0
+    )
+    assert '"embed": ["https://a.org", "http://b"]' in out.read_text()
 
 
 def test_options_of_pages_are_for_pages(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--split")
+    assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--embed", "https://example.com")
+    refused = refusal("export", tmp_path / "none", "-o", tmp_path / "tour.html", "--embed", "example.com")
+    assert "got 'example.com'" in refused, "before anything is loaded"
     assert ".sog, .glb, .ply" in refusal("export", scene, "-o", tmp_path / "scene.stl")
     assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "x.spz", "--points")
     assert "--up is for a scene file" in refusal("export", tmp_path, "-o", tmp_path / "out.ply", "--up", "z")

@@ -1,5 +1,7 @@
 """Images of every format are read alike, and defects of files are reported."""
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -236,4 +238,16 @@ def test_the_size_of_an_image_is_read_without_its_pixels(tmp_path: Path, monkeyp
 def test_the_size_of_a_damaged_image_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(InputError, match=rf"a\.png: needed .* {message}"):
+        read_size(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(("rows", "is_refused"), [(9459, False), (9460, True)])
+def test_the_largest_image_is_the_largest_that_pillow_opens(tmp_path: Path, rows: int, is_refused: bool) -> None:
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", 18918, rows, 8, 2, 0, 0, 0)
+    content = struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk)) + b"\0\0\0\0IDAT"
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + content)
+    if not is_refused:
+        assert read_size(tmp_path / "a.png") == (18918, rows)
+        return
+    with pytest.raises(InputError, match=r"a\.png: needed at most 179 megapixels \(18918x9459\), got more .*shrink it"):
         read_size(tmp_path / "a.png")

@@ -33,8 +33,8 @@ def server(plain_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         server.shutdown()
 
 
-def get(server: PageServer, path: str, method: str = "GET") -> tuple[int, str | None, bytes]:
-    """Status, type and content; the certificate must be valid for the address."""
+def ask(server: PageServer, path: str, method: str = "GET") -> tuple[http.client.HTTPResponse, bytes]:
+    """The answer and its content; the certificate must be valid for the address."""
     port = server.server_address[1]
     context = ssl.create_default_context(cadata=ssl.get_server_certificate(("127.0.0.1", port)))
     connection = http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=30)
@@ -42,6 +42,12 @@ def get(server: PageServer, path: str, method: str = "GET") -> tuple[int, str | 
     answer = connection.getresponse()
     content = answer.read()
     connection.close()
+    return answer, content
+
+
+def get(server: PageServer, path: str, method: str = "GET") -> tuple[int, str | None, bytes]:
+    """Status, type and content."""
+    answer, content = ask(server, path, method)
     return answer.status, answer.getheader("Content-Type"), content
 
 
@@ -66,6 +72,21 @@ def test_the_page_and_its_parts_are_served_and_nothing_else(server: PageServer, 
     assert get(server, "/", "POST")[0] == 501
     part.unlink()
     assert get(server, f"/our%20home_files/{part.name}")[0] == 404
+
+
+@pytest.mark.parametrize("origins", [(), ("https://example.com", "http://localhost:8000")])
+def test_every_answer_forbids_frames_of_other_origins_and_guesses_of_types(
+    plain_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, origins: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
+    with PageServer(write_page(plain_scene, tmp_path / "home.html", embed=origins)) as server:
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        for path, method, status in (("/", "GET", 200), ("/", "HEAD", 200), ("/none", "GET", 404), ("/", "POST", 501)):
+            answer, _ = ask(server, path, method)
+            assert answer.status == status and answer.getheader("X-Content-Type-Options") == "nosniff"
+            ancestors = " ".join(origins) or "'none'"
+            assert answer.getheader("Content-Security-Policy") == f"frame-ancestors {ancestors}"
+        server.shutdown()
 
 
 def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(
