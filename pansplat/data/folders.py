@@ -34,6 +34,7 @@ from pansplat.data.pairs import (
     find_mask,
     list_names,
     list_panorama_files,
+    localize_pairs,
     single_view_pairs,
     too_many_panoramas,
 )
@@ -72,6 +73,8 @@ def load_pairs(
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
+    Poses are in a world of metres around its origin; `Panorama.frame` states where it is in the world of the files.
+
     Args:
         path: a panorama; a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the
             formats of docs/input.md (poses.json, nerfstudio, COLMAP, openMVG, OpenSfM, Metashape, PanoGRF, 360Loc,
@@ -90,7 +93,7 @@ def load_pairs(
         _check_blur_masks(error.panoramas)
         raise
     _check_blur_masks([view for pair in pairs for view in pair.context + pair.targets])
-    return pairs
+    return localize_pairs(pairs)
 
 
 def _check_blur_masks(panoramas: Sequence[Panorama]) -> None:

@@ -91,14 +91,14 @@ class _Coded:
 
 
 def save_scene(scene: Scene, path: str | Path) -> None:
-    """Write a scene in the format of the file's suffix, atomically.
+    """Write a scene in the format of the file's suffix, atomically, in the user's unit.
 
     Gaussians with a non-finite value are left out with a warning, and so are harmonics above the format's degree.
 
     Raises:
         InputError: unknown suffix, a scene that the format cannot hold, or a folder that cannot be written.
     """
-    path = Path(path)
+    path, scene = Path(path), scene.scaled(scene.frame.unit)
     coded = _CODED.get(find_scene_suffix(path))
     if coded is not None:
         _save_coded(scene, path, coded)
