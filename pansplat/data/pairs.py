@@ -328,27 +328,23 @@ class Collection:
 
 def localize_pairs(pairs: Sequence[Pair]) -> list[Pair]:
     """The pairs in working worlds (`WorldFrame`), one for all panoramas of a world of a folder."""
-    worlds: dict[tuple[Path, int], dict[Path, Panorama]] = {}
-    nears: dict[tuple[Path, int], float] = {}
+    worlds: dict[tuple[Path, int], list[tuple[Tensor, float]]] = {}
     for pair in pairs:
         for view in pair.context + pair.targets:
-            key = pair.folder, view.world
-            worlds.setdefault(key, {})[view.image] = view
-            nears[key] = min(nears.get(key, pair.near), pair.near)
+            worlds.setdefault((pair.folder, view.world), []).append((view.cam2world, pair.near))
     frames = {
-        key: choose_frame(torch.stack([view.cam2world for view in views.values()]), nears[key])
-        for key, views in worlds.items()
+        key: choose_frame(torch.stack([pose for pose, _ in found]), min(near for _, near in found))
+        for key, found in worlds.items()
     }
-
-    def localize(pair: Pair) -> Pair:
+    localized = []
+    for pair in pairs:
         context, targets = (
             tuple(view.in_frame(frames[pair.folder, view.world]) for view in part)
             for part in (pair.context, pair.targets)
         )
-        unit = context[0].frame.unit
-        return replace(pair, context=context, targets=targets, near=pair.near / unit, far=pair.far / unit)
-
-    return [localize(pair) for pair in pairs]
+        near, far = (bound / context[0].frame.unit for bound in (pair.near, pair.far))
+        localized.append(replace(pair, context=context, targets=targets, near=near, far=far))
+    return localized
 
 
 def single_view_pairs(

@@ -16,6 +16,7 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas, uv_from_directions
+from pansplat.geometry.world import require_working_world
 from pansplat.model.base import Network
 from pansplat.model.heads import TileGaussians, merge_tiles
 from pansplat.model.layers import Compat, Precision, require_views

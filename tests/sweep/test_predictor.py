@@ -12,6 +12,7 @@ from torch import Tensor
 
 import pansplat
 from pansplat.data.pairs import Pair
+from pansplat.errors import InputError
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
