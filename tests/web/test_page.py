@@ -275,9 +275,7 @@ def test_large_pages_have_a_lower_degree_of_harmonics(
     assert write_page(scene, tmp_path / "tour.html").degree == 0
 
 
-def test_a_page_of_another_unit_shows_lengths_in_it_and_is_otherwise_that_of_metres(
-    flat: Scene, tmp_path: Path
-) -> None:
+def test_a_page_of_another_unit_is_that_of_metres_but_for_the_lengths_it_shows(flat: Scene, tmp_path: Path) -> None:
     write_page(flat, tmp_path / "metres.html")
     write_page(dataclasses.replace(flat, frame=WorldFrame(1e3)), tmp_path / "millimetres.html")
     metres, millimetres = (read_header(tmp_path / f"{name}.html") for name in ("metres", "millimetres"))
