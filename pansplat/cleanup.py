@@ -23,7 +23,6 @@ from pansplat.errors import InputError
 from pansplat.gaussians.crop import Box, crop, keep_gaussians
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pad_equirect, row_weights, uv_from_directions
-from pansplat.geometry.world import working_factor
 from pansplat.pipeline import render
 from pansplat.rendering import rasterize
 from pansplat.tours import make_graph
@@ -211,7 +210,6 @@ def find_floaters(scene: Scene) -> Bool[Tensor, "n"]:
     it, such as a distant tree before the sky, is kept. In a scene without input cameras, Gaussians float whose
     neighbours are far, relative to the neighbours' own ones and to their size.
     """
-    scene = scene.scaled(working_factor(scene.near))  # the rasterisers have thresholds in metres
     gaussians = scene.gaussians
     means = gaussians.means.double().cpu().numpy()
     finite = np.flatnonzero(np.isfinite(means).all(axis=1))

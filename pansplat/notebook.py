@@ -110,7 +110,6 @@ def _reduce(scene: Scene, count: int) -> Scene:
     """
     import torch
 
-    from pansplat.geometry.world import working_factor
     from pansplat.refinement.budget import merge_to
 
     if len(scene.gaussians) <= count:
@@ -119,9 +118,8 @@ def _reduce(scene: Scene, count: int) -> Scene:
         raise InputError(f"`gaussians` must be at least 1, got {count}")
     if int(scene.gaussians.views.max()) >= len(scene.cam2world):
         return _choose(scene, count)
-    factor = working_factor(scene.near)
     with torch.no_grad():
-        return merge_to(_choose(scene, _MAX_MERGERS * count).scaled(factor), _MERGE_SIZE, count).scaled(1 / factor)
+        return merge_to(_choose(scene, _MAX_MERGERS * count), _MERGE_SIZE, count)
 
 
 def _choose(scene: Scene, count: int) -> Scene:

@@ -31,7 +31,6 @@ from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.ply import save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
-from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.model.layers import Precision
 from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
 from pansplat.poses.estimate import estimate_poses
@@ -448,7 +447,7 @@ def _run_refinement(
     scene: Scene, views: Views, config: RefineConfig | None, seed: int, **run: Any
 ) -> tuple[Scene, RefineReport]:
     """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`."""
-    refinement = Refinement(scene, views, config, seed=seed)
+    refinement = Refinement(scene, views.in_frame(scene.frame), config, seed=seed)
     if run["steps"] is None and run["seconds"] is None:
         run["seconds"] = choose_refine_seconds(None if config is None else config.gaussians, joint=scene.joint)
     report = refinement.run(**run)
@@ -552,7 +551,7 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
         part = select_views(scene, nodes)
         if len(nodes) > 1:
             pair = tour.make_pair(nodes)
-            views = replace(pair.load_context(scene.height), cam2world=part.cam2world)
+            views = replace(pair.load_context(scene.height), cam2world=part.cam2world, frame=part.frame)
             if refine_seconds:
                 refinement = Refinement(fuse_views(part), views)
                 refinement.run(
@@ -644,7 +643,8 @@ def render(
 
     Args:
         scene: the Gaussians and their input cameras.
-        cam2world: pose of the camera, OpenCV axes, metres.
+        cam2world: pose of the camera, OpenCV axes, in the world of `scene.cam2world`; `scene.frame.localize` brings a
+            pose of the user's world there.
         blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; in a scene of
             a tour, those of the views at the nearest edge, and other views of its part fill their holes. "joint"
             renders all Gaussians together, of a tour those of the part; a number renders those of one view only. By
@@ -672,14 +672,6 @@ def render(
             torch.cat([getattr(eye, name) for eye in both], dim=-2) for name in ("color", "alpha", "depth")
         )
         return Rendering(color, alpha, depth)
-    factor = working_factor(scene.near)
-    if factor != 1:  # the rasterisers have thresholds in metres
-        for name, power in (("near", 1), ("eye_offset", 1), ("covariances", 2)):
-            if raster.get(name) is not None:
-                raster[name] = raster[name] * factor**power
-        options: dict[str, Any] = {"blend": blend, "size": size, "layout": layout, "drawing": drawing, **raster}
-        rendering = render(scene.scaled(factor), scale_poses(pose, factor), **options)
-        return replace(rendering, depth=rendering.depth / factor)
     if blend is None:
         blend = "joint" if scene.joint else "deferred"
     if size is None:
@@ -725,7 +717,7 @@ def _choose_rasterizer(
 
 
 def save(scene: Scene, path: str | Path) -> None:
-    """Write a scene in the format of the file's suffix (docs/formats.md), atomically.
+    """Write a scene in the format of the file's suffix (docs/formats.md), atomically, in the user's unit.
 
     Raises:
         InputError: unknown suffix, a scene that the format cannot hold, or a folder that cannot be written.
@@ -734,7 +726,7 @@ def save(scene: Scene, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> Scene:
-    """Read a scene file of `save` or of another tool (docs/formats.md).
+    """Read a scene file of `save` or of another tool (docs/formats.md); it is brought to a unit near metres.
 
     Raises:
         InputError: unknown suffix, or a missing or damaged file.
@@ -777,4 +769,5 @@ def _make_scene(
         gains=content.gains,
         starts=list_starts(panoramas),
         joint=joint,
+        frame=views.frame,
     )

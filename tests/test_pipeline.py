@@ -1,6 +1,9 @@
 """Predict into memory or a file, render, save and load."""
 
+import json
+import math
 import os
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -423,3 +426,77 @@ def test_a_photograph_alone_is_refused_by_a_model_that_needs_two(pair_folder: Pa
             run_prediction(single, weights)
     with pytest.raises(InputError, match=r"left: pansplat needed 2"):
         predict(single.load_context(64), weights)
+
+
+FRAMES = {"metres": (1.0, 0.0), "millimetres": (1e3, 0.0), "UTM": (1.0, 5e6), "UTM in millimetres": (1e3, 5e9)}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """A function from a name of `FRAMES` to the folder of the living room in this frame."""
+    parent, sample = tmp_path_factory.mktemp("rooms"), Path(__file__).parents[1] / "assets" / "living_room"
+
+    def write(name: str) -> Path:
+        folder, (unit, origin) = parent / name, FRAMES[name]
+        if not folder.exists():
+            shutil.copytree(sample, folder)
+            content = json.loads((folder / "poses.json").read_text())
+            content["near"], content["far"] = unit * content["near"], unit * content["far"]
+            for entry in content["poses"].values():
+                for row, axis in zip(entry["cam2world"][:3], (1, -0.1, 0.01), strict=True):
+                    row[3] = unit * row[3] + axis * origin
+            (folder / "poses.json").write_text(json.dumps(content))
+        return folder
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def scene_in_metres(room: Callable[[str], Path]) -> Scene:
+    return predict(room("metres"), "sweep", height=64, cache=False)
+
+
+@pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
+def test_the_unit_and_the_origin_of_the_poses_do_not_change_the_picture(
+    name: str, room: Callable[[str], Path], scene_in_metres: Scene, tmp_path: Path
+) -> None:
+    folder, size = room(name), (64, 128)
+    scene = predict(folder, "sweep", height=64, cache=False)
+    ours = [render(scene_in_metres, scene_in_metres.pose_between(at), size=size).color for at in (0.0, 0.5)]
+    theirs = [render(scene, scene.pose_between(at), size=size).color for at in (0.0, 0.5)]
+    target = load_pairs(room("metres"))[0].load_targets(64).images[0]
+    errors = [float((picture[1] - target).square().mean()) for picture in (ours, theirs)]
+    assert abs(10 * math.log10(errors[0] / errors[1])) < 0.01, "dB, of the pictures at half the way"
+    for expected, found in zip(ours, theirs, strict=True):
+        assert float((expected - found).square().mean()) < 1e-4, "40 dB"
+    pose = json.loads((folder / "poses.json").read_text())["poses"]["left.jpg"]["cam2world"]
+    users, unit = torch.tensor(pose, dtype=torch.float64), FRAMES[name][0]
+    suffixes = ("ply", "glb", "compressed.ply", "sog", *(["spz"] if unit == 1 else []))  # .spz ends at 2048
+    for file in (f"scene.{suffix}" for suffix in suffixes):
+        save(scene, tmp_path / file)
+        loaded = load(tmp_path / file)
+        torch.testing.assert_close(loaded.frame.globalize(loaded.cam2world)[0], users, rtol=1e-12, atol=1e-7)
+        again = render(loaded, loaded.frame.localize(users), size=size).color
+        limit = 1e-4 if file in ("scene.ply", "scene.glb") else 1e-3
+        assert float((again - ours[0]).square().mean()) < limit, file
+    entry = json.loads((tmp_path / "scene.ply").read_bytes().split(b"comment pansplat ", 1)[1].split(b"\n", 1)[0])
+    assert entry["near"] == pytest.approx(0.45 * unit) and ("origin" in entry) == (FRAMES[name][1] > 0)
+    (tmp_path / "pose.json").write_text(json.dumps(users.tolist()))
+    command = ["render", str(tmp_path / "scene.ply"), "--pose", str(tmp_path / "pose.json"), "--height", "64"]
+    assert run([*command, "-o", str(tmp_path / "view.png")]) == 0
+    drawn = torch.from_numpy(np.array(Image.open(tmp_path / "view.png"))).permute(2, 0, 1) / 255
+    assert float((drawn - ours[0].clamp(0, 1)).square().mean()) < 1e-4
+
+
+def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin(
+    room: Callable[[str], Path], tmp_path: Path
+) -> None:
+    (pair,) = load_pairs(room("UTM"))
+    views = pair.load_context(64)
+    scene = predict(views, "sweep")
+    x, y, z = scene.frame.origin
+    frame = replace(scene.frame, origin=(x - 512.0, y, z))
+    moved = replace(views, frame=frame, cam2world=frame.localize(scene.frame.globalize(scene.cam2world)))
+    assert float((moved.cam2world - scene.cam2world).abs().max()) == 512
+    refined = pipeline.refine(scene, moved, steps=1)
+    assert refined.frame == scene.frame and torch.equal(refined.cam2world, scene.cam2world)

@@ -310,8 +310,10 @@ def _write_film(
             with open_frames(create, loaded.scene, scenes, load, pixels, settings, format_) as frames:
                 if path is not None:
                     assert options.out is not None
-                    level = create_level_camera(loaded.scene, tour)
-                    for file in write_path_film(frames, path, level, options.out, options.fps, show_progress):
+                    level, frame = create_level_camera(loaded.scene, tour), loaded.scene.frame
+                    for file in write_path_film(
+                        frames, path.map_places(frame.localize_places), level, options.out, options.fps, show_progress
+                    ):
                         show_file(file)
                 elif isinstance(frames, TourFrames):
                     assert scenes is not None

@@ -151,6 +151,7 @@ class SceneFrames:
     Attributes:
         image_format: of the frames.
         tour: None.
+        unit: see `pansplat.geometry.world.WorldFrame`.
     """
 
     tour = None
@@ -166,7 +167,7 @@ class SceneFrames:
         """Upload the scene; `size` is (width, height) of one eye, pixels."""
         renderer.upload(scene)
         self._renderer, self._size = renderer, size
-        self._settings = fit_settings(settings, scene)
+        self._settings, self.unit = fit_settings(settings, scene), scene.frame.unit
         self.image_format = image_format or ImageFormat()
 
     def draw(
@@ -188,6 +189,7 @@ class TourFrames:
     Attributes:
         image_format: of the frames.
         tour: the graph.
+        unit: see `pansplat.geometry.world.WorldFrame`.
     """
 
     def __init__(
@@ -212,7 +214,7 @@ class TourFrames:
         self.image_format, self.tour = image_format or ImageFormat(), scenes.tour
         self._renderers, self._scenes, self._load, self._size = renderers, scenes, load, size
         self._settings = replace(settings, near=NEAR_OF_FAR * scenes.tour.far)
-        self._fade = CrossFade()
+        self._fade, self.unit = CrossFade(), scenes.tour.panoramas[0].frame.unit
 
     def draw(
         self, pose: Float[np.ndarray, "4 4"], vertical_fov_degrees: float, now: float, *, with_depth: bool = False
@@ -384,6 +386,7 @@ def write_path_film(
     else:
         for frame in range(num_frames):
             color, depth = draw(frame, with_depth=file.suffix.lower() == ".exr")
+            depth = None if depth is None else depth * frames.unit
             written.append(name_frame(file, frame))
             write_image(written[-1], color, depth=depth, panorama=(projection, stereo) == ("equirect", "mono"))
     progress("done", 1.0)

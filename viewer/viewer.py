@@ -18,6 +18,7 @@ from pansplat.errors import InputError
 from pansplat.files import find_scene_suffix
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
+from pansplat.geometry.world import USER_FRAME
 from pansplat.tours import list_starts, plan_route
 from pansplat_viewer.capture import (
     find_free_name,
@@ -752,7 +753,8 @@ class Viewer:
         if source is not None:
             panoramas = entry.panoramas if entry.pair is None else entry.pair.context
             poses = torch.stack([panorama.cam2world for panorama in panoramas])
-            scene = Scene(empty_gaussians(), poses, source.near, source.far, starts=list_starts(panoramas))
+            starts, frame = list_starts(panoramas), panoramas[0].frame
+            scene = Scene(empty_gaussians(), poses, source.near, source.far, starts=starts, frame=frame)
             if entry.tour is None:
                 enter_scene(self.state, scene, at=self._at)
             else:
@@ -1002,12 +1004,15 @@ class Viewer:
 
     def _execute_path(self, commands: Commands, size: tuple[int, int], now: float) -> None:
         """Save, load and film the camera path."""
+        frame = USER_FRAME if self._loaded is None else self._loaded.scene.frame
         try:
             if commands.save_path is not None:
-                write_path(self.state.path, Path(commands.save_path).expanduser())
+                users = self.state.path.map_places(frame.globalize_places)
+                write_path(users, Path(commands.save_path).expanduser())
                 self.state.show_message(f"wrote {commands.save_path}", now)
             elif commands.open_path is not None:
-                self.state.path = read_path(Path(commands.open_path).expanduser())
+                users = read_path(Path(commands.open_path).expanduser())
+                self.state.path = users.map_places(frame.localize_places)
                 self.state.path_seconds, self.state.path_playing = 0.0, False
             elif commands.film:
                 self._start_film(size)
@@ -1059,7 +1064,7 @@ class Viewer:
             else:
                 self.renderer.render(self.state.camera.cam2world, size, settings, wait=True)
                 color = self.renderer.read_color()[..., :3]
-                depth = self.renderer.read_depth() if suffix == "exr" else None
+                depth = self._loaded.scene.frame.unit * self.renderer.read_depth() if suffix == "exr" else None
             path = write_screenshot(
                 self._folder / self._loaded.entry.folder_name,
                 suffix,

@@ -141,7 +141,7 @@ class Export:
             print(f"{self.out}: the floors of {len(scene.cam2world)} panoramas")
         else:
             if self.points:
-                save_points(scene.gaussians, self.out)
+                save_points(scene, self.out)
             else:
                 save_scene(scene, self.out)
             size, count = self.out.stat().st_size, len(scene.gaussians)
@@ -178,13 +178,19 @@ class Export:
 
         `layers` is the scene with all that each panorama shows, if `scene` is not.
         """
+        import torch
+
         from pansplat.cleanup import Cleaning, clean_up
         from pansplat.gaussians.scene import prune
 
         if self.up is not None:
             turn = _rotation_from(self.up)
             scene, layers = scene.rotated(turn), None if layers is None else layers.rotated(turn)
-        cleaning = Cleaning(self.rooms, self.crop, self.floaters, self.min_opacity)
+        box = self.crop
+        if box is not None:
+            corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
+            box = tuple(scene.frame.localize_places(corners).flatten().tolist())
+        cleaning = Cleaning(self.rooms, box, self.floaters, self.min_opacity)
         try:
             with progress_bar() as progress:
                 scene, changes = clean_up(scene, cleaning, layers, progress)
@@ -251,12 +257,13 @@ class Export:
         panoramas = source.context if isinstance(source, Pair) else source.panoramas
         views = [
             PosedPanorama(panorama, pose, source.siblings)
-            for panorama, pose in zip(panoramas, scene.cam2world, strict=True)
+            for panorama, pose in zip(panoramas, scene.frame.globalize(scene.cam2world), strict=True)
         ]
-        means, colors = gaussians.means.double().cpu().numpy(), make_colors(gaussians).cpu().numpy()
+        means = scene.frame.globalize_places(gaussians.means).cpu().numpy()
+        colors = make_colors(gaussians).cpu().numpy()
         with replacing_folder(self.out) as folder, progress_bar() as progress:
             count = write_dataset(folder, views, means, colors, progress)
-            save_points(gaussians.rotated(Z_UP[:3, :3]), folder / POINTS)
+            save_points(dataclasses.replace(scene, gaussians=gaussians).rotated(Z_UP[:3, :3]), folder / POINTS)
         print(
             f"{self.out}: {count} cube faces of {len(views)} panoramas, {len(gaussians):,} points; sparse/0 is a model "
             "of COLMAP, transforms.json is for nerfstudio"

@@ -34,6 +34,7 @@ class Info:
         from pansplat import pipeline
 
         scene = pipeline.load(self.path)
+        scene = scene.scaled(scene.frame.unit)
         gaussians = scene.gaussians
         print(f"{self.path}: {len(gaussians):,} Gaussians, SH degree {gaussians.degree}")
         if scene.model:
@@ -51,6 +52,8 @@ class Info:
         low, high = gaussians.means.amin(dim=0).tolist(), gaussians.means.amax(dim=0).tolist()
         axes = (f"{axis} {a:.4g} to {b:.4g} m" for axis, a, b in zip("xyz", low, high, strict=True))
         print("bounds          " + ", ".join(axes))
+        if any(scene.frame.origin):
+            print(f"origin          at ({', '.join(f'{x:.15g}' for x in scene.frame.origin)}) m")
         for index, pose in enumerate(scene.cam2world):
             name = scene.names[index] if index < len(scene.names) else ""
             position = ", ".join(f"{x:.6g}" for x in pose[:3, 3].tolist())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,6 +84,7 @@ class Render:
                 f"{self.pose} holds {len(poses)} poses; write an .mp4 or .webm, or keep one pose in the file"
             )
         scene = self.prediction.open(self.path)
+        poses = None if poses is None else [scene.frame.localize(pose) for pose in poses]
         layout = self.layout or ("perspective" if self._is_video and not self.stereo else "equirect")
         options = self._render_options(layout, self.height or self._choose_height(layout, scene))
         size = f"{options['size'][1]}x{options['size'][0] * (2 if self.stereo else 1)}"
@@ -100,10 +100,11 @@ class Render:
         with torch.no_grad():
             image = pipeline.render(scene, pose, **options)
         panorama = layout != "perspective" and not self.stereo  # GPano has no property for stereo
+        depth = image.depth * scene.frame.unit
         if self.depth:
-            write_depth(self.out, image.depth, panorama=panorama)
+            write_depth(self.out, depth, panorama=panorama)
         else:
-            depth = image.depth if self.out.suffix.lower() == ".exr" else None
+            depth = depth if self.out.suffix.lower() == ".exr" else None
             write_image(self.out, image.color, depth=depth, panorama=panorama)
         print(f"{self.out}: {size}, {layout}")
         return 0
@@ -169,18 +170,12 @@ class Render:
 
 def _plan_flight(scene: Scene) -> Route | None:
     """The flight through a tour of several parts; None for another scene. Between parts there is nothing to see."""
-    from pansplat.geometry.world import scale_poses, working_factor
     from pansplat.tours import make_graph, plan_route
 
     if not scene.overlaps:
         return None
-    factor = working_factor(scene.near)
-    poses = scale_poses(scene.cam2world, factor)
-    tour = make_graph(dataclasses.replace(scene, cam2world=poses, near=scene.near * factor, far=scene.far * factor))
-    if not max(tour.parts):
-        return None
-    route = plan_route(tour, tour.plan_walk())
-    return dataclasses.replace(route, positions=route.positions / factor)
+    tour = make_graph(scene)
+    return plan_route(tour, tour.plan_walk()) if max(tour.parts) else None
 
 
 def read_poses(path: Path) -> list[Tensor]:

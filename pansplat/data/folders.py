@@ -36,6 +36,7 @@ from pansplat.data.pairs import (
     find_mask,
     list_names,
     list_panorama_files,
+    localize_pairs,
     single_view_pairs,
     too_many_panoramas,
 )
@@ -76,6 +77,8 @@ def load_pairs(
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
+    Poses are in a world of metres around its origin; `Panorama.frame` states where it is in the world of the files.
+
     Args:
         path: a panorama; a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the
             formats of docs/input.md (poses.json, nerfstudio, COLMAP, openMVG, OpenSfM, Metashape, PanoGRF, 360Loc,
@@ -95,7 +98,7 @@ def load_pairs(
         require_known_masks(root, error.panoramas)
         raise
     require_known_masks(root, [view for pair in pairs for view in pair.context + pair.targets])
-    return pairs
+    return localize_pairs(pairs)
 
 
 def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:

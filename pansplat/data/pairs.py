@@ -20,7 +20,7 @@ from pansplat.data.placements import PLACED, Placement
 from pansplat.data.views import CAMERA_HEIGHT, Views
 from pansplat.descriptions import describe_range, list_first
 from pansplat.errors import InputError, InputWarning
-from pansplat.geometry.world import require_depth_range, working_factor
+from pansplat.geometry.world import USER_FRAME, WorldFrame, choose_frame, require_depth_range
 
 NEAR, FAR = 0.45, 10.0  # metres; depth range of the official indoor data (docs/official.md, section 2.1)
 FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, sections 2.2 and 2.3)
@@ -28,7 +28,7 @@ FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, s
 MAX_CONTEXT = 64  # context panoramas of a pair
 
 _MAX_NAMES = 20  # in a note
-_COINCIDENT = 1e-3  # metres, in a world of metres
+_COINCIDENT = 1e-3  # metres
 _MATCHING_SECONDS = 2.0  # for two panoramas of 512 rows on two cores
 
 
@@ -67,6 +67,7 @@ class Panorama:
         start: yaw and pitch, as of a link, of the view that a visitor sees first; None if there is none.
         camera_height: over the floor, metres; the scale of a scene of this panorama alone.
         placement: how the pose was found, or why there is none.
+        frame: where the world of the pose is in the user's world, that of files.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Panorama:
     start: tuple[float, float] | None = None
     camera_height: float = CAMERA_HEIGHT
     placement: Placement = PLACED
+    frame: WorldFrame = USER_FRAME
 
     def __repr__(self) -> str:
         position = ", ".join(f"{x:.3g}" for x in self.cam2world[:3, 3].tolist())
@@ -91,6 +93,10 @@ class Panorama:
     def label(self) -> str:
         """The title, or the name if there is none."""
         return self.title or self.name
+
+    def in_frame(self, frame: WorldFrame) -> Panorama:
+        """The panorama in the world of another frame."""
+        return replace(self, cam2world=frame.localize(self.frame.globalize(self.cam2world)), frame=frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +147,7 @@ class Pair:
         centres = torch.stack([panorama.cam2world[:3, 3] for panorama in self.context])
         if len(self.context) > MAX_CONTEXT:
             raise too_many_panoramas(self.name, len(self.context))
-        if len(centres) > 1 and float(torch.pdist(centres).min()) < _COINCIDENT / working_factor(self.near):
+        if len(centres) > 1 and float(torch.pdist(centres).min()) < _COINCIDENT:
             warnings.warn(
                 f"{self.name}: cameras of the context views coincide (less than 1 mm apart); "
                 "depth cannot be estimated without a baseline, and only rotations of the camera will look right. "
@@ -171,7 +177,8 @@ class Pair:
                     f"{panorama.mask or panorama.image}: needed some pixels that show the scene (white in a mask, "
                     "opaque in an image), got none; invert the mask or remove the alpha channel."
                 )
-        depths = [read_depth(p.depth, height) for p in panoramas if p.depth is not None]
+        frame = panoramas[0].frame if panoramas else USER_FRAME
+        depths = [read_depth(p.depth, height) / frame.unit for p in panoramas if p.depth is not None]
         no_poses = torch.empty(0, 4, 4, dtype=torch.float64)
         return Views(
             images=images,
@@ -182,6 +189,7 @@ class Pair:
             names=tuple(p.name for p in panoramas),
             camera_height=panoramas[0].camera_height if panoramas else CAMERA_HEIGHT,
             depths=torch.stack(depths) if depths and len(depths) == len(panoramas) else None,
+            frame=frame,
         )
 
     def _scene_mask(self, panorama: Panorama, height: int) -> Bool[Tensor, "height width"]:
@@ -316,6 +324,27 @@ class Collection:
             parent[distance_to_new < distance] = new
             distance = torch.minimum(distance, distance_to_new)
         return sorted(edges)
+
+
+def localize_pairs(pairs: Sequence[Pair]) -> list[Pair]:
+    """The pairs in working worlds (`WorldFrame`), one for all panoramas of a world of a folder."""
+    worlds: dict[tuple[Path, int], list[tuple[Tensor, float]]] = {}
+    for pair in pairs:
+        for view in pair.context + pair.targets:
+            worlds.setdefault((pair.folder, view.world), []).append((view.cam2world, pair.near))
+    frames = {
+        key: choose_frame(torch.stack([pose for pose, _ in found]), min(near for _, near in found))
+        for key, found in worlds.items()
+    }
+    localized = []
+    for pair in pairs:
+        context, targets = (
+            tuple(view.in_frame(frames[pair.folder, view.world]) for view in part)
+            for part in (pair.context, pair.targets)
+        )
+        near, far = (bound / context[0].frame.unit for bound in (pair.near, pair.far))
+        localized.append(replace(pair, context=context, targets=targets, near=near, far=far))
+    return localized
 
 
 def single_view_pairs(

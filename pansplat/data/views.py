@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.errors import InputError
+from pansplat.geometry.world import USER_FRAME, WorldFrame
 
 CAMERA_HEIGHT = 1.5  # metres over the floor, if it is not known; tripods of tours stand at 1.3 to 1.6 m
 
@@ -27,6 +28,7 @@ class Views:
         names: one per view, for messages and file names.
         depths: radial distance in metres, 0 where unknown; None when the data set has no depth.
         camera_height: over the floor, metres; the scale of a single view.
+        frame: where the world of the poses is in the user's world, that of files.
     """
 
     images: Float[Tensor, "view 3 height width"]
@@ -37,6 +39,7 @@ class Views:
     names: tuple[str, ...]
     depths: Float[Tensor, "view height width"] | None = None
     camera_height: float = CAMERA_HEIGHT
+    frame: WorldFrame = USER_FRAME
 
     def __repr__(self) -> str:
         count, _, height, width = self.images.shape
@@ -50,6 +53,20 @@ class Views:
         if self.depths is not None:
             parts.append("with depths")
         return f"<Views: {', '.join(parts)}>"
+
+    def in_frame(self, frame: WorldFrame) -> Views:
+        """The views in the world of another frame, such as that of a scene file."""
+        if frame == self.frame:
+            return self
+        factor = self.frame.unit / frame.unit
+        return replace(
+            self,
+            cam2world=frame.localize(self.frame.globalize(self.cam2world)),
+            near=self.near * factor,
+            far=self.far * factor,
+            depths=None if self.depths is None else self.depths * factor,
+            frame=frame,
+        )
 
 
 def select_views(views: Views, indices: Sequence[int]) -> Views:

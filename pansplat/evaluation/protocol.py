@@ -236,7 +236,8 @@ def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
                 for view, pose in enumerate(context.cam2world)
             ]
         depth = torch.stack(depths)
-    return depth_errors(depth, context.depths, context.near, context.far)
+    unit = context.frame.unit
+    return depth_errors(depth * unit, context.depths * unit, context.near * unit, context.far * unit)
 
 
 ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"]

@@ -71,8 +71,10 @@ def crop(scene: Scene, box: Box) -> Scene:
     cropped = keep_gaussians(scene, is_inside, views or None)
     if not len(cropped.gaussians):
         finite = scene.gaussians.means[torch.isfinite(scene.gaussians.means).all(dim=1)]
-        found = "no Gaussian" if not len(finite) else f"a scene from {_list(finite.amin(0))} to {_list(finite.amax(0))}"
-        low, high = _sort_corners(box)
+        found, users = "no Gaussian", scene.frame.globalize_places
+        if len(finite):
+            found = f"a scene from {_list(users(finite.amin(0)))} to {_list(users(finite.amax(0)))}"
+        low, high = map(users, _sort_corners(box))
         raise InputError(
             f"needed a box with Gaussians, got {_list(low)} to {_list(high)} m and {found}; choose another"
         )

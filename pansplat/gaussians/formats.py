@@ -15,6 +15,7 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ import numpy as np
 import torch
 
 from pansplat.atomic import replacing
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.files import find_scene_suffix, read_file, require_file
 from pansplat.gaussians.gltf import load_glb, save_glb
 from pansplat.gaussians.ply import COMMENT_PREFIX, find_entry, format_plain_ply, load_ply, read_ply, save_ply
@@ -91,14 +92,14 @@ class _Coded:
 
 
 def save_scene(scene: Scene, path: str | Path) -> None:
-    """Write a scene in the format of the file's suffix, atomically.
+    """Write a scene in the format of the file's suffix, atomically, in the user's unit.
 
     Gaussians with a non-finite value are left out with a warning, and so are harmonics above the format's degree.
 
     Raises:
         InputError: unknown suffix, a scene that the format cannot hold, or a folder that cannot be written.
     """
-    path = Path(path)
+    path, scene = Path(path), scene.scaled(scene.frame.unit)
     coded = _CODED.get(find_scene_suffix(path))
     if coded is not None:
         _save_coded(scene, path, coded)
@@ -151,6 +152,10 @@ def _save_coded(scene: Scene, path: Path, coded: _Coded) -> None:
     content = _encode(gaussians.rotated(Y_UP) if coded.y_up else gaussians, path, coded)
     if coded.insert_entry is not None:
         content = coded.insert_entry(content, format_entry(scene, find_label_runs(gaussians)))
+    elif any(scene.frame.origin):
+        origin = ", ".join(f"{x:.15g}" for x in scene.frame.origin)
+        message = f"{path}: positions are relative to ({origin}), which the format does not hold"
+        warnings.warn(message, InputWarning, stacklevel=4)
     with replacing(path) as partial:
         partial.write_bytes(content)
 

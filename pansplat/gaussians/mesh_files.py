@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
@@ -23,6 +24,7 @@ from pansplat.atomic import replacing
 from pansplat.errors import InputError
 from pansplat.gaussians.gltf import write_glb
 from pansplat.gaussians.scene_files import Y_UP
+from pansplat.geometry.world import USER_FRAME, WorldFrame
 
 MESH_SUFFIXES = (".obj", ".glb")
 
@@ -54,9 +56,15 @@ class MeshPart:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A surface of textured parts."""
+    """A surface of textured parts.
+
+    Attributes:
+        parts: one of each panorama.
+        frame: where their world is in the user's world, that of files.
+    """
 
     parts: tuple[MeshPart, ...]
+    frame: WorldFrame = USER_FRAME
 
     @property
     def num_triangles(self) -> int:
@@ -102,7 +110,8 @@ def _save_obj(mesh: Mesh, path: Path) -> tuple[Path, ...]:
         file.write(f"# pansplat; metres, y up\nmtllib {materials.name}\n")
         for number, part in enumerate(mesh.parts):
             file.write(f"o view_{number}\nusemtl view_{number}\n")
-            np.savetxt(file, part.positions @ Y_UP.numpy(), "v %.4f %.4f %.4f")
+            places = mesh.frame.globalize_places(torch.from_numpy(part.positions)) @ Y_UP
+            np.savetxt(file, places.numpy(), "v %.4f %.4f %.4f")
             np.savetxt(file, part.uv * (1, -1) + (0, 1), "vt %.6f %.6f")  # v up
             corners = np.repeat(part.triangles + first, 2, axis=1)  # position and texture have one number
             np.savetxt(file, corners, "f %d/%d %d/%d %d/%d")
@@ -112,8 +121,10 @@ def _save_obj(mesh: Mesh, path: Path) -> tuple[Path, ...]:
 
 def _save_glb(mesh: Mesh, path: Path) -> tuple[Path, ...]:
     blocks: list[bytes] = []
+    # float32 does not hold large positions: they are relative to the origin.
+    extras = {"extras": {"pansplat": {"origin": mesh.frame.origin}}} if any(mesh.frame.origin) else {}
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "pansplat"},
+        "asset": {"version": "2.0", "generator": "pansplat", **extras},
         "extensionsUsed": [_UNLIT],
         "scene": 0,
         "scenes": [{"nodes": [*range(len(mesh.parts))]}],
@@ -136,7 +147,7 @@ def _save_glb(mesh: Mesh, path: Path) -> tuple[Path, ...]:
         return len(lists["accessors"]) - 1
 
     for number, part in enumerate(mesh.parts):
-        positions = (part.positions @ Y_UP.numpy()).astype(np.float32)
+        positions = (mesh.frame.unit * part.positions @ Y_UP.numpy()).astype(np.float32)
         bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
         primitive = {
             "attributes": {

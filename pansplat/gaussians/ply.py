@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
+from operator import methodcaller
 from pathlib import Path
 from typing import BinaryIO
 
@@ -80,7 +81,7 @@ def format_plain_ply(gaussians: Gaussians) -> bytes:
 
 
 def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -> int:
-    """Write parts one after another, atomically, with one part in memory at a time.
+    """Write parts one after another, atomically, in the user's unit, with one part in memory at a time.
 
     Gaussians with a non-finite value are left out with a warning.
 
@@ -95,9 +96,10 @@ def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -
         InputError: when the folder does not exist or cannot be written.
         ValueError: a part has another degree than the first.
     """
-    path = Path(path)
+    path, unit = Path(path), scene.frame.unit
+    scene = scene.scaled(unit)
     with replacing(path) as partial:
-        rest = iter(parts)
+        rest = map(methodcaller("scaled", unit), parts)  # keeps no reference to a part
         first = [next(rest, scene.gaussians.select(scene.gaussians.levels < 0))]
         coefficients = first[0].harmonics.shape[1]
         size = len(_format_header(scene, [], coefficients)) + _RUNS_SPACE
@@ -167,16 +169,21 @@ def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, si
     return (begin + " " * (size - len(begin) - len(end)) + end).encode("ascii")
 
 
-def save_points(gaussians: Gaussians, path: str | Path) -> None:
-    """Write the means as a .ply point cloud, atomically: float32 positions in metres, 8-bit sRGB without direction."""
-    path = Path(path)
-    kept = select_finite(gaussians, path).to(device="cpu")
-    fields = [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
+def save_points(scene: Scene, path: str | Path) -> None:
+    """Write the means as a .ply point cloud, atomically: positions in the user's world, 8-bit sRGB without direction.
+
+    Positions are float32, or float64 if the world is not around its origin.
+    """
+    path, frame = Path(path), scene.frame
+    kept = select_finite(scene.gaussians, path).to(device="cpu")
+    kind = "<f8" if any(frame.origin) else "<f4"
+    fields = [(name, kind) for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
     table = np.empty(len(kept), fields)
     colors = make_colors(kept)
-    for column, (name, _) in zip((*kept.means.unbind(1), *colors.unbind(1)), fields, strict=True):
+    places = frame.globalize_places(kept.means)
+    for column, (name, _) in zip((*places.unbind(1), *colors.unbind(1)), fields, strict=True):
         table[name] = column.detach().numpy()
-    kinds = {"<f4": "float", "u1": "uchar"}
+    kinds = {"<f4": "float", "<f8": "double", "u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(kept)}"]
     lines += [*(f"property {kinds[kind]} {name}" for name, kind in fields), "end_header\n"]
     with replacing(path) as partial, open(partial, "wb") as file:

@@ -14,7 +14,7 @@ from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import interpolate_poses, multiply_quats, quats_from_rotations, rotations_from_quats
-from pansplat.geometry.world import scale_poses
+from pansplat.geometry.world import USER_FRAME, WorldFrame
 
 Gains = tuple[tuple[float, ...], ...]
 """Factors of R, G and B for each view's photograph."""
@@ -149,7 +149,7 @@ class Scene:
     Attributes:
         gaussians: all context views' Gaussians.
         cam2world: poses of the context views, float64, in the order of `gaussians.views`; empty for a file of another
-            tool.
+            tool. `frame` brings other poses to their world.
         near, far: depth range of the prediction, metres.
         names: image file name of each context view.
         model: name of the predictor, e.g. "sweep".
@@ -161,6 +161,7 @@ class Scene:
         starts: of a scene of a whole tour: one for each view, or none.
         joint: whether the Gaussians of all views belong in one image, as other programs draw them. Else those of a view
             show its whole surroundings, and images of single views are blended ("deferred").
+        frame: where the world of the Gaussians and cameras is in the user's world, that of files.
     """
 
     gaussians: Gaussians
@@ -175,6 +176,7 @@ class Scene:
     links: Links = ()
     starts: Starts = ()
     joint: bool = False
+    frame: WorldFrame = USER_FRAME
 
     def __repr__(self) -> str:
         count = len(self.cam2world)
@@ -191,27 +193,38 @@ class Scene:
         return f"<Scene: {', '.join(parts)}>"
 
     def scaled(self, factor: float) -> Scene:
-        """The scene in a world that is multiplied by a factor."""
+        """The scene in a world that is multiplied by a factor; its place in the user's world stays the same."""
         if factor == 1:
             return self
-        poses = scale_poses(self.cam2world, factor)
+        poses = self.cam2world.clone()
+        poses[:, :3, 3] *= factor
+        frame = dataclasses.replace(self.frame, unit=self.frame.unit / factor)
         near, far = self.near * factor, self.far * factor
-        return dataclasses.replace(self, gaussians=self.gaussians.scaled(factor), cam2world=poses, near=near, far=far)
+        gaussians = self.gaussians.scaled(factor)
+        return dataclasses.replace(self, gaussians=gaussians, cam2world=poses, near=near, far=far, frame=frame)
 
     def rotated(self, rotation: Float[Tensor, "3 3"]) -> Scene:
-        """The scene after a rotation of the world about its origin."""
+        """The scene after a rotation of the user's world about its origin."""
         poses = self.cam2world.clone()
         poses[:, :3] = rotation.to(poses) @ poses[:, :3]
-        return dataclasses.replace(self, gaussians=self.gaussians.rotated(rotation), cam2world=poses)
+        x, y, z = (rotation.double().cpu() @ torch.tensor(self.frame.origin, dtype=torch.float64)).tolist()
+        frame = dataclasses.replace(self.frame, origin=(x, y, z))
+        return dataclasses.replace(self, gaussians=self.gaussians.rotated(rotation), cam2world=poses, frame=frame)
 
-    def moved(self, motion: Float[Tensor, "4 4"]) -> Scene:
-        """The scene after a rigid motion of the world."""
+    def moved(self, motion: Float[Tensor, "4 4"], frame: WorldFrame) -> Scene:
+        """The scene after a rigid motion of its world, which becomes that of a frame.
+
+        Args:
+            motion: of places of the world before.
+            frame: of the world after.
+        """
         scene = self.rotated(motion[:3, :3])
         poses = scene.cam2world.clone()
         poses[:, :3, 3] += motion[:3, 3].to(poses)
         gaussians = scene.gaussians
         means = (gaussians.means.double() + motion[:3, 3].to(gaussians.means.device)).to(gaussians.means)
-        return dataclasses.replace(scene, gaussians=dataclasses.replace(gaussians, means=means), cam2world=poses)
+        gaussians = dataclasses.replace(gaussians, means=means)
+        return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, frame=frame)
 
     def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
         """The pose at a fraction from the first context camera (0) to the last (1); an InputError without cameras."""

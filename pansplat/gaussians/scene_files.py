@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gains, Gaussians, Links, Overlaps, Scene, Starts, empty_gaussians, prune
-from pansplat.geometry.world import MAX_POSITION, require_depth_range
+from pansplat.geometry.world import MAX_POSITION, WorldFrame, choose_unit, require_depth_range
 from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
 
 Y_UP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # from y down to y up, and back
@@ -34,6 +34,8 @@ _MAX_ANGLE = 4 * np.pi  # radians
 def format_entry(scene: Scene, runs: list[list[int]]) -> str:
     """The pansplat entry of a scene as ASCII JSON without line breaks; the Gaussians are not used.
 
+    Positions of files are relative to the origin of the scene's frame, because float32 does not hold large ones.
+
     Args:
         runs: see `find_label_runs`.
     """
@@ -45,6 +47,7 @@ def format_entry(scene: Scene, runs: list[list[int]]) -> str:
         "far": scene.far,
         "names": [_escape(name) for name in scene.names],
         "cam2world": scene.cam2world.double().cpu().tolist(),
+        **({"origin": scene.frame.origin} if any(scene.frame.origin) else {}),
         **({"gains": scene.gains} if scene.gains else {}),
         **({"overlaps": scene.overlaps} if scene.overlaps else {}),
         **({"links": [[*link[:4], _escape(link[4])] for link in scene.links]} if scene.links else {}),
@@ -61,7 +64,7 @@ def _escape(text: str) -> str:
 
 
 def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
-    """The scene of a file.
+    """The scene of a file, in a unit near metres.
 
     Without an entry the scene has no cameras, and all Gaussians are at level 0 of view 0. A damaged entry is ignored
     with a warning, and Gaussians with a non-finite value are left out with a warning.
@@ -79,7 +82,7 @@ def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
     kept = select_finite(replace(gaussians, levels=levels, views=views), path)
     if len(gaussians) and not len(kept):
         raise InputError(f"{path}: none of its {len(gaussians)} Gaussians is finite; write the file again")
-    return replace(scene, gaussians=kept)
+    return replace(scene, gaussians=kept).scaled(1 / choose_unit(scene.near))
 
 
 def select_finite(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -178,8 +181,16 @@ def _read_entry(content: Any) -> _Entry:
         _read_links(list_field(content, "links", "comment"), len(poses)),
         _read_starts(list_field(content, "starts", "comment"), len(poses)),
         joint=content.get("joint") is True,
+        frame=WorldFrame(origin=_read_origin(list_field(content, "origin", "comment"))),
     )
     return scene, list_field(content, "runs", "comment")
+
+
+def _read_origin(values: list[Any]) -> tuple[float, float, float]:
+    if values and not (len(values) == 3 and all(type(v) in (int, float) and abs(v) <= MAX_POSITION for v in values)):
+        raise InputError(f"comment: needed three numbers up to {MAX_POSITION:g} in origin, got {values!r:.60}")
+    x, y, z = map(float, values or (0, 0, 0))
+    return x, y, z
 
 
 def _read_gains(rows: list[Any], cameras: int) -> Gains:

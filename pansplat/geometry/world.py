@@ -1,13 +1,16 @@
-"""The unit of a world: limits of depths and positions, and the factor to a unit near metres.
+"""The world in memory, near a metre and near its origin, and where it is in the user's world, that of files.
 
-Poses may be in any unit from micrometres to thousands of kilometres. The networks, the matching and the rasterisers
-have thresholds in metres and sums in float32. They work in a world whose smallest depth is of the order of a metre.
+Poses of files may be in any unit from micrometres to thousands of kilometres, and far from their origin, as UTM
+coordinates are. The networks, the matching and the flights have thresholds in metres, and Gaussians are float32. Poses
+and scenes are therefore brought to a working world once, when they are loaded, and back once, when they are saved.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -17,8 +20,86 @@ MIN_DEPTH, MAX_DEPTH = 1e-9, 1e9
 MAX_POSITION = 1e12  # of a camera
 MIN_RATIO = 1.001  # of the largest to the smallest depth
 
-_METRES = (1 / 64, 64.0)  # smallest depths of worlds that are left as they are
-_WORKING_NEAR = 0.5  # metres; the smallest depth of other worlds becomes 1/2 to 1 of it
+_METRES = (1 / 64, 64.0)  # smallest depths of worlds whose unit is kept
+_MAX_LOCAL = 1e5  # metres from the origin, at which float32 has steps of a centimetre
+_KEPT = 256.0  # metres from the origin, within which the middle of the cameras may be
+_CELL = 64.0  # metres; other origins are multiples, so that they seldom change when a camera is added
+
+
+@dataclass(frozen=True)
+class WorldFrame:
+    """Where the working world is in the user's world: a place p of the first is at `unit` p + `origin` of the second.
+
+    Attributes:
+        unit: of the working world, about a metre, in the user's unit: 1, or a power of 1000.
+        origin: of the working world, in the user's unit.
+    """
+
+    unit: float = 1.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def localize(self, cam2world: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+        """Poses of the user's world in the working world, float64."""
+        return _with_places(cam2world, self.localize_places(cam2world[..., :3, 3]))
+
+    def globalize(self, cam2world: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+        """Poses of the working world in the user's world, float64."""
+        return _with_places(cam2world, self.globalize_places(cam2world[..., :3, 3]))
+
+    def localize_places(self, places: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Places of the user's world in the working world, float64."""
+        return (places.double() - self._origin_as(places)) / self.unit
+
+    def globalize_places(self, places: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Places of the working world in the user's world, float64."""
+        return places.double() * self.unit + self._origin_as(places)
+
+    def _origin_as(self, places: Tensor) -> Tensor:
+        return torch.tensor(self.origin, dtype=torch.float64, device=places.device)
+
+
+def _with_places(cam2world: Tensor, places: Tensor) -> Tensor:
+    moved = cam2world.double().clone()
+    moved[..., :3, 3] = places
+    return moved
+
+
+USER_FRAME = WorldFrame()
+
+
+def choose_frame(cam2world: Float[Tensor, "*batch 4 4"], near: float) -> WorldFrame:
+    """The frame of a working world for cameras of the user's world, of which `near` is the smallest depth.
+
+    A world of metres whose cameras are around its origin, within 256 m, is kept.
+    """
+    unit = choose_unit(near)
+    center = cam2world[..., :3, 3].double().reshape(-1, 3).mean(dim=0).cpu()
+    if float(center.abs().max()) <= _KEPT * unit:
+        return WorldFrame(unit)
+    x, y, z = (torch.round(center / (_CELL * unit)) * _CELL * unit).tolist()
+    return WorldFrame(unit, (x, y, z))
+
+
+def choose_unit(near: float) -> float:
+    """The unit of a working world, see `WorldFrame`: that of micrometres, millimetres, metres, kilometres and so on in
+    which the smallest depth is nearest to 1; 1 for most worlds."""
+    return 1.0 if _METRES[0] <= near <= _METRES[1] else 1000.0 ** round(math.log(near, 1000))
+
+
+def require_working_world(cam2world: Float[Tensor, "*batch 4 4"], near: float, far: float) -> None:
+    """Check poses and depths of a prediction.
+
+    Raises:
+        InputError: see `require_depth_range`; or another unit, or places, that a working world does not have.
+    """
+    require_depth_range(near, far, "`near` and `far`")
+    farthest = float(cam2world[..., :3, 3].abs().max())
+    if choose_unit(near) != 1 or farthest > _MAX_LOCAL:
+        raise InputError(
+            f"`near` and `cam2world`: needed depths from {_METRES[0]:g} to {_METRES[1]:g} m and cameras within "
+            f"{_MAX_LOCAL:g} m of the origin, got near={near:g} and a camera at {farthest:g}; bring them to a world of "
+            "metres (pansplat.geometry.world.choose_frame)."
+        )
 
 
 def require_depth_range(near: float, far: float, source: object, advice: str = "correct them") -> None:
@@ -38,22 +119,3 @@ def require_depth_range(near: float, far: float, source: object, advice: str = "
             f"{source}: needed near and far of {MIN_DEPTH:g} to {MAX_DEPTH:g}, with far at least {MIN_RATIO} "
             f"times near, got near={near:g} and far={far:g}; {advice}."
         )
-
-
-def working_factor(near: float) -> float:
-    """The power of two by which a world is multiplied so that its smallest depth is near a metre; 1 for most worlds.
-
-    A power of two changes no digit of a number.
-    """
-    if _METRES[0] <= near <= _METRES[1]:
-        return 1.0
-    return 2.0 ** math.floor(math.log2(_WORKING_NEAR / near))
-
-
-def scale_poses(cam2world: Float[Tensor, "*batch 4 4"], factor: float) -> Float[Tensor, "*batch 4 4"]:
-    """Poses with their translations multiplied by a factor."""
-    if factor == 1:
-        return cam2world
-    scaled = cam2world.clone()
-    scaled[..., :3, 3] *= factor
-    return scaled

@@ -16,7 +16,7 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas, uv_from_directions
-from pansplat.geometry.world import require_depth_range, scale_poses, working_factor
+from pansplat.geometry.world import require_working_world
 from pansplat.model.base import Network
 from pansplat.model.heads import TileGaussians, merge_tiles
 from pansplat.model.layers import Compat, Precision, require_views
@@ -131,12 +131,12 @@ class NetworkPredictor:
         progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
         """As `__call__`, with the radial depth maps of the swept levels, metres, coarse to fine."""
-        matched, tiles, factor = self._match(images, cam2world, near, far, masks, progress)
+        matched, tiles = self._match(images, cam2world, near, far, masks, progress)
         parts = list(self._lift(matched, tiles, progress))
-        gaussians = merge_tiles(parts, self.network.compat)[0].scaled(1 / factor).to(device=images.device)
+        gaussians = merge_tiles(parts, self.network.compat)[0].to(device=images.device)
         if masks is not None:
             gaussians = remove_masked_gaussians(gaussians, cam2world, masks)
-        return gaussians, [depth[0].to(images.device) / factor for depth in matched.depths.depth]
+        return gaussians, [depth[0].to(images.device) for depth in matched.depths.depth]
 
     def stream(
         self,
@@ -150,14 +150,14 @@ class NetworkPredictor:
     ) -> Iterator[Gaussians]:
         """Yield the Gaussians of `__call__` tile by tile, in bounded memory; errors are raised at the first part."""
         with torch.no_grad():
-            matched, tiles, factor = self._match(images, cam2world, near, far, masks, progress)
+            matched, tiles = self._match(images, cam2world, near, far, masks, progress)
         parts = self._lift(matched, tiles, progress)
         while True:
             with torch.no_grad():  # closed before each yield: the caller keeps its own grad mode
                 part = next(parts, None)
                 if part is None:
                     return
-                gaussians = part.gaussians[0].scaled(1 / factor).to(device=images.device)
+                gaussians = part.gaussians[0].to(device=images.device)
                 gaussians = gaussians if masks is None else remove_masked_gaussians(gaussians, cam2world, masks)
             yield gaussians
 
@@ -169,12 +169,8 @@ class NetworkPredictor:
         far: float | Tensor,
         masks: Tensor | None,
         progress: Progress | None,
-    ) -> tuple[Any, int, float]:
-        """Check and match the views of one item.
-
-        Returns:
-            The match, the number of tiles along each side, and the factor of the world that the match is in.
-        """
+    ) -> tuple[Any, int]:
+        """Check and match the views of one item; returns the match and the number of tiles along each side."""
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
         tiles = self.tiles or choose_tiles(images.shape[-2])
@@ -182,13 +178,11 @@ class NetworkPredictor:
         if progress is not None:
             progress("matching views", 0.0)
         weight = next(self.network.parameters())
-        factor = working_factor(float(low.min()))
-        low, high, cam2world = low * factor, high * factor, scale_poses(cam2world, factor)
         images, _ = fit_panoramas(images, None, max(_MULTIPLE, 8 * tiles))
         pose = cam2world.to(device=weight.device, dtype=weight.dtype)
         near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
         matched = self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views)
-        return matched, tiles, factor
+        return matched, tiles
 
     def _lift(self, matched: Any, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
         report = progress or (lambda stage, fraction: None)
@@ -233,7 +227,7 @@ def _check_inputs(
             f"`near` and `far` must be one number, or one number per view, got {near.tolist()} and {far.tolist()}"
         )
     for low, high in zip(near.expand(shape[0]).tolist(), far.expand(shape[0]).tolist(), strict=True):
-        require_depth_range(low, high, "`near` and `far`")
+        require_working_world(cam2world, low, high)
 
 
 def load_predictor(

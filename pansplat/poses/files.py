@@ -17,7 +17,7 @@ from pansplat.atomic import replacing
 from pansplat.cache_folders import cache_folders, write_cache_file
 from pansplat.data.folders import make_names_unique
 from pansplat.data.images import list_masks, read_thumbnail
-from pansplat.data.pairs import Collection, Pair, Panorama, single_view_pairs
+from pansplat.data.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
 from pansplat.data.placements import Placement, judge, read_ties
 from pansplat.data.poses import rigid_matrix, to_cam2world
 from pansplat.data.views import CAMERA_HEIGHT
@@ -230,7 +230,7 @@ def _make_pairs(
     ]
     first_world = len(content["worlds"])
     pairs += single_view_pairs(single, folder, near, far, siblings=readable, first_world=first_world)
-    return make_names_unique(pairs)
+    return localize_pairs(make_names_unique(pairs))
 
 
 def _in_brackets(title: str) -> str:

@@ -20,7 +20,6 @@ from torch.nn import functional
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pad_equirect, uv_from_directions
-from pansplat.geometry.world import working_factor
 from pansplat.rendering import rasterize
 
 _HEIGHT = 512  # rows of the depth of a view's surface
@@ -38,9 +37,7 @@ def fuse_views(scene: Scene) -> Scene:
     """
     if scene.joint or len(scene.cam2world) < 2:
         return scene
-    factor = working_factor(scene.near)
-    scaled = scene.scaled(factor)
-    gaussians, poses = scaled.gaussians, scaled.cam2world
+    gaussians, poses = scene.gaussians, scene.cam2world
     own = gaussians.views.long()
     centers = poses[:, :3, 3].to(gaussians.means)
     nearest = (gaussians.means - centers[own]).norm(dim=1)

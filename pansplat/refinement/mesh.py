@@ -20,7 +20,6 @@ from pansplat.errors import InputError
 from pansplat.gaussians.mesh_files import Mesh, MeshPart
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pad_equirect, pixel_directions
-from pansplat.geometry.world import working_factor
 from pansplat.refinement.fusion import BACKGROUND_LEVEL, OPAQUE, are_seen, measure_reach
 from pansplat.rendering import rasterize
 
@@ -55,11 +54,9 @@ def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Tex
             f"a mesh of {count} panoramas needs {4 * count * _FEWEST_ROWS**2:,} triangles or more, got a limit of "
             f"{triangles:,}; raise it"
         )
-    factor = working_factor(scene.near)
-    scaled = scene.scaled(factor)
     size = rows, 2 * rows
-    poses, own = scaled.cam2world.double(), scaled.gaussians.views
-    seen = [scaled.gaussians if scene.joint else scaled.gaussians.select(own == view) for view in range(count)]
+    poses, own = scene.cam2world.double(), scene.gaussians.views
+    seen = [scene.gaussians if scene.joint else scene.gaussians.select(own == view) for view in range(count)]
     depths, reaches = [], []
     for gaussians, pose in zip(seen, poses, strict=True):
         # Where a mask leaves out the surface, the background shows beside it.
@@ -80,8 +77,8 @@ def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Tex
         triangle = corners[is_free[_find_points(corners, rows)].any(axis=1)]
         texture = _draw(seen[view], pose, scene) if textures is None else textures(view)
         name = scene.names[view] if view < len(scene.names) else f"panorama {view + 1}"
-        parts.append(_make_part(name, points.numpy() / factor, triangle, rows, _balance(texture, scene, view)))
-    return Mesh(tuple(part for part in parts if len(part.triangles)))
+        parts.append(_make_part(name, points.numpy(), triangle, rows, _balance(texture, scene, view)))
+    return Mesh(tuple(part for part in parts if len(part.triangles)), scene.frame)
 
 
 def _join_at_pole(places: Float[Tensor, "row column 3"], row: int) -> Float[Tensor, "3"]:

@@ -31,7 +31,6 @@ from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.geometry.pose import nearest_views
-from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
@@ -140,9 +139,7 @@ class Refinement:
     """
 
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
-        self._factor = working_factor(scene.near)
-        scene = scene.scaled(self._factor)
-        _check_fit(scene, views, scale_poses(views.cam2world, self._factor))
+        _check_fit(scene, views)
         self.config = config or RefineConfig()
         if self.config.poses and scene.joint:
             raise InputError(
@@ -316,17 +313,13 @@ class Refinement:
                 weight += float(compared.sum())
         return error / weight if weight > 0 else 0.0
 
+    @torch.no_grad()
     def scene(self) -> Scene:
         """The scene in its present state.
 
         After a run it has no Gaussians without contribution. If the run made it worse before its last part, it is the
         scene at the start.
         """
-        return self._scene().scaled(1 / self._factor)
-
-    @torch.no_grad()
-    def _scene(self) -> Scene:
-        """`scene` in the refinement's unit of length."""
         if self._result is not None or not self._views:
             return self._result or self._start
         parts = [self._cameras.move(parameters.build(), view) for view, parameters in self._views.items()]
@@ -407,7 +400,7 @@ class Refinement:
                 clock.shorten()
         after = measure() if after is None else after
         report("refined", 1.0)
-        self._result = self._scene() if after <= before else self._start
+        self._result = self.scene() if after <= before else self._start
         self._release_parameters()
         if after <= before:
             detail = self._counted_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
@@ -510,7 +503,7 @@ def refinement_fingerprint(config: RefineConfig | None = None) -> str:
     return digest.hexdigest()
 
 
-def _check_fit(scene: Scene, views: Views, poses: Tensor) -> None:
+def _check_fit(scene: Scene, views: Views) -> None:
     count = len(scene.cam2world)
     if not count:
         raise InputError("the scene has no input cameras, so it cannot be compared with photographs; refine a pair")
@@ -521,7 +514,7 @@ def _check_fit(scene: Scene, views: Views, poses: Tensor) -> None:
     last = int(scene.gaussians.views.max()) if len(scene.gaussians) else 0
     if last >= count:
         raise InputError(f"the Gaussians must come from the scene's {count} views, got one of view {last}")
-    difference = float((scene.cam2world.double() - poses.double()).abs().max())
+    difference = float((scene.cam2world.double() - views.cam2world.double()).abs().max())
     if not difference < _POSE_TOLERANCE:
         raise InputError(
             "the poses of the photographs must be those of the scene, got poses that differ by up to "

@@ -16,7 +16,7 @@ from pansplat.data.pairs import MAX_CONTEXT
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
-from pansplat.geometry.world import require_depth_range, scale_poses, working_factor
+from pansplat.geometry.world import require_working_world
 from pansplat.predictor import Progress, require_matching_inputs, select_item
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.sweep.lift import LiftConfig, lift
@@ -78,7 +78,8 @@ class Sweep:
                 exact black (0, 0, 0), the holes of scans, are masked too.
 
         Raises:
-            InputError: wrong shapes, no view, non-finite values, or near >= far.
+            InputError: wrong shapes, no view, non-finite values, near >= far, or a world of another unit or far from
+                its origin.
         """
         if images.ndim == 5:
             item_masks = [None] * len(images) if masks is None else masks
@@ -101,8 +102,6 @@ class Sweep:
     ) -> Gaussians:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
         _check_inputs(images, cam2world, low, high, masks)
-        factor = working_factor(low)
-        low, high, cam2world = low * factor, high * factor, scale_poses(cam2world, factor)
         images, masks = fit_panoramas(images, masks, _MULTIPLE)
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
@@ -125,7 +124,7 @@ class Sweep:
             gaussians, images.detach().cpu(), torch.from_numpy(posed.cam2world), visible.cpu(), self.config.colors
         )
         report("done", 1.0)
-        return gaussians.scaled(1 / factor).to(device=images.device)
+        return gaussians.to(device=images.device)
 
 
 def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Tensor | None) -> None:
@@ -136,7 +135,7 @@ def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, ma
             "stack RGB equirectangular images of one size"
         )
     require_matching_inputs(images, cam2world, masks)
-    require_depth_range(near, far, "`near` and `far`")
+    require_working_world(cam2world, near, far)
 
 
 def _compute_fingerprint(config: SweepConfig) -> str:

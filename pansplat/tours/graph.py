@@ -22,7 +22,6 @@ from pansplat.data.pairs import FAR, NEAR, Link, Pair, Panorama
 from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.gaussians.scene import Gains, Gaussians, Scene, Starts
 from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
-from pansplat.geometry.world import working_factor
 from pansplat.tours.layout import REACH, lay_out
 
 Edge = tuple[int, int]
@@ -263,7 +262,8 @@ class TourGraph:
         """The scene of `make_pair` in the world of the tour."""
         if not self.originals or self.panoramas[views[0]] is self.originals[views[0]]:
             return scene
-        return scene.moved(self.cam2world[views[0]] @ self.originals[views[0]].cam2world.double().inverse())
+        first = self.panoramas[views[0]]
+        return scene.moved(first.cam2world @ self.originals[views[0]].cam2world.inverse(), first.frame)
 
     def find_nearest_edge(self, position: Float[np.ndarray, "3"], part: int | None = None) -> tuple[Edge, float]:
         """The edge nearest to a position, of all or of one part, and the distance in metres."""
@@ -282,7 +282,7 @@ class TourGraph:
         """
         nearest, distance = self.find_nearest_edge(position)
         part = self.parts[current[0]]
-        if self.parts[nearest[0]] != part and distance > REACH / working_factor(self.near):
+        if self.parts[nearest[0]] != part and distance > REACH:
             nearest, distance = self.find_nearest_edge(position, part)
         return current if self.measure_distance(current, position) <= distance + EDGE_HYSTERESIS else nearest
 
@@ -468,7 +468,7 @@ def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
     near, far = min(pair.near for pair in measured), max(pair.far for pair in measured)
     originals = tuple(found[image] for image in images)
     name = f"{first.folder.resolve().name} tour"
-    return TourGraph(name, first.folder, lay_out(originals, near), near, far, first.siblings, overlaps, originals)
+    return TourGraph(name, first.folder, lay_out(originals), near, far, first.siblings, overlaps, originals)
 
 
 def _list_images(pair: Pair) -> set[Path]:
@@ -578,7 +578,9 @@ def make_graph(scene: Scene) -> TourGraph:
         links[start].append(Link(names[end], yaw, pitch, text))
     starts = scene.starts or (None,) * count
     panoramas = tuple(
-        Panorama(names[k], Path(names[k]), pose, title=titles[k], links=tuple(links[k]), start=starts[k])
+        Panorama(
+            names[k], Path(names[k]), pose, title=titles[k], links=tuple(links[k]), start=starts[k], frame=scene.frame
+        )
         for k, pose in enumerate(scene.cam2world.double())
     )
     overlaps = {(a, b): overlap for a, b, overlap in scene.overlaps}

@@ -11,22 +11,21 @@ import torch
 
 from pansplat.data.pairs import Panorama
 from pansplat.geometry.path import level_pose, up_direction
-from pansplat.geometry.world import working_factor
 
 REACH = 2.0  # metres, in which a camera moves around the panoramas of its part
 _GAP = 8.0  # metres, between what the cameras of two worlds reach, so that few rooms meet in the floor plan
 _ASPECT = 1.5  # of the width of all rows to the square root of their area
 
 
-def lay_out(panoramas: Sequence[Panorama], near: float) -> tuple[Panorama, ...]:
+def lay_out(panoramas: Sequence[Panorama]) -> tuple[Panorama, ...]:
     """The panoramas with poses in one world.
 
-    The largest world stays where it is. The others are turned, so that their first panoramas look in the direction of
-    its first one, level, and stand in rows on its right and behind it, with their cameras at its height.
+    The largest world stays where it is, and its frame is that of all. The others are turned, so that their first
+    panoramas look in the direction of its first one, level, and stand in rows on its right and behind it, with their
+    cameras at its height.
 
     Args:
         panoramas: of one or more worlds (`Panorama.world`).
-        near: smallest depth; states the unit of the world.
     """
     members: dict[int, list[int]] = {}
     for node, panorama in enumerate(panoramas):
@@ -36,10 +35,9 @@ def lay_out(panoramas: Sequence[Panorama], near: float) -> tuple[Panorama, ...]:
     poses = [torch.stack([panoramas[node].cam2world for node in members[world]]).double() for world in order]
     levels = [level_pose(group[0], up_direction(group))[:3, :3] for group in poses]
     places = [(group[:, :3, 3] @ level).numpy() for group, level in zip(poses, levels, strict=True)]
-    margin = (2 * REACH + _GAP) / working_factor(near)
-    sizes = np.array([np.ptp(place, axis=0)[[0, 2]] + margin for place in places])  # right, forward
+    sizes = np.array([np.ptp(place, axis=0)[[0, 2]] + 2 * REACH + _GAP for place in places])  # right, forward
     corners = _arrange_in_rows(sizes)
-    laid_out, axes = list(panoramas), levels[0]
+    laid_out, axes, frame = list(panoramas), levels[0], panoramas[members[order[0]][0]].frame
     # Of each world the left front corner, and the mean height, move to those of the first one and its place in the row.
     ends = np.array([(place[:, 0].min(), place[:, 1].mean(), place[:, 2].max()) for place in places])
     for world, group, level, end, corner in zip(order, poses, levels, ends, corners, strict=True):
@@ -49,7 +47,7 @@ def lay_out(panoramas: Sequence[Panorama], near: float) -> tuple[Panorama, ...]:
         motion[:3, :3] = axes @ level.T
         motion[:3, 3] = axes @ torch.from_numpy(ends[0] - end + (corner[0], 0, -corner[1]))
         for node, pose in zip(members[world], motion @ group, strict=True):
-            laid_out[node] = dataclasses.replace(panoramas[node], cam2world=pose)
+            laid_out[node] = dataclasses.replace(panoramas[node], cam2world=pose, frame=frame)
     return tuple(laid_out)
 
 

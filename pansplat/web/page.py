@@ -36,7 +36,6 @@ from pansplat.data.views import Views
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import path_poses, turn_pose
-from pansplat.geometry.world import working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
@@ -144,11 +143,10 @@ def write_page(
             stacklevel=2,
         )
         scene = dataclasses.replace(scene, overlaps=(), links=(), starts=())
-    factor = working_factor(scene.near)
     tour, has_cameras = make_graph(scene), len(scene.cam2world) > 0
-    rooms = find_rooms(scene.scaled(factor)) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
-    scene = _prepare(scene, factor)
-    flights = _plan_flights(scene, tour, factor)
+    rooms = find_rooms(scene) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
+    scene = _prepare(scene)
+    flights = _plan_flights(scene, tour)
     if len(scene.gaussians) > gaussians:
         report("merging Gaussians", 0.1)
         scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0)
@@ -160,7 +158,7 @@ def write_page(
     report("drawing the poster", 0.8)
     poster = _draw_poster(scene, flights.start)
     report("writing", 0.9)
-    header = _describe_scene(scene, packed, origin, flights, tour, factor)
+    header = _describe_scene(scene, packed, origin, flights, tour)
     header |= {"embed": embed, "doll": None}
     if rooms is not None and cameras is not None:
         header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
@@ -169,7 +167,7 @@ def write_page(
 
 @dataclass(frozen=True, eq=False)
 class _Flights:
-    """How the camera moves, in a unit near metres.
+    """How the camera moves.
 
     Attributes:
         start: first pose, without roll.
@@ -198,13 +196,12 @@ class _Flights:
     hysteresis: float = 0.0
 
 
-def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
+def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
     """The flights of a tour; without edges, the camera flies from view to view.
 
     Args:
         scene: of `_prepare`.
-        tour: in the unit of the scene before.
-        factor: of the scene's unit.
+        tour: of the scene before.
     """
     views = tuple(range(len(scene.cam2world)))
     if not tour.overlaps:
@@ -217,11 +214,9 @@ def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
     groups = tuple(dict.fromkeys(scenes.values()))
     walk = tour.plan_walk()
     route = plan_route(tour, [*walk, *tour.find_walk(walk[-1], walk[0])[1:]])  # ends where it begins
-    samples, jumps = _resample(route, factor)
-    start = torch.from_numpy(route.pose(0.0))
-    start[:3, 3] *= factor
+    samples, jumps = _resample(route)
     return _Flights(
-        start,
+        torch.from_numpy(route.pose(0.0)),
         route.level,
         float(samples[0, 3]),
         float(samples[0, 4]),
@@ -231,7 +226,7 @@ def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
         tuple(tuple(row) for row in tour.find_next_nodes()),
         samples,
         jumps,
-        factor * EDGE_HYSTERESIS,
+        EDGE_HYSTERESIS,
     )
 
 
@@ -248,9 +243,9 @@ def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: floa
     return turn_pose(turned, pitch, -turned[:3, 0])
 
 
-def _resample(route: Route, factor: float) -> tuple[Float[np.ndarray, "time 5"], tuple[int, ...]]:
+def _resample(route: Route) -> tuple[Float[np.ndarray, "time 5"], tuple[int, ...]]:
     """Positions, yaws and pitches at `_ROUTE_RATE`, and the samples after which the camera jumps."""
-    columns = np.stack([*(factor * route.positions.T), route.yaws, route.pitches])
+    columns = np.stack([*route.positions.T, route.yaws, route.pitches])
     rate = _ROUTE_RATE * route.seconds / (len(route.yaws) - 1)
     sections = []
     for section in np.split(columns, route.jumps + 1, axis=1):
@@ -261,9 +256,8 @@ def _resample(route: Route, factor: float) -> tuple[Float[np.ndarray, "time 5"],
     return np.concatenate(sections), tuple(ends.tolist())
 
 
-def _prepare(scene: Scene, factor: float) -> Scene:
-    """The visible Gaussians on the CPU, in a scaled unit; with a camera in the middle if there is none."""
-    scene = scene.scaled(factor)
+def _prepare(scene: Scene) -> Scene:
+    """The visible Gaussians on the CPU; with a camera in the middle if there is none."""
     gaussians = prune(scene.gaussians.to(device="cpu"), min_opacity=constants.ALPHA_CUT)
     numbers = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities[:, None])
     finite = torch.stack([(value.abs() <= constants.MAX_MAGNITUDE).all(1) for value in numbers]).all(0)
@@ -357,7 +351,6 @@ def _describe_scene(
     origin: Float[np.ndarray, "3"],
     flights: _Flights,
     tour: TourGraph,
-    factor: float,
 ) -> dict[str, Any]:
     """The numbers of a page, without those of single Gaussians; page.js reads them as HEADER."""
     level = flights.level
@@ -389,7 +382,7 @@ def _describe_scene(
         "views": views_of_page,
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(tour, positions, heights, level, factor) if flights.edges else [],
+        "links": _describe_links(tour, positions, heights, level) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
@@ -408,7 +401,7 @@ def _describe_scene(
         "jumps": flights.jumps,
         "batch": _BATCH,
         "near": constants.NEAR,
-        "unit": factor,
+        "unit": 1 / scene.frame.unit,
         "tallest": _TALLEST,
         "filterVariance": constants.FILTER_VARIANCE["angular"],
         "speed": _SPEED * float(np.median(reaches)),
@@ -452,24 +445,23 @@ def _describe_links(
     positions: Float[np.ndarray, "node 3"],
     heights: list[float],
     level: Float[np.ndarray, "3 3"],
-    factor: float,
 ) -> list[dict[str, Any]]:
     """The links of a page; those to other parts have a ring on the floor, and a place where the fade begins.
 
     Args:
-        tour: in the unit of the scene.
-        positions, heights: of the cameras, in the page's unit.
+        tour: of the scene.
+        positions: of the cameras, relative to the page's origin.
+        heights: of the cameras over the floor.
         level: axes of a level camera.
-        factor: of the page's unit.
     """
     links = []
     for (start, end), link in tour.links.items():
         found: dict[str, Any] = {"from": start, "to": end, "text": link.text}
         way = find_way_along_link(tour, start, end)
-        ring = find_link_ring(tour, start, end, heights[start] / factor)
+        ring = find_link_ring(tour, start, end, heights[start])
         if way is not None and ring is not None and tour.is_fade(start, end):
-            found["mark"] = _round(positions[start] + factor * ring)
-            found["leave"] = _round(positions[start] + factor * way)
+            found["mark"] = _round(positions[start] + ring)
+            found["leave"] = _round(positions[start] + way)
             found["yaw"] = round(find_angles(level.T @ way / np.linalg.norm(way))[0], 5)
         links.append(found)
     return links

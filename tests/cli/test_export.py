@@ -16,6 +16,7 @@ from pansplat.cli import export as export_module
 from pansplat.cli import run
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.geometry.world import WorldFrame
 from pansplat.web import page as page_module
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
@@ -46,6 +47,36 @@ def test_points_have_the_means_and_the_colours(scene: Path, tmp_path: Path) -> N
     assert np.array_equal(points["position"], gaussians.means.numpy())
     colors = 255 * (0.5 + 0.28209479 * gaussians.harmonics[:, 0].numpy())
     assert np.abs(points["color"] - colors.clip(0, 255)).max() <= 0.51
+
+
+@pytest.mark.parametrize("frame", [WorldFrame(1e3), WorldFrame(1.0, (5e6, -4e5, 64.0)), WorldFrame(1e3, (64e5, 0, 0))])
+def test_exports_are_in_the_unit_and_at_the_place_of_the_poses(
+    frame: WorldFrame, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], refusal: Callable[..., str]
+) -> None:
+    metres, given, points = pipeline.load(scene), tmp_path / "given.ply", tmp_path / "points.ply"
+    pipeline.save(dataclasses.replace(metres, frame=frame), given)
+    assert run(["export", str(given), "-o", str(points), "--points", "--layers"]) == 0
+    header, body = points.read_bytes().split(b"end_header\n")
+    kind = "<f8" if any(frame.origin) else "<f4"
+    assert (b"property double x" in header) == any(frame.origin)
+    table = np.frombuffer(body, [("position", kind, 3), ("color", "u1", 3)])["position"]
+    expected = frame.globalize_places(metres.gaussians.means)
+    assert np.allclose(table, expected, rtol=1e-6 if kind == "<f4" else 0, atol=1e-6 * frame.unit)
+    corners = frame.globalize_places(torch.tensor(((-9.0, -9, -9), (0.5, 9, 9)))).flatten().tolist()
+    assert run(["export", str(given), "-o", str(points), "--layers", "--crop", *map(str, corners)]) == 0
+    assert (
+        run(["export", str(scene), "-o", str(scene), "--layers", "--crop", *["-9", "-9", "-9", "0.5", "9", "9"]]) == 0
+    )
+    part, cropped = pipeline.load(points), pipeline.load(scene)
+    assert part.names == ("a",) and len(part.gaussians) == len(cropped.gaussians) and part.frame == frame
+    x = 50 * frame.unit + frame.origin[0]
+    message = refusal("export", given, "-o", points, "--layers", "--crop", x, 0, 0, x + 1, 1, 1)
+    assert f"got ({x:.2f}, 0.00, 0.00) to ({x + 1:.2f}, 1.00, 1.00) m and a scene from" in message
+    assert run(["info", str(given)]) == 0
+    shown = capsys.readouterr().out
+    assert f"near {0.45 * frame.unit:g} m" in shown and ("origin          at (" in shown) == any(frame.origin)
+    assert run(["export", str(given), "-o", str(tmp_path / "scene.splat"), "--layers"]) == 0
+    assert ("positions are relative to (" in capsys.readouterr().err) == any(frame.origin)
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".splat", ".sog", ".glb", ".compressed.ply"])

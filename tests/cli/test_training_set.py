@@ -43,6 +43,31 @@ def test_a_folder_to_train_from_has_the_poses_and_gaussians_of_the_scene(
         np.testing.assert_allclose(view.cam2world, pose, atol=1e-6)
 
 
+def test_a_folder_to_train_from_is_where_the_poses_are(room: Path, tmp_path: Path) -> None:
+    source, out, origin = room / "poses.json", tmp_path / "set", np.array((5e6, -4e5, 64.0))
+    content = json.loads(source.read_text())
+    for name, entry in content["poses"].items():
+        rows = entry["cam2world"] if isinstance(entry, dict) else entry
+        for row, x in zip(rows, origin, strict=False):
+            row[3] += x
+        content["poses"][name] = rows
+    source.write_text(json.dumps(content))
+    assert run(["export", str(room), "-o", str(out), *OPTIONS]) == 0
+    points = [line.split()[1:4] for line in (out / "sparse/0/points3D.txt").read_text().splitlines()[1:]]
+    points = np.array(points, float)
+    assert np.abs(points - origin).max() < 100
+    _, body = (out / "points.ply").read_bytes().split(b"end_header\n")
+    x, y, z = points.T
+    table = np.frombuffer(body, [("position", "<f8", 3), ("color", "u1", 3)])
+    np.testing.assert_allclose(table["position"], np.stack((x, z, -y), axis=1), rtol=0, atol=2e-3)  # z up
+    (given,), (pair,) = pipeline.load_pairs(room), pipeline.load_pairs(out)
+    assert float(given.context[0].cam2world[:3, 3].abs().max()) < 100
+    for view, expected in zip(pair.context, given.context, strict=True):
+        np.testing.assert_allclose(
+            view.frame.globalize(view.cam2world), expected.frame.globalize(expected.cam2world), rtol=0, atol=0.01
+        )
+
+
 def test_a_folder_with_files_and_a_scene_file_are_refused(
     room: Path, scene: Path, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:

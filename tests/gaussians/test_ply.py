@@ -318,12 +318,13 @@ def test_an_interrupted_save_leaves_the_old_file(tmp_path: Path, scene: Scene, m
 
 
 def test_points_of_gaussians_that_require_gradients_are_written(tmp_path: Path, make_scene) -> None:
-    gaussians = make_scene().gaussians
-    save_points(gaussians, tmp_path / "expected.ply")
+    scene = make_scene()
+    gaussians = scene.gaussians
+    save_points(scene, tmp_path / "expected.ply")
     leaf = dataclasses.replace(
         gaussians,
         means=gaussians.means.clone().requires_grad_(),
         harmonics=gaussians.harmonics.clone().requires_grad_(),
     )
-    save_points(leaf, tmp_path / "points.ply")
+    save_points(dataclasses.replace(scene, gaussians=leaf), tmp_path / "points.ply")
     assert (tmp_path / "points.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()

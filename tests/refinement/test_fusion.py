@@ -56,12 +56,6 @@ def test_each_place_keeps_the_gaussians_of_the_nearest_camera() -> None:
     assert fuse_views(fused) is fused
 
 
-def test_the_choice_does_not_depend_on_the_unit_of_length() -> None:
-    scene = _scene(_shell(LEFT, 0), _shell(RIGHT, 1))
-    counts = {len(fuse_views(scene.scaled(factor)).gaussians) for factor in (1e-3, 1.0, 1e3)}
-    assert len(counts) == 1
-
-
 def test_what_the_nearer_camera_does_not_see_is_kept() -> None:
     """A screen around the right camera hides the shell beyond it from that camera."""
     screen = _shell(RIGHT, 1, torch.full((1200,), 0.5))

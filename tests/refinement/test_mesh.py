@@ -13,6 +13,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.mesh_files import Mesh, save_mesh
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.geometry.world import WorldFrame
 from pansplat.refinement.mesh import make_mesh
 
 LOW, HIGH = torch.tensor((-2.0, -1.1, -3.0)), torch.tensor((2.0, 1.5, 3.0))  # y is down
@@ -170,6 +171,23 @@ def test_files_are_read_by_another_program(mesh: Mesh, tmp_path: Path, name: str
     for file in files[2:]:
         with Image.open(file) as image:
             assert not image.getexif()
+
+
+@pytest.mark.parametrize("frame", [WorldFrame(1e3), WorldFrame(1.0, (5e6, -4e5, 64.0))])
+def test_files_are_in_the_unit_of_the_poses_and_at_their_place_or_state_it(
+    box: Scene, tmp_path: Path, frame: WorldFrame
+) -> None:
+    mesh = make_mesh(dataclasses.replace(box, frame=frame), triangles=TRIANGLES)
+    save_mesh(mesh, tmp_path / "house.obj")
+    lines = [line.split()[1:] for line in (tmp_path / "house.obj").read_text().splitlines() if line.startswith("v ")]
+    places = np.concatenate([part.positions for part in mesh.parts])
+    expected = frame.globalize_places(torch.from_numpy(places)).numpy() * (1, -1, -1)
+    assert np.allclose(np.array(lines, float), expected, rtol=0, atol=1e-4)
+    save_mesh(mesh, tmp_path / "house.glb")
+    read = trimesh.load(tmp_path / "house.glb", process=False)
+    vertices = np.concatenate([np.asarray(part.vertices) for part in read.geometry.values()]) * (1, -1, -1)
+    assert np.allclose(np.sort(vertices, axis=0), np.sort(frame.unit * places, axis=0), rtol=1e-5, atol=1e-3)
+    assert (b'"origin":[5000000.0,-400000.0,64.0]' in (tmp_path / "house.glb").read_bytes()) == any(frame.origin)
 
 
 def test_bad_scenes_and_names_are_refused(box: Scene, mesh: Mesh, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 import pansplat
 from pansplat.data.pairs import Pair
+from pansplat.errors import InputError
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
@@ -71,15 +72,13 @@ def test_any_height_is_predicted_from(small):
     assert len(gaussians) > 1000 and gaussians.means.isfinite().all()
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1e6])
-def test_a_world_in_another_unit_gives_the_same_scene_in_that_unit(small, predicted, unit):
+@pytest.mark.parametrize(("unit", "origin"), [(1e-6, 0.0), (1e3, 0.0), (1.0, 5e6)])
+def test_a_world_that_is_not_in_metres_around_its_origin_is_refused(small, unit, origin):
     images, poses = small
-    scaled = poses.clone()
-    scaled[:, :3, 3] *= unit
-    gaussians = Sweep()(images, scaled, 0.5 * unit, 8.0 * unit)
-    assert abs(len(gaussians) - len(predicted)) < 0.05 * len(predicted)
-    ours, theirs = gaussians.means.norm(dim=1).median() / unit, predicted.means.norm(dim=1).median()
-    assert abs(ours / theirs - 1) < 0.05
+    moved = poses.clone()
+    moved[:, :3, 3] = moved[:, :3, 3] * unit + origin
+    with pytest.raises(InputError, match=r"needed depths from .* bring them to a world of metres .*choose_frame"):
+        Sweep()(images, moved, 0.5 * unit, 8.0 * unit)
 
 
 def test_masks_of_another_size_are_refused(small):

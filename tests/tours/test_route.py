@@ -2,15 +2,19 @@
 
 import dataclasses
 import itertools
+import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from pansplat.data.folders import load_pairs
 from pansplat.data.pairs import Panorama
-from pansplat.tours import TourGraph, plan_route
+from pansplat.tours import TourGraph, find_tours, plan_route
+from pansplat.tours.floor import assign_storeys
 
 
 def test_a_route_is_smooth_and_passes_the_panoramas(comb):
@@ -119,3 +123,38 @@ def test_a_fade_without_a_link_begins_at_once_and_ends_in_the_start_view_or_the_
     tour = dataclasses.replace(home, panoramas=tuple(panoramas))
     route = plan_route(tour, [3, 4], start)
     assert route.yaws[-1] == pytest.approx(-0.5) and route.pitches[-1] == pytest.approx(-0.2)
+
+
+@pytest.mark.parametrize(("unit", "origin"), [(1e3, (0, 0, 0)), (1.0, (5e6, 4e5, 120)), (1e3, (5e9, 4e8, 1e5))])
+def test_a_home_in_another_unit_or_far_from_the_origin_has_the_same_flight_and_graph(
+    tmp_path: Path, unit: float, origin: tuple[float, float, float]
+) -> None:
+    metres, other = _load_home(tmp_path / "metres"), _load_home(tmp_path / "other", unit, origin)
+    assert np.ptp(other.positions, axis=0).max() == pytest.approx(9.0), "metres again"
+    assert metres.plan_walk() == other.plan_walk() and list(metres.overlaps) == list(other.overlaps)
+    assert assign_storeys(metres) == assign_storeys(other) == [0, 0, 0, 1, 1]
+    ours, theirs = (plan_route(tour, tour.plan_walk()) for tour in (metres, other))
+    assert theirs.seconds == ours.seconds and 9 < ours.seconds < 60
+    edges = []
+    for tour, route in ((metres, ours), (other, theirs)):
+        edge, followed = (0, 1), []
+        for fraction in np.linspace(0, 1, 40):
+            edge = tour.follow_edge(route.pose(fraction)[:3, 3] + (0.1, 0, 0), edge)
+            followed.append(edge)
+        edges.append(followed)
+    assert edges[0] == edges[1] and len(set(edges[0])) > 1
+
+
+def _load_home(folder: Path, unit: float = 1.0, origin: tuple[float, float, float] = (0, 0, 0)) -> TourGraph:
+    """A home of two storeys, 9 m long, whose cameras look about, from a poses.json."""
+    folder.mkdir()
+    poses = {}
+    for number, place in enumerate(((0, 0, 0), (0, 0, 4.5), (0, 0, 9), (2, -3, 9), (2, -3, 5))):
+        Image.new("RGB", (64, 32), (20 * number, 90, 40)).save(folder / f"{number}.png")
+        pose = np.eye(4)
+        pose[:3, 3] = unit * np.array(place) + origin
+        poses[f"{number}.png"] = pose.tolist()
+    content = {"convention": "cam2world opencv", "near": 0.45 * unit, "far": 10.0 * unit, "poses": poses}
+    (folder / "poses.json").write_text(json.dumps(content))
+    (tour,) = find_tours(load_pairs(folder))
+    return tour

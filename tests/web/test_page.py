@@ -19,6 +19,7 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.geometry.world import WorldFrame
 from pansplat.refinement.budget import merge_to
 from pansplat.tours import find_camera_height, find_rooms, select_views
 from pansplat.web import page as page_module
@@ -102,17 +103,6 @@ def test_the_dolls_house_of_a_scene_without_views_has_the_nearest_cameras(scene:
     distances = torch.cdist(scene.gaussians.means.double(), scene.cam2world[:, :3, 3]).numpy()
     inside = cameras >= 0
     assert 0.2 < inside.mean() < 0.95 and (cameras == distances.argmin(axis=1))[inside].all()
-
-
-def test_links_have_the_same_lengths_in_a_page_of_another_unit(flat: Scene, tmp_path: Path) -> None:
-    write_page(flat, tmp_path / "metres.html")
-    write_page(flat.scaled(2.0**-12), tmp_path / "small.html")
-    metres, small = (read_header(tmp_path / f"{name}.html") for name in ("metres", "small"))
-    factor = small["spots"][0]["radius"] / metres["spots"][0]["radius"]  # of the units of the pages
-    assert factor == pytest.approx(1, abs=0.01)
-    for first, second in zip(metres["links"], small["links"], strict=True):
-        for place in ("mark", "leave"):
-            assert second[place] == pytest.approx(first[place], abs=1e-3)
 
 
 @pytest.mark.parametrize(("size", "limit"), [(1.0, 1.0), (0.5, 0.62)])
@@ -208,7 +198,7 @@ def test_merged_gaussians_of_a_scene_whose_views_are_unknown_keep_their_image(pl
     foreign = dataclasses.replace(
         plain_scene, gaussians=dataclasses.replace(plain_scene.gaussians, views=7 + plain_scene.gaussians.views)
     )
-    full = page_module._prepare(foreign, 1.0)
+    full = page_module._prepare(foreign)
     merged = page_module._merge(full, (0, 0), 700)
     for pose in full.cam2world:  # the second camera has no Gaussians of its own
         images = [pipeline.render(scene, pose, blend="joint", size=(32, 64)).color for scene in (full, merged)]
@@ -318,11 +308,11 @@ def test_large_pages_have_a_lower_degree_of_harmonics(
     assert write_page(scene, tmp_path / "tour.html").degree == 0
 
 
-def test_tiny_worlds_are_enlarged(scene: Scene, tmp_path: Path) -> None:
-    write_page(scene.scaled(2.0**-12), tmp_path / "small.html")
-    write_page(scene, tmp_path / "tour.html")
-    small, usual = read_header(tmp_path / "small.html"), read_header(tmp_path / "tour.html")
-    assert small["near"] == usual["near"] and small["speed"] == pytest.approx(usual["speed"])
+def test_a_page_of_another_unit_is_that_of_metres_but_for_the_lengths_it_shows(flat: Scene, tmp_path: Path) -> None:
+    write_page(flat, tmp_path / "metres.html")
+    write_page(dataclasses.replace(flat, frame=WorldFrame(1e3)), tmp_path / "millimetres.html")
+    metres, millimetres = (read_header(tmp_path / f"{name}.html") for name in ("metres", "millimetres"))
+    assert (metres.pop("unit"), millimetres.pop("unit")) == (1.0, 1e-3) and metres == millimetres
 
 
 def test_pages_that_cannot_be_drawn_or_written_are_refused(

@@ -4,8 +4,8 @@ A file is an object with `key_frames`, a list of objects in the order of time:
 
     {"key_frames": [{"seconds": 0, "position": [0, 0, 0], "direction": [0, 0, 1], "vertical_fov_degrees": 75}, ...]}
 
-`position` is in metres, `direction` is where the camera looks (of any length), both in world axes. The camera has no
-roll relative to the scene's up direction. `vertical_fov_degrees` is optional (75).
+`position` is in the user's unit, `direction` is where the camera looks (of any length), both in axes of the user's
+world. The camera has no roll relative to the scene's up direction. `vertical_fov_degrees` is optional (75).
 """
 
 from __future__ import annotations
@@ -13,13 +13,15 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.interpolate import PchipInterpolator
+from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
@@ -39,7 +41,7 @@ class KeyFrame:
     """A camera at a time."""
 
     seconds: float  # since the start of the path
-    position: Vector  # metres
+    position: Vector  # in the world of a scene; of a file, in the user's world
     direction: Vector  # where the camera looks
     vertical_fov_degrees: float = _DEFAULT_FOV  # vertical field of view
 
@@ -106,6 +108,12 @@ class CameraPath:
         """The path with a further key frame; one at the same time is replaced."""
         others = [other for other in self.key_frames if other.seconds != frame.seconds]
         return CameraPath(tuple(sorted((*others, frame), key=lambda other: other.seconds)))
+
+    def map_places(self, move: Callable[[Tensor], Tensor]) -> CameraPath:
+        """The path with other positions, as by `WorldFrame.localize_places` and back."""
+        places = (move(torch.tensor(frame.position, dtype=torch.float64)).tolist() for frame in self.key_frames)
+        moved = (replace(frame, position=(x, y, z)) for frame, (x, y, z) in zip(self.key_frames, places, strict=True))
+        return CameraPath(tuple(moved))
 
     def remove(self, index: int) -> CameraPath:
         """The path without one key frame."""

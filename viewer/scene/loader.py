@@ -161,7 +161,9 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
 
 
 def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
-    """The photographs of a folder among all entries, in their own worlds, by name."""
+    """The photographs of a folder among all entries, in the worlds of its files, by name."""
+    from pansplat.geometry.world import USER_FRAME
+
     found: dict[Path, Panorama] = {}
     for entry in entries:
         tour, pair = entry.tour, entry.pair
@@ -169,7 +171,7 @@ def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panor
             found |= {view.image: view for view in tour.originals or tour.panoramas}
         elif pair is not None and pair.folder == folder:
             found |= {view.image: view for view in pair.context + pair.targets}
-    return sorted(found.values(), key=lambda view: view.name)
+    return sorted((view.in_frame(USER_FRAME) for view in found.values()), key=lambda view: view.name)
 
 
 @contextlib.contextmanager

@@ -233,7 +233,7 @@ def write_colmap(
         pose = _join(_format_pose(invert_pose(pictures[0][1])))
         frames.append(f"{frame} {kind + 1} {pose} {len(members)} {' '.join(members)}")
     table = [
-        f"{number} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} {_NOT_COMPUTED}"
+        f"{number} {x:.10g} {y:.10g} {z:.10g} {r} {g} {b} {_NOT_COMPUTED}"
         for number, ((x, y, z), (r, g, b)) in enumerate(zip(points.tolist(), colors.tolist(), strict=True), start=1)
     ]
     files = {"rigs": sensors, "cameras": cameras, "frames": frames, "images": images, "points3D": table}

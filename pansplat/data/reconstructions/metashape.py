@@ -2,7 +2,8 @@
 
 The transform of a camera is cam2world in the frame of the chunk (or component), with OpenCV axes; the transform of the
 chunk has a rotation, a translation and a scale to the world. The translation is left out: in a geographic system its
-origin is the centre of the Earth. With a scale the unit is the metre, otherwise it is arbitrary.
+origin is the centre of the Earth. Components then have no relation to each other. With a scale the unit is the metre,
+otherwise it is arbitrary.
 
 Source: https://github.com/agisoft-llc/metashape-scripts, src/render_spherical_panorama.py (a basis right, up, back
 becomes a camera by Scale(1, -1, -1)); nerfstudio.process_data.metashape_utils (the fields of the XML)
@@ -10,6 +11,7 @@ becomes a camera by Scale(1, -1, -1)); nerfstudio.process_data.metashape_utils (
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,7 +19,7 @@ import numpy as np
 import torch
 
 from pansplat.data.poses import rigid_matrix, to_cam2world
-from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
+from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture, note_smaller
 from pansplat.errors import InputError
 from pansplat.files import read_file
 
@@ -38,7 +40,7 @@ def find_metashape(folder: Path) -> Path | None:
 
 
 def read_metashape(source: Path, convention: str | None = None) -> Reconstruction:
-    """The aligned cameras of spherical sensors.
+    """The aligned cameras of spherical sensors; of several components, those of the largest, with a note.
 
     Args:
         source: the file.
@@ -57,26 +59,29 @@ def read_metashape(source: Path, convention: str | None = None) -> Reconstructio
             raise ValueError("no chunk")
         sensors = {sensor.get("id") for sensor in chunk.iter("sensor") if sensor.get("type") == "spherical"}
         rotation, scale, is_metric = _read_chunk_transform(chunk)
-        components = {component.get("id"): _read_chunk_transform(component) for component in chunk.iter("component")}
+        transforms = {component.get("id"): _read_chunk_transform(component) for component in chunk.iter("component")}
         cameras = [camera for camera in chunk.iter("camera") if camera.find("transform") is not None]
         spherical = [camera for camera in cameras if camera.get("sensor_id") in sensors]
+        sizes = Counter(camera.get("component_id") for camera in spherical)
+        largest = max(sizes, key=sizes.__getitem__, default=None)
+        own, factor, has_scale = transforms.get(largest, (rotation, scale, is_metric))
+        if has_scale:
+            rotation, scale, is_metric = own, factor, True
         shots, missing = [], []
         for camera in spherical:
+            if camera.get("component_id") != largest:
+                continue
             name = camera.get("label", "")
             image = find_picture(source.parent, name)
             if image is None:
                 missing.append(name)
                 continue
-            own, factor, has_scale = components.get(camera.get("component_id"), (rotation, scale, is_metric))
-            if not has_scale:
-                own, factor = rotation, scale
-            is_metric = is_metric or has_scale
             matrix = np.array((camera.findtext("transform") or "").split(), np.float64).reshape(4, 4)
             pose = to_cam2world(
                 rigid_matrix(matrix.tolist(), f"{source}, {name!r}"), convention or "cam2world opencv"
             ).clone()
-            pose[:3] = torch.from_numpy(own) @ pose[:3]
-            pose[:3, 3] *= factor
+            pose[:3] = torch.from_numpy(rotation) @ pose[:3]
+            pose[:3, 3] *= scale
             shots.append(Shot(name, image, pose))
     except (ElementTree.ParseError, ValueError, TypeError) as error:
         if isinstance(error, InputError):
@@ -91,6 +96,7 @@ def read_metashape(source: Path, convention: str | None = None) -> Reconstructio
             f"{len(sensors)} spherical sensors; set the camera type to Spherical and align, or move the file away to "
             "estimate poses."
         )
+    note_smaller(source, len(sizes) - 1)
     return Reconstruction(source, source.parent, shots, is_metric=is_metric, missing=missing)
 
 

@@ -8,7 +8,6 @@ Source: https://opensfm.org/docs/geometry.html, https://opensfm.org/docs/dataset
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pansplat.data.poses import rigid_matrix, to_cam2world
-from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
-from pansplat.errors import InputError, InputWarning
+from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture, note_smaller
+from pansplat.errors import InputError
 from pansplat.strict_json import read_json, require_object
 
 FILE = "reconstruction.json"
@@ -70,10 +69,5 @@ def read_opensfm(source: Path, convention: str | None = None) -> Reconstruction:
             f"{source}: needed shots of a spherical camera, got none of {len(part['shots'])}; state "
             '"projection_type": "equirectangular" and reconstruct again, or move the file away to estimate poses.'
         )
-    if others:
-        warnings.warn(
-            f"{source}: {others} smaller reconstructions, whose poses have no relation to the largest, are left out.",
-            InputWarning,
-            stacklevel=4,
-        )
+    note_smaller(source, others)
     return Reconstruction(source, source.parent, shots, table, is_metric, missing)

@@ -25,12 +25,12 @@ from pansplat.data.pairs import FAR, NEAR, Collection, Panorama, find_mask, list
 from pansplat.data.poses import read_number
 from pansplat.data.rig_images import Lens, RigImage, RigView, write_rig
 from pansplat.errors import InputError, InputWarning
-from pansplat.geometry.world import scale_poses
+from pansplat.geometry.world import WorldFrame
 
 _SCALE = "scale.txt"
 _IMAGE_FOLDERS = ("images", "image", "panos", "frames", "input", ".")
 _SAME_PLACE = 1e-3  # distance of cameras of one rig, over the median distance of cameras from their mean
-_ROUNDING = 1e-5  # of positions in a file
+_ROUNDING, _DIGITS = 1e-5, 1e-9  # of positions in a file, around the cameras and from the origin
 _AGREE = 0.999  # cosine between down axes
 _PANORAMIC = 0.6  # share of the sphere that the pictures of a panorama show; four side faces show two thirds
 _MIN_POINTS = 100  # to find near and far
@@ -76,6 +76,16 @@ class Reconstruction:
     points: Float[Array, "point 3"] = field(default_factory=lambda: np.empty((0, 3)))
     is_metric: bool = False
     missing: Sequence[str] = ()
+
+
+def note_smaller(source: Path, count: int) -> None:
+    """Warn that a file holds smaller reconstructions, if there are any."""
+    if count:
+        warnings.warn(
+            f"{source}: {count} smaller reconstructions, whose poses have no relation to the largest, are left out.",
+            InputWarning,
+            stacklevel=5,
+        )
 
 
 def find_picture(folder: Path, name: str, *more: Path) -> Path | None:
@@ -144,7 +154,7 @@ def make_collection(found: Reconstruction) -> Collection:
             InputWarning,
             stacklevel=4,
         )
-    panoramas = [replace(view, cam2world=scale_poses(view.cam2world[None], scale)[0]) for view in panoramas]
+    panoramas = [replace(view, cam2world=WorldFrame(1 / scale).localize(view.cam2world)) for view in panoramas]
     centres = np.stack([view.cam2world[:3, 3].numpy() for view in panoramas])
     near, far = _find_range(centres, found.points * scale, found.is_metric or scale_file is not None)
     return Collection(
@@ -230,8 +240,10 @@ def _join_shots(found: Reconstruction) -> tuple[list[Panorama], dict[str, float]
 def _group_by_place(shots: Sequence[Shot]) -> Iterable[list[Shot]]:
     """Each equirectangular picture alone, and the perspective pictures of each place."""
     centres = np.stack([shot.cam2world[:3, 3].numpy() for shot in shots])
-    spread = float(np.median(np.linalg.norm(centres - centres.mean(axis=0), axis=1)))
-    tolerance = _SAME_PLACE * spread + _ROUNDING * (1 + float(np.abs(centres).max()))
+    offsets = centres - centres.mean(axis=0)
+    spread = float(np.median(np.linalg.norm(offsets, axis=1)))
+    local, farthest = (float(np.abs(places).max()) for places in (offsets, centres))
+    tolerance = _SAME_PLACE * spread + _ROUNDING * (1 + local) + _DIGITS * farthest
     flat = np.flatnonzero([shot.lens is not None for shot in shots])
     ends = flat[cKDTree(centres[flat]).query_pairs(tolerance, output_type="ndarray")].reshape(-1, 2).T
     graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(shots), len(shots)))

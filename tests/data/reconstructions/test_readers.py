@@ -340,6 +340,34 @@ def test_metashape_spherical_cameras(
         load_pairs(tmp_path)
 
 
+def test_only_the_largest_component_of_metashape_is_one_world(
+    tmp_path: Path, cameras: list[Array], write_panorama
+) -> None:
+    turn = " ".join(map(str, Rotation.from_rotvec((0, 0.5, 0)).as_matrix().reshape(-1)))
+    rows = []
+    for number, (name, pose) in enumerate(zip(NAMES, cameras, strict=True)):
+        write_panorama(tmp_path / name, pose)
+        rows.append(
+            f'<camera id="{number}" sensor_id="0" component_id="{min(number, 1)}" label="{name[:-4]}"><transform>'
+            f"{' '.join(map(str, pose.reshape(-1)))}</transform></camera>"
+        )
+    (tmp_path / "cameras.xml").write_text(
+        '<document version="2.0.0"><chunk><sensors><sensor id="0" type="spherical"/></sensors><components>'
+        f'<component id="0"><transform><rotation>{turn}</rotation><scale>7</scale></transform></component>'
+        '<component id="1"><transform><scale>2</scale></transform></component></components>'
+        f"<cameras>{''.join(rows)}</cameras></chunk></document>"
+    )
+    with pytest.warns(InputWarning) as notes:
+        pairs = load_pairs(tmp_path)
+    assert any("cameras.xml: 1 smaller reconstructions" in str(note.message) for note in notes)
+    worlds = {view.name: view.world for pair in pairs for view in pair.context}
+    alone, *others = (worlds[name[:-4]] for name in NAMES)
+    assert len(worlds) == 3 and len(set(others)) == 1 and alone not in others, "a scene of its own"
+    (pair,) = (pair for pair in pairs if len(pair.context) == 2)
+    for view, pose in zip(pair.context, cameras[1:], strict=True):
+        np.testing.assert_allclose(view.cam2world[:3, 3], 2 * pose[:3, 3], atol=1e-9)
+
+
 def test_scale_txt_states_the_unit(tmp_path: Path, cameras: list[Array], write_panorama) -> None:
     frames = []
     for name, pose in zip(NAMES, cameras, strict=True):

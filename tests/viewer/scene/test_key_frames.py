@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from pansplat.errors import InputError
+from pansplat.geometry.world import WorldFrame
 from pansplat_viewer.capture import SceneFrames, name_frame, write_path_film
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.scene.camera import Camera
@@ -61,6 +62,15 @@ def test_key_frames_stay_in_the_order_of_time():
 def test_a_path_is_the_same_after_writing_and_reading(tmp_path):
     write_path(PATH, tmp_path / "path.json")
     assert read_path(tmp_path / "path.json") == PATH
+
+
+def test_a_path_in_the_world_of_a_scene_and_back_is_the_same():
+    frame = WorldFrame(1e3, (5e9, 0.0, 64e3))
+    local = PATH.map_places(frame.localize_places)
+    assert local.key_frames[0].position == pytest.approx((np.array(PATH.key_frames[0].position) - frame.origin) / 1e3)
+    for frame_again, given in zip(local.map_places(frame.globalize_places).key_frames, PATH.key_frames, strict=True):
+        assert frame_again.position == pytest.approx(given.position, abs=1e-5)
+        assert replace(frame_again, position=given.position) == given
 
 
 FRAME = '{"seconds": 0, "position": [0, 0, 0], "direction": [0, 0, 1]}'

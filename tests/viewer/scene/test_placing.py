@@ -291,6 +291,20 @@ def test_a_folder_that_cannot_be_written_gives_a_message_and_changes_nothing(sta
     assert not started.is_changed and started.panoramas[2].placement.state == "not placed"
 
 
+@pytest.mark.parametrize(("unit", "origin"), [(1e3, 0.0), (1.0, 5e6)])
+def test_photographs_are_placed_in_the_world_of_their_file(folder: Path, unit: float, origin: float):
+    content = json.loads((folder / "poses.json").read_text())
+    content["worlds"][0] |= {"near": 0.45 * unit, "far": 8.0 * unit}
+    for entry in content["poses"].values():
+        for row in entry["cam2world"][:3]:
+            row[3] = unit * row[3] + origin
+    (folder / "poses.json").write_text(json.dumps(content))
+    photographs = _load(folder)
+    assert Placing(folder, photographs).problem is None
+    for view, (name, entry) in zip(photographs, content["poses"].items(), strict=False):
+        assert view.image.name == name and np.allclose(view.cam2world, entry["cam2world"], rtol=0, atol=1e-8)
+
+
 def test_a_photograph_that_cannot_be_read_is_not_placed(folder: Path):
     _write(folder / "other.png")
     placing = Placing(folder, _load(folder), read=_read)
