@@ -36,7 +36,7 @@ class _Task(Generic[Result]):
 
 
 class BackgroundWorker(Generic[Result]):
-    """Runs one piece of work at a time in a thread; a new one cancels the one before, and begins when that has ended."""
+    """Runs one piece of work at a time in a thread; a new one cancels the one before, and begins after its end."""
 
     def __init__(self, name: str) -> None:
         """A thread with this name starts with the first work."""
