@@ -13,10 +13,7 @@ _COMMENT, _ALIAS = re.compile(r"#.*"), re.compile(r"\bas \w+")
 
 @functools.cache
 def hash_sources(module: str, prefixes: tuple[str, ...] = ("pansplat.",)) -> str:
-    """Hash of a module and of the modules that it imports, directly or not, also inside functions.
-
-    It depends on their text only, not on where the package is installed. The package itself, which imports its public
-    names late, does not count.
+    """Hash of the text of a module and of the modules that it imports, directly or not, also inside functions.
 
     Args:
         module: name of a module of the package, or of one that is loaded.

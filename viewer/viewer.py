@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -59,20 +59,12 @@ from pansplat_viewer.ui.photographs import find_open_view
 from pansplat_viewer.ui.presenter import PhotographLayer, Presenter
 from pansplat_viewer.window.file_watch import FileWatch
 from pansplat_viewer.window.gui import Gui
-from pansplat_viewer.window.input import Commands, Input, MaskAnswer, apply_input, read_input
+from pansplat_viewer.window.input import Commands, Input, apply_input, read_input
 from pansplat_viewer.window.preferences import read_preferences, write_preferences
 
 PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
 _MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
 _REDUCTION = 4  # a scene that does not fit is offered with this fraction of its Gaussians
-
-
-class _Held(NamedTuple):
-    """What waits for the answer about an unsaved mask; see `Viewer._leave_mask`."""
-
-    action: Callable[[], None]
-    after_saving: bool
-    otherwise: Callable[[], None]
 
 
 class Viewer:
@@ -150,7 +142,7 @@ class Viewer:
         self._placing: Placing | None = None
         self._cleaner = Cleaner()
         self._painter: MaskPainter | None = None
-        self._held: _Held | None = None
+        self._held: tuple[Callable[[], None], bool, Callable[[], None]] | None = None  # see `_leave_mask`
         self._bounds: tuple[Scene, tuple[float, ...]] | None = None  # a scene and its box
         self._doll_houses: BackgroundWorker[DollHouse | None] = BackgroundWorker("doll-house")
         self._inside = self.state.camera  # before the doll's house
@@ -494,22 +486,12 @@ class Viewer:
     ) -> None:
         """Do what drops a mask, or writes a scene without it; if the mask is not saved, ask first.
 
-        Args:
-            action: what to do.
-            after_saving: whether to do it after the answer to save the mask, too.
-            otherwise: what to do instead after another answer.
+        The action is done after the answer to drop the mask, or with `after_saving` to save it; else `otherwise` is.
         """
         if self._painter is not None and self._painter.is_changed:
-            self._held = _Held(action, after_saving, otherwise)
+            self._held = action, after_saving, otherwise
         else:
             action()
-
-    def _answer(self, held: _Held, answer: MaskAnswer, now: float) -> None:
-        self._held = None
-        if answer == "drop":
-            self._stop_painting()
-        goes_on = answer == "drop" or (answer == "save" and self._save_mask(now) and held.after_saving)
-        (held.action if goes_on else held.otherwise)()
 
     def _save_mask(self, now: float) -> bool:
         """Write the mask that is painted; returns whether that was possible."""
@@ -1014,7 +996,11 @@ class Viewer:
         if commands.doll_house:
             self._toggle_doll_house(now)
         if commands.answer is not None and self._held is not None:
-            self._answer(self._held, commands.answer, now)
+            (action, after_saving, otherwise), self._held = self._held, None
+            if commands.answer == "drop":
+                self._stop_painting()
+            is_saved = commands.answer == "save" and self._save_mask(now)
+            (action if commands.answer == "drop" or (is_saved and after_saving) else otherwise)()
         if commands.choose is not None and commands.choose != self.panel_data.current:
             self._leave_mask(partial(self.show, self.entries, commands.choose, self.path))
         elif commands.reload:

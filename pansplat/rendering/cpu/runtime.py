@@ -4,7 +4,6 @@ Numba caches compiled code on disk, so each kernel is compiled once per machine.
 """
 
 import contextlib
-import functools
 import gc
 import inspect
 import itertools
@@ -64,19 +63,18 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     Without a writable cache directory the function is compiled once per process.
     """
-    return functools.partial(_compile_cached, options)
 
-
-def _compile_cached(options: dict[str, Any], function: Callable[..., Any]) -> Any:
-    function = inspect.unwrap(function)  # the tests' annotation checks wrap every function
-    try:
-        compiled: Any = nb.njit(cache=True, **options)(function)
-    except RuntimeError:  # no writable cache directory
+    def decorate(function: Callable[..., Any]) -> Any:
+        function = inspect.unwrap(function)  # the tests' annotation checks wrap every function
+        # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
+        stamp = hash_sources(function.__module__, (*_INLINED, function.__module__.rpartition(".")[0]))
+        with contextlib.suppress(RuntimeError):  # no writable cache directory
+            compiled = nb.njit(cache=True, **options)(function)
+            if set_source_stamp(compiled, stamp):
+                return compiled
         return nb.njit(**options)(function)
-    # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
-    package = function.__module__.rpartition(".")[0]
-    stamp = hash_sources(function.__module__, (*_INLINED, package))
-    return compiled if set_source_stamp(compiled, stamp) else nb.njit(**options)(function)
+
+    return decorate
 
 
 def inline_kernel(function: Callable[..., Any]) -> Any:
