@@ -29,8 +29,7 @@ class InputWarning(UserWarning):
 def collect_notes() -> Iterator[list[str]]:
     """List the text of each `InputWarning` that this thread, or a pool of `worker_threads` for it, makes in the block.
 
-    The filters of `warnings` decide only whether it is shown, too: they belong to all threads, so that a thread that
-    changes and restores them can leave them changed for good.
+    No filters of `warnings` change: they belong to all threads, and one may restore what another has just changed.
     """
     notes: list[str] = []
     token = _notes.set(notes)
