@@ -33,7 +33,7 @@ from pansplat.data.folders import find_panorama_folders
 from pansplat.data.images import list_masks
 from pansplat.data.pairs import Pair
 from pansplat.data.views import CAMERA_HEIGHT
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputError, InputWarning, collect_notes
 from pansplat.files import SCENE_SUFFIXES, expand_home, is_portable_name, read_file
 from pansplat.gaussians.scene import Scene
 from pansplat.predictor import Predictor
@@ -209,9 +209,7 @@ def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path)
     began = time.perf_counter()
     outputs: list[str] = []
     num_written, error = 0, None
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("always", InputWarning)
+    with collect_notes() as caught:
         try:
             folder = out / item.name
             folder.mkdir(parents=True, exist_ok=True)
@@ -223,7 +221,7 @@ def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path)
         except Exception as problem:  # whatever it is, other items go on
             error = _describe(problem)
     status = "failed" if error else "done" if num_written else "skipped"
-    notes = tuple(" ".join(str(warning.message).splitlines()) for warning in caught)
+    notes = tuple(" ".join(note.splitlines()) for note in caught)
     return ItemReport(item.name, status, round(time.perf_counter() - began, 3), tuple(outputs), notes, error)
 
 
@@ -567,6 +565,7 @@ def dask_setup(worker: Any) -> None:
     import torch
 
     del worker
+    warnings.simplefilter("ignore")  # reports have the notes
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))  # it may have been imported before the variable was set
     with contextlib.suppress(ValueError):  # only the main thread can set handlers
         signal.signal(signal.SIGINT, signal.SIG_IGN)

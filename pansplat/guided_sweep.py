@@ -28,6 +28,7 @@ from pansplat.model.weights import (
     require_shapes,
     save_weights,
 )
+from pansplat.source_hash import hash_sources
 from pansplat.sweep import Sweep
 from pansplat.sweep.predictor import SweepConfig
 from pansplat.sweep.prior import DepthPrior
@@ -37,14 +38,6 @@ from pansplat.sweep.surface import resize_sphere
 MODEL = "depth"  # name of the network in a weights file
 SHARPENING = "depth_sharpening"  # name of the sharpening network
 _SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
-_SOURCES = (
-    "guided_sweep.py",
-    "model/efficientnet.py",
-    "model/depth_network.py",
-    "model/depth_refinement.py",
-    "model/depth_sharpening.py",
-    "model/layers.py",
-)
 
 
 class GuidedSweep(Sweep):
@@ -61,7 +54,7 @@ class GuidedSweep(Sweep):
         self, network: DepthRefinement, sharpening: DepthSharpening, weights_hash: str, name: str = "default"
     ) -> None:
         config = SweepConfig(search=SearchConfig(finest_height=_SEARCH_HEIGHT))
-        super().__init__(config, NetworkPrior(network, sharpening, weights_hash + _hash_sources()))
+        super().__init__(config, NetworkPrior(network, sharpening, weights_hash + hash_sources(__name__)))
         self.name, self.network = name, network
 
 
@@ -139,14 +132,6 @@ def _hash_files(*paths: Path) -> str:
     digest = hashlib.blake2b(digest_size=8)
     for path in paths:
         digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def _hash_sources() -> str:
-    """Hash of the modules that compute the prior."""
-    digest = hashlib.blake2b(digest_size=4)
-    for name in _SOURCES:
-        digest.update(files("pansplat").joinpath(name).read_bytes())
     return digest.hexdigest()
 
 

@@ -3,11 +3,14 @@
 import contextlib
 import os
 import threading
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+from typing import Any, TypeVar
 
 import torch
 
+_T = TypeVar("_T")
 _lock = threading.Lock()
 _num_running = 0  # sections that are running
 _num_threads = 1  # outside of all sections
@@ -34,6 +37,13 @@ def one_thread() -> Iterator[None]:
             torch.set_num_threads(_num_threads)
 
 
+class _ContextPool(ThreadPoolExecutor):
+    """A pool whose work runs in the context of the thread that submits it, which collects its notes."""
+
+    def submit(self, function: Callable[..., _T], /, *args: Any, **kwargs: Any) -> Future[_T]:
+        return super().submit(copy_context().run, function, *args, **kwargs)
+
+
 def worker_threads() -> ThreadPoolExecutor:
     """A pool for work that releases Python's lock, with a thread for each processor, four at most."""
-    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))
+    return _ContextPool(max(1, min(4, os.cpu_count() or 1)))

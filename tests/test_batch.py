@@ -30,6 +30,9 @@ from pansplat.web import page as page_module
 HEIGHT = 64
 
 
+ignores_notes = pytest.mark.filterwarnings("ignore::pansplat.errors.InputWarning")  # as workers do
+
+
 @pytest.fixture
 def sphere(sphere_predictor: type, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """`--model sphere` in this process."""
@@ -135,6 +138,7 @@ def parted_house(tmp_path: Path, write_tour: Callable[..., Path]) -> Path:
     return house
 
 
+@ignores_notes
 def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     parted_house: Path, tmp_path: Path, sphere: None, sphere_predictor: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +153,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     assert process_item(item, options, "1", tmp_path / "out").status == "skipped"
 
 
+@ignores_notes
 def test_predictions_depend_on_titles_start_views_and_of_single_views_the_camera_height(
     parted_house: Path, tmp_path: Path, sphere: None
 ) -> None:
@@ -172,6 +177,7 @@ def test_the_command_passes_the_camera_height_to_its_items() -> None:
     assert Batch(Path("rooms"), Path("out"), camera_height=2.0)._make_options().camera_height == 2.0
 
 
+@ignores_notes
 def test_single_views_are_not_refined_with_one_note(
     parted_house: Path, tmp_path: Path, sphere: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

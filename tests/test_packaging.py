@@ -17,6 +17,7 @@ import pansplat
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.source_hash import hash_sources
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -109,6 +110,13 @@ def test_an_installed_wheel_reads_its_own_shaders(installed: Path) -> None:
     )
     done = run_in(installed, sys.executable, "-c", program, str(installed))
     assert done.returncode == 0, done.stderr
+
+
+def test_an_installed_wheel_has_the_hashes_of_sources_of_the_checkout(installed: Path) -> None:
+    modules = ("pansplat.guided_sweep", "pansplat.refinement", "pansplat.poses.files", "pansplat.model.network")
+    program = f"from pansplat.source_hash import hash_sources; print(*map(hash_sources, {modules}))"
+    done = run_in(installed, sys.executable, "-c", program)
+    assert done.stdout.split() == [hash_sources(module) for module in modules], done.stderr
 
 
 @pytest.mark.parametrize("command", ["pansplat", "pansplat-view", "pansplat-train"])

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,7 @@ class Viewer:
         self._placing: Placing | None = None
         self._cleaner = Cleaner()
         self._painter: MaskPainter | None = None
+        self._held: tuple[Callable[[], None], bool, Callable[[], None]] | None = None  # see `_leave_mask`
         self._bounds: tuple[Scene, tuple[float, ...]] | None = None  # a scene and its box
         self._doll_houses: BackgroundWorker[DollHouse | None] = BackgroundWorker("doll-house")
         self._inside = self.state.camera  # before the doll's house
@@ -250,6 +252,9 @@ class Viewer:
         # The step is limited, so that after a slow frame the camera does not move far.
         events = self._paint(self._leave_placing(read_input(min(seconds, _MAX_STEP_SECONDS))), size)
         key_commands = apply_input(self.state, events)
+        if self.state.quit:
+            self.state.quit = False
+            self.request_quit()
         self._update_doll_house(min(seconds, 2 * _MAX_STEP_SECONDS))
         self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
         advance_path(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
@@ -268,6 +273,10 @@ class Viewer:
         milliseconds = 1000 * (time.perf_counter() - start)
         data = self.panel_data
         data.frame_ms += (milliseconds - data.frame_ms) * (0.15 if data.frame_ms else 1.0)
+
+    def request_quit(self) -> None:
+        """Close the viewer, after a question if a mask is not saved."""
+        self._leave_mask(lambda: setattr(self.state, "quit", True))
 
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""
@@ -290,7 +299,9 @@ class Viewer:
         self.gui.close()
 
     def _take_loaded(self, now: float) -> None:
-        """Show the scene, the entries or the error of a finished load or search."""
+        """Show the scene, the entries or the error of a finished load or search, which wait during a question."""
+        if self._held is not None:
+            return
         if self._incoming is not None and self._preparer.is_ready(self._incoming.scene):
             incoming, self._incoming = self._incoming, None
             self._show_loaded(incoming, now)
@@ -324,6 +335,13 @@ class Viewer:
             self._list_entries(*self._shown)
 
     def _show_loaded(self, loaded: LoadedScene, now: float) -> None:
+        """Show a scene, after a question if that ends an unsaved mask."""
+        if self._find_painted(loaded.entry) is None:
+            self._leave_mask(lambda: self._replace_scene(loaded, now), otherwise=self._list_shown)
+        else:
+            self._replace_scene(loaded, now)
+
+    def _replace_scene(self, loaded: LoadedScene, now: float) -> None:
         """Show a scene; if it does not fit into memory, keep the one before and offer the largest Gaussians."""
         error = self._upload(self._slots[0], loaded.scene, loaded.entry)
         if error is None:
@@ -369,13 +387,17 @@ class Viewer:
         self._resolution = self._create_resolution()
         self._fade.clear()
         self._comparer.photographs.open(loaded.entry.panoramas)
-        if self._painter is not None and self._painter.panorama not in loaded.entry.panoramas:
+        painted = self._find_painted(loaded.entry)
+        if painted is None:
             self._stop_painting()
         self._open_placing(loaded.entry)
         if loaded.entry.tour is None:
             enter_scene(self.state, loaded.scene, at=self._at)
         else:
             self._enter_tour(loaded, remaining)
+        if painted is not None and self._painter is not None:
+            self._painter.move(loaded.entry.panoramas[painted])
+            self.state.photograph = painted
         tour, part = self._tour, 0 if self._tour is None else self._tour.part
         self._scene_slot, self._scene_views = 0, loaded.entry.views
         is_here = tour is None or tour.is_inside(np.asarray(self.state.camera.position), self._scene_views)
@@ -431,7 +453,7 @@ class Viewer:
             painter.paint(direction, math.radians(self.state.brush_degrees), erase="shift" in events.held)
         pressed = events.pressed - {"escape"}
         if pressed != events.pressed:
-            self._stop_painting()
+            self._leave_mask(self._stop_painting)
         return replace(events, pressed=pressed, drag=events.pan, pan=(0.0, 0.0), click=None, pointer=None)
 
     def _start_painting(self) -> None:
@@ -450,23 +472,47 @@ class Viewer:
         state.settings = replace(state.settings, stereo="mono")
 
     def _stop_painting(self) -> None:
+        self._held = None
         if self._painter is not None:
             self._painter = None
             self.state.photograph, self.state.comparison, self.state.split = None, "off", ViewerState().split
+
+    def _find_painted(self, entry: SceneEntry) -> int | None:
+        """The place of the photograph that is painted on among those of an entry, which may have been loaded again."""
+        image = None if self._painter is None else self._painter.panorama.image
+        return next((n for n, view in enumerate(entry.panoramas) if view.image == image), None)
+
+    def _leave_mask(
+        self, action: Callable[[], None], *, after_saving: bool = True, otherwise: Callable[[], None] = lambda: None
+    ) -> None:
+        """Do what drops a mask, or writes a scene without it; if the mask is not saved, ask first.
+
+        The action is done after the answer to drop the mask, or with `after_saving` to save it; else `otherwise` is.
+        """
+        if self._painter is not None and self._painter.is_changed:
+            self._held = action, after_saving, otherwise
+        else:
+            action()
+
+    def _save_mask(self, now: float) -> bool:
+        """Write the mask that is painted; returns whether that was possible."""
+        assert self._painter is not None
+        try:
+            self.state.show_message(f"wrote {self._painter.save()}; Reload predicts the scene again", now)
+        except (InputError, OSError) as error:
+            self.panel_data.error = str(error)
+        return not self._painter.is_changed
 
     def _execute_cleaning(self, commands: Commands, now: float) -> None:
         scene, painter = self._slot.scene, self._painter
         if commands.paint:
             self._start_painting()
         elif commands.paint is not None:
-            self._stop_painting()
+            self._leave_mask(self._stop_painting)
         if painter is not None and commands.clear_mask:
             painter.clear()
         if painter is not None and commands.save_mask:
-            try:
-                self.state.show_message(f"wrote {painter.save()}; Reload predicts the scene again", now)
-            except (InputError, OSError) as error:
-                self.panel_data.error = str(error)
+            self._save_mask(now)
         if scene is None:
             return
         if commands.remove_floaters:
@@ -478,7 +524,8 @@ class Viewer:
             except InputError as error:
                 self.panel_data.error = str(error)
             else:
-                self._cleaner.save(scene, self.state.settings, path)
+                settings = self.state.settings
+                self._leave_mask(lambda: self._cleaner.save(scene, settings, path), after_saving=False)
 
     def _take_cleaned(self, now: float) -> None:
         """Show the scene without floaters, or report the file that is written, or the error."""
@@ -708,6 +755,7 @@ class Viewer:
         if comparer.error is not None:
             data.error, comparer.error = comparer.error, None
         data.panoramas = self._name_panoramas()
+        data.unsaved = None if self._held is None or self._painter is None else self._painter.panorama.label
         data.bounds, data.painter, data.cleaning = self._measure_bounds(), self._painter, self._cleaner.progress
         film = self._films.progress
         data.tour, data.film = self._tour, None if film is None else film[1]
@@ -949,16 +997,18 @@ class Viewer:
             self.state.target = commands.visit
         if commands.doll_house:
             self._toggle_doll_house(now)
+        if commands.answer is not None and self._held is not None:
+            (action, after_saving, otherwise), self._held = self._held, None
+            if commands.answer == "drop":
+                self._stop_painting()
+            is_saved = commands.answer == "save" and self._save_mask(now)
+            (action if commands.answer == "drop" or (is_saved and after_saving) else otherwise)()
         if commands.choose is not None and commands.choose != self.panel_data.current:
-            self.show(self.entries, commands.choose, self.path)
+            self._leave_mask(partial(self.show, self.entries, commands.choose, self.path))
         elif commands.reload:
-            current = max(self.panel_data.current, 0)
-            if self.path is None:
-                self.show(self.entries, current)
-            else:
-                self.open(self.path, self.entries[current].name)
+            self._leave_mask(self._reload)
         elif commands.open is not None:
-            self.open(Path(commands.open).expanduser())
+            self._leave_mask(partial(self.open, Path(commands.open).expanduser()))
         self._execute_cleaning(commands, now)
         if self._loaded is None:
             return
@@ -976,6 +1026,14 @@ class Viewer:
             self._write_screenshot("exr", size, now)
         if commands.panorama:
             self._write_screenshot("png", (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT), now, panorama=True)
+
+    def _reload(self) -> None:
+        """Load the entry again."""
+        current = max(self.panel_data.current, 0)
+        if self.path is None:
+            self.show(self.entries, current)
+        else:
+            self.open(self.path, self.entries[current].name)
 
     def _pin(self, now: float) -> None:
         """Keep this image as the right side of a comparison."""

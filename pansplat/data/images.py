@@ -11,8 +11,6 @@ import logging
 import math
 import struct
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -168,7 +166,7 @@ def _read_shape(path: Path) -> tuple[int, int, Crop | None]:
             head = file.read(32)
         if head.startswith(_EXR_MAGIC):
             return (*_exr_size(path), None)
-        with _quiet_pillow(), Image.open(path, formats=_list_formats(path, head)) as image:
+        with Image.open(path, formats=_list_formats(path, head)) as image:
             size = image.size
             # Pillow would decode the pixels of a PNG to look for EXIF behind them, and turns the size of a TIFF itself.
             is_done = image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info)
@@ -183,6 +181,7 @@ def _read_shape(path: Path) -> tuple[int, int, Crop | None]:
 
 def _list_formats(path: Path, head: bytes) -> tuple[str, ...]:
     """Pillow's names of the formats of a file that starts with some bytes."""
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # a damaged file is an error of one line
     if head[4:8] != b"ftyp" or head[8:12] not in _HEIF_BRANDS:
         return _PILLOW_FORMATS
     try:
@@ -653,13 +652,12 @@ def _open_with_pillow(
         orient: whether the orientation of EXIF is applied.
     """
     try:
-        with _quiet_pillow():
-            image = Image.open(io.BytesIO(data), formats=_list_formats(path, data[:32]))
-            if at_least is not None:
-                image.draft("RGB", (2 * at_least, at_least))
-            if load:
-                image.load()
-            return ImageOps.exif_transpose(image) if orient else image
+        image = Image.open(io.BytesIO(data), formats=_list_formats(path, data[:32]))
+        if at_least is not None:
+            image.draft("RGB", (2 * at_least, at_least))
+        if load:
+            image.load()
+        return ImageOps.exif_transpose(image) if orient else image
     except Image.UnidentifiedImageError as error:
         if data.startswith(_TIFF_MAGIC):  # its directory may be at the end
             raise InputError(
@@ -685,21 +683,11 @@ def _open_with_pillow(
 def _count_tiff_bits(data: bytes) -> int:
     """Bits of a sample of a TIFF; 1 if its header cannot be read, which is reported later."""
     try:
-        with _quiet_pillow(), Image.open(io.BytesIO(data), formats=("TIFF",)) as image:
+        with Image.open(io.BytesIO(data), formats=("TIFF",)) as image:
             value = image.tag_v2.get(_BITS_PER_SAMPLE, 1)  # type: ignore[attr-defined]
             return int(max(value) if isinstance(value, tuple) else value)
     except (*_DAMAGED, Image.DecompressionBombError):
         return 1
-
-
-@contextmanager
-def _quiet_pillow() -> Iterator[None]:
-    """Without messages of Pillow: panoramas of 100 megapixels are normal, and damaged files are an error."""
-    logging.getLogger("PIL").setLevel(logging.CRITICAL)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        warnings.filterwarnings("ignore", module="PIL")
-        yield
 
 
 def _decode_deep(path: Path, data: bytes) -> _DecodedImage:

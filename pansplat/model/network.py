@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Iterator, Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, get_args
 
@@ -36,6 +35,7 @@ from pansplat.model.weights import (
     require_shapes,
 )
 from pansplat.predictor import Progress, require_matching_inputs, select_item
+from pansplat.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
     "pansplat": (PanSplat, PanSplatConfig),
@@ -75,15 +75,11 @@ class NetworkPredictor:
     def fingerprint(self) -> str:
         """Hash of weights, settings and source code, so that a cached prediction is never outdated."""
         precisions = [getattr(self.network, name, None) for name in ("precision", "attention_precision")]
-        settings = (self.network.config, self.network.compat, *precisions, self.tiles)
+        settings = (self.network.config, self.network.compat, *precisions, self.tiles, hash_sources(__name__))
         digest = hashlib.blake2b(repr(settings).encode(), digest_size=8)
         for name, tensor in sorted(self.network.state_dict().items()):
             digest.update(name.encode())
             digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-        for package in ("pansplat.model", "pansplat.gaussians", "pansplat.geometry"):
-            for source in sorted(files(package).iterdir(), key=lambda s: s.name):
-                if source.name.endswith(".py"):
-                    digest.update(source.read_bytes())
         return f"{self.name}-{self.network.compat}-{digest.hexdigest()}"
 
     def __call__(

@@ -34,9 +34,9 @@ from pansplat.poses.pose_file import (
     make_world,
 )
 from pansplat.predictor import Progress
+from pansplat.source_hash import hash_sources
 from pansplat.strict_json import read_json
 
-_FORMAT = "8"  # version of the estimate and of its cached file; part of the cache's key
 SUFFIXES = (".json", ".tum", ".kitti")
 
 
@@ -238,8 +238,8 @@ def _in_brackets(title: str) -> str:
 
 
 def _hash_inputs(panoramas: Sequence[Panorama], camera_height: float) -> str:
-    """A hash of the names, by which the cached file states its poses, and of the pictures' and masks' states."""
-    digest = hashlib.blake2b(f"{_FORMAT} {camera_height:g}".encode(), digest_size=12)
+    """A hash of the code, of the names, by which the cached file states its poses, and of the files' states."""
+    digest = hashlib.blake2b(f"{hash_sources(__name__)} {camera_height:g}".encode(), digest_size=12)
     for panorama in panoramas:
         links = [(link.target, round(link.yaw, 6)) for link in panorama.links]
         digest.update(os.fsencode(f"{panorama.name} {links};"))

@@ -20,7 +20,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 
 import torch
 from torch import Tensor
@@ -39,6 +38,7 @@ from pansplat.refinement.parameters import CameraParameters, LearningRates, View
 from pansplat.rendering import rasterize
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.weights import compute_blending_weights
+from pansplat.source_hash import hash_sources
 
 _HEIGHT = 512  # largest of the images that are compared; colours are fitted at the photographs' own height
 # The same with a limit of Gaussians. These are larger than the pixels, and fitted at 512 rows they show as rows of dots
@@ -495,12 +495,8 @@ def _cosine_fall(fraction: float) -> float:
 
 def refinement_fingerprint(config: RefineConfig | None = None) -> str:
     """Hash of the settings and of the source code of the refinement; part of the key of cached scenes."""
-    digest = hashlib.blake2b(repr(config or RefineConfig()).encode(), digest_size=8)
-    sources = sorted(files("pansplat.refinement").iterdir(), key=lambda source: source.name)
-    for source in (*sources, files("pansplat.rendering") / "color_fit.py"):
-        if source.name.endswith(".py"):
-            digest.update(source.read_bytes())
-    return digest.hexdigest()
+    settings = f"{config or RefineConfig()} {hash_sources('pansplat.refinement')}"
+    return hashlib.blake2b(settings.encode(), digest_size=8).hexdigest()
 
 
 def _check_fit(scene: Scene, views: Views) -> None:

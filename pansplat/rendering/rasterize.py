@@ -7,7 +7,6 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from typing import Any, Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
 
 import torch
@@ -26,11 +25,6 @@ Order = Literal["radial", "z"]
 Lowpass = Literal["angular", "3dgs"]
 Backend = Literal["auto", "torch", "numba", "triton"]
 
-_BACKEND_MODULES = {
-    "torch": "pansplat.rendering.reference",
-    "numba": "pansplat.rendering.cpu",
-    "triton": "pansplat.rendering.cuda",
-}
 MIN_TRITON = 3, 2  # the kernels join tuples, which earlier versions do not compile
 MAX_EYE_OFFSET = 1e6  # metres
 _MAX_POSE_ERROR = 1e-4
@@ -290,8 +284,13 @@ def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> Rast
         available = kernel == "ray" if on_cpu else gaussians.means.is_cuda and get_triton_version() >= MIN_TRITON
         fast: Backend = "numba" if on_cpu else "triton"
         name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
-    module = import_module(_BACKEND_MODULES[name])
-    return module.rasterize_planes  # type: ignore[no-any-return]
+    if name == "numba":
+        from pansplat.rendering.cpu import rasterize_planes as rasterize
+    elif name == "triton":
+        from pansplat.rendering.cuda import rasterize_planes as rasterize
+    else:
+        from pansplat.rendering.reference import rasterize_planes as rasterize
+    return rasterize
 
 
 def get_triton_version() -> tuple[int, ...]:

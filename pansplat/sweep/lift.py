@@ -26,6 +26,7 @@ from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
+from pansplat.rendering.cpu.runtime import cached_njit
 from pansplat.sweep.search import PosedImages
 from pansplat.sweep.surface import (
     CONSISTENT,
@@ -264,7 +265,7 @@ def _locate_lattice(rows: int, height: int) -> _Lattice:
     return rays, nearest_pixel(rays, height)
 
 
-@nb.njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _sample_bilinear(padded, rays, samples, first, end):
     """Write bilinear samples (n, c) of a panorama, which is padded by one pixel, along rays (n, 3)."""
     height = len(padded) - 2
@@ -345,7 +346,7 @@ def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> t
     return opacity, (near == 0) & (contradicted <= confirmed)
 
 
-@nb.njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _count_judgements(points, inverse_depth, certain, cam2world, tolerance, nearest, counts, first, end):
     """Add what a view says about each point to `counts`; see `_estimate_opacity`."""
     for n in range(first, end):
@@ -372,7 +373,7 @@ def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
     return np.stack((east / (pixel * shrink), south / pixel), axis=-1)
 
 
-@nb.njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _shape_discs(rays, inverse_depth, gradient, size, steepest, thickness, cam2world, quats, scales, first, end):
     """Write quaternions (n, 4, wxyz) in the world, and standard deviations (n, 3), of discs on the surface.
 

@@ -28,7 +28,7 @@ import numba as nb
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.rendering.cpu.runtime import parallel_for, thread_count
+from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.surface import pad_sphere, ray_grid
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
@@ -94,7 +94,7 @@ def _fast_atan2(y, x):
     return -r if y < 0 else r
 
 
-@nb.njit(fastmath=True, nogil=True, cache=True, error_model="numpy")
+@cached_njit(fastmath=True, nogil=True, error_model="numpy")
 def _project_row(rays, rotation, translation, inverse, height, width, u, v, scale, cosine):
     """For one row: padded pixel coordinates in the other view, ratio of inverse depths, cosine between the two rays."""
     for j in range(rays.shape[0]):
@@ -111,7 +111,7 @@ def _project_row(rays, rotation, translation, inverse, height, width, u, v, scal
         cosine[j] = (flat + y * y - along) * scale[j]
 
 
-@nb.njit(fastmath=True, nogil=True, cache=True)
+@cached_njit(fastmath=True, nogil=True)
 def _window_sums(gray, warped, m, column_b, column_bb, column_ab, row_b, row_bb, row_ab):
     """Sums over (2m+1)^2 windows of the warped grey values, their squares and products; inputs padded by m."""
     rows, columns = gray.shape
@@ -149,7 +149,7 @@ def _window_sums(gray, warped, m, column_b, column_bb, column_ab, row_b, row_bb,
             column_ab[j] -= gray[i, j] * b
 
 
-@nb.njit(fastmath=True, nogil=True, cache=True)
+@cached_njit(fastmath=True, nogil=True)
 def _pad_in_place(padded, m):
     """Fill the margins of a padded panorama: columns wrap, rows continue over the poles."""
     rows, columns = padded.shape
@@ -319,7 +319,7 @@ def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m,
             share[i, j, slot] = seen
 
 
-@nb.njit(fastmath=True, nogil=True, cache=True)
+@cached_njit(fastmath=True, nogil=True)
 def _compute_block_cost(view, other, hypotheses, bounds, weights, cost, total, offset, block):
     """Add the weighted costs of a block of a set's hypotheses to `cost`, the weights to `total` (h, w, labels).
 
@@ -557,7 +557,7 @@ def _jump_penalty(pixel, before, penalties):
     return max(penalties.jump * math.exp(-difference / penalties.edge_scale), floor)
 
 
-@nb.njit(fastmath=True, nogil=True, cache=True)
+@cached_njit(fastmath=True, nogil=True)
 def _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx, run_up):
     """Add the costs of horizontal paths; each starts `run_up` columns early, so that it has no visible start."""
     height, width, labels = cost.shape
@@ -580,7 +580,7 @@ def _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx,
             previous, current = current, previous
 
 
-@nb.njit(fastmath=True, nogil=True, cache=True)
+@cached_njit(fastmath=True, nogil=True)
 def _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, run_up):
     """Add the costs of vertical or diagonal paths; each starts `run_up` rows early, beyond the pole."""
     height, width, labels = cost.shape
@@ -652,7 +652,7 @@ def select_labels(total: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
     return label, offset
 
 
-@nb.njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _select_labels(total, count, label, offset, i):
     width, labels = total.shape[1:]
     for j in range(width):

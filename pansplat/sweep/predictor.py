@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
-from importlib.resources import files
 
 import numpy as np
 import torch
@@ -19,11 +18,11 @@ from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_working_world
 from pansplat.predictor import Progress, require_matching_inputs, select_item
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.source_hash import hash_sources
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
 
-_SOURCES = ("rendering/color_fit.py", "rendering/weights.py", "data/masks.py")  # used outside of the sweep's packages
 _MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
 
 
@@ -140,11 +139,5 @@ def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, ma
 
 def _compute_fingerprint(config: SweepConfig) -> str:
     """Hash of the settings and of the source code that computes the Gaussians; keys the prediction cache."""
-    digest = hashlib.sha256(repr(config).encode())
-    for package in ("pansplat.sweep", "pansplat.gaussians", "pansplat.geometry"):
-        for source in sorted(files(package).iterdir(), key=lambda s: s.name):
-            if source.name.endswith(".py"):
-                digest.update(source.read_bytes())
-    for name in _SOURCES:
-        digest.update(files("pansplat").joinpath(name).read_bytes())
-    return f"sweep-{digest.hexdigest()[:16]}"
+    digest = hashlib.blake2b(f"{config} {hash_sources(__name__)}".encode(), digest_size=8)
+    return f"sweep-{digest.hexdigest()}"

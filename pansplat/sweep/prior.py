@@ -17,13 +17,12 @@ from functools import partial
 from typing import Protocol
 
 import cv2
-import numba as nb
 import numpy as np
 import torch
 
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.geometry.equirect import rotate_equirect, row_weights
-from pansplat.rendering.cpu.runtime import parallel_for, thread_count
+from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
 from pansplat.sweep.surface import Surface, list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
@@ -357,7 +356,7 @@ def apply_prior_cost(
         parallel_for(add, len(cost), thread_count())
 
 
-@nb.njit(nogil=True, fastmath=True, cache=True)
+@cached_njit(nogil=True, fastmath=True)
 def _add_cost(cost, log_depth, scale, penalty, base, step, offset, count, weight, cap, i):
     priors, _, width = log_depth.shape
     for j in range(width):

@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.rendering.cpu.runtime import parallel_for, thread_count
+from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 
 
 @functools.lru_cache(maxsize=4)
@@ -47,7 +47,7 @@ def nearest_pixel(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.n
     return row, column
 
 
-@nb.njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _locate_pixels(directions, height, pixels, first, end):
     for n in range(first, end):
         pixels[0, n], pixels[1, n] = locate_pixel(directions[n, 0], directions[n, 1], directions[n, 2], height)
@@ -136,7 +136,7 @@ def classify_point(point, inverse_depth, cam2world, tolerance):
     return FREE_SPACE if ratio > 1 + tolerance else kind, distance, row, column
 
 
-@nb.njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _classify_points(points, inverse_depth, cam2world, tolerance, classes, first, end):
     for n in range(first, end):
         classes[n] = classify_point(points[n], inverse_depth, cam2world, tolerance)[0]
@@ -200,7 +200,7 @@ def guided_upsample(
     return Surface(result, orientations)
 
 
-@nb.njit(nogil=True, fastmath=True, cache=True)
+@cached_njit(nogil=True, fastmath=True)
 def _upsample(inverse, orientation, is_smooth, coarse, fine, needed, result, orientations, i):
     h, w = inverse.shape
     height, width = fine.shape[:2]

@@ -6,7 +6,6 @@ N processes compute the gradients that one process computes for the joint batch.
 from __future__ import annotations
 
 import os
-import warnings
 from contextlib import AbstractContextManager, nullcontext
 from datetime import timedelta
 from typing import Any
@@ -181,9 +180,7 @@ def data_parallel(step: nn.Module, processes: ProcessGroup) -> nn.Module:
     """
     if processes.count == 1:
         return step
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # torch 2.4 deprecates `broadcast_buffers` without a replacement
-        wrapped = DistributedDataParallel(_ReachAllParameters(step), broadcast_buffers=False)
+    wrapped = DistributedDataParallel(_ReachAllParameters(step), broadcast_buffers=False)
     # The first step reorders the buckets, and a sum over three or more processes depends on the order. An empty first
     # step makes a resumed run equal to one that was not interrupted.
     loss, _ = wrapped()

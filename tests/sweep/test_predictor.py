@@ -2,8 +2,6 @@
 
 import dataclasses
 import math
-import shutil
-from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -185,20 +183,6 @@ def test_the_fingerprint_depends_on_the_settings():
     ]  # fmt: skip
     assert len({Sweep().fingerprint, *(Sweep(config).fingerprint for config in others)}) == 4
     assert Sweep().name == "sweep" and Sweep().fingerprint.startswith("sweep-")
-
-
-@pytest.mark.parametrize("source", ["sweep/lift.py", "geometry/warp.py", "rendering/color_fit.py", "data/masks.py"])
-def test_the_fingerprint_depends_on_the_source_code(monkeypatch, tmp_path, source):
-    def find(package: str) -> Path:
-        return tmp_path.joinpath(*package.split("."))
-
-    for name in ("sweep", "gaussians", "geometry", "rendering", "data"):
-        shutil.copytree(files(f"pansplat.{name}"), find(f"pansplat.{name}"), ignore=shutil.ignore_patterns("*.pyc"))
-    monkeypatch.setattr("pansplat.sweep.predictor.files", find)
-    before = Sweep().fingerprint
-    with (find("pansplat") / source).open("a") as file:
-        file.write("# another line\n")
-    assert Sweep().fingerprint != before
 
 
 def test_the_settings_change_the_prediction(small, predicted):

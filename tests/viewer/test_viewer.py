@@ -51,6 +51,7 @@ from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
 from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.viewer import Viewer
+from pansplat_viewer.window.input import Commands
 from pansplat_viewer.window.preferences import Preferences
 
 pytestmark = pytest.mark.gl
@@ -406,6 +407,8 @@ def test_a_mask_is_painted_on_the_photograph_and_saved(cleaning, pair):
         user.click("Clear")
         assert not painter.hidden.any() and painter.is_changed
         user.press(imgui.Key.escape)
+        user.draw_frames(1)
+        user.click("Drop it")
         assert user.viewer._painter is None and user.state.comparison == "off" and not user.state.quit
         user.click("paint what to hide")
         user.draw_frames(1)
@@ -414,6 +417,110 @@ def test_a_mask_is_painted_on_the_photograph_and_saved(cleaning, pair):
         assert user.viewer._painter is None
     finally:
         mask.unlink()
+
+
+@pytest.fixture
+def painted(cleaning: User, pair) -> Iterator[User]:
+    """The user with a mask that is not saved."""
+    user = cleaning
+    user.show(SceneEntry(pair.name, pair=pair), SceneEntry("other", file=pair.folder / "other.ply"))
+    user.click("paint what to hide")
+    user.draw_frames(2)
+    user.drag((400, 300), (480, 320))
+    user.draw_frames(1)
+    assert user.viewer._painter.is_changed
+    yield user
+    user.viewer._stop_painting()
+    user.show(*user.entries)
+
+
+def press_escape(user: User) -> None:
+    user.press(imgui.Key.escape)
+
+
+def press_quit(user: User) -> None:
+    user.press(imgui.Key.mod_ctrl, imgui.Key.q)
+
+
+LEAVING = {
+    "Esc": press_escape,
+    "untick": lambda user: user.click("paint what to hide"),
+    "Reload": lambda user: user.click("Reload"),
+    "another scene": lambda user: user.viewer._execute(Commands(choose=1), SIZE, user.clock[0]),
+    "another path": lambda user: user.viewer._execute(Commands(open="nowhere"), SIZE, user.clock[0]),
+    "export": lambda user: user.click("Save##clean"),
+    "quit": press_quit,
+    "close the window": lambda user: user.viewer.request_quit(),
+}
+
+
+@pytest.mark.parametrize("leave", LEAVING.values(), ids=LEAVING)
+def test_an_unsaved_mask_is_dropped_only_after_a_question(painted, leave, pair, tmp_path):
+    user, painter, mask = painted, painted.viewer._painter, pair.folder / "a_blur.png"
+    user.panels.cleaning.file = str(tmp_path / "clean.ply")
+    hidden = painter.hidden.copy()
+
+    def ask() -> None:
+        leave(user)
+        user.draw_until(lambda: "Go on painting" in user.panels.items, "question")
+        user.draw_frames(2)
+        assert user.viewer._painter is painter and np.array_equal(painter.hidden, hidden) and painter.is_changed
+        assert not user.state.quit and not mask.exists() and not (tmp_path / "clean.ply").exists()
+        assert user.viewer.loader.entry is None and not user.viewer.loader.is_searching
+
+    ask()
+    user.click("Go on painting")
+    user.draw_frames(2)
+    assert "Go on painting" not in user.panels.items and user.viewer._painter is painter and painter.is_changed
+    ask()
+    user.click("Drop it")
+    assert user.viewer._painter is None and not mask.exists()
+    user.state.quit = False
+    user.data.error = None
+
+
+def test_an_unsaved_mask_is_saved_by_the_answer(painted, pair):
+    user, mask = painted, pair.folder / "a_blur.png"
+    hidden = user.viewer._painter.hidden.copy()
+    try:
+        user.panels.cleaning.file = str(pair.folder / "clean.ply")
+        user.click("Save##clean")
+        user.draw_frames(2)
+        user.click("Save mask##answer")
+        user.draw_frames(2)
+        assert np.array_equal(read_blur_mask(mask, 512), hidden) and "Reload" in user.state.message
+        assert not (pair.folder / "clean.ply").exists(), "the scene shows what the new mask hides"
+        press_quit(user)
+        assert user.state.quit, "there is nothing to lose"
+    finally:
+        user.state.quit = False
+        mask.unlink(missing_ok=True)
+
+
+def test_a_mask_that_is_painted_stays_when_its_photograph_is_loaded_again(painted, pair):
+    user, painter = painted, painted.viewer._painter
+    hidden, entry = painter.hidden.copy(), user.viewer._loaded.entry
+    again = replace(pair, context=tuple(replace(view) for view in pair.context))
+    user.viewer._show_loaded(replace(user.viewer._loaded, entry=replace(entry, pair=again)), user.clock[0])
+    user.draw_frames(2)
+    assert user.viewer._painter is painter and painter.is_changed and np.array_equal(painter.hidden, hidden)
+    assert painter.panorama is again.context[0] and user.state.photograph == 0
+
+
+def test_a_scene_that_was_loading_while_a_mask_was_painted_waits_for_the_answer(painted):
+    user, painter = painted, painted.viewer._painter
+    shown = user.viewer._loaded
+    user.viewer.show(user.viewer.entries, 1)
+    user.draw_until(lambda: "Go on painting" in user.panels.items, "question")
+    assert user.viewer._loaded is shown and user.viewer._painter is painter
+    user.click("Go on painting")
+    user.draw_frames(2)
+    assert user.viewer._loaded is shown and user.viewer._painter is painter and user.data.current == 0
+    user.viewer.show(user.viewer.entries, 1)
+    user.draw_until(lambda: "Drop it" in user.panels.items, "question")
+    user.click("Drop it")
+    user.draw_until(lambda: user.viewer._loaded is not shown, "the other scene")
+    assert user.viewer._painter is None and user.data.current == 1
 
 
 def painted_without(user: User) -> np.ndarray:

@@ -135,7 +135,7 @@ class Programs:
 
     def compute(self, name: str, **defines: int) -> moderngl.ComputeShader:
         """The compute shader of this file (GL 4.3)."""
-        return self._compile(self._ctx.compute_shader, 430, name, TILE_SIZE=TILE_SIZE, DIGITS=f"{DIGITS}u", **defines)
+        return self._compile(self._ctx.compute_shader, 430, name, TILE_SIZE=TILE_SIZE, DIGITS=DIGITS, **defines)
 
     def compile_compute(self) -> None:
         """Compile all compute shaders at once: a driver may refuse one although it offers OpenGL 4.3."""
@@ -177,7 +177,7 @@ class Programs:
 
         return self._compile(compile_pair, 330, vertex, fragment, **defines)
 
-    def _compile(self, compile_sources: Callable[..., Any], version: int, *files: str, **defines: int | str) -> Any:
+    def _compile(self, compile_sources: Callable[..., Any], version: int, *files: str, **defines: int) -> Any:
         """The program of these files; `extra` is the set of its uniforms, for `set_uniforms`."""
         key = (*files, *defines.items())
         if key not in self._compiled:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, TypeVar
 
 Result = TypeVar("Result")
@@ -36,11 +36,11 @@ class _Task(Generic[Result]):
 
 
 class BackgroundWorker(Generic[Result]):
-    """Runs one piece of work at a time in a thread; a new one cancels the one before."""
+    """Runs one piece of work at a time in a thread; a new one cancels the one before, and begins after its end."""
 
     def __init__(self, name: str) -> None:
         """A thread with this name starts with the first work."""
-        self._executor = ThreadPoolExecutor(thread_name_prefix=name)
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix=name)
         self._task: _Task[Result] | None = None
 
     def start(self, work: Callable[[Report], Result], description: str = "starting") -> None:
@@ -70,16 +70,17 @@ class BackgroundWorker(Generic[Result]):
         return future.exception() or future.result()
 
     def cancel(self, *, join: bool = False) -> bool:
-        """Make the work end at its next report; with `join`, wait for that. Returns whether there was work."""
+        """Make the work end at its next report; with `join`, wait for its end. Returns whether there was work."""
         task, self._task = self._task, None
         if task is None:
             return False
         task.is_cancelled = True
-        if not task.future.cancel() and join:
-            wait([task.future])  # its result and error are not needed
+        task.future.cancel()
+        if join:
+            self._executor.submit(int).result()  # begins after all work
         return True
 
     def close(self) -> None:
-        """Cancel the work and wait for the threads."""
+        """Cancel the work and wait for the thread."""
         self.cancel()
         self._executor.shutdown()

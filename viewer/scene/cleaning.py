@@ -110,9 +110,14 @@ class MaskPainter:
         self.panorama = panorama
         self.hidden: Bool[np.ndarray, "height width"] = read_hidden(panorama.image, _ROWS)
         self.is_changed = False
-        self._rotation = panorama.cam2world[:3, :3].double().numpy()
+        self.move(panorama)
         self._last: Float[np.ndarray, "3"] | None = None  # of the stroke
         self._rays = pixel_directions(_ROWS, 2 * _ROWS).numpy()
+
+    def move(self, panorama: Panorama) -> None:
+        """Go on with the same photograph, which was loaded again."""
+        self.panorama = panorama
+        self._rotation = panorama.cam2world[:3, :3].double().numpy()
 
     def paint(self, direction: Float[np.ndarray, "3"], radius: float, *, erase: bool = False) -> None:
         """Continue a stroke to a direction.

@@ -5,14 +5,12 @@ loaded; `tour` requests the predictions of its parts. A file that has the graph 
 are parts of the scene in the file. Imports no torch before it loads.
 """
 
-import contextlib
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputError, collect_notes
 from pansplat.files import is_scene_file, make_portable_name
 from pansplat_viewer.scene.background import BackgroundWorker
 
@@ -132,7 +130,7 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
     try:
         from pansplat.pipeline import load_pairs
 
-        with _collect_notes() as notes:
+        with collect_notes() as notes:
             pairs = load_pairs(
                 path,
                 convention=options.convention,
@@ -151,7 +149,7 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
     tours = find_tours(pairs)
     if any(a == b for tour in tours for a, b in tour.overlaps):
         predictor = load_model(options.model, compat=options.compat, precision=options.precision)
-        with _collect_notes() as replaced:
+        with collect_notes() as replaced:
             for tour in tours:
                 warn_of_single_views(tour, predictor)
         notes += replaced
@@ -172,24 +170,6 @@ def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panor
         elif pair is not None and pair.folder == folder:
             found |= {view.image: view for view in pair.context + pair.targets}
     return sorted((view.in_frame(USER_FRAME) for view in found.values()), key=lambda view: view.name)
-
-
-@contextlib.contextmanager
-def _collect_notes() -> Iterator[list[str]]:
-    """The warnings about the input while pairs are looked for; they are also shown as before."""
-    notes: list[str] = []
-    show = warnings.showwarning
-
-    def note(message: Warning | str, *rest: Any) -> None:
-        if isinstance(message, InputWarning):
-            notes.append(str(message))
-        show(message, *rest)
-
-    warnings.showwarning = note
-    try:
-        yield notes
-    finally:
-        warnings.showwarning = show
 
 
 def load_entry(

@@ -6,7 +6,6 @@ Needs neither imgui nor OpenGL: the panel draws what is here and passes the poin
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -186,9 +185,7 @@ class Placing:
         """Take poses and placements from the poses.json, or as at first if there is none."""
         found = {panorama.image.resolve(): panorama for panorama in self._first}
         if self._editor is not None and self._editor.file.exists():
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                collection = read_pose_file_folder(self._folder)
+            collection = read_pose_file_folder(self._folder)
             found |= {view.image.resolve(): view for view in (*collection.panoramas, *collection.unposed)}
         self.panoramas = tuple(
             replace(

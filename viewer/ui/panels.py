@@ -38,7 +38,7 @@ from pansplat_viewer.ui.overlays import (
 )
 from pansplat_viewer.ui.placing import PlacingWindow, draw_photographs
 from pansplat_viewer.window.gui import PANEL_WIDTH
-from pansplat_viewer.window.input import HELP, Commands
+from pansplat_viewer.window.input import HELP, Commands, MaskAnswer
 from pansplat_viewer.window.preferences import Preferences, Theme
 
 Rectangle = tuple[float, float, float, float]  # left, top, right, bottom, pixels
@@ -91,6 +91,7 @@ class PanelData:
     placing: Placing | None = None  # the photographs and their poses; None if nothing is known of these
     bounds: tuple[float, ...] | None = None  # of the scene, metres; None if it cannot be cropped
     painter: MaskPainter | None = None  # the mask that is painted; None if none is
+    unsaved: str | None = None  # the photograph of a mask whose end waits for an answer
     cleaning: tuple[str, float] | None = None  # work on the scene, and the fraction done
 
 
@@ -135,7 +136,9 @@ class Panels:
             commands.reload |= self.placing.draw(data.placing, self._button, self._record_rectangle)
         if state.help:
             state.help = _draw_help()
-        if data.loading:
+        if data.unsaved is not None:
+            self._draw_question(data.unsaved, commands)
+        elif data.loading:
             commands.cancel_loading = self._draw_progress(*data.loading)
         elif data.error:
             self._draw_error(data, data.error, commands)
@@ -546,6 +549,17 @@ class Panels:
             if self._button(f"Show the {data.reduced:,} largest Gaussians###Reduce"):
                 commands.reduce = data.reduced
             self._record_rectangle("Reduce")
+        imgui.end()
+
+    def _draw_question(self, photograph: str, commands: Commands) -> None:
+        _place_at_center()
+        imgui.begin("Unsaved mask", None, FIXED | imgui.WindowFlags_.no_collapse.value)
+        imgui.text_unformatted(f"What is painted on {photograph} is not saved.")
+        answers: dict[str, MaskAnswer] = {"Save mask##answer": "save", "Drop it": "drop", "Go on painting": "keep"}
+        for label, answer in answers.items():
+            if self._button(label):
+                commands.answer = answer
+            imgui.same_line()
         imgui.end()
 
 

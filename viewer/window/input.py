@@ -6,12 +6,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, step_flight, toggle_play
 from pansplat_viewer.window.preferences import Theme
+
+MaskAnswer = Literal["save", "drop", "keep"]
 
 FLY_SPEED = 1.0  # metres per second
 FAST, SLOW = 4.0, 0.2
@@ -99,6 +102,7 @@ class Commands:
     paint: bool | None = None  # start or end to paint a mask
     clear_mask: bool = False
     save_mask: bool = False
+    answer: MaskAnswer | None = None  # what to do with a mask that is not saved
     doll_house: bool = False  # go out of the rooms, or back into the last panorama
     save_path: str | None = None
     open_path: str | None = None

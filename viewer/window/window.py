@@ -8,7 +8,6 @@ import ctypes
 import os
 import sys
 import time
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -74,23 +73,23 @@ class Window:
 
     def _create(self, title: str, size: tuple[int, int]) -> Any:
         glfw = self._glfw
-        with warnings.catch_warnings(record=True) as caught:  # glfw reports errors as warnings
-            warnings.simplefilter("always")
-            if not glfw.init():
-                raise NoWindowError(f"the display cannot be used ({_describe_last(caught)})")
-            glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
-            glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
-            glfw.window_hint(glfw.SCALE_TO_MONITOR, True)
-            glfw.window_hint(glfw.VISIBLE, False)  # until the first frame: an empty window is black
-            glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
-            for major, minor in CONTEXT_VERSIONS:
-                glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
-                glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
-                if handle := glfw.create_window(*size, title, None, None):
-                    break
-            else:
-                glfw.terminate()
-                raise NoWindowError(f"the display has no OpenGL 3.3 ({_describe_last(caught)}); {_DEBIAN}")
+        errors = ["unknown reason"]
+        glfw.set_error_callback(lambda _, text: errors.append(" ".join(text.decode("utf-8", "replace").split())))
+        if not glfw.init():
+            raise NoWindowError(f"the display cannot be used ({errors[-1]})")
+        glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
+        glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
+        glfw.window_hint(glfw.SCALE_TO_MONITOR, True)
+        glfw.window_hint(glfw.VISIBLE, False)  # until the first frame: an empty window is black
+        glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
+        for major, minor in CONTEXT_VERSIONS:
+            glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
+            glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
+            if handle := glfw.create_window(*size, title, None, None):
+                break
+        else:
+            glfw.terminate()
+            raise NoWindowError(f"the display has no OpenGL 3.3 ({errors[-1]}); {_DEBIAN}")
         glfw.make_context_current(handle)
         glfw.swap_interval(1)
         try:
@@ -189,6 +188,12 @@ class Window:
         """Whether the user closed the window."""
         return bool(self._glfw.window_should_close(self._handle))
 
+    def keep_open(self) -> None:
+        """Take the user's request to close back, and show a minimised window, so that a question is seen."""
+        self._glfw.set_window_should_close(self._handle, False)
+        if self._glfw.get_window_attrib(self._handle, self._glfw.ICONIFIED):
+            self._glfw.restore_window(self._handle)
+
     def set_title(self, title: str) -> None:
         """Set the window's title."""
         self._glfw.set_window_title(self._handle, title)
@@ -229,7 +234,11 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
     active_until = 0.0
     shown = False
     target = window.ctx.detect_framebuffer(0)
-    while not (window.closing or viewer.state.quit):
+    while not viewer.state.quit:
+        if window.closing:
+            window.keep_open()
+            viewer.request_quit()
+            continue
         before = time.perf_counter()
         visible = window.is_visible
         has_input = before < active_until or window.gamepad_moves or viewer.gui.has_input
@@ -262,8 +271,3 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
         data = viewer.panel_data
         if data.current >= 0 and title != (title := f"{data.entries[data.current]} - pansplat"):
             window.set_title(title)
-
-
-def _describe_last(caught: list[warnings.WarningMessage]) -> str:
-    text = str(caught[-1].message) if caught else "unknown reason"
-    return " ".join(text.split())

@@ -5,11 +5,9 @@ Numba caches compiled code on disk, so each kernel is compiled once per machine.
 
 import contextlib
 import gc
-import hashlib
 import inspect
 import itertools
 import os
-import re
 import sys
 import threading
 from collections import deque
@@ -23,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pansplat import constants
 from pansplat.rendering.cpu.numba_api import (
     find_cache_folder,
     known_options,
@@ -31,9 +28,10 @@ from pansplat.rendering.cpu.numba_api import (
     set_source_stamp,
     share_literal_versions,
 )
+from pansplat.source_hash import hash_sources
 
 _PACKAGE = __name__.rpartition(".")[0]
-_IMPORT = re.compile(rf"^(?:from|import) {re.escape(_PACKAGE)}(?:\.(\w+)| import ([\w, ]+))", re.MULTILINE)
+_INLINED = _PACKAGE, "pansplat.constants"  # modules whose functions and constants become part of kernels
 
 # --- compilation ---
 
@@ -51,19 +49,8 @@ _cache_folder: Path | None = None  # of the kernels; None without a cache
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function at its first call, to run without the interpreter lock, and cache the code on disk.
-
-    Without a writable cache directory the function is compiled once per process.
-    """
-    function = inspect.unwrap(function)  # the tests' annotation checks wrap every function
-    options = known_options(_OPTIONS)
-    try:
-        compiled: Any = nb.njit(cache=True, **options)(function)
-    except RuntimeError:  # no writable cache directory
-        return nb.njit(**options)(function)
-    # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
-    if not set_source_stamp(compiled, _hash_sources(Path(inspect.getfile(function)))):
-        return nb.njit(**options)(function)
+    """Compile a function at its first call, to run without the interpreter lock, and cache the code on disk."""
+    compiled = cached_njit(**known_options(_OPTIONS))(function)
     folder = find_cache_folder(compiled)
     if folder is not None:
         global _cache_folder
@@ -71,17 +58,23 @@ def kernel(function: Callable[..., Any]) -> Any:
     return compiled
 
 
-def _hash_sources(module: Path) -> str:
-    """Hash of a module, of the modules of this package that it imports, directly or not, and of the constants."""
-    sources, pending = {}, [module, Path(constants.__file__)]
-    while pending:
-        path = pending.pop()
-        if path not in sources and path.exists():
-            sources[path] = path.read_bytes()
-            names = " ".join("".join(groups) for groups in _IMPORT.findall(sources[path].decode()))
-            pending += [Path(__file__).with_name(f"{name}.py") for name in re.findall(r"\w+", names)]
-    texts = (sources[path] for path in sorted(sources, key=lambda path: path.name))
-    return hashlib.sha256(b"\0".join(texts)).hexdigest()
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """A decorator: `numba.njit`, with a cache on disk that a change of the sources of inlined functions invalidates.
+
+    Without a writable cache directory the function is compiled once per process.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        function = inspect.unwrap(function)  # the tests' annotation checks wrap every function
+        # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
+        stamp = hash_sources(function.__module__, (*_INLINED, function.__module__.rpartition(".")[0]))
+        with contextlib.suppress(RuntimeError):  # no writable cache directory
+            compiled = nb.njit(cache=True, **options)(function)
+            if set_source_stamp(compiled, stamp):
+                return compiled
+        return nb.njit(**options)(function)
+
+    return decorate
 
 
 def inline_kernel(function: Callable[..., Any]) -> Any:
@@ -147,11 +140,8 @@ def hide_message() -> None:
 
 def _mark(folder: Path) -> bool:
     """Leave a mark of this version of the kernels in their cache; whether there was none."""
-    digest = hashlib.sha256(nb.__version__.encode())
-    for file in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(file.read_bytes())
     try:
-        (folder / f"announced-{digest.hexdigest()[:16]}").touch(exist_ok=False)
+        (folder / f"announced-{nb.__version__}-{hash_sources(_PACKAGE, _INLINED)}").touch(exist_ok=False)
     except FileExistsError:
         return False
     except OSError:

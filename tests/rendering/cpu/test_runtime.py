@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat import source_hash
 from pansplat.rendering.cpu import runtime
 from pansplat.rendering.cpu.runtime import (
     Workspace,
     announce_compilation,
+    cached_njit,
     inline_kernel,
     kernel,
     parallel_for,
@@ -92,18 +94,22 @@ def test_kernels_are_compiled_from_the_unwrapped_function(decorate):
     assert compiled.py_func is _add_indices and inspect.isfunction(compiled.py_func)
 
 
-def test_a_change_of_an_imported_module_invalidates_a_kernel(tmp_path, monkeypatch):
-    monkeypatch.setattr(runtime, "__file__", str(tmp_path / "runtime.py"))
-    package = runtime.__package__
-    (tmp_path / "upper.py").write_text(f"from {package} import middle as m, other\n")
-    (tmp_path / "middle.py").write_text(f"from {package}.lower import (\n    a,\n    b,\n)\n")
-    for name in ("lower", "other", "stranger"):
-        (tmp_path / f"{name}.py").write_text("a = 1\n")
-    hashes = [runtime._hash_sources(tmp_path / "upper.py")]
-    for name in ("lower", "other", "stranger"):
-        (tmp_path / f"{name}.py").write_text("a = 2\n")
-        hashes.append(runtime._hash_sources(tmp_path / "upper.py"))
-    assert len(set(hashes[:3])) == 3 and hashes[2] == hashes[3]
+@pytest.mark.parametrize("decorate", [kernel, cached_njit(nogil=True)])
+def test_a_change_of_an_imported_module_invalidates_a_kernel(decorate, monkeypatch, tmp_path):
+    """`lift` inlines functions of `surface`; numba itself checks the file of the kernel only."""
+    stamps = []
+    monkeypatch.setattr(source_hash, "_FOLDER", tmp_path)
+    monkeypatch.setattr(runtime, "set_source_stamp", lambda compiled, stamp: not stamps.append(stamp))
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep/lift.py").write_text("from pansplat.sweep.surface import locate\n")
+    function = type(_add_indices)(_add_indices.__code__, {"range": range})
+    function.__module__ = "pansplat.sweep.lift"
+    for content in ("1", "2"):
+        (tmp_path / "sweep/surface.py").write_text(content)
+        source_hash.hash_sources.cache_clear()
+        decorate(function)
+    source_hash.hash_sources.cache_clear()
+    assert len(set(stamps)) == 2
 
 
 def test_a_kernel_is_compiled_without_a_cache_directory(monkeypatch):

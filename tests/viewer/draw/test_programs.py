@@ -2,6 +2,7 @@
 
 import re
 from importlib import resources
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -50,3 +51,25 @@ def test_every_program_compiles_once(ctx):
     assert len({program.glo for program in compiled}) == 8
     assert programs.accumulate(1) is programs.accumulate(1)
     programs.release()
+
+
+def test_qualifiers_of_layouts_are_signed_literals():
+    """GLSL 4.30 has no other integers there; expressions and unsigned literals came with 4.40."""
+    sources = []
+
+    def compile_program(*stages, **options):
+        sources.extend([*stages, *(text for name, text in options.items() if name.endswith("_shader"))])
+        return SimpleNamespace()
+
+    programs = Programs(SimpleNamespace(program=compile_program, compute_shader=compile_program))
+    programs.compile_compute()
+    for build in (programs.project, programs.splat, programs.resolve, programs.arrange, programs.present):
+        build()
+    programs.accumulate(0)
+    values = []
+    for source in sources:
+        defines = dict(re.findall(r"^#define (\w+) (.*)$", source, re.MULTILINE))
+        for qualifiers in re.findall(r"^layout\(([^)]*)\)", source, re.MULTILINE):
+            values += [defines.get(value, value) for value in re.findall(r"= *([^,]+)", qualifiers)]
+    assert len(sources) == 19 and len(values) > 40
+    assert all(re.fullmatch(r"\d+", value) for value in values), values

@@ -1,0 +1,89 @@
+"""Notes about the input belong to the thread that issues them; filters of warnings belong to commands."""
+
+import re
+import threading
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pansplat.data.images import read_size
+from pansplat.errors import InputWarning, collect_notes
+from pansplat.threads import worker_threads
+
+ROOT = Path(__file__).resolve().parents[1]
+OWNERS = {"console.py": {"own_warnings", "print_once"}, "batch.py": {"dask_setup"}}  # the frames of processes
+
+
+def warn(text: str) -> None:
+    warnings.warn(text, InputWarning, stacklevel=2)
+
+
+@pytest.mark.filterwarnings("ignore::pansplat.errors.InputWarning")
+def test_notes_are_collected_per_thread_whatever_the_filters() -> None:
+    barrier = threading.Barrier(2)
+
+    def work(name: str) -> list[str]:
+        barrier.wait()
+        with collect_notes() as notes:
+            for n in range(3):
+                warn(f"{name} {n}")
+                barrier.wait()
+        warn("afterwards")
+        return notes
+
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(work, ("first", "second"))
+    assert first == [f"first {n}" for n in range(3)] and second == [f"second {n}" for n in range(3)]
+
+
+@pytest.mark.filterwarnings("ignore::pansplat.errors.InputWarning")
+def test_notes_of_a_pool_belong_to_the_thread_that_started_the_work() -> None:
+    with worker_threads() as pool:
+        with collect_notes() as notes:
+            list(pool.map(warn, ("a", "b")))
+            pool.submit(warn, "c").result()
+        pool.submit(warn, "d").result()
+    assert sorted(notes) == ["a", "b", "c"]
+
+
+def test_pictures_that_two_threads_read_leave_the_filters_of_warnings(tmp_path, monkeypatch) -> None:
+    Image.fromarray(np.zeros((4, 8, 3), np.uint8)).save(tmp_path / "a.png")
+    first_is_inside, second_is_inside, first_is_done = (threading.Event() for _ in range(3))
+    open_image = Image.open
+
+    def open_in_turn(*arguments, **options):
+        if not first_is_inside.is_set():
+            first_is_inside.set()
+            assert second_is_inside.wait(60)
+        else:
+            second_is_inside.set()
+            assert first_is_done.wait(60)
+        return open_image(*arguments, **options)
+
+    monkeypatch.setattr(Image, "open", open_in_turn)
+    before = list(warnings.filters)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(read_size, tmp_path / "a.png")
+        assert first_is_inside.wait(60)
+        second = pool.submit(read_size, tmp_path / "a.png")
+        assert first.result() == (8, 4)
+        first_is_done.set()
+        assert second.result() == (8, 4)
+    assert list(warnings.filters) == before
+
+
+def test_only_the_frames_of_processes_change_filters_of_warnings() -> None:
+    changed = []
+    for source in (*(ROOT / "pansplat").rglob("*.py"), *(ROOT / "viewer").rglob("*.py")):
+        function = ""
+        for number, line in enumerate(source.read_text("utf-8").splitlines(), 1):
+            found = re.match(r" *(?:def|class) (\w+)", line)
+            function = found[1] if found else function
+            changes = re.search(r"\b(catch_warnings|simplefilter|filterwarnings|showwarning)\b", line)
+            if changes and function not in OWNERS.get(source.name, ()):
+                changed.append(f"{source.relative_to(ROOT)}:{number}: {line.strip()}")
+    assert not changed, "\n".join(changed)
