@@ -15,7 +15,7 @@ from imgui_bundle import imgui
 from jaxtyping import Float
 
 from pansplat.errors import InputError
-from pansplat.files import find_scene_suffix
+from pansplat.files import find_scene_suffix, require_replaceable
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
 from pansplat.tours import list_starts, plan_route
@@ -474,6 +474,7 @@ class Viewer:
             path = Path(commands.save_scene).expanduser()
             try:
                 find_scene_suffix(path)
+                require_replaceable("the scene", [path])
             except InputError as error:
                 self.panel_data.error = str(error)
             else:
@@ -1004,7 +1005,9 @@ class Viewer:
         """Save, load and film the camera path."""
         try:
             if commands.save_path is not None:
-                write_path(self.state.path, Path(commands.save_path).expanduser())
+                file = Path(commands.save_path).expanduser()
+                require_replaceable("the camera path", [file])
+                write_path(self.state.path, file)
                 self.state.show_message(f"wrote {commands.save_path}", now)
             elif commands.open_path is not None:
                 self.state.path = read_path(Path(commands.open_path).expanduser())
