@@ -156,9 +156,7 @@ def require_new_folder(option: str, folder: Path) -> None:
         raise InputError(f"{option} {folder}: needed a new or empty folder, got one with files; choose another name")
 
 
-def require_output_file(
-    option: str, path: Path, suffixes: tuple[str, ...] = (), *, overwrite: bool | None = True
-) -> None:
+def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = (), overwrite: bool | None = True) -> None:
     """Check that a file can be written, before the work.
 
     Args:
@@ -200,7 +198,7 @@ def require_replaceable(option: str, files: Iterable[Path], overwrite: bool | No
 
     Args:
         option: the option that error messages name, such as "--out".
-        files: all that are written; others may be among them.
+        files: all that are written.
         overwrite: whether files of others may be replaced; None if there is no --overwrite.
 
     Raises:

@@ -189,8 +189,8 @@ def _run(options: Options) -> int:
 
     if options.out is not None:
         require_output_file("--out", options.out, (*VIDEO_SUFFIXES, ".png", ".exr"))
-        stem, suffix = options.out.stem, options.out.suffix.lower()
-        sequence = options.out.parent.glob(f"{glob.escape(stem)}_[0-9]*{suffix}")
+        suffix = options.out.suffix.lower()
+        sequence = options.out.parent.glob(f"{glob.escape(options.out.stem)}_[0-9]*{suffix}")
         require_replaceable("--out", [options.out] if suffix in VIDEO_SUFFIXES else sequence, options.overwrite)
         if options.path_file is None or options.offscreen is not None or options.pair == "all":
             raise InputError("--out needs --path, one scene and no --offscreen; give the file of a camera path")

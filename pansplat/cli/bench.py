@@ -43,8 +43,7 @@ class _Options(Writer):
         from pansplat.bench.harness import describe_machine
         from pansplat.bench.report import Report
 
-        if self.json is not None:
-            require_replaceable("--json", [self.json], self.overwrite)
+        require_replaceable("--json", filter(None, [self.json]), self.overwrite)
         if self.out is not None:
             require_output_folder("--out", self.out)
             files = [self.out / f"{benchmark.name}{suffix}" for suffix in (".json", ".md", ".png")]

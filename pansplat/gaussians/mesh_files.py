@@ -96,10 +96,7 @@ def save_mesh(mesh: Mesh, path: Path, *, overwrite: bool | None = True) -> tuple
         raise InputError(f"cannot write {path}: needed one or more triangles, got none; give a scene with surfaces")
     files = name_mesh_files(path, len(mesh.parts))
     require_replaceable(f"cannot write {path}", files, overwrite)
-    if suffix == ".obj":
-        _save_obj(mesh, *files)
-    else:
-        _save_glb(mesh, path)
+    (_save_obj if suffix == ".obj" else _save_glb)(mesh, *files)
     return tuple(files)
 
 
