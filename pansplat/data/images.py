@@ -433,11 +433,8 @@ def _write_exr(path: Path, pixels: NDArray[Any], depth: Tensor | NDArray[Any] | 
                 f"{int((~np.isfinite(plane)).sum())} NaN or infinite values; nothing was written."
             )
         channels["Z"] = plane
-    header: dict[str, Any] = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "comments": SOFTWARE,
-    }
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header["comments"] = SOFTWARE
     if pixels.shape[1] == 2 * pixels.shape[0] if panorama is None else panorama:
         header["envmap"] = OpenEXR.ENVMAP_LATLONG
     # OpenEXR raises a RuntimeError or worse when the disk is full.
