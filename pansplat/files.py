@@ -6,12 +6,23 @@ import errno
 import os
 import re
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 
 from pansplat.errors import InputError
 
 # Suffixes of scene files; the first that fits a name is its format (pansplat.gaussians.formats).
 SCENE_SUFFIXES = (".compressed.ply", ".spz", ".splat", ".sog", ".glb", ".ply")
+
+SOFTWARE = "software: pansplat"  # comment in every written file whose format has a place for one
+
+# The forms that the comment takes: in pictures, JSON and pages; in scene files; of an entry of a zip; in weights.
+_WRITTEN = re.compile(
+    rb'(software|generator)\W{1,5}(content\W{1,3})?pansplat|pansplat \{"version"|PK\x01\x02.{42}pansplat\.json'
+    rb'|"pansplat_format"',
+    re.IGNORECASE | re.DOTALL,
+)
+_REACH = 1 << 16  # bytes at the start and end of a file where the comment is
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -145,16 +156,18 @@ def require_new_folder(option: str, folder: Path) -> None:
         raise InputError(f"{option} {folder}: needed a new or empty folder, got one with files; choose another name")
 
 
-def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = ()) -> None:
+def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = (), overwrite: bool | None = True) -> None:
     """Check that a file can be written, before the work.
 
     Args:
         option: the option that error messages name, such as "--out".
         path: the file; its folder must exist.
         suffixes: the allowed suffixes in lower case; any suffix by default.
+        overwrite: see `require_replaceable`.
 
     Raises:
-        InputError: another suffix, a folder or a FIFO of this name, or a folder that is missing or not writable.
+        InputError: another suffix, a folder or a FIFO of this name, a folder that is missing or not writable, or a
+            file that pansplat did not write.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise InputError(f"{option} must end in {', '.join(suffixes)}, got {path}")
@@ -166,6 +179,38 @@ def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = ())
         raise InputError(f"{option} {path}: needed an existing folder, got {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise InputError(f"{option} {path}: needed a writable folder, got {path.parent}, which is read-only")
+    require_replaceable(option, [path], overwrite)
+
+
+def is_written(path: Path) -> bool:
+    """Whether pansplat wrote a file: it is named as the software in the first or last 64 KiB."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_REACH)
+            file.seek(max(os.fstat(file.fileno()).st_size - _REACH, len(head)))
+            return _WRITTEN.search(head) is not None or _WRITTEN.search(file.read()) is not None
+    except OSError:
+        return False
+
+
+def require_replaceable(option: str, files: Iterable[Path], overwrite: bool | None = None) -> None:
+    """Check all files of a command before it writes the first: those that exist are empty, or pansplat wrote them.
+
+    Args:
+        option: the option that error messages name, such as "--out".
+        files: all that are written.
+        overwrite: whether files of others may be replaced; None if there is no --overwrite.
+
+    Raises:
+        InputError: it names the files of others.
+    """
+    others = [] if overwrite else [f for f in files if f.is_file() and f.stat().st_size and not is_written(f)]
+    if others:
+        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
+        raise InputError(
+            f"{option}: needed names of new files, got {', '.join(map(str, others[:3]))}{more}, which pansplat did not "
+            f"write; choose another name{'' if overwrite is None else ', or replace them with --overwrite'}"
+        )
 
 
 def _find_system_problem(path: Path, *expected: int) -> str | None:

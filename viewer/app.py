@@ -1,5 +1,6 @@
 """The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
+import glob
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ import tyro
 
 from pansplat.console import own_warnings, parse_arguments, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import expand_home, require_output_file, require_output_folder
+from pansplat.files import expand_home, require_output_file, require_output_folder, require_replaceable
 from pansplat.options import EYE_DISTANCE, REAL, Depth, EyeDistance, Height, Positive, Range, Seconds, check_numbers
 from pansplat_viewer.scene.loader import (
     LoadedScene,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from pansplat_viewer.draw.stereo import ImageFormat
     from pansplat_viewer.scene.key_frames import CameraPath
 
+_WRITTEN = "view_*.png", "panorama_*.png", "[0-9]*_*.png", "floor_plan.png", "flythrough.mp4", "tour.mp4"  # offscreen
 _WINDOW_SIZE = 1280, 720  # pixels
 _PREDICTION_PART = 0.6  # of the work of a film; the rest is drawing
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
@@ -48,6 +50,8 @@ class Options:
     """A camera path (docs/viewer.md): the window has its key frames; with --out, the film follows it."""
     out: Path | None = None
     """Open no window; write the film of --path to this file: .mp4, .webm, or .png or .exr for a numbered sequence."""
+    overwrite: bool = False
+    """With --offscreen or --out: replace files that pansplat did not write, too."""
     pair: str | None = None
     """Name or number of the tour, pair or scene to show first if the path holds several; offscreen also "all"."""
     model: str = "default"
@@ -185,6 +189,9 @@ def _run(options: Options) -> int:
 
     if options.out is not None:
         require_output_file("--out", options.out, (*VIDEO_SUFFIXES, ".png", ".exr"))
+        suffix = options.out.suffix.lower()
+        sequence = options.out.parent.glob(f"{glob.escape(options.out.stem)}_[0-9]*{suffix}")
+        require_replaceable("--out", [options.out] if suffix in VIDEO_SUFFIXES else sequence, options.overwrite)
         if options.path_file is None or options.offscreen is not None or options.pair == "all":
             raise InputError("--out needs --path, one scene and no --offscreen; give the file of a camera path")
     path = None if options.path_file is None else read_path(expand_home(options.path_file))
@@ -205,10 +212,11 @@ def _run(options: Options) -> int:
     chosen = entries if show_all else entries[first : first + 1]
     if len(chosen) < len(entries):
         print(f"{options.path} has {len(entries)} scenes: showing {chosen[0].name}; select with --pair NAME or all")
-    for entry in chosen:
-        target = Path("renders") if folder is None else folder
-        if folder is None or show_all:
-            target /= entry.folder_name
+    root = folder or Path("renders")
+    targets = [root / entry.folder_name if folder is None or show_all else root for entry in chosen]
+    written = [file for target in targets for name in _WRITTEN for file in target.glob(name)]
+    require_replaceable(f"{root}", written, options.overwrite)
+    for entry, target in zip(chosen, targets, strict=True):
         _write_film(options, entry, target, pixels)
     return 0
 

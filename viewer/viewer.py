@@ -16,7 +16,7 @@ from imgui_bundle import imgui
 from jaxtyping import Float
 
 from pansplat.errors import InputError
-from pansplat.files import find_scene_suffix
+from pansplat.files import find_scene_suffix, require_replaceable
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
 from pansplat.geometry.world import USER_FRAME
@@ -521,6 +521,7 @@ class Viewer:
             path = Path(commands.save_scene).expanduser()
             try:
                 find_scene_suffix(path)
+                require_replaceable("the scene", [path])
             except InputError as error:
                 self.panel_data.error = str(error)
             else:
@@ -1065,8 +1066,9 @@ class Viewer:
         frame = USER_FRAME if self._loaded is None else self._loaded.scene.frame
         try:
             if commands.save_path is not None:
-                users = self.state.path.map_places(frame.globalize_places)
-                write_path(users, Path(commands.save_path).expanduser())
+                file = Path(commands.save_path).expanduser()
+                require_replaceable("the camera path", [file])
+                write_path(self.state.path.map_places(frame.globalize_places), file)
                 self.state.show_message(f"wrote {commands.save_path}", now)
             elif commands.open_path is not None:
                 users = read_path(Path(commands.open_path).expanduser())

@@ -14,6 +14,7 @@ from pansplat.atomic import replacing
 from pansplat.console import make_table_console
 from pansplat.errors import InputError
 from pansplat.evaluation.report import write_json
+from pansplat.files import SOFTWARE
 from pansplat.strict_json import read_json
 
 if TYPE_CHECKING:
@@ -265,10 +266,10 @@ class Report:
             return written
         page, picture = (self._out / f"{self._benchmark.name}{suffix}" for suffix in (".md", ".png"))
         with replacing(page) as partial:
-            partial.write_text(self._benchmark.markdown(self.rows), "utf-8")
+            partial.write_text(f"<!-- {SOFTWARE} -->\n{self._benchmark.markdown(self.rows)}", "utf-8")
         figure = self._benchmark.plot(self.rows, self.header)
         if figure is None:
             return [*written, page]
         with replacing(picture) as partial:
-            figure.savefig(partial, dpi=110)
+            figure.savefig(partial, dpi=110, metadata={"Software": "pansplat"})
         return [*written, page, picture]

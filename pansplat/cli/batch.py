@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from pansplat.cli.inputs import Compat, Out, Precision
+from pansplat.cli.inputs import Compat, Out, Precision, Writer
 from pansplat.console import print_message, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import expand_home, require_output_folder
+from pansplat.files import expand_home, require_output_folder, require_replaceable
 from pansplat.options import Count, Height, Positive, Seconds, Threads
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(Writer):
     """Predict, refine and export many pairs and tours; finished items are not done again (docs/batch.md).
 
     An item that fails is reported and stops no other; the exit status is 1 then.
@@ -66,6 +66,7 @@ class Batch:
         from pansplat import batch
 
         require_output_folder("--out", self.out)
+        require_replaceable("--out", [expand_home(self.out) / batch.REPORT_NAME], self.overwrite)
         options = self._make_options()
         batch.require_cluster()
         memory = self._parse_memory()
@@ -156,7 +157,7 @@ class Batch:
             began = time.perf_counter()
             for report in batch.run_items(address, items, options, out):
                 reports.append(report)
-                lines.add(json.dumps(dataclasses.asdict(report)) + "\n")
+                lines.add(json.dumps({"software": "pansplat", **dataclasses.asdict(report)}) + "\n")
                 progress(f"{len(reports)} of {len(items)}: {report.item[-30:]}", len(reports) / len(items))
                 if report.error is not None:
                     print_message("note", f"{report.item}: {report.error}")

@@ -11,9 +11,9 @@ from tyro.conf import Positional, subcommand
 
 import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
-from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, predict_scene
+from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.errors import InputError
-from pansplat.files import is_scene_file, require_output_folder
+from pansplat.files import is_scene_file, require_output_folder, require_replaceable
 from pansplat.options import WHOLE, Positive, Range, Threads
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _TiledHeight = Annotated[int, Range(64, 8192, "pixels", multiple=32), WHOLE]  # 
 
 
 @dataclass(frozen=True)
-class _Options:
+class _Options(Writer):
     """Options of every benchmark."""
 
     json: Path | None = None
@@ -43,8 +43,11 @@ class _Options:
         from pansplat.bench.harness import describe_machine
         from pansplat.bench.report import Report
 
+        require_replaceable("--json", filter(None, [self.json]), self.overwrite)
         if self.out is not None:
             require_output_folder("--out", self.out)
+            files = [self.out / f"{benchmark.name}{suffix}" for suffix in (".json", ".md", ".png")]
+            require_replaceable("--out", files, self.overwrite)
             self.out.mkdir(parents=True, exist_ok=True)
         if self.json is not None and not self.json.resolve().parent.is_dir():
             raise InputError(f"cannot write {self.json}: its folder does not exist; create it first")

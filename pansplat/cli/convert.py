@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out
+from pansplat.cli.inputs import Out, Writer
 from pansplat.console import make_table_console
 from pansplat.files import require_output_file
 
@@ -21,7 +21,7 @@ _MAX_NAMES = 2  # in a row of the report
 
 
 @dataclass(frozen=True)
-class Convert:
+class Convert(Writer):
     """Convert a checkpoint of the official PanSplat (or its MVSplat baseline) to a file of weights.
 
     No code in the checkpoint is executed. Use the weights with --model.
@@ -37,7 +37,7 @@ class Convert:
         from pansplat.model.network import convert_checkpoint
         from pansplat.model.weights import match_tensors, read_checkpoint, save_weights
 
-        require_output_file("--out", self.out, (".safetensors",))
+        require_output_file("--out", self.out, (".safetensors",), overwrite=self.overwrite)
         content = read_checkpoint(self.path)
         make_table_console().print(_make_report_table(match_tensors(content, self.path)))
         weights = convert_checkpoint(content, self.path)

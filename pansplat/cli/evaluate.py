@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import ModelChoice, Out, parse_blend
+from pansplat.cli.inputs import ModelChoice, Out, Writer, parse_blend
 from pansplat.console import make_table_console, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import expand_home, require_output_folder
+from pansplat.files import expand_home, require_output_folder, require_replaceable
 from pansplat.options import Count, CountOrNone, Depth, Height, Seconds
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from pansplat.evaluation.lpips import Backbone, Lpips
     from pansplat.evaluation.protocol import Blend, Method, ProtocolName
 
+_WRITTEN = "results.json", "*/prediction.png", "*/target.png", "*/error.png"
+_WRITTEN_OF_PROTOCOL = "results.json", "table.md", "frame_distance.png", "*/*/*.png"
 _PROTOCOL_WIDTH = 150  # characters of a protocol's tables if there is no terminal
 
 
@@ -54,7 +56,7 @@ class ProtocolChoice:
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Writer):
     """Compare predictions with the real panoramas between the inputs, and with the cross-fade baseline.
 
     With --protocol: compute a table of the paper, with the paper's rows and ours. The cache is not used, so that times
@@ -89,6 +91,8 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate the folders' pairs, or a protocol of the paper."""
         require_output_folder("--out", self.out)
+        written = _WRITTEN if self.protocol.protocol is None else _WRITTEN_OF_PROTOCOL
+        require_replaceable("--out", [file for name in written for file in self.out.glob(name)], self.overwrite)
         return self._run_folders() if self.protocol.protocol is None else self._run_protocol(self.protocol.protocol)
 
     def _run_folders(self) -> int:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, ScenePrediction
+from pansplat.cli.inputs import Out, ScenePrediction, Writer
 from pansplat.console import progress_bar
 from pansplat.errors import InputError
 from pansplat.files import (
@@ -20,6 +20,7 @@ from pansplat.files import (
     is_scene_file,
     require_new_folder,
     require_output_file,
+    require_replaceable,
 )
 from pansplat.options import WHOLE, Count, Fraction, Range, Real
 
@@ -39,7 +40,7 @@ _MIN_POINT_OPACITY, _MOST_POINTS = 0.1, 200_000  # of the points to train from
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Writer):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
     web page (.html, docs/web.md), as a floor plan (.svg and .dxf with straight walls and areas; .png), as textured
     triangles (.obj, .glb with --mesh), or as a folder to train further from (a name without suffix): cube faces, poses
@@ -96,7 +97,7 @@ class Export:
         if is_dataset:
             require_new_folder("--out", self.out)
         else:
-            require_output_file("--out", self.out, _SUFFIXES)
+            require_output_file("--out", self.out, _SUFFIXES, overwrite=self.overwrite)
         suffix = self.out.suffix.lower()
         is_page, is_picture, is_drawing = suffix == _PAGE_SUFFIX, suffix == _PICTURE_SUFFIX, suffix in _DRAWING_SUFFIXES
         is_mesh = self.mesh or suffix == _MESH_SUFFIX
@@ -201,9 +202,10 @@ class Export:
     def _write_mesh(self) -> None:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.data.pairs import Pair
-        from pansplat.gaussians.mesh_files import save_mesh
+        from pansplat.gaussians.mesh_files import name_mesh_files, save_mesh
         from pansplat.refinement.mesh import DEFAULT_TRIANGLES, make_mesh
 
+        require_replaceable("--out", name_mesh_files(self.out, 1), self.overwrite)  # before the prediction
         load: Callable[[int], Tensor] | None = None
         if is_scene_file(self.path):
             edited, changes = self._edit(self.prediction.open(self.path))
@@ -222,7 +224,7 @@ class Export:
                 return pair.load_context(min(pair.image_height, _TEXTURE_HEIGHT)).images[0]
 
         mesh = make_mesh(edited, triangles=self.triangles or DEFAULT_TRIANGLES, textures=load)
-        files = save_mesh(mesh, self.out)
+        files = save_mesh(mesh, self.out, overwrite=self.overwrite)
         size = sum(file.stat().st_size for file in files)
         beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
         count = len(mesh.parts)

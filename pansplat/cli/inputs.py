@@ -30,6 +30,14 @@ Precision = Literal["float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
+class Writer:
+    """A command that writes files."""
+
+    overwrite: bool = field(default=False, kw_only=True)
+    """Replace files that pansplat did not write, too."""
+
+
+@dataclass(frozen=True)
 class PairChoice:
     """How to read a panorama, a folder of panoramas or a web tour, and which of its pairs to use."""
 

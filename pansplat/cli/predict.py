@@ -9,14 +9,14 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair
+from pansplat.cli.inputs import ModelChoice, Out, PairChoice, Writer, choose_pair
 from pansplat.console import progress_bar
 from pansplat.files import SCENE_SUFFIXES, require_output_file
 from pansplat.options import WHOLE, Fraction, Height, Range, Seconds
 
 
 @dataclass(frozen=True)
-class Predict:
+class Predict(Writer):
     """Predict the 3D Gaussians of one panorama or of a pair, and write them in the format of the file's suffix
     (docs/formats.md)."""
 
@@ -47,7 +47,7 @@ class Predict:
         """Predict, write the scene and print the time of the prediction."""
         from pansplat import pipeline
 
-        require_output_file("--out", self.out, SCENE_SUFFIXES)
+        require_output_file("--out", self.out, SCENE_SUFFIXES, overwrite=self.overwrite)
         pair = choose_pair(self.path, self.choice)
         model = self.model.load()
         joint = not self.layers and len(pair.context) > 1 and not pipeline.can_stream(model)

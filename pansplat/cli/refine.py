@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair, predict_scene
+from pansplat.cli.inputs import ModelChoice, Out, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.console import call_at_first_signal, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import SCENE_SUFFIXES, is_scene_file, require_output_file
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Refine:
+class Refine(Writer):
     """Fit a scene to its own photographs by rendering and comparison, and write it in the format of the file's suffix.
 
     Ctrl+C ends the refinement early and writes the scene as it is then.
@@ -89,9 +89,9 @@ class Refine:
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        require_output_file("--out", self.out, SCENE_SUFFIXES)
+        require_output_file("--out", self.out, SCENE_SUFFIXES, overwrite=self.overwrite)
         if self.report is not None:
-            require_output_file("--report", self.report, (".json",))
+            require_output_file("--report", self.report, (".json",), overwrite=self.overwrite)
         if self.poses and not self.layers:
             raise InputError("--poses compares all Gaussians of each view with the photographs; add --layers")
         if self.seconds is not None and self.steps is not None:

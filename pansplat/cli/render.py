@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, ScenePrediction, parse_blend
+from pansplat.cli.inputs import Out, ScenePrediction, Writer, parse_blend
 from pansplat.console import progress_bar
 from pansplat.errors import InputError
 from pansplat.files import read_file, require_output_file
@@ -32,7 +32,7 @@ _MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
 
 
 @dataclass(frozen=True)
-class Render:
+class Render(Writer):
     """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4,
     .webm)."""
 
@@ -120,7 +120,7 @@ class Render:
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, *_VIDEO_SUFFIXES))
+        require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, *_VIDEO_SUFFIXES), overwrite=self.overwrite)
         if self.depth and self.out.suffix.lower() != ".png":
             raise InputError(f"--depth writes a .png, got {self.out}; an .exr holds the depth without it")
         if self.at is not None and self.pose is not None:

@@ -13,7 +13,8 @@ import difflib
 import os
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ from pansplat.data.reconstructions import find_reconstruction, read_reconstructi
 from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.data.web_tours.entries import plain_text
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import expand_home, read_file
+from pansplat.files import expand_home, is_written, read_file
 from pansplat.strict_json import list_field, number_field, read_json, require_object
 
 _POSES, _PAIRS = "poses.json", "pairs.json"
@@ -172,7 +173,7 @@ def _load_pairs(root: Path, convention: str | None, near: float | None, far: flo
             return _make_unposed_pairs(root.parent, _read_tour_file(root), near, far)
         else:
             root = root.parent if root.is_file() else root
-            collections = _find_collections(root, convention, _MAX_DEPTH)
+            collections = _search(root, partial(_find_collections, convention=convention))
             if collections:
                 _note_unread_panoramas(root, *_list_files(collections))
         unposed = [] if collections else _list_unposed(root)
@@ -287,7 +288,13 @@ def _make_unposed_pairs(folder: Path, panoramas: list[Panorama], near: float | N
     return [dataclasses.replace(pair, name=folder.resolve().name)]
 
 
-def _find_collections(folder: Path, convention: str | None, depth: int) -> list[tuple[Path, Collection]]:
+def _search(root: Path, find: Callable[[Path, int, bool], list[Any]]) -> list[Any]:
+    """What is found at or below a folder; exports of pansplat in subfolders count only if there is nothing else."""
+    found = find(root, _MAX_DEPTH, False)
+    return found if found or not all(map(is_written, list_panorama_files(root))) else find(root, _MAX_DEPTH, True)
+
+
+def _find_collections(folder: Path, depth: int, exports: bool, convention: str | None) -> list[tuple[Path, Collection]]:
     """The collections in a folder itself, or else those in its subfolders."""
     if (folder / _POSES).exists():  # the reader refuses what is no file
         return [(folder, read_pose_file_folder(folder, convention))]
@@ -306,8 +313,8 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
         return [(folder, found if is_joined else _with_further(found))]
     if find_web_tour(folder) is not None:
         return []
-    subfolders = _list_subfolders(folder, depth)
-    return [found for sub in subfolders for found in _find_collections(sub, convention, depth - 1)]
+    find = partial(_find_collections, depth=depth - 1, exports=exports, convention=convention)
+    return [found for sub in _list_subfolders(folder, depth, exports) for found in find(sub)]
 
 
 def _leave_out_damaged(collection: Collection) -> Collection:
@@ -355,22 +362,32 @@ def find_panorama_folders(root: Path) -> list[Path]:
     Raises:
         OSError: a folder cannot be listed.
     """
-    return _find_panorama_folders(root, _MAX_DEPTH)
+    return _search(root, _find_panorama_folders)
 
 
-def _find_panorama_folders(folder: Path, depth: int) -> list[Path]:
+def _find_panorama_folders(folder: Path, depth: int, exports: bool) -> list[Path]:
     has_poses = (folder / _POSES).exists() or is_loc360_sequence(folder) or is_matterport3d_scene(folder)
     if has_poses or triplet_files(folder) or find_trajectory(folder) is not None or list_panorama_files(folder):
         return [folder]
     if find_reconstruction(folder) is not None or find_web_tour(folder) is not None:
         return [folder]
-    return [found for sub in _list_subfolders(folder, depth) for found in _find_panorama_folders(sub, depth - 1)]
+    find = partial(_find_panorama_folders, depth=depth - 1, exports=exports)
+    return [found for sub in _list_subfolders(folder, depth, exports) for found in find(sub)]
 
 
-def _list_subfolders(folder: Path, depth: int) -> list[Path]:
+def _list_subfolders(folder: Path, depth: int, exports: bool = True) -> list[Path]:
     """Subfolders to search, sorted; none at depth 0."""
     found = sorted(folder.iterdir()) if depth else []
-    return [sub for sub in found if sub.is_dir() and not sub.name.startswith((".", "__"))]
+    subfolders = [sub for sub in found if sub.is_dir() and not sub.name.startswith((".", "__"))]
+    return [sub for sub in subfolders if exports or not _is_export(sub)]
+
+
+def _is_export(folder: Path) -> bool:
+    """Whether pansplat wrote the folder: a training set, or all pictures of a folder without poses."""
+    if (folder / "transforms.json").is_file():
+        return is_written(folder / "transforms.json")
+    pictures = [] if (folder / _POSES).exists() else list_panorama_files(folder)
+    return bool(pictures) and all(map(is_written, pictures))
 
 
 class UnposedPanoramasError(InputError):

@@ -37,10 +37,10 @@ from pansplat.data.blur_masks import (
     widen_hidden,
 )
 from pansplat.data.cube_images import CUBE_SUFFIX, CubeImage, read_cube
-from pansplat.data.panorama_metadata import Crop, find_crop, find_xmp, make_gpano_xmp, parse_gpano
+from pansplat.data.panorama_metadata import SOFTWARE_XMP, Crop, find_crop, find_xmp, make_gpano_xmp, parse_gpano
 from pansplat.data.rig_images import RIG_SUFFIX, RigImage, read_rig
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import read_file, require_file
+from pansplat.files import SOFTWARE, read_file, require_file
 
 WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
 READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff", ".heic", ".heif")
@@ -459,12 +459,11 @@ def _encode(
     chunks = PngInfo()
     if description:
         chunks.add_text("Description", description)
-    if image.width == 2 * image.height if panorama is None else panorama:
-        xmp = make_gpano_xmp(image.width, image.height, is_photograph=panorama == "photograph")
-        options = options | {"xmp": xmp}
-        chunks.add_itxt("XML:com.adobe.xmp", xmp.decode())
-    if suffix == ".png":
-        options = {"pnginfo": chunks}
+    is_panorama = image.width == 2 * image.height if panorama is None else panorama
+    is_photograph = panorama == "photograph"
+    xmp = make_gpano_xmp(image.width, image.height, is_photograph=is_photograph) if is_panorama else SOFTWARE_XMP
+    chunks.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    options = {"pnginfo": chunks} if suffix == ".png" else options | {"xmp": xmp}
     encoded = io.BytesIO()  # Pillow's own writing to a file misses a disk that becomes full
     image.save(encoded, Image.registered_extensions()[suffix], **options)
     with replacing(path) as temporary:
@@ -508,6 +507,7 @@ def _write_exr(
             )
         channels["Z"] = plane
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header["comments"] = SOFTWARE
     if pixels.shape[1] == 2 * pixels.shape[0] if panorama is None else panorama:
         header["envmap"] = OpenEXR.ENVMAP_LATLONG
     # OpenEXR raises a RuntimeError or worse when the disk is full.

@@ -43,6 +43,13 @@ _RDF = (
 )
 
 
+SOFTWARE_XMP = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    b'<rdf:Description rdf:about="" xmlns:tiff="http://ns.adobe.com/tiff/1.0/" tiff:Software="pansplat"/>'
+    b"</rdf:RDF></x:xmpmeta>"
+)
+
+
 def make_gpano_xmp(width: int, height: int, *, is_photograph: bool = False) -> bytes:
     """XMP of a full equirectangular panorama of a size in pixels; a rendering names pansplat as its software."""
     properties = {

@@ -15,9 +15,9 @@ from pansplat.data.cube_faces import find_layout, group_faces
 from pansplat.data.cube_images import CubeImage, write_cube
 from pansplat.data.images import is_two_to_one, read_size, require_complete, require_two_to_one
 from pansplat.data.pairs import Link, Panorama, find_mask, list_panorama_files
-from pansplat.data.panorama_metadata import read_xmp
 from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links
 from pansplat.errors import InputError, InputWarning
+from pansplat.files import is_written
 from pansplat.geometry.path import wrap_angle
 from pansplat.strict_json import list_field, read_json, require_object
 
@@ -42,7 +42,7 @@ def list_photographs(folder: Path) -> list[Panorama]:
         InputError: there are pictures, and none can be used.
     """
     every = list_panorama_files(folder)
-    rendered = [image for image in every if _is_rendered(image)]
+    rendered = [image for image in every if is_written(image)]
     panoramas, problems = _read_pictures([image for image in every if image not in rendered], folder)
     if panoramas:
         problems += [f"{image}: it was rendered by pansplat." for image in rendered]
@@ -88,7 +88,7 @@ def _list_others(folder: Path, known: Collection[Path], stated: Collection[str] 
     """The pictures of a folder other than the known files, which are stated, or which pansplat has not rendered."""
     read = {_identify(file) for file in known}
     others = [image for image in list_panorama_files(folder) if _identify(image) not in read]
-    return [image for image in others if image.name in stated or not _is_rendered(image)]
+    return [image for image in others if image.name in stated or not is_written(image)]
 
 
 def _identify(file: Path) -> object:
@@ -103,11 +103,6 @@ def _identify(file: Path) -> object:
 def _warn_left_out(problems: Sequence[str]) -> None:
     for problem in problems:
         warnings.warn(f"left out: {problem}", category=InputWarning, stacklevel=4)
-
-
-def _is_rendered(image: Path) -> bool:
-    """Whether the metadata name pansplat as the program that made the picture."""
-    return b'StitchingSoftware="pansplat"' in read_xmp(image)
 
 
 def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama], list[str]]:

@@ -15,7 +15,7 @@ from pansplat.atomic import replacing
 from pansplat.data.panorama_metadata import Projection, Stereo, mark_spherical_video
 from pansplat.data.spherical_webm import mark_spherical_webm
 from pansplat.errors import InputError
-from pansplat.files import require_file
+from pansplat.files import SOFTWARE, require_file
 
 _MAX_SKIP = 48  # frames between two reads; a larger gap is skipped by seeking
 _ENCODERS = {
@@ -180,6 +180,7 @@ def write_video(
         count = 0
         options = {"movflags": "+faststart"} if path.suffix.lower() == ".mp4" else {}
         with av.open(str(temporary), "w", options=options) as container:
+            container.metadata["comment"] = SOFTWARE  # at the start of a .webm
             stream: Any = None
             for count, frame in enumerate(frames, start=1):
                 pixels = _check_frame(path, frame, count, None if stream is None else (stream.height, stream.width))
@@ -196,6 +197,9 @@ def write_video(
         if panorama:
             mark = mark_spherical_video if path.suffix.lower() == ".mp4" else mark_spherical_webm
             mark(temporary, "equirect" if panorama is True else panorama, stereo)
+        if path.suffix.lower() == ".mp4":
+            with open(temporary, "ab") as file:  # a box that players skip
+                file.write((8 + len(SOFTWARE)).to_bytes(4, "big") + b"free" + SOFTWARE.encode())
     return count
 
 

@@ -10,11 +10,12 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import torch
@@ -207,9 +208,11 @@ def error_image(
     return torch.from_numpy(heat).permute(2, 0, 1)
 
 
-def write_json(value: object, path: Path) -> None:
-    """Write a value without non-finite numbers as JSON, atomically."""
-    text = json.dumps(value, indent=1, allow_nan=False)
+def write_json(value: Mapping[str, Any] | Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write an object, or a list of objects, without non-finite numbers as JSON, atomically."""
+    mark = {"software": "pansplat"}
+    marked = {**mark, **value} if isinstance(value, dict) else [{**mark, **row} for row in value]
+    text = json.dumps(marked, indent=1, allow_nan=False)
     with replacing(path) as unfinished:
         unfinished.write_text(text + "\n", encoding="utf-8")
 

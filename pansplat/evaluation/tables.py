@@ -16,6 +16,7 @@ from rich.table import Table
 
 from pansplat.atomic import replacing
 from pansplat.evaluation.protocol import ProtocolResult, SetResult
+from pansplat.files import SOFTWARE
 
 Values = dict[tuple[str, str], float]
 """By test set and metric."""
@@ -237,7 +238,7 @@ def plot_frame_distance(result: ProtocolResult, path: Path) -> None:
         axes.grid(alpha=0.25)
     panels[0].legend(fontsize=8)
     with replacing(path) as partial:
-        figure.savefig(partial, dpi=110)
+        figure.savefig(partial, dpi=110, metadata={"Software": "pansplat"})
 
 
 _PAPER_LPIPS = "lpips-vgg"
@@ -289,7 +290,8 @@ def write_report(result: ProtocolResult, out: Path) -> list[Path]:
     tables = [markdown_table(layout, our_rows(result, layout)) for layout in list_table_layouts(result)]
     with replacing(out / "table.md") as partial:
         partial.write_text(
-            "\n".join([*tables, *(f"* {note}" for note in report_notes(result))]) + "\n", encoding="utf-8"
+            "\n".join([f"<!-- {SOFTWARE} -->", *tables, *(f"* {note}" for note in report_notes(result))]) + "\n",
+            encoding="utf-8",
         )
     written = [out / "table.md"]
     if result.protocol == "frame-distance":

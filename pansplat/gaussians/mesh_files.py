@@ -11,17 +11,20 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
+from pansplat.files import SOFTWARE, require_replaceable
 from pansplat.gaussians.gltf import write_glb
 from pansplat.gaussians.scene_files import Y_UP
 from pansplat.geometry.world import USER_FRAME, WorldFrame
@@ -44,14 +47,14 @@ class MeshPart:
         positions: world, y down, metres.
         uv: places in the texture, u to the right and v down; u may exceed 1 by a part of a pixel, where it repeats.
         triangles: vertices; the normals (b - a) x (c - a) point to the camera.
-        texture: equirectangular, sRGB.
+        texture: makes the equirectangular picture, sRGB; one is in memory at a time.
     """
 
     name: str
     positions: Float[np.ndarray, "vertex 3"]
     uv: Float[np.ndarray, "vertex 2"]
     triangles: Int[np.ndarray, "triangle 3"]
-    texture: UInt8[np.ndarray, "height width 3"]
+    texture: Callable[[], UInt8[np.ndarray, "height width 3"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,42 +75,87 @@ class Mesh:
         return sum(len(part.triangles) for part in self.parts)
 
 
-def save_mesh(mesh: Mesh, path: Path) -> tuple[Path, ...]:
+def name_mesh_files(path: Path, parts: int) -> list[Path]:
+    """The files of a mesh of some number of parts, the named one first."""
+    if path.suffix.lower() != ".obj":
+        return [path]
+    stem = re.sub(r"[^\w-]+", "_", path.stem, flags=re.ASCII) or "scene"  # readers split lines at spaces
+    return [path, *(path.with_name(f"{stem}{end}") for end in (".mtl", *(f"_{n}.jpg" for n in range(parts))))]
+
+
+def save_mesh(mesh: Mesh, path: Path, *, overwrite: bool | None = True) -> tuple[Path, ...]:
     """Write a mesh in the format of the suffix, each file atomically, and return the files, the named one first.
 
+    Textures show only what triangles need of them: the rest has the colours around it.
+
+    Args:
+        mesh: one or more triangles.
+        path: of the mesh.
+        overwrite: see `pansplat.files.require_replaceable`.
+
     Raises:
-        InputError: no triangle, another suffix, more than 4 GiB, or a folder that cannot be written.
+        InputError: no triangle, another suffix, more than 4 GiB, a file that pansplat did not write, or a folder that
+            cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise InputError(f"cannot write {path}: a mesh must end in {' or '.join(MESH_SUFFIXES)}; rename it")
     if not mesh.num_triangles:
         raise InputError(f"cannot write {path}: needed one or more triangles, got none; give a scene with surfaces")
-    return _save_obj(mesh, path) if suffix == ".obj" else _save_glb(mesh, path)
+    files = name_mesh_files(path, len(mesh.parts))
+    require_replaceable(f"cannot write {path}", files, overwrite)
+    (_save_obj if suffix == ".obj" else _save_glb)(mesh, *files)
+    return tuple(files)
 
 
-def _encode(texture: UInt8[np.ndarray, "height width 3"]) -> bytes:
-    """A JPEG without metadata."""
-    stream = io.BytesIO()
-    Image.fromarray(texture).save(stream, "JPEG", quality=_QUALITY)
+def _encode_texture(part: MeshPart) -> bytes:
+    """A JPEG without metadata of the photograph."""
+    texture, stream = part.texture(), io.BytesIO()
+    shown = _fill_unused(texture, _find_used_texels(part, *texture.shape[:2]))
+    Image.fromarray(shown).save(stream, "JPEG", quality=_QUALITY, comment=SOFTWARE)
     return stream.getvalue()
 
 
-def _save_obj(mesh: Mesh, path: Path) -> tuple[Path, ...]:
-    # Readers split lines of .obj and .mtl at spaces.
-    stem = re.sub(r"[^\w-]+", "_", path.stem, flags=re.ASCII) or "scene"
-    materials = path.with_name(f"{stem}.mtl")
-    files, described, first = [path, materials], [], 1
-    for number, part in enumerate(mesh.parts):
-        image = path.with_name(f"{stem}_{number}.jpg")
+def _find_used_texels(part: MeshPart, height: int, width: int) -> Bool[np.ndarray, "height width"]:
+    """The texels that triangles cover, and the next ones, which bilinear filtering reads."""
+    corners = part.uv[part.triangles] * (width, height) - 0.5
+    beyond = max(int(np.ceil(corners[..., 0].max())) + 2 - width, 0)
+    covered = np.zeros((height, width + beyond), np.uint8)
+    cv2.fillPoly(covered, list(np.rint(16 * corners).astype(np.int32)), 1, shift=4)
+    covered[:, :beyond] |= covered[:, width:]
+    around = np.pad(covered[:, :width], ((0, 0), (1, 1)), "wrap")
+    return cv2.dilate(around, np.ones((3, 3), np.uint8))[:, 1:-1] > 0
+
+
+def _fill_unused(
+    texture: UInt8[np.ndarray, "height width 3"], used: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The texture with the mean colour of used texels around in place of the others.
+
+    Black would show at the edges of triangles: programs draw distant triangles with smaller sizes of the texture.
+    """
+    levels = [(texture * used[..., None].astype(np.float32), used.astype(np.float32))]
+    while levels[-1][1].size > 1:
+        height, width = levels[-1][1].shape
+        size = (max(width // 2, 1), max(height // 2, 1))
+        levels.append(tuple(cv2.resize(values, size, interpolation=cv2.INTER_AREA) for values in levels[-1]))
+    filled = np.zeros((1, 1, 3), np.float32)
+    for color, weight in reversed(levels):
+        filled = cv2.resize(filled, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        np.divide(color.reshape(filled.shape), weight[..., None], out=filled, where=weight[..., None] > 0)
+    return np.where(used[..., None], texture, np.rint(filled).astype(np.uint8))
+
+
+def _save_obj(mesh: Mesh, path: Path, materials: Path, *images: Path) -> None:
+    described, first = [f"# {SOFTWARE}\n"], 1
+    for number, (part, image) in enumerate(zip(mesh.parts, images, strict=True)):
         with replacing(image) as partial:
-            partial.write_bytes(_encode(part.texture))
-        files.append(image)
+            partial.write_bytes(_encode_texture(part))
         described.append(f"newmtl view_{number}\nKd 1 1 1\nillum 0\nmap_Kd {image.name}\n")
     with replacing(materials) as partial:
         partial.write_text("\n".join(described), encoding="utf-8")
     with replacing(path) as partial, open(partial, "w", encoding="utf-8", newline="\n") as file:
-        file.write(f"# pansplat; metres, y up\nmtllib {materials.name}\n")
+        file.write(f"# {SOFTWARE}; metres, y up\nmtllib {materials.name}\n")
         for number, part in enumerate(mesh.parts):
             file.write(f"o view_{number}\nusemtl view_{number}\n")
             places = mesh.frame.globalize_places(torch.from_numpy(part.positions)) @ Y_UP
@@ -116,10 +164,9 @@ def _save_obj(mesh: Mesh, path: Path) -> tuple[Path, ...]:
             corners = np.repeat(part.triangles + first, 2, axis=1)  # position and texture have one number
             np.savetxt(file, corners, "f %d/%d %d/%d %d/%d")
             first += len(part.positions)
-    return tuple(files)
 
 
-def _save_glb(mesh: Mesh, path: Path) -> tuple[Path, ...]:
+def _save_glb(mesh: Mesh, path: Path) -> None:
     blocks: list[bytes] = []
     # float32 does not hold large positions: they are relative to the origin.
     extras = {"extras": {"pansplat": {"origin": mesh.frame.origin}}} if any(mesh.frame.origin) else {}
@@ -162,7 +209,6 @@ def _save_glb(mesh: Mesh, path: Path) -> tuple[Path, ...]:
         lists["meshes"].append({"primitives": [primitive]})
         lists["materials"].append({"pbrMetallicRoughness": surface, "extensions": {_UNLIT: {}}})
         lists["textures"].append({"sampler": 0, "source": number})
-        lists["images"].append({"bufferView": add_block(_encode(part.texture)), "mimeType": "image/jpeg"})
+        lists["images"].append({"bufferView": add_block(_encode_texture(part)), "mimeType": "image/jpeg"})
     document |= lists | {"buffers": [{"byteLength": sum(map(len, blocks))}]}
     write_glb(document, blocks, path, f"{mesh.num_triangles:,} triangles", "reduce --triangles")
-    return (path,)

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import require_file
+from pansplat.files import SOFTWARE, require_file
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.gaussians.scene_files import (
@@ -184,7 +184,7 @@ def save_points(scene: Scene, path: str | Path) -> None:
     for column, (name, _) in zip((*places.unbind(1), *colors.unbind(1)), fields, strict=True):
         table[name] = column.detach().numpy()
     kinds = {"<f4": "float", "<f8": "double", "u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(kept)}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {SOFTWARE}", f"element vertex {len(kept)}"]
     lines += [*(f"property {kinds[kind]} {name}" for name, kind in fields), "end_header\n"]
     with replacing(path) as partial, open(partial, "wb") as file:
         file.write("\n".join(lines).encode())

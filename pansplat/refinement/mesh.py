@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -75,9 +76,9 @@ def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Tex
         points = points @ pose[:3, :3].T + pose[:3, 3]
         is_free = ~_are_seen_nearer(points, view, poses.cpu(), reaches).numpy()
         triangle = corners[is_free[_find_points(corners, rows)].any(axis=1)]
-        texture = _draw(seen[view], pose, scene) if textures is None else textures(view)
+        draw = partial(_draw, seen[view], pose, scene) if textures is None else partial(textures, view)
         name = scene.names[view] if view < len(scene.names) else f"panorama {view + 1}"
-        parts.append(_make_part(name, points.numpy(), triangle, rows, _balance(texture, scene, view)))
+        parts.append(_make_part(name, points.numpy(), triangle, rows, partial(_balance, draw, scene, view)))
     return Mesh(tuple(part for part in parts if len(part.triangles)), scene.frame)
 
 
@@ -163,8 +164,12 @@ def _draw(gaussians: Gaussians, pose: Float[Tensor, "4 4"], scene: Scene) -> Flo
     return drawn.color / drawn.alpha.clamp_min(OPAQUE)
 
 
-def _balance(texture: Float[Tensor, "3 height width"], scene: Scene, view: int) -> UInt8[np.ndarray, "height width 3"]:
+@torch.no_grad()
+def _balance(
+    draw: Callable[[], Float[Tensor, "3 height width"]], scene: Scene, view: int
+) -> UInt8[np.ndarray, "height width 3"]:
     """The pixels of a texture, with the mean exposure and white balance of all views if those of each are known."""
+    texture = draw()
     if scene.gains and not scene.joint:
         texture = texture / torch.tensor(scene.gains[view]).to(texture)[:, None, None]
     return (texture.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
@@ -175,7 +180,7 @@ def _make_part(
     points: Float[np.ndarray, "n 3"],
     corners: Int[np.ndarray, "triangle 3"],
     rows: int,
-    texture: UInt8[np.ndarray, "height width 3"],
+    texture: Callable[[], UInt8[np.ndarray, "height width 3"]],
 ) -> MeshPart:
     """The part of some triangles, with the vertices that they need."""
     used, triangles = np.unique(corners, return_inverse=True)

@@ -20,6 +20,7 @@ from shapely.geometry import Polygon
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
+from pansplat.files import SOFTWARE
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import make_graph
@@ -176,7 +177,7 @@ def _draw_svg(plan: Plan) -> str:
         return f'<text x="{x:.3f}" y="{y:.3f}" font-size="{size}"{more}>{text}</text>'
 
     parts = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<?xml version="1.0" encoding="UTF-8"?><!-- {SOFTWARE} -->',
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width * _PAPER:.1f}mm" height="{total * _PAPER:.1f}mm" '
         f'viewBox="{number((0, 0, width, total))}">',
         f'<style>{_STYLE}</style><rect width="100%" height="100%" fill="#fff"/>',
@@ -235,5 +236,6 @@ def _draw_dxf(plan: Plan) -> str:
         entity = space.add_text(content, height=text.size, dxfattribs={"layer": text.layer})
         entity.set_placement(text.place, align=align)
     stream = io.StringIO()
+    stream.write(f"999\n{SOFTWARE}\n")
     document.write(stream)
     return stream.getvalue()

@@ -34,6 +34,7 @@ from pansplat.atomic import replacing
 from pansplat.console import with_progress_bar
 from pansplat.data.views import Views
 from pansplat.errors import InputError, InputWarning
+from pansplat.files import SOFTWARE, is_written
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import path_poses, turn_pose
 from pansplat.predictor import Progress
@@ -506,7 +507,7 @@ def _write_files(
     """Write the page, and its parts if it is split."""
     count = header["count"]
     parts = [base64.b64encode(content[k : k + _PART_BYTES]).decode() for k in range(0, len(content), _PART_BYTES)]
-    scripts = [f'addPart("{part}");\n' for part in parts] if split else []
+    scripts = [f'addPart("{part}"); // {SOFTWARE}\n' for part in parts] if split else []
     folder = path.with_name(f"{path.stem}_files")
     names = [f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js" for text in scripts]
     tags = [f'<script src="{quote(os.fsencode(folder.name))}/{name}"></script>' for name in names]
@@ -583,7 +584,7 @@ def _make_folder(folder: Path) -> None:
 def _remove_old_parts(folder: Path, kept: set[str]) -> None:
     """Remove the parts of the page that was replaced."""
     for file in folder.glob("*.js"):
-        if file.name not in kept and re.fullmatch(r"[0-9a-f]{16}\.js", file.name):
+        if file.name not in kept and re.fullmatch(r"[0-9a-f]{16}\.js", file.name) and is_written(file):
             with suppress(OSError):
                 file.unlink()
 

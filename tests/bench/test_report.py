@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from pansplat.bench.report import Benchmark, Column, Report, Row
 from pansplat.errors import InputError
+from pansplat.files import is_written
 
 HEADER = {"machine": {"cpu": "some", "gpu": None, "threads": 2}}
 
@@ -91,6 +92,7 @@ def test_an_interrupted_run_is_printed_and_written(tmp_path, capsys):
     assert len(json.loads((tmp_path / "speed.json").read_text())["rows"]) == 1
     assert "### Speed: 16" in (tmp_path / "speed.md").read_text()
     assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+    assert all(is_written(tmp_path / f"speed{suffix}") for suffix in (".json", ".md", ".png"))
     printed, steps = capsys.readouterr()
     assert "some, GPU: none, 2 threads" in printed and "speed: 16" in printed and "1 rows." in printed
     assert printed.split()[-3:] == [str(tmp_path / name) for name in ("speed.json", "speed.md", "speed.png")]

@@ -16,6 +16,9 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
+from pansplat.data.folders import UnposedPanoramasError, find_panorama_folders, load_pairs
+from pansplat.data.photographs import list_photographs
+from pansplat.errors import InputWarning
 from pansplat.web import page as page_module
 
 OPTIONS = ["--model", "sphere", "--refine", "0", "--predict-height", "64"]
@@ -76,6 +79,41 @@ def test_a_folder_with_files_and_a_scene_file_are_refused(
     assert "needed the folder of the panoramas to write their cube faces, got a scene file" in message
     assert not (tmp_path / "set").exists()
     assert "--points writes a .ply" in refusal("export", room, "-o", tmp_path / "set", "--points", *OPTIONS)
+
+
+def test_an_export_into_a_folder_of_photographs_does_not_hide_them(
+    tmp_path: Path, write_room: Callable[..., Path], recwarn: pytest.WarningsRecorder
+) -> None:
+    room = write_room(tmp_path / "room", target=False)
+    out = room / "exports" / "training_set"
+    assert run(["export", str(room), "-o", str(out), *OPTIONS]) == 0
+    for name in ("poses.json", "pairs.json"):
+        (room / name).unlink()
+    recwarn.clear()
+    with pytest.raises(UnposedPanoramasError) as photographs:  # as of a folder of photographs without poses
+        load_pairs(room)
+    assert [panorama.image for panorama in photographs.value.panoramas] == [room / f"{n}.png" for n in "abc"]
+    assert find_panorama_folders(tmp_path) == [room]
+    for folder in (out, out.parent):
+        images = [view.image for pair in load_pairs(folder) for view in pair.context]
+        assert images and all(out in image.parents for image in images), "alone, it is a scene"
+    shutil.move(out, tmp_path / "set")
+    assert find_panorama_folders(tmp_path) == [room]
+    room.rename(tmp_path / ".room")
+    assert find_panorama_folders(tmp_path) == [tmp_path / "set"]
+
+
+@pytest.mark.parametrize("name", ["house.obj", "view.png", "view.jpg", "view.webp"])
+def test_no_export_or_picture_is_a_panorama_of_the_folder(room: Path, scene: Path, name: str) -> None:
+    for file in ("poses.json", "pairs.json"):
+        (room / file).unlink()
+    if name == "house.obj":
+        command = ["export", str(scene), "-o", str(room / name)]
+    else:
+        command = ["render", str(scene), "-o", str(room / name), "--height", "16"]
+    assert run(command) == 0
+    with pytest.warns(InputWarning, match="rendered by pansplat"):
+        assert [panorama.name for panorama in list_photographs(room)] == ["a", "b", "c"]
 
 
 def test_no_export_repeats_the_metadata_of_the_photographs(

@@ -35,6 +35,7 @@ from pansplat.evaluation.tables import (
     rich_tables,
     write_report,
 )
+from pansplat.files import is_written
 from pansplat.model.network import NetworkPredictor
 
 HEIGHT = 32
@@ -299,6 +300,7 @@ def test_the_figure_has_a_line_for_each_method(tmp_path: Path, sphere_predictor)
     lines = frame_distance_curves(result.sets, "ws_psnr")
     assert {method: [gap for gap, _ in line] for method, line in lines.items()} == {m.name: [2, 4] for m in both}
     written = write_report(result, tmp_path / "out")
+    assert all(map(is_written, written))
     assert {path.name for path in written} == {"table.md", "frame_distance.png"}
     with Image.open(tmp_path / "out" / "frame_distance.png") as figure:
         assert figure.size[0] > 300

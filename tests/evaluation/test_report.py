@@ -21,7 +21,7 @@ from pansplat.evaluation.report import ERROR_SCALE, Case, error_image, evaluate,
 
 HEIGHT = 16
 KEYS = [
-    *("name", "model", "height", "ws_psnr", "psnr", "ssim", "cross_fade_ws_psnr", "predict_seconds"),
+    *("software", "name", "model", "height", "ws_psnr", "psnr", "ssim", "cross_fade_ws_psnr", "predict_seconds"),
     *("render_seconds", "num_gaussians", "prediction", "target", "own_ws_psnr", "refine_seconds"),
 ]
 
@@ -73,7 +73,7 @@ def test_results_have_the_documented_fields_and_files(folder: Path, case: Case) 
 
 
 def test_metrics_are_those_of_the_written_images(folder: Path, case: Case) -> None:
-    assert json.loads((folder / "out" / "results.json").read_text()) == [case.as_json()]
+    assert json.loads((folder / "out" / "results.json").read_text()) == [{"software": "pansplat", **case.as_json()}]
     prediction, target = read_image(case.prediction), read_image(case.target)
     torch.testing.assert_close(target, read_image(folder / "room" / "c.png"))
     assert case.ws_psnr == pytest.approx(ws_psnr(prediction, target), abs=0.01)  # 8 bits

@@ -1,6 +1,8 @@
 """Textured triangles of a box room: places, textures, steps in depth, each place once, and the files."""
 
 import dataclasses
+import weakref
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,9 @@ import trimesh
 from PIL import Image
 
 from pansplat.errors import InputError
-from pansplat.gaussians.mesh_files import Mesh, save_mesh
+from pansplat.gaussians.mesh_files import Mesh, MeshPart, save_mesh
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.refinement.mesh import make_mesh
@@ -97,11 +100,12 @@ def test_each_place_is_kept_from_the_nearest_camera(mesh: Mesh) -> None:
 def test_a_texture_has_the_colour_of_the_place(mesh: Mesh) -> None:
     """Also at the seam and the poles: the texture repeats beyond its last column."""
     for part in mesh.parts:
-        height, width, _ = part.texture.shape
+        texture = part.texture()
+        height, width, _ = texture.shape
         column = (part.uv[:, 0] * width).astype(int) % width
         row = (part.uv[:, 1] * height).astype(int).clip(0, height - 1)
         expected = _color(torch.from_numpy(part.positions)).numpy() * 255
-        error = np.abs(part.texture[row, column] - expected)
+        error = np.abs(texture[row, column] - expected)
         assert np.quantile(error, 0.98) < 4 and error.max() < 20, "more in corners, which the image rounds"
         spans = np.ptp(part.uv[part.triangles], axis=1)
         assert spans.max() < 0.02, "no triangle spans the whole texture"
@@ -111,7 +115,7 @@ def test_photographs_are_textures_without_their_exposure(box: Scene) -> None:
     grey = torch.full((3, 16, 32), 0.4)
     exposed = dataclasses.replace(box, gains=((2.0, 1.0, 1.0), (0.5, 1.0, 1.0)))
     parts = make_mesh(exposed, triangles=TRIANGLES, textures=lambda view: grey * (1 + view)).parts
-    assert [part.texture[0, 0].tolist() for part in parts] == [[51, 102, 102], [255, 204, 204]]
+    assert [part.texture()[0, 0].tolist() for part in parts] == [[51, 102, 102], [255, 204, 204]]
 
 
 def test_no_triangle_spans_a_step_in_depth(box: Scene) -> None:
@@ -188,6 +192,80 @@ def test_files_are_in_the_unit_of_the_poses_and_at_their_place_or_state_it(
     vertices = np.concatenate([np.asarray(part.vertices) for part in read.geometry.values()]) * (1, -1, -1)
     assert np.allclose(np.sort(vertices, axis=0), np.sort(frame.unit * places, axis=0), rtol=1e-5, atol=1e-3)
     assert (b'"origin":[5000000.0,-400000.0,64.0]' in (tmp_path / "house.glb").read_bytes()) == any(frame.origin)
+
+
+def _read_textures(file: Path) -> list[np.ndarray]:
+    """The textures of the parts of a file, (height, width, 3)."""
+    parts = trimesh.load_scene(file, process=False).geometry.values()
+    images = [getattr(p.visual.material, "baseColorTexture", None) or p.visual.material.image for p in parts]
+    return [np.asarray(image.convert("RGB"), float) for image in images]
+
+
+@pytest.mark.parametrize("name", ["house.glb", "house.obj"])
+def test_textures_show_nothing_that_no_triangle_uses(box: Scene, tmp_path: Path, name: str) -> None:
+    """Half of the walls are left out, and the photograph is red there; the seam of the texture is in the other half."""
+    rays = box.gaussians.means - CENTERS[0]
+    kept = box.gaussians.select((box.gaussians.views == 0) & (rays[:, 2] < 0.3 * rays[:, 0]))
+    scene = dataclasses.replace(box, gaussians=kept, cam2world=box.cam2world[:1], names=("a.jpg",))
+    directions = pixel_directions(256, 512)
+    is_secret = directions[..., 2] > 0.3 * directions[..., 0] + 0.03  # more than a triangle from the edge of the walls
+    photograph = torch.where(is_secret, torch.tensor((1.0, 0, 0))[:, None, None], torch.tensor(0.4))
+    file = tmp_path / name
+    save_mesh(make_mesh(scene, triangles=TRIANGLES, textures=lambda view: photograph), file)
+    (texture,) = _read_textures(file)
+    assert texture.shape == (256, 512, 3) and np.abs(texture - 102).max() < 12, "grey, as what the triangles show"
+
+
+def test_what_triangles_use_of_a_texture_is_that_of_the_photograph(
+    box: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pansplat.gaussians.mesh_files._QUALITY", 100)
+    noise = torch.rand(1, 128, 256, generator=torch.Generator().manual_seed(0)).expand(3, -1, -1)  # grey
+    mesh = make_mesh(box, triangles=TRIANGLES, textures=lambda view: noise)
+    save_mesh(mesh, tmp_path / "a.glb")
+    expected = 255 * noise.permute(1, 2, 0).numpy()
+    for part, texture in zip(mesh.parts, _read_textures(tmp_path / "a.glb"), strict=True):
+        corners = part.uv[part.triangles]
+        for weights in ((1, 0, 0), (0.05, 0.9, 0.05), (1 / 3, 1 / 3, 1 / 3), (0.5, 0.5, 0), (0, 0.3, 0.7)):
+            place = np.einsum("k,tkc->tc", weights, corners) * (256, 128) - 0.5
+            first = np.floor(place).astype(int)
+            for right in (0, 1):  # the texels of bilinear filtering
+                for below in (0, 1):
+                    column, row = (first[:, 0] + right) % 256, (first[:, 1] + below).clip(0, 127)
+                    assert np.abs(texture[row, column] - expected[row, column]).max() < 4
+
+
+@pytest.mark.parametrize("name", ["house.glb", "house.obj"])
+def test_one_texture_is_in_memory_at_a_time(box: Scene, tmp_path: Path, name: str) -> None:
+    """Twelve cameras in a row: before a photograph is read, that of the last texture is gone."""
+    poses = box.cam2world[:1].repeat(12, 1, 1)
+    poses[:, 0, 3] += 0.1 * torch.arange(12)
+    plain = _view(0, count=4000)
+    plain = dataclasses.replace(plain, scales=4 * plain.scales)
+    views = [dataclasses.replace(plain, views=torch.full((4000,), k)) for k in range(12)]
+    views = [dataclasses.replace(v, means=v.means + torch.tensor((0.1 * k, 0, 0))) for k, v in enumerate(views)]
+    scene = dataclasses.replace(box, gaussians=Gaussians.cat(views), cam2world=poses, names=(), height=64)
+    read: list[weakref.ref] = []
+
+    def read_photograph(view: int) -> torch.Tensor:
+        assert not any(photograph() is not None for photograph in read), "an earlier one is still in memory"
+        photograph = torch.full((3, 64, 128), 0.5)
+        read.append(weakref.ref(photograph))
+        return photograph
+
+    mesh = make_mesh(scene, triangles=12 * 4 * 32**2, textures=read_photograph)
+    assert len(mesh.parts) == 12 and not read, "photographs are read when textures are written"
+    made: list[weakref.ref] = []
+
+    def make(part: MeshPart) -> np.ndarray:
+        assert not any(texture() is not None for texture in made)
+        texture = part.texture()
+        made.append(weakref.ref(texture))
+        return texture
+
+    parts = tuple(dataclasses.replace(part, texture=partial(make, part)) for part in mesh.parts)
+    save_mesh(Mesh(parts), tmp_path / name)
+    assert len(read) == len(made) == 12
 
 
 def test_bad_scenes_and_names_are_refused(box: Scene, mesh: Mesh, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import torch
 
 from pansplat.cleanup import crop_to_rooms
 from pansplat.errors import InputError
+from pansplat.files import is_written
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.tours import make_graph
@@ -141,6 +142,7 @@ def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Pa
     scene = _make_house(WALLS, CAMERAS, names=("living room", "living room", "hall"), count=20000)
     file = tmp_path / f"plan{suffix}"
     assert [room.name for room in write_plan(scene, file).rooms] == ["living room", "hall"]
+    assert is_written(file)
     if suffix == ".svg":
         texts = [element.text for element in ElementTree.parse(file).iter() if element.tag.endswith("}text")]
     else:

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from pansplat.errors import InputError
+from pansplat.files import is_written
 from pansplat_viewer import run
 from pansplat_viewer.app import Options, choose_entry
 from pansplat_viewer.capture import STILLS, Film, compute_flight_pose, compute_panorama_pose
@@ -123,6 +124,41 @@ def test_the_film_of_a_path_has_a_frame_for_each_time(room):
         assert [round(10 * frame.time) for frame in film.decode(video=0)] == list(range(6))
     assert run([str(room), *arguments, "walk.exr"]) == 0
     assert [path.name for path in sorted(Path().glob("*.exr"))] == [f"walk_{i:04d}.exr" for i in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("out/view_025.png", ["--offscreen", "out"]),
+        ("out/flythrough.mp4", ["--offscreen", "out"]),
+        ("out/room/panorama_050.png", ["--offscreen", "out", "--pair", "all"]),
+        ("out/03_Attic.png", ["--offscreen", "out"]),
+        ("walk.mp4", ["--path", "walk.json", "--out", "walk.mp4"]),
+        ("walk_0003.png", ["--path", "walk.json", "--out", "walk.PNG"]),
+    ],
+)
+def test_a_file_of_the_user_needs_overwrite(room, capsys, name, arguments):
+    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.5)]
+    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
+    own = Path(name)
+    own.parent.mkdir(parents=True, exist_ok=True)
+    own.write_bytes(b"of the user")
+    assert run([str(room), *arguments, "--renderer", "cpu"]) == 2
+    printed = capsys.readouterr()
+    assert f"got {own}, which pansplat did not write; choose another name, or replace them with --ov" in printed.err
+    assert own.read_bytes() == b"of the user" and len(list(own.parent.iterdir())) <= 3, "nothing is written"
+
+
+def test_the_film_of_a_path_replaces_the_one_before_and_with_overwrite_any_file(room):
+    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.1)]
+    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
+    command = [str(room), "--renderer", "cpu", "--size", "64x48", "--fps", "20", "--path", "walk.json", "--out"]
+    for name in ("walk.mp4", "walk.png"):
+        written = Path("walk.mp4" if name == "walk.mp4" else "walk_0001.png")
+        written.write_bytes(b"of the user")
+        assert run([*command, name]) == 2
+        assert run([*command, name, "--overwrite"]) == run([*command, name]) == 0
+        assert is_written(written)
 
 
 @pytest.mark.gl

@@ -363,11 +363,14 @@ def test_a_box_hides_what_is_outside_and_a_saved_scene_lacks_it(cleaning, small_
     inside = (means[:, 0] >= box[0]) & (opacities >= 0.5)
     assert len(saved.gaussians) == int(inside.sum())
     assert "Gaussians left out" in user.state.message and "small.ply" in user.state.message
-    user.panels.cleaning.file = "small.stl"
-    user.click("Save##clean")
-    user.draw_frames(2)
-    assert "small.stl" in user.data.error
-    user.data.error = None
+    (tmp_path / "own.ply").write_bytes(b"of the user")
+    for name, message in (("small.stl", "small.stl"), (str(tmp_path / "own.ply"), "own.ply, which pansplat did not")):
+        user.panels.cleaning.file = name
+        user.click("Save##clean")
+        user.draw_frames(2)
+        assert message in user.data.error
+        user.data.error = None
+    assert (tmp_path / "own.ply").read_bytes() == b"of the user"
     user.click("crop to a box")
     assert user.state.settings.box is None
 
@@ -1837,10 +1840,15 @@ def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
     user.click("Delete##0")
     user.click("Load")
     assert user.state.path == path
-    user.panels.path_file = str(tmp_path / "missing.json")
-    user.click("Load")
-    assert "missing.json" in user.data.error
-    user.click("OK")
+    user.click("Save")
+    assert user.data.error is None, "pansplat wrote the file"
+    (tmp_path / "own.json").write_text("{}")
+    for name, button in (("missing.json", "Load"), ("own.json", "Save")):
+        user.panels.path_file = str(tmp_path / name)
+        user.click(button)
+        assert name in user.data.error
+        user.click("OK")
+    assert (tmp_path / "own.json").read_text() == "{}"
     user.state.film_fps = 2.0
     user.click(".png")
     user.click("Write film")

@@ -139,7 +139,7 @@ def read_path(file: Path) -> CameraPath:
         InputError: unreadable, an unknown or missing field, a value out of range, or times that do not increase.
     """
     content = require_object(read_json(file), file)
-    _require_fields(content, ("key_frames",), file)
+    _require_fields(content, ("key_frames", "software"), file)
     frames = [
         _read_frame(require_object(entry, f"{file}, key frame {number}"), f"{file}, key frame {number}")
         for number, entry in enumerate(list_field(content, "key_frames", file), start=1)
@@ -191,4 +191,4 @@ def write_path(path: CameraPath, file: Path) -> None:
     rows = [{key: getattr(frame, key) for key in _FIELDS} for frame in path.key_frames]
     text = "[\n  " + ",\n  ".join(json.dumps(row) for row in rows) + "\n]"
     with replacing(file) as unfinished:
-        unfinished.write_text(f'{{"key_frames": {text}}}\n', "utf-8")
+        unfinished.write_text(f'{{"software": "pansplat", "key_frames": {text}}}\n', "utf-8")

@@ -23,7 +23,7 @@ from pansplat.data.poses import rigid_matrix, to_cam2world
 from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
 from pansplat.data.rig_images import Lens
 from pansplat.errors import InputError
-from pansplat.files import read_file
+from pansplat.files import SOFTWARE, read_file
 from pansplat.geometry.pose import invert_pose, quats_from_rotations, rotations_from_quats
 
 CONVENTION = "world2cam opencv"
@@ -238,7 +238,7 @@ def write_colmap(
     ]
     files = {"rigs": sensors, "cameras": cameras, "frames": frames, "images": images, "points3D": table}
     for name, lines in files.items():
-        text = "\n".join([f"# {_HEADS[name]}", *lines]) + "\n"
+        text = "\n".join([f"# {_HEADS[name]}; {SOFTWARE}", *lines]) + "\n"
         (folder / f"{name}.txt").write_text(text, encoding="utf-8")
 
 

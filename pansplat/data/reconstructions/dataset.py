@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +30,7 @@ _MAX_HEIGHT = 8192  # of a panorama, pixels
 _MASK_HEIGHT = 512
 _LOSSLESS = (".png", ".exr", ".tif", ".tiff")  # pictures whose faces are PNG; those of others are JPG
 _MARGIN = 2  # pixels, of the cubic filter
+_BAND = 256  # rows of a face that are sampled together
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +57,8 @@ def write_dataset(
 ) -> int:
     """Write cube faces with poses, and points: images/, masks/ (if some are not white), sparse/0/, transforms.json.
 
-    The pictures are made anew and carry no metadata. transforms.json names `POINTS`, which the caller writes, in the
-    world of `pansplat.data.reconstructions.nerfstudio.Z_UP`.
+    The pictures are made anew, one at a time, and carry no metadata of the photographs. transforms.json names
+    `POINTS`, which the caller writes, in the world of `pansplat.data.reconstructions.nerfstudio.Z_UP`.
 
     Args:
         folder: an empty one.
@@ -86,16 +87,16 @@ def write_dataset(
         size = 2 * math.ceil(height / math.pi)
         lens = Lens(size / 2, size / 2, size / 2, size / 2, size, size)
         faces = cut_faces(read_panorama(image, height)[0], size)
-        hidden = cut_faces(mask.float().expand(3, -1, -1), size) if has_masks else None
+        shown = cut_faces(mask.float().expand(3, -1, -1), size)
         plain = re.sub(r"[^\w.-]+", "_", view.panorama.name)  # COLMAP reads no spaces
         stem = f"{number:04d}_{plain}"
         suffix = ".png" if image.suffix.lower() in _LOSSLESS else ".jpg"
         rig = []
         for face, pose in enumerate(face_poses(view.cam2world.double())):
             name = f"{stem}_{FACES[face]}{suffix}"
-            write_image(folder / "images" / name, faces[face], panorama=False)
-            if hidden is not None:
-                white = np.where(hidden[face] >= 0.5, np.uint8(255), np.uint8(0))
+            write_image(folder / "images" / name, next(faces), panorama=False)
+            if has_masks:
+                white = np.where(next(shown) >= 0.5, np.uint8(255), np.uint8(0))
                 write_image(folder / "masks" / f"{name}.png", white, panorama=False)
             rig.append((name, pose, lens))
             shots.append((f"images/{name}", pose, lens, f"masks/{name}.png" if has_masks else None))
@@ -115,18 +116,22 @@ def _find_mask(view: PosedPanorama) -> Bool[Tensor, "height width"]:
     return opaque & scene_mask_of_files(view.siblings, _MASK_HEIGHT)
 
 
-def cut_faces(image: Float[Tensor, "3 height width"], size: int) -> Float[Array, "face size size 3"]:
-    """The six cube faces of a panorama, by bicubic samples, in [0, 1]."""
-    padded = np.ascontiguousarray(pad_equirect(image, _MARGIN).permute(1, 2, 0).numpy())
-    height = image.shape[1]
+def cut_faces(image: Float[Tensor, "3 height width"], size: int) -> Iterator[Float[Array, "size size 3"]]:
+    """Yield the six cube faces of a panorama, by bicubic samples, in [0, 1]."""
+    height, width = image.shape[1:]
+    padded = np.empty((height + 2 * _MARGIN, width + 2 * _MARGIN, 3), np.float32)
+    for channel in range(3):
+        padded[..., channel] = pad_equirect(image[channel : channel + 1], _MARGIN)[0]
+    del image  # gigabytes
     position = (torch.arange(size, dtype=torch.float64) + 0.5) / size * 2 - 1
-    y, x = torch.meshgrid(position, position, indexing="ij")
-    local = torch.stack((x, y, torch.ones_like(x)), dim=-1)
-    faces = []
     for rotation in face_rotations():
-        uv = uv_from_directions(local @ rotation.T).numpy()
-        columns, rows = (
-            (uv[..., axis] * count - 0.5 + _MARGIN).astype(np.float32) for axis, count in ((0, 2 * height), (1, height))
-        )
-        faces.append(cv2.remap(padded, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
-    return np.stack(faces).clip(0, 1)
+        face = np.empty((size, size, 3), np.float32)
+        for first in range(0, size, _BAND):
+            y, x = torch.meshgrid(position[first : first + _BAND], position, indexing="ij")
+            uv = uv_from_directions(torch.stack((x, y, torch.ones_like(x)), dim=-1) @ rotation.T).numpy()
+            columns, rows = (
+                (uv[..., axis] * count - 0.5 + _MARGIN).astype(np.float32) for axis, count in ((0, width), (1, height))
+            )
+            band = cv2.remap(padded, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            face[first : first + _BAND] = band.clip(0, 1)
+        yield face

@@ -165,7 +165,7 @@ def write_nerfstudio(
             "transform_matrix": matrix.tolist(),
         }  # fmt: skip
         frames.append(frame | ({} if mask is None else {"mask_path": mask}))
-    content: dict[str, Any] = {"camera_model": "OPENCV", "applied_transform": Z_UP[:3].tolist()}
+    content: dict[str, Any] = {"software": "pansplat", "camera_model": "OPENCV", "applied_transform": Z_UP[:3].tolist()}
     content |= {} if points is None else {"ply_file_path": points}
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(content | {"frames": frames}, indent=1) + "\n", encoding="utf-8")

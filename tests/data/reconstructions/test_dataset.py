@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from PIL import Image
 from pansplat.data.folders import load_pairs
 from pansplat.data.images import read_panorama
 from pansplat.data.pairs import Panorama
+from pansplat.data.reconstructions import dataset as dataset_module
 from pansplat.data.reconstructions.dataset import PosedPanorama, write_dataset
 from pansplat.data.reconstructions.nerfstudio import Z_UP
 
@@ -104,6 +106,28 @@ def test_a_round_trip_keeps_poses_and_pictures(
             assert shown[:48].all() and not shown[53:].any()
         else:
             check_colors(image, view.cam2world)
+
+
+def test_one_picture_is_in_memory_at_a_time(
+    tmp_path: Path, cameras: list[Array], write_panorama, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A panorama with a mask has six faces and six masks: each is gone before the one after the next is written."""
+    image, mask = tmp_path / "p.png", tmp_path / "m.png"
+    write_panorama(image, cameras[0])
+    Image.fromarray(np.arange(64 * 128, dtype=np.uint8).reshape(64, 128) // 128 * 255).save(mask)
+    view = PosedPanorama(Panorama("p", image, torch.eye(4), mask), torch.from_numpy(cameras[0]))
+    written: list[weakref.ref] = []
+
+    def write(path: Path, pixels: Array, *, panorama: bool) -> None:
+        assert sum(picture() is not None for picture in written) <= 1, "the face of this mask, or the last face"
+        assert pixels.base is None, "no view of an array of all faces"
+        written.append(weakref.ref(pixels))
+
+    monkeypatch.setattr(dataset_module, "write_image", write)
+    folder = tmp_path / "set"
+    folder.mkdir()
+    write_dataset(folder, [view], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), lambda *_: None)
+    assert len(written) == 12
 
 
 class _nothing:

@@ -81,7 +81,7 @@ FRAME = '{"seconds": 0, "position": [0, 0, 0], "direction": [0, 0, 1]}'
     [
         ("[]", "needed a JSON object"),
         ("{}", 'needed one or more "key_frames", got none'),
-        ('{"key_frames": [], "speed": 1}', "needed only the fields key_frames, got 'speed'"),
+        ('{"key_frames": [], "speed": 1}', "needed only the fields key_frames, software, got 'speed'"),
         (f'{{"key_frames": [{FRAME}, {FRAME}]}}', 'key frame 2: needed "seconds" after 0, got 0'),
         (f'{{"key_frames": [{FRAME.replace("[0, 0, 1]", "[0, 0, 0]")}]}}', 'needed a "direction" with a length'),
         (f'{{"key_frames": [{FRAME.replace("[0, 0, 0]", "[0, 0]")}]}}', 'needed three numbers as "position"'),

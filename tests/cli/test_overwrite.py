@@ -1,0 +1,158 @@
+"""Files of the user are replaced with --overwrite only; those that pansplat wrote, always."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pansplat.cli import run
+from pansplat.data.images import write_depth, write_image
+from pansplat.data.video import write_video
+from pansplat.errors import InputError
+from pansplat.evaluation.report import write_json
+from pansplat.files import is_written, require_replaceable
+
+OWN = b"of the user"
+SPHERE = ["--model", "sphere", "--refine", "0"]
+EXPORT = ["export", *SPHERE, "--predict-height", "64"]
+COMMANDS = {
+    "scene.ply": ["predict", "{room}", "--model", "sphere", "--height", "64"],
+    "again.ply": ["refine", "{room}", "--model", "sphere", "--height", "64", "--steps", "1"],
+    "view.png": ["render", "{scene}", "--height", "16"],
+    "view.jpg": ["render", "{scene}", "--height", "16", "--layout", "perspective"],
+    "view.webp": ["render", "{scene}", "--height", "16", "--layout", "perspective"],
+    "view.exr": ["render", "{scene}", "--height", "16"],
+    "film.mp4": ["render", "{scene}", "--height", "16", "--seconds", "0.1"],
+    "film.webm": ["render", "{scene}", "--height", "16", "--seconds", "0.1"],
+    "scene.glb": [*EXPORT, "{room}"],
+    "scene.spz": [*EXPORT, "{room}"],
+    "scene.sog": [*EXPORT, "{room}"],
+    "scene.compressed.ply": [*EXPORT, "{room}"],
+    "points.ply": [*EXPORT, "{room}", "--points"],
+    "page.html": [*EXPORT, "{room}"],
+    "plan.png": [*EXPORT, "{room}"],
+    "mesh.obj": [*EXPORT, "{room}"],
+    "mesh.glb": [*EXPORT, "{room}", "--mesh"],
+}
+
+
+def write_own(file: Path) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(OWN)
+    return file
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_file_of_the_user_needs_overwrite_and_our_own_does_not(
+    room: Path, scene: Path, tmp_path: Path, name: str, refusal: Callable[..., str]
+) -> None:
+    file = write_own(tmp_path / "out" / name)
+    command = [part.format(room=room, scene=scene) for part in COMMANDS[name]]
+    if name == "plan.png":  # the sphere of the predictor has no floor to draw
+        write_image(file.with_name("ours.png"), np.zeros((9, 7, 3)))
+        assert "--overwrite" in refusal(*command, "-o", file) and file.read_bytes() == OWN
+        assert is_written(file.with_name("ours.png"))
+        return
+    assert f"--out: needed names of new files, got {file}" in refusal(*command, "-o", file)
+    assert [path for path in file.parent.iterdir()] == [file] and file.read_bytes() == OWN
+    assert run([*command, "-o", str(file), "--overwrite"]) == 0
+    assert is_written(file)
+    assert run([*command, "-o", str(file)]) == 0, "pansplat wrote it"
+
+
+def test_files_beside_a_mesh_are_checked_before_the_first_is_written(
+    room: Path, tmp_path: Path, refusal: Callable[..., str]
+) -> None:
+    out = tmp_path / "my_house" / "house.obj"
+    for name in ("house_0.jpg", "house_1.jpg", "house.mtl"):
+        own = write_own(out.with_name(name))
+        assert f"got {own}, which pansplat did not write" in refusal(*EXPORT, room, "-o", out)
+        assert list(out.parent.iterdir()) == [own] and own.read_bytes() == OWN
+        own.unlink()
+    write_own(out.with_name("house_0.jpg"))
+    write_own(out.with_name("house_2.jpg"))
+    assert run([*EXPORT, str(room), "-o", str(out), "--overwrite"]) == 0
+    assert all(is_written(out.with_name(name)) for name in ("house.obj", "house.mtl", "house_0.jpg", "house_1.jpg"))
+    assert out.with_name("house_2.jpg").read_bytes() == OWN, "two panoramas have two textures"
+    assert run([*EXPORT, str(room), "-o", str(out)]) == 0
+
+
+def test_the_folder_of_a_split_page_keeps_files_of_the_user(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page.html"
+    own = write_own(tmp_path / "page_files" / "0123456789abcdef.js")
+    for count in ("100", "50"):
+        assert run(["export", str(scene), "-o", str(out), "--split", "--gaussians", count]) == 0
+    others = [file for file in own.parent.iterdir() if file != own]
+    assert own.read_bytes() == OWN and len(others) == 1 and is_written(others[0]), "parts of the first page are removed"
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("report.jsonl", ["batch", "{room}", "--model", "sphere"]),
+        ("results.json", ["evaluate", "{room}", "--model", "sphere"]),
+        ("room/target.png", ["evaluate", "{room}", "--model", "sphere"]),
+        ("table.md", ["evaluate", "--protocol", "m3d", "--data", "{room}", "--model", "sphere"]),
+        ("set/case/1_target.png", ["evaluate", "--protocol", "m3d", "--data", "{room}", "--model", "sphere"]),
+        ("raster.json", ["bench", "raster", "--quick"]),
+        ("raster.md", ["bench", "raster", "--quick"]),
+        ("raster.png", ["bench", "raster", "--quick"]),
+    ],
+)
+def test_files_of_the_user_in_a_folder_need_overwrite(
+    room: Path, tmp_path: Path, name: str, command: list[str], refusal: Callable[..., str]
+) -> None:
+    own = write_own(tmp_path / "out" / name)
+    message = refusal(*(part.format(room=room) for part in command), "-o", tmp_path / "out")
+    assert f"got {own}, which pansplat did not write; choose another name, or replace them with --overwrite" in message
+    assert own.read_bytes() == OWN
+
+
+def test_more_files_than_the_named_one_need_overwrite(room: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
+    own = write_own(tmp_path / "report.json")
+    command = ["refine", room, "-o", tmp_path / "out.ply", "--report", own]
+    assert f"--report: needed names of new files, got {own}" in refusal(*command)
+    command = ["bench", "raster", "--quick", "--json", own]
+    assert f"got {own}, which pansplat did not write" in refusal(*command)
+    command = ["convert", tmp_path / "official.ckpt", "-o", write_own(tmp_path / "model.safetensors")]
+    assert "--overwrite" in refusal(*command)
+
+
+def test_the_results_of_a_run_are_replaced_by_those_of_the_next(room: Path, tmp_path: Path) -> None:
+    command = ["evaluate", str(room), "--model", "sphere", "--height", "64", "-o", str(tmp_path / "out")]
+    for _ in range(2):
+        assert run(command) == 0
+    files = [file for file in (tmp_path / "out").rglob("*") if file.is_file()]
+    assert len(files) == 4 and all(map(is_written, files))
+
+
+def test_reports_and_pictures_of_all_kinds_are_marked(tmp_path: Path) -> None:
+    grey = np.full((8, 16, 3), 0.5, np.float32)
+    for suffix in (".png", ".jpg", ".webp", ".exr"):
+        for panorama in (False, True):
+            write_image(tmp_path / f"{panorama}{suffix}", grey, panorama=panorama)
+    write_depth(tmp_path / "depth.png", grey[..., 0])
+    write_json([{"a": 1}], tmp_path / "list.json")
+    write_json({"a": 1}, tmp_path / "object.json")
+    for suffix in (".mp4", ".webm"):
+        noise = np.random.default_rng(0).integers(0, 255, (3, 256, 512, 3), dtype=np.uint8)
+        write_video(tmp_path / f"film{suffix}", noise, 8.0, quality=0)  # longer than what is searched at each end
+    files = list(tmp_path.iterdir())
+    assert len(files) == 13 and all(map(is_written, files))
+
+
+def test_other_files_are_not_taken_for_ours(tmp_path: Path) -> None:
+    texts = ("", "notes on pansplat", '{"path": "/home/pansplat/a.jpg"}', "# I like pansplat", "software: other")
+    for number, text in enumerate(texts):
+        (tmp_path / f"{number}.txt").write_text(text)
+    Image.new("RGB", (8, 4)).save(tmp_path / "p.png")
+    assert not any(map(is_written, tmp_path.iterdir())) and not is_written(tmp_path / "missing")
+    require_replaceable("--out", [tmp_path / "0.txt", tmp_path / "missing"])
+    with pytest.raises(
+        InputError, match=r"1\.txt, .*2\.txt, .*3\.txt and 1 more, which pansplat did not write; choose"
+    ):
+        require_replaceable("--out", [tmp_path / f"{number}.txt" for number in range(5)])
