@@ -39,7 +39,7 @@ class Pose:
         """Estimate, print the table and write the file."""
         from pansplat.data.folders import VIDEO_FILES
         from pansplat.poses.estimate import estimate_poses
-        from pansplat.poses.files import SUFFIXES, write_poses
+        from pansplat.poses.files import SUFFIXES, name_pictures, write_poses
 
         if not self.paths:
             raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
@@ -50,6 +50,8 @@ class Pose:
             require_output_file("--out", self.out, SUFFIXES)
         with progress_bar() as progress:
             images = self._extract_frames(progress) if is_video else _list_images(self.paths)
+            if self.out is not None and not is_video and self.out.suffix.lower() == ".json":
+                name_pictures(self.out, images)  # an error now, not after the work
             estimate = estimate_poses(
                 images, camera_height=self.camera_height, baseline=self.baseline, progress=progress
             )

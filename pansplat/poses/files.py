@@ -21,6 +21,7 @@ from pansplat.data.images import read_thumbnail
 from pansplat.data.pairs import Collection, Pair, Panorama, single_view_pairs
 from pansplat.data.placements import Placement, judge, read_ties
 from pansplat.data.poses import rigid_matrix, to_cam2world
+from pansplat.data.stated_files import locate_inside
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
@@ -52,8 +53,7 @@ def write_poses(estimate: PoseEstimate, path: Path) -> None:
         InputError: another suffix, or the file cannot be written.
     """
     if path.suffix.lower() == ".json":
-        folder = path.resolve().parent
-        names = {image: _name_from(folder, image.resolve()) for image in estimate.images}
+        names = name_pictures(path, estimate.images)
         merged = merge_estimate(path, estimate, names)
         if merged is not None:
             warnings.warn(
@@ -76,12 +76,17 @@ def write_poses(estimate: PoseEstimate, path: Path) -> None:
     _write(path, "\n".join(lines) + "\n")
 
 
-def _name_from(folder: Path, image: Path) -> str:
-    """The path of an image relative to a folder; the whole path on another drive of Windows."""
+def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
+    """The names of images in a poses.json, relative to its folder.
+
+    Raises:
+        InputError: an image is outside of the folder; readers would refuse the file.
+    """
+    folder = path.parent
     try:
-        return Path(os.path.relpath(image, folder)).as_posix()
-    except ValueError:
-        return image.as_posix()
+        return {image: locate_inside(folder, os.path.abspath(image)).relative_to(folder).as_posix() for image in images}
+    except InputError as error:
+        raise InputError(f"{path}: {error}, write poses.json above it, or write a .tum or .kitti.") from None
 
 
 def _write(path: Path, text: str) -> None:

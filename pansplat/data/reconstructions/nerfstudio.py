@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,8 @@ from pansplat.data.images import read_size
 from pansplat.data.poses import from_cam2world, rigid_matrix, to_cam2world
 from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
 from pansplat.data.rig_images import Lens
-from pansplat.errors import InputError
+from pansplat.data.stated_files import locate_inside
+from pansplat.errors import InputError, InputWarning
 from pansplat.files import read_file
 from pansplat.geometry.pose import invert_pose
 from pansplat.strict_json import list_field, number_field, read_json, require_object, text_field
@@ -79,7 +81,10 @@ def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstructi
         pose[:3, 3] /= scale
         mask = text_field(frame, "mask_path", where)
         lens = _read_lens({**content, **frame}, image, where)
-        shots.append(Shot(name, image, undo @ pose, lens, None if mask is None else find_picture(folder, mask)))
+        mask_file = None if mask is None else find_picture(folder, mask)
+        if mask is not None and mask_file is None:
+            raise InputError(f"{where}: needed the mask, got no such file: {locate_inside(folder, mask)}; add it.")
+        shots.append(Shot(name, image, undo @ pose, lens, mask_file))
     points = _read_points(content, source)
     points = (points / scale) @ undo[:3, :3].T.numpy() + undo[:3, 3].numpy()
     return Reconstruction(source, folder, shots, points, missing=missing)
@@ -115,7 +120,11 @@ def _read_lens(fields: Mapping[str, Any], image: Path, where: str) -> Lens | Non
 def _read_points(content: Mapping[str, Any], source: Path) -> Float[Array, "point 3"]:
     """The points of the .ply that the file names; none if there is none, or it cannot be read: they are optional."""
     name = content.get("ply_file_path")
-    path = source.parent / name if isinstance(name, str) else None
+    try:
+        path = locate_inside(source.parent, name) if isinstance(name, str) else None
+    except InputError as error:
+        warnings.warn(f"{source}: its points are left out: {error}.", InputWarning, stacklevel=4)
+        path = None
     if path is None or not path.is_file():
         return np.empty((0, 3))
     data = read_file(path, limit=_MAX_PLY)
