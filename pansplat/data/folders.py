@@ -496,7 +496,7 @@ def _list_further(source: Path, folders: Sequence[Path], panoramas: Sequence[Pan
 def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_stated: bool) -> Panorama:
     """One entry of poses.json. `is_stated`: whether `convention` comes from the file."""
     source = f"{folder / _POSES}, {name!r}"
-    image = _locate(folder, name, source)
+    image = locate_inside(folder, name, source)
     matrix, mask, depth, world, room = entry, None, None, 0, ""
     if isinstance(entry, dict):
         key = next((key for key in _MATRIX_KEYS if key in entry), None)
@@ -515,17 +515,10 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
     return Panorama(image.stem, image, cam2world, mask or find_mask(image, folder), depth, world=world, title=room)
 
 
-def _locate(folder: Path, name: str, source: str) -> Path:
-    try:
-        return locate_inside(folder, name)
-    except InputError as error:
-        raise InputError(f"{source}: {error}.") from None
-
-
 def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -> Path | None:
     if entry.get(key) is None:
         return None
-    path = _locate(folder, str(entry[key]), source)
+    path = locate_inside(folder, str(entry[key]), source)
     if path.is_file():
         return path
     if key != "depth":
@@ -710,7 +703,7 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
         )
     panoramas = []
     for frame, matrix in content.items():
-        inside = _locate(folder, frame, f"{source}, {frame!r}").relative_to(folder)
+        inside = locate_inside(folder, frame, f"{source}, {frame!r}").relative_to(folder)
         places = [folder / sub / inside for sub in _IMAGE_FOLDERS]
         image = next((place for place in places if place.is_file()), places[0])
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, {frame!r}"), convention)

@@ -12,7 +12,6 @@ https://developer.playcanvas.com/user-manual/gaussian-splatting/formats (compres
 
 from __future__ import annotations
 
-import contextlib
 import io
 import subprocess
 import sys
@@ -56,9 +55,8 @@ limit = int(sys.argv[3])
 try:
     import resource
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    page = os.sysconf("SC_PAGE_SIZE")
-    used = int(open("/proc/self/statm").read().split()[0]) * page
-    most = min(os.sysconf("SC_PHYS_PAGES") * page, used + 8 * limit)  # Gaussians are held several times
+    used, page = int(open("/proc/self/statm").read().split()[0]), os.sysconf("SC_PAGE_SIZE")
+    most = min(os.sysconf("SC_PHYS_PAGES"), used + 8 * limit // page) * page  # Gaussians are held several times
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
 except (ImportError, OSError, ValueError):
     pass
@@ -98,7 +96,7 @@ class _Coded:
     order: Callable[[Gaussians], Gaussians] = sort_by_label
     max_gaussians: int = (1 << 31) - 1
     max_position: float = float("inf")
-    count: Callable[[bytes], int] | None = None
+    count: Callable[[bytes], int] = lambda content: 0
 
 
 def save_scene(scene: Scene, path: str | Path) -> None:
@@ -170,11 +168,6 @@ def _load_coded(path: Path, coded: _Coded) -> Scene:
     content = read_file(path, f"a .{coded.name} scene", limit=_MAX_FILE)
     if not content.startswith(coded.magic):
         raise InputError(f"{path}: needed a .{coded.name} scene, got a file that starts with {content[:8]!r}; check it")
-    if coded.count is not None and (size := coded.count(content) * _DECODED_BYTES) > _limit_decoded(content):
-        raise InputError(
-            f"{path}: needed a .{coded.name} scene of at most {_limit_decoded(content):,} bytes when decoded, got "
-            f"{size:,}: its {len(content):,} bytes cannot hold as many Gaussians; copy or export it again"
-        )
     gaussians, _ = read_ply(io.BytesIO(_decode(content, path, coded)), path)
     entry = None if coded.find_entry is None else coded.find_entry(content)
     return make_scene(gaussians.rotated(Y_UP) if coded.y_up else gaussians, entry, path)
@@ -191,17 +184,15 @@ def _encode(gaussians: Gaussians, path: Path, coded: _Coded) -> bytes:
 
 
 def _decode(content: bytes, path: Path, coded: _Coded) -> bytes:
+    limit = _FREE_BYTES + _EXPANSION * len(content)
     try:
-        return _convert(content, coded.name, "ply", _limit_decoded(content), _DECODE_SECONDS)
-    except _CoderError as error:
+        if coded.count(content) * _DECODED_BYTES > limit:
+            raise _CoderError(f"it decodes to more than {limit:,} bytes")
+        return _convert(content, coded.name, "ply", limit, _DECODE_SECONDS)
+    except (_CoderError, zlib.error) as error:
         raise InputError(
             f"{path}: needed a complete .{coded.name} scene, got damaged data ({error}); copy or export it again"
         ) from error
-
-
-def _limit_decoded(content: bytes) -> int:
-    """Largest size of a decoded file, bytes: a few bytes may state millions of equal Gaussians."""
-    return _FREE_BYTES + _EXPANSION * len(content)
 
 
 class _CoderError(Exception):
@@ -297,8 +288,7 @@ _ZIP_ENTRY = "pansplat.json"
 def _count_spz(content: bytes) -> int:
     """Gaussians of the header, which is compressed up to version 3 of the format."""
     if content[:2] == b"\x1f\x8b":
-        with contextlib.suppress(zlib.error):  # the decoder will refuse it
-            content = zlib.decompressobj(31).decompress(content, 12)
+        content = zlib.decompressobj(31).decompress(content, 12)
     return int.from_bytes(content[8:12], "little")
 
 

@@ -82,11 +82,8 @@ def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
     Raises:
         InputError: an image is outside of the folder; readers would refuse the file.
     """
-    folder = path.parent
-    try:
-        return {image: locate_inside(folder, os.path.abspath(image)).relative_to(folder).as_posix() for image in images}
-    except InputError as error:
-        raise InputError(f"{path}: {error}, write poses.json above it, or write a .tum or .kitti.") from None
+    inside = {image: locate_inside(path.parent, os.path.abspath(image), path) for image in images}
+    return {image: file.relative_to(path.parent).as_posix() for image, file in inside.items()}
 
 
 def _write(path: Path, text: str) -> None:

@@ -245,6 +245,4 @@ def test_poses_of_pictures_outside_of_their_folder_are_refused_before_the_estima
     monkeypatch.setattr("pansplat.poses.estimate.estimate_poses", lambda *_, **__: pytest.fail("estimated"))
     (tmp_path / "other").mkdir()
     message = _message(capsys, "pose", str(tmp_path / "room"), "-o", str(tmp_path / "other" / "poses.json"))
-    assert (
-        "poses.json: needed a file inside" in message and "copy the file into the folder, write poses.json" in message
-    )
+    assert "poses.json: needed a file inside" in message and "copy the picture into the folder" in message

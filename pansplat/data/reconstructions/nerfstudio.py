@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from pansplat.data.poses import from_cam2world, rigid_matrix, to_cam2world
 from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
 from pansplat.data.rig_images import Lens
 from pansplat.data.stated_files import locate_inside
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputError
 from pansplat.files import read_file
 from pansplat.geometry.pose import invert_pose
 from pansplat.strict_json import list_field, number_field, read_json, require_object, text_field
@@ -120,11 +119,7 @@ def _read_lens(fields: Mapping[str, Any], image: Path, where: str) -> Lens | Non
 def _read_points(content: Mapping[str, Any], source: Path) -> Float[Array, "point 3"]:
     """The points of the .ply that the file names; none if there is none, or it cannot be read: they are optional."""
     name = content.get("ply_file_path")
-    try:
-        path = locate_inside(source.parent, name) if isinstance(name, str) else None
-    except InputError as error:
-        warnings.warn(f"{source}: its points are left out: {error}.", InputWarning, stacklevel=4)
-        path = None
+    path = locate_inside(source.parent, name, source) if isinstance(name, str) else None
     if path is None or not path.is_file():
         return np.empty((0, 3))
     data = read_file(path, limit=_MAX_PLY)

@@ -22,7 +22,7 @@ from pansplat.data.images import READABLE_SUFFIXES
 from pansplat.data.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
 from pansplat.data.poses import read_number
 from pansplat.data.rig_images import Lens, RigImage, RigView, write_rig
-from pansplat.data.stated_files import find_inside, leads_out
+from pansplat.data.stated_files import find_inside
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import scale_poses
 
@@ -115,17 +115,13 @@ def make_collection(found: Reconstruction) -> Collection:
             f"{found.source}: needed its pictures, got none of them ({', '.join(found.missing[:3])}, ...); copy them "
             f"to {found.folder / 'images'}."
         )
-    outside = [name for name in found.missing if leads_out(found.folder, name.replace("\\", "/"))]
-    for names, reason in (
-        ([name for name in found.missing if name not in outside], "the pictures are missing"),
-        (outside, f"their paths lead out of {found.folder}; copy them into it"),
-    ):
-        if names:
-            warnings.warn(
-                f"left out of {found.source}, because {reason}: {list_names([Path(name) for name in names])}.",
-                InputWarning,
-                stacklevel=4,
-            )
+    if found.missing:
+        warnings.warn(
+            f"left out of {found.source}, because the pictures are missing in {found.folder}, out of which no path is "
+            f"followed: {list_names([Path(name) for name in found.missing])}.",
+            InputWarning,
+            stacklevel=4,
+        )
     panoramas, partial = _join_shots(found)
     if not panoramas:
         raise InputError(

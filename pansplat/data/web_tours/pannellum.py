@@ -137,7 +137,7 @@ def _list_arguments(text: str, source: Path) -> Iterator[Any]:
     The time is proportional to the length of the text: calls in arguments of others are no calls, a variable is read
     once, and no more once those that were read add up to twice the text.
     """
-    settings: dict[str, int] | None = None  # positions of the values of variables
+    settings = {found[1]: found.end() for found in reversed(list(_SETTING.finditer(text)))}
     position, left = 0, 2 * len(text)
     while (call := _CALL.search(text, position)) is not None:
         value, position = parse_literal(text, call.end(), source)
@@ -145,14 +145,11 @@ def _list_arguments(text: str, source: Path) -> Iterator[Any]:
             continue
         start = skip_space(text, position + 1)
         value, position = parse_literal(text, start, source)
-        name = _NAME.match(text, start) if value is None else None
-        if name is not None:
-            if settings is None:
-                settings = {found[1]: found.end() for found in reversed(list(_SETTING.finditer(text)))}
-            begin = settings.pop(name.group(), None)
-            if begin is not None and left > 0:
-                value, end = parse_literal(text, begin, source)
-                left -= end - begin
+        name = _NAME.match(text, start)
+        if value is None and left > 0 and name is not None and name.group() in settings:
+            begin = settings.pop(name.group())
+            value, end = parse_literal(text, begin, source)
+            left -= end - begin
         yield value
 
 
