@@ -77,11 +77,7 @@ def write_poses(estimate: PoseEstimate, path: Path) -> None:
 
 
 def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
-    """The names of images in a poses.json, relative to its folder.
-
-    Raises:
-        InputError: an image is outside of the folder; readers would refuse the file.
-    """
+    """The names of images in a poses.json, relative to its folder; an InputError for one outside of it."""
     inside = {image: locate_inside(path.parent, os.path.abspath(image), path) for image in images}
     return {image: file.relative_to(path.parent).as_posix() for image, file in inside.items()}
 

@@ -137,7 +137,7 @@ def _list_arguments(text: str, source: Path) -> Iterator[Any]:
     The time is proportional to the length of the text: calls in arguments of others are no calls, a variable is read
     once, and no more once those that were read add up to twice the text.
     """
-    settings = {found[1]: found.end() for found in reversed(list(_SETTING.finditer(text)))}
+    settings: dict[str, int] = {}  # positions of values, found at the first variable
     position, left = 0, 2 * len(text)
     while (call := _CALL.search(text, position)) is not None:
         value, position = parse_literal(text, call.end(), source)
@@ -146,10 +146,14 @@ def _list_arguments(text: str, source: Path) -> Iterator[Any]:
         start = skip_space(text, position + 1)
         value, position = parse_literal(text, start, source)
         name = _NAME.match(text, start)
-        if value is None and left > 0 and name is not None and name.group() in settings:
-            begin = settings.pop(name.group())
-            value, end = parse_literal(text, begin, source)
-            left -= end - begin
+        if value is None and name is not None and left > 0:
+            for found in () if settings else _SETTING.finditer(text):
+                settings.setdefault(found[1], found.end())
+            begin = settings.get(name.group(), len(text))
+            settings[name.group()] = len(text)
+            if begin < len(text):
+                value, end = parse_literal(text, begin, source)
+                left -= end - begin
         yield value
 
 
