@@ -380,7 +380,7 @@ def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_
         pids = [nanny.pid for nanny in cluster.workers.values()]
         began = time.perf_counter()
         raise KeyboardInterrupt
-    assert time.perf_counter() - began < 120 and not any(is_alive(pid) for pid in pids)
+    assert time.perf_counter() - began < 550 and not any(is_alive(pid) for pid in pids)
     batch.remove_unfinished(list_items(rooms), other)
     complete = list_outputs(other)  # a refinement may end early
     assert complete and all(len(pipeline.load(other / name).gaussians) for name in complete)

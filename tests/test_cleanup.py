@@ -72,7 +72,7 @@ def test_floaters_go_and_everything_else_stays(joint: bool) -> None:
     cleaned, (change,) = clean_up(dirty, Cleaning(floaters=False))
     assert change == Change("floaters", len(dirty.gaussians), len(dirty.gaussians) - 10, (2, 2), change.psnr)
     assert change.psnr is not None and 15 < change.psnr < 55
-    assert compare_pictures(scene, cleaned) == math.inf or compare_pictures(scene, cleaned) > 60
+    assert compare_pictures(scene, cleaned) > 60
 
 
 def test_the_unit_of_the_world_and_values_that_are_not_finite_have_no_influence() -> None:

@@ -1,8 +1,10 @@
 """The wheel contains both packages and nothing else, and works without the checkout and with its dependencies alone."""
 
 import importlib.metadata
+import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -14,6 +16,7 @@ import torch
 from packaging.requirements import Requirement
 
 import pansplat
+from pansplat.data.video import open_video
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -41,13 +44,24 @@ def read_project() -> dict:
     return tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
+def list_instructions(name: str) -> list[str]:
+    """The arguments of an instruction of the Dockerfile."""
+    text = (ROOT / "Dockerfile").read_text("utf-8").replace("\\\n", " ")
+    lines = [line.split(maxsplit=1) for line in text.splitlines() if line and not line.startswith("#")]
+    return [value for instruction, value in lines if instruction == name]
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from the files that the Dockerfile copies, and from tests, which it must not contain."""
     source = tmp_path_factory.mktemp("source")
-    for folder in (*FOLDERS.values(), "tests"):
-        shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    for file in ("pyproject.toml", "README.md", "LICENSE", "setup.sh", "constraints.txt"):
-        shutil.copy(ROOT / file, source)
+    for copied in (*list_instructions("COPY"), "tests tests"):
+        *names, target = [word for word in shlex.split(copied) if not word.startswith("--")]
+        for path in (ROOT / name for name in names):
+            if path.is_dir():
+                shutil.copytree(path, source / target, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy(path, source / target)
     build = [sys.executable, "-m", "build", "--no-isolation", "."]  # the wheel of the source distribution
     done = subprocess.run(build, cwd=source, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -119,7 +133,9 @@ def test_an_installed_wheel_has_the_hashes_of_sources_of_the_checkout(installed:
     assert done.stdout.split() == [hash_sources(module) for module in modules], done.stderr
 
 
-@pytest.mark.parametrize("command", ["pansplat", "pansplat-view", "pansplat-train"])
+@pytest.mark.parametrize(
+    "command", sorted({"pansplat", "pansplat-view", "pansplat-train", *json.loads(list_instructions("ENTRYPOINT")[0])})
+)
 def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: str) -> None:
     done = run_in(installed, sys.executable, str(installed / "bin" / command), "--help")
     assert done.returncode == 0, done.stderr
@@ -171,7 +187,7 @@ def test_an_installed_wheel_needs_its_dependencies_only(installed: Path, tmp_pat
     command = [sys.executable, "-c", program, ",".join(foreign), str(tmp_path / "scene.ply"), *options]
     done = run_in(installed, *command)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "out" / "flythrough.mp4").stat().st_size > 0
+    assert len(open_video(tmp_path / "out" / "flythrough.mp4").stamps) > 1
 
 
 def test_tests_pass_against_the_installed_wheel(installed: Path) -> None:

@@ -21,7 +21,6 @@ from pansplat.files import is_portable_name, make_portable_name, require_output_
 from pansplat.gaussians import formats
 from pansplat.kernel_cache import choose_kernel_cache
 from pansplat.model.weights import load_weights, pack_weights, save_weights
-from pansplat.poses import files as pose_files
 
 
 @pytest.fixture
@@ -65,24 +64,14 @@ def test_a_picture_that_poses_name_in_other_capitals_is_one_picture(pair_folder:
     assert sorted(view.image.name for view in pair.context) == ["LEFT.PNG", "right.png"]
 
 
-def test_poses_name_pictures_on_another_drive_by_their_whole_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> str:
-        raise ValueError("path is on mount 'D:', start on mount 'C:'")
-
-    assert pose_files._name_from(tmp_path, tmp_path / "a" / "b.jpg") == "a/b.jpg"
-    monkeypatch.setattr(os.path, "relpath", refuse)
-    assert pose_files._name_from(tmp_path, tmp_path / "b.jpg") == (tmp_path / "b.jpg").as_posix()
-
-
 def test_a_drive_that_does_not_exist_ends_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os.path, "lexists", lambda _: False)
     with pytest.raises(InputError, match="needed an existing drive"):
         require_output_folder("--out", Path("/nowhere/at/all"))
+    monkeypatch.setattr(os, "access", lambda *_: False)
     environment = {"XDG_CACHE_HOME": "/nowhere"}
     choose_kernel_cache("/nowhere", environment)
-    assert "NUMBA_CACHE_DIR" not in environment or Path(environment["NUMBA_CACHE_DIR"]).is_dir()
+    assert Path(environment["NUMBA_CACHE_DIR"]).is_dir()
 
 
 # Files that are in use

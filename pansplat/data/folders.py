@@ -52,6 +52,7 @@ from pansplat.data.photographs import (
 from pansplat.data.placements import Placement, is_by_hand, judge, read_rejected, read_ties
 from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.data.reconstructions import find_reconstruction, read_reconstruction
+from pansplat.data.stated_files import find_inside, locate_inside
 from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.data.web_tours.entries import plain_text
 from pansplat.errors import InputError, InputWarning
@@ -576,7 +577,7 @@ def _list_further(
 def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_stated: bool) -> Panorama:
     """One entry of poses.json. `is_stated`: whether `convention` comes from the file."""
     source = f"{folder / _POSES}, {name!r}"
-    image = folder / name
+    image = locate_inside(folder, name, source)
     matrix, mask, depth, world, room = entry, None, None, 0, ""
     if isinstance(entry, dict):
         key = next((key for key in MATRIX_KEYS if key in entry), None)
@@ -598,7 +599,7 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
 def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -> Path | None:
     if entry.get(key) is None:
         return None
-    path = folder / str(entry[key])
+    path = locate_inside(folder, str(entry[key]), source)
     if path.is_file():
         return path
     if key != "depth":
@@ -640,7 +641,7 @@ def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
             unposed |= {
                 name: where
                 for name in (*context, *targets)
-                if name not in {**numbers, **unposed} and (source.parent / name).is_file()
+                if name not in {**numbers, **unposed} and find_inside(source.parent, name) is not None
             }
             first, second = (
                 tuple(_find_name(name, numbers, where) for name in part if name not in unposed)
@@ -783,7 +784,8 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
         )
     panoramas = []
     for frame, matrix in content.items():
-        places = [folder / sub / frame for sub in _IMAGE_FOLDERS]
+        inside = locate_inside(folder, frame, f"{source}, {frame!r}").relative_to(folder)
+        places = [folder / sub / inside for sub in _IMAGE_FOLDERS]
         image = next((place for place in places if place.is_file()), places[0])
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, {frame!r}"), convention)
         panoramas.append(Panorama(image.stem, image, cam2world, find_mask(image, folder)))

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,25 +43,31 @@ from pansplat.gaussians.scene_files import (
 
 _MAX_FILE = 1 << 32  # bytes
 _MAX_ENTRY = 1 << 26  # bytes of the pansplat entry
+_EXPANSION, _FREE_BYTES = 256, 1 << 26  # bytes of decoded Gaussians for a byte of their file, and for any file
+_DECODED_BYTES = 236  # of a Gaussian with harmonics of degree 3
 _DECODE_SECONDS = 600  # a damaged file may not end
 _CODER = """
 import os, sys
 sys.path[:] = [folder for folder in sys.path if folder]  # without the current folder
-try:
-    import resource
-    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    resource.setrlimit(resource.RLIMIT_AS, (pages, pages))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-except (ImportError, OSError, ValueError):
-    pass
 output = os.fdopen(os.dup(1), "wb")
 os.dup2(2, 1)  # the library prints
 import gaussforge
+limit = int(sys.argv[3])
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    used, page = int(open("/proc/self/statm").read().split()[0]), os.sysconf("SC_PAGE_SIZE")
+    most = min(os.sysconf("SC_PHYS_PAGES"), used + 8 * limit // page) * page  # Gaussians are held several times
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+except (ImportError, OSError, ValueError):
+    pass
 result = gaussforge.GaussForge().convert(sys.stdin.buffer.read(), sys.argv[1], sys.argv[2])
 if "error" in result:
     sys.exit(result["error"])
 if not result["data"]:
     sys.exit("it holds no Gaussians")
+if len(result["data"]) > limit:
+    sys.exit(f"it decodes to more than {limit:,} bytes")
 output.write(result["data"])
 output.close()
 """
@@ -78,6 +85,7 @@ class _Coded:
         y_up: whether the axes of the file have y up.
         order: sorts the Gaussians; near ones should follow each other where they share a range or a tile.
         max_gaussians, max_position: limits; metres.
+        count: the Gaussians that the bytes of a file state, without decoding it.
     """
 
     name: str
@@ -89,6 +97,7 @@ class _Coded:
     order: Callable[[Gaussians], Gaussians] = sort_by_label
     max_gaussians: int = (1 << 31) - 1
     max_position: float = float("inf")
+    count: Callable[[bytes], int] = lambda content: 0
 
 
 def save_scene(scene: Scene, path: str | Path) -> None:
@@ -180,9 +189,12 @@ def _encode(gaussians: Gaussians, path: Path, coded: _Coded) -> bytes:
 
 
 def _decode(content: bytes, path: Path, coded: _Coded) -> bytes:
+    limit = _FREE_BYTES + _EXPANSION * len(content)
     try:
-        return _convert(content, coded.name, "ply", seconds=_DECODE_SECONDS)
-    except _CoderError as error:
+        if coded.count(content) * _DECODED_BYTES > limit:
+            raise _CoderError(f"it decodes to more than {limit:,} bytes")
+        return _convert(content, coded.name, "ply", limit, _DECODE_SECONDS)
+    except (_CoderError, zlib.error) as error:
         raise InputError(
             f"{path}: needed a complete .{coded.name} scene, got damaged data ({error}); copy or export it again"
         ) from error
@@ -192,9 +204,9 @@ class _CoderError(Exception):
     """The child process did not succeed."""
 
 
-def _convert(content: bytes, source: str, target: str, seconds: float | None = None) -> bytes:
-    """The bytes of a file in another format, by gaussforge in a child process."""
-    command = [sys.executable, "-c", _CODER, source, target]
+def _convert(content: bytes, source: str, target: str, limit: int = _MAX_FILE, seconds: float | None = None) -> bytes:
+    """The bytes of a file in another format, at most `limit`, by gaussforge in a child process."""
+    command = [sys.executable, "-c", _CODER, source, target, str(limit)]
     try:
         done = subprocess.run(command, input=content, capture_output=True, timeout=seconds)
     except subprocess.TimeoutExpired:
@@ -278,6 +290,13 @@ def _find_gzip_comment(content: bytes) -> str | None:
 _ZIP_ENTRY = "pansplat.json"
 
 
+def _count_spz(content: bytes) -> int:
+    """Gaussians of the header, which is compressed up to version 3 of the format."""
+    if content[:2] == b"\x1f\x8b":
+        content = zlib.decompressobj(31).decompress(content, 12)
+    return int.from_bytes(content[8:12], "little")
+
+
 def _insert_zip_entry(content: bytes, entry: str) -> bytes:
     buffer = io.BytesIO(content)
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
@@ -299,7 +318,7 @@ _CODED = {
     ),
     ".spz": _Coded(
         "spz", 3, (b"\x1f\x8b", b"NGSP"), _insert_gzip_comment, _find_gzip_comment,
-        y_up=True, max_gaussians=10_000_000, max_position=2048,
+        y_up=True, max_gaussians=10_000_000, max_position=2048, count=_count_spz,
     ),
     ".splat": _Coded("splat", 0),
     ".sog": _Coded("sog", 3, (b"PK\x03\x04",), _insert_zip_entry, _find_zip_entry, order=_sort_by_place),

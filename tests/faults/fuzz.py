@@ -171,7 +171,8 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
     def read_cached(path: Path) -> None:
         body = path.read_bytes()[:-4]  # with a valid checksum, else nothing is parsed
         path.write_bytes(body + zlib.crc32(body).to_bytes(4, "little"))
-        _read_scene(path, 2)
+        if _read_scene(path, 2) is None:
+            raise InputError("it is predicted again")
 
     def read_pair(path: Path) -> None:
         del path

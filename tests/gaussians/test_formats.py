@@ -180,6 +180,41 @@ def test_damaged_files_are_refused(tmp_path: Path, suffix: str, make_scene) -> N
             load_scene(path)
 
 
+def test_an_spz_of_more_gaussians_than_its_bytes_can_hold_is_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """2 million Gaussians of zeros are a file of 37 KB, and half a gigabyte when decoded."""
+    head = struct.pack("<III4B", 0x5053474E, 2, 2_000_000, 0, 12, 0, 0)
+    monkeypatch.setattr(formats, "_convert", lambda *_, **__: pytest.fail("the file was decoded"))
+    for content in (gzip.compress(head + bytes(19 * 2_000_000)), head + bytes(40_000)):
+        (tmp_path / "a.spz").write_bytes(content)
+        with pytest.raises(InputError, match=r"a\.spz: needed .* decodes to more than \d\d,\d{3},\d{3} bytes"):
+            load_scene(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("suffix", CODED)
+def test_more_bytes_than_a_file_may_decode_to_do_not_reach_this_process(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch, make_scene
+) -> None:
+    save_scene(make_scene(degree=0), tmp_path / f"a{suffix}")
+    monkeypatch.setattr(formats, "_EXPANSION", 0)
+    monkeypatch.setattr(formats, "_FREE_BYTES", 100)
+    monkeypatch.setattr(formats, "_CODER", formats._CODER.replace("8 * limit", "(1 << 30)"))  # memory suffices
+    monkeypatch.setattr(formats, "_DECODED_BYTES", 0)  # whatever the header states
+    with pytest.raises(InputError, match="decodes to more than 100 bytes"):
+        load_scene(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is limited on Linux only")
+def test_a_decoder_has_memory_in_proportion_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An .spz whose header states one Gaussian, and whose stream holds a gigabyte."""
+    head = struct.pack("<III4B", 0x5053474E, 2, 1, 0, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(1 << 30), 1))
+    monkeypatch.setattr(formats, "_EXPANSION", 0)
+    with pytest.raises(InputError, match="damaged data"):
+        load_scene(tmp_path / "a.spz")
+
+
 def test_a_crash_of_the_decoder_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene) -> None:
     save_scene(make_scene(), tmp_path / "a.sog")
     monkeypatch.setattr(formats, "_CODER", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")

@@ -234,3 +234,15 @@ def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> 
     assert _is_mirrored(views["left"], views["mirrored"])
     assert not _is_mirrored(views["left"], views["right"])
     assert not _is_mirrored(views["left"], views["left"])
+
+
+def test_poses_of_pictures_outside_of_their_folder_are_refused_before_the_estimate(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "room").mkdir()
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / "room" / name), np.full((64, 128, 3), 90, np.uint8))
+    monkeypatch.setattr("pansplat.poses.estimate.estimate_poses", lambda *_, **__: pytest.fail("estimated"))
+    (tmp_path / "other").mkdir()
+    message = _message(capsys, "pose", str(tmp_path / "room"), "-o", str(tmp_path / "other" / "poses.json"))
+    assert "poses.json: needed a file inside" in message and "copy the picture into the folder" in message

@@ -58,8 +58,10 @@ def test_pinhole_boxes_contain_every_visible_pixel_and_touch_it(size):
         centre = torch.arange(extent) + 0.5
         inside = (centre >= low[:, None] - 1e-6) & (centre <= high[:, None] + 1e-6)
         assert not (shadow & ~inside).any()
+        if size != 0.05:  # smaller cones are of few pixels, and larger ones leave the image
+            continue
         # For cones wholly in the image, a pixel next to the box's edge is seen.
         whole = (boxes[:, 0] > 2) & (boxes[:, 1] < 78) & (boxes[:, 2] > 2) & (boxes[:, 3] < 58)
         whole &= (boxes[:, 1] - boxes[:, 0] > 12) & (boxes[:, 3] - boxes[:, 2] > 12)
         extra = (inside & ~shadow).sum(dim=1)[whole]
-        assert size != 0.05 or (len(extra) >= 5 and float(extra.double().mean()) < 2.5)
+        assert len(extra) >= 5 and float(extra.double().mean()) < 2.5

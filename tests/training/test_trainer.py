@@ -119,7 +119,8 @@ def test_validation_writes_measures_and_images(micro_run: Callable) -> None:
     trained(config)
     rows = read_table(config.out / "validation.csv")
     assert [row["step"] for row in rows] == ["0", "1", "2"]
-    assert all(float(row["psnr"]) > 0 and float(row["depth_error"]) > 0 for row in rows)
+    for measure in ("psnr", "depth_error"):  # each of another network
+        assert len({row[measure] for row in rows} - {"nan"}) == 3
     assert len(list((config.out / "pictures").glob("*.png"))) == 3
     with Image.open(config.out / "curves.png") as curves:
         assert min(curves.size) > 300

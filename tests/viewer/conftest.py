@@ -37,7 +37,7 @@ _Y0 = 0.28209479177387814  # the constant harmonic
 def wait_until() -> Callable[..., Any]:
     """Calls a function until its result is true, and returns the result; fails after `seconds`."""
 
-    def wait(condition: Callable[[], Any], expected: str, seconds: float = 60.0) -> Any:
+    def wait(condition: Callable[[], Any], expected: str, seconds: float = 300.0) -> Any:
         deadline = time.monotonic() + seconds
         while not (result := condition()):
             assert time.monotonic() < deadline, f"no {expected} in {seconds:.0f} s"

@@ -99,7 +99,7 @@ class User:
 
     def draw_until(self, condition: Callable[[], object], expected: str, seconds: float = 1 / 30) -> None:
         """Draw frames until a condition is true; their number does not matter, for threads can be slow."""
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 300
         while not condition():
             assert time.monotonic() < deadline, f"no {expected}"
             self.draw_frames(1, seconds)
@@ -289,11 +289,10 @@ def test_clicking_the_widget_changes_the_image(user, label):
 
 def test_levels_are_hidden_and_shown_again(user):
     before = user.read_image()
-    for _ in range(2):
+    for shown in (False, True):
         for level in range(4):
             user.click(f"{level}##level")
-        if user.state.settings.levels is not None:
-            assert user.read_image().max() == 0
+        assert (user.read_image().max() > 0) == shown
     assert changed_fraction(before, user.read_image()) == 0
 
 
@@ -380,11 +379,10 @@ def test_floaters_are_removed_and_the_box_stays(cleaning, small_scene):
     user.click("crop to a box")
     user.click("Remove floaters")
     user.draw_until(lambda: "floaters:" in user.state.message, "message")
-    count = len(user.viewer._slot.scene.gaussians)
     expected = len(small_scene.gaussians) - int(find_floaters(small_scene).sum())
     assert f"{len(small_scene.gaussians) - expected:,} of {len(small_scene.gaussians):,}" in user.state.message
     user.draw_until(lambda: len(user.viewer._slot.scene.gaussians) == expected, "cleaned scene")
-    assert count >= expected and user.state.settings.box is not None
+    assert user.state.settings.box is not None
     user.show(*user.entries)
 
 
@@ -808,7 +806,7 @@ def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, sm
 
     def predict(entry, progress, show):
         progress("matching", 0.5)
-        assert go.wait(60)
+        assert go.wait(300)
         return LoadedScene(entry, small_scene)
 
     monkeypatch.setattr(viewer.loader, "_load", predict)
@@ -948,12 +946,12 @@ def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_s
     def slow(entry, progress, show):
         progress("searching depth", 0.5)
         reported.set()
-        assert go.wait(60)
+        assert go.wait(300)
         return LoadedScene(entry, small_scene)
 
     monkeypatch.setattr(user.viewer.loader, "_load", slow)
     user.viewer.show([SceneEntry("slow")], 0)
-    assert reported.wait(60)
+    assert reported.wait(300)
     user.draw_frames(2)
     assert user.data.loading == ("slow", "searching depth", 0.5)
     left, top, right, bottom = user.panels.items["Cancel##loading"]
@@ -972,7 +970,7 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
     def load(entry, progress, show):
         show(LoadedScene(entry, small_scene, is_final=False))
         progress("refining", 0.75)
-        assert go.wait(60)
+        assert go.wait(300)
         return LoadedScene(entry, replace(small_scene, gaussians=gaussians))
 
     monkeypatch.setattr(user.viewer.loader, "_load", load)
@@ -1011,7 +1009,7 @@ def test_a_cancelled_refinement_keeps_the_prediction(user, small_scene, monkeypa
     user.draw_until(lambda: user.viewer.loader.refinement is not None, "refinement")
     user.draw_frames(2)
     user.click("Cancel")
-    assert cancelled.wait(60)
+    assert cancelled.wait(300)
     user.settle()
     assert user.data.refinement is None and user.data.error is None
 
@@ -1116,7 +1114,7 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_s
 
     def slow(scene, report):
         report(0.25)
-        assert go.wait(60)
+        assert go.wait(300)
         return prepare(scene, report)
 
     monkeypatch.setattr(user.viewer._preparer, "_prepare", slow)
@@ -1138,7 +1136,7 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_s
 def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair, small_scene, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.scene.slots._LARGE_SCENE", 0)
     before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
-    monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(60) and draw(*arguments))
+    monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(300) and draw(*arguments))
     other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
     monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
     user.viewer.show([SceneEntry("large", pair=pair)], 0)
@@ -1904,8 +1902,8 @@ def test_a_film_of_a_tour_is_cancelled_during_a_prediction(user, house, load_hou
     user.viewer._tour._loaded.clear()
     user.state.path = CameraPath((KeyFrame.of_camera(user.state.camera, 0.0),))
     user.viewer._start_film(SIZE)
-    assert predicting.wait(60)
-    timer = threading.Timer(5, go.set)
+    assert predicting.wait(300)
+    timer = threading.Timer(300, go.set)  # the end of a prediction that is not cancelled
     timer.start()
     user.viewer._films.cancel(join=True)
     assert not go.is_set(), "it waited for the prediction"

@@ -80,11 +80,12 @@ def read_colmap(source: Path, folder: Path, convention: str | None = None) -> Re
             "export it again."
         ) from error
     shots, missing = [], []
+    project = next((place.parent for place in (source.parent, source.parent.parent) if place.name == "sparse"), folder)
     for quat, translation, camera, name in images:
         where = f"{source}, {name!r}"
         if camera not in cameras:
             raise InputError(f"{where}: needed a camera of the cameras file, got number {camera}; export it again.")
-        image = find_picture(folder, name, source.parent.parent / "images", source.parent.parent.parent / "images")
+        image = find_picture(folder, name, project / "images")
         if image is None:
             missing.append(name)
             continue

@@ -26,6 +26,7 @@ from pansplat.data.images import read_size
 from pansplat.data.poses import from_cam2world, rigid_matrix, to_cam2world
 from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
 from pansplat.data.rig_images import Lens
+from pansplat.data.stated_files import locate_inside
 from pansplat.errors import InputError
 from pansplat.files import read_file
 from pansplat.geometry.pose import invert_pose
@@ -118,7 +119,7 @@ def _read_lens(fields: Mapping[str, Any], image: Path, where: str) -> Lens | Non
 def _read_points(content: Mapping[str, Any], source: Path) -> Float[Array, "point 3"]:
     """The points of the .ply that the file names; none if there is none, or it cannot be read: they are optional."""
     name = content.get("ply_file_path")
-    path = source.parent / name if isinstance(name, str) else None
+    path = locate_inside(source.parent, name, source) if isinstance(name, str) else None
     if path is None or not path.is_file():
         return np.empty((0, 3))
     data = read_file(path, limit=_MAX_PLY)

@@ -17,6 +17,7 @@ import torch
 
 from pansplat.data.poses import rigid_matrix, to_cam2world
 from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
+from pansplat.data.stated_files import find_inside
 from pansplat.errors import InputError
 from pansplat.strict_json import list_field, read_json, require_object
 
@@ -46,9 +47,9 @@ def read_openmvg(source: Path, convention: str | None = None) -> Reconstruction:
         for view in posed:
             name = "/".join(part for part in (view.get("local_path"), view["filename"]) if part)
             where = f"{source}, {name!r}"
-            image = find_picture(source.parent, name, source.parent / root)
+            image = find_inside(source.parent, f"{root}/{name}" if root else name) or find_picture(source.parent, name)
             if image is None:
-                missing.append(name)
+                missing.append(f"{root}/{name}" if root else name)
                 continue
             pose, matrix = poses[view["id_pose"]], torch.eye(4, dtype=torch.float64)
             matrix[:3, :3] = torch.tensor(pose["rotation"], dtype=torch.float64)

@@ -24,6 +24,7 @@ from pansplat.data.images import READABLE_SUFFIXES
 from pansplat.data.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
 from pansplat.data.poses import read_number
 from pansplat.data.rig_images import Lens, RigImage, RigView, write_rig
+from pansplat.data.stated_files import find_inside
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import WorldFrame
 
@@ -89,13 +90,16 @@ def note_smaller(source: Path, count: int) -> None:
 
 
 def find_picture(folder: Path, name: str, *more: Path) -> Path | None:
-    """A picture that a file names: below a folder, in its usual subfolders or others; a name may lack its suffix."""
+    """A picture that a file names: below a folder, in its usual subfolders or others; a name may lack its suffix.
+
+    Of a name that leads out of the folder only the last part is used.
+    """
     name = name.replace("\\", "/")
     last = name.rsplit("/", 1)[-1]
     bases = [*more, *(folder / sub for sub in _IMAGE_FOLDERS)]
-    for candidate in (*(base / name for base in bases), *(base / last for base in bases)):
-        if candidate.is_file():
-            return candidate
+    for found in (find_inside(base, part) for part in (name, last) for base in bases):
+        if found is not None:
+            return found
     for base in bases:  # a label without a suffix
         found = sorted(base.glob(f"{_escape(last)}.*")) if last and base.is_dir() else []
         pictures = [file for file in found if file.suffix.lower() in READABLE_SUFFIXES and file.is_file()]
@@ -125,8 +129,8 @@ def make_collection(found: Reconstruction) -> Collection:
         )
     if found.missing:
         warnings.warn(
-            f"left out of {found.source}, because the pictures are missing: "
-            f"{list_names([Path(name) for name in found.missing])}.",
+            f"left out of {found.source}, because the pictures are missing in {found.folder}, out of which no path is "
+            f"followed: {list_names([Path(name) for name in found.missing])}.",
             InputWarning,
             stacklevel=4,
         )

@@ -17,6 +17,7 @@ import torch
 
 from pansplat.data.cube_images import CubeImage, write_cube
 from pansplat.data.pairs import Link, Panorama, find_mask
+from pansplat.data.stated_files import locate_inside
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import make_portable_name, read_file
 
@@ -94,8 +95,7 @@ def locate(folder: Path, *parts: Any, suffix: str = "") -> str:
     plain = posixpath.normpath(path.lstrip("/"))
     decoded = posixpath.normpath(unquote(re.sub(r"[?#].*", "", path, flags=re.DOTALL)).lstrip("/"))
     for name in (plain, decoded):
-        if name.split("/")[0] == ".." or name.startswith("/") or "\0" in name:
-            raise InputError(f"needed a file inside {folder}, got the path {path[:80]!r}")
+        locate_inside(folder, name)
     return plain if plain == decoded or (folder / plain).exists() else decoded
 
 

@@ -72,8 +72,9 @@ def _read_data(source: Path) -> dict[str, Any]:
     text = read_text(source)
     if text.lstrip().startswith("<"):
         raise InputError(f"{source}: needed `var APP_DATA = {{...}}`, got an HTML page; export or download it again.")
-    for found in _ASSIGNMENT.finditer(text):
-        content, _ = parse_literal(text, found.end(), source)
+    position = 0
+    while (found := _ASSIGNMENT.search(text, position)) is not None:
+        content, position = parse_literal(text, found.end(), source)
         if isinstance(content.get("scenes"), list):
             return content
     raise InputError(

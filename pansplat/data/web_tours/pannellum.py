@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from pansplat.data.web_tours.entries import (
     read_text,
     require_tiles,
 )
-from pansplat.data.web_tours.javascript import parse_literal
+from pansplat.data.web_tours.javascript import parse_literal, skip_space
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
 
@@ -44,7 +45,10 @@ _PICTURES = ("panorama", "cubeMap", "multiRes")
 _FACES = "frblud"
 _MAX_LEVEL = 20
 _CALL = re.compile(r"pannellum\s*\.\s*viewer\s*\(")
-_EMBEDDED = re.compile(r"pannellum\.html?[?#](?:[^\"'\s]*&)?config=([^\"'&\s]+)")
+_EMBEDDED = re.compile(r"pannellum\.html?([?#][^\"'\s]*)")
+_STATED = re.compile(r"[?#&]config=([^?#&]+)")
+_SETTING = re.compile(r"(?<![\w$.])([A-Za-z_$][\w$]*)\s*=\s*(?=\{)")
+_MAX_FRAMES = 100  # of a page
 _NAME = re.compile(r"[A-Za-z_$][\w$]*")
 
 
@@ -116,32 +120,41 @@ def _find_configuration(source: Path) -> dict[str, Any] | None:
         ):
             return None
         return _accept(parse_literal(text, start, source)[0])
-    for found in _CALL.finditer(text):
-        literal = _find_argument(text, found.end(), source)
-        if literal is not None and _accept(literal) is not None:
+    for literal in _list_arguments(text, source):
+        if _accept(literal) is not None:
             return literal
-    for found in _EMBEDDED.finditer(text):
-        file = source.parent / locate(source.parent, found[1])
+    names = (name for found in _EMBEDDED.finditer(text) for name in _STATED.findall(found[1]))
+    for name in islice(names, _MAX_FRAMES):
+        file = source.parent / locate(source.parent, name)
         if file.suffix.lower() == ".json" and file.is_file() and file.parent == source.parent:
             return _find_configuration(file)
     return None
 
 
-def _find_argument(text: str, position: int, source: Path) -> Any:
-    """The second argument of a call, a literal or a variable that was set to one; None if it is neither."""
-    arguments = []
-    while len(arguments) < 2:
-        found = _NAME.match(text, position + len(text[position:]) - len(text[position:].lstrip()))
-        value, position = parse_literal(text, position, source)
-        arguments.append(value if value is not None or found is None else found)
-        if text[position : position + 1] != ",":
-            break
-        position += 1
-    argument = arguments[-1] if len(arguments) == 2 else None
-    if not isinstance(argument, re.Match):
-        return argument
-    setting = re.search(rf"(?<![\w$.]){re.escape(argument.group())}\s*=\s*(?=\{{)", text)
-    return parse_literal(text, setting.end(), source)[0] if setting is not None else None
+def _list_arguments(text: str, source: Path) -> Iterator[Any]:
+    """The second arguments of the calls of a page, each a literal or a variable that was set to one.
+
+    The time is proportional to the length of the text: calls in arguments of others are no calls, a variable is read
+    once, and no more once those that were read add up to twice the text.
+    """
+    settings: dict[str, int] = {}  # positions of values, found at the first variable
+    position, left = 0, 2 * len(text)
+    while (call := _CALL.search(text, position)) is not None:
+        value, position = parse_literal(text, call.end(), source)
+        if not text.startswith(",", position):
+            continue
+        start = skip_space(text, position + 1)
+        value, position = parse_literal(text, start, source)
+        name = _NAME.match(text, start)
+        if value is None and name is not None and left > 0:
+            for found in () if settings else _SETTING.finditer(text):
+                settings.setdefault(found[1], found.end())
+            begin = settings.get(name.group(), len(text))
+            settings[name.group()] = len(text)
+            if begin < len(text):
+                value, end = parse_literal(text, begin, source)
+                left -= end - begin
+        yield value
 
 
 def _accept(content: Any) -> dict[str, Any] | None:

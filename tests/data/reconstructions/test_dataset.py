@@ -46,7 +46,7 @@ def dataset(tmp_path: Path, cameras: list[Array], points: Array, write_panorama)
 def test_pycolmap_reads_cameras_rigs_and_points(dataset: Path, cameras: list[Array], points: Array) -> None:
     model = pycolmap.Reconstruction(dataset / "sparse" / "0")
     assert (model.num_rigs(), model.num_frames(), model.num_reg_images()) == (1, 3, 18)
-    assert model.is_valid() is None or model.is_valid()
+    assert model.is_valid()
     for number, pose in enumerate(cameras):
         image = model.find_image_with_name(f"{number:04d}_p_{number}_front.png")
         np.testing.assert_allclose(np.linalg.inv(_matrix(image)), pose, atol=1e-9)

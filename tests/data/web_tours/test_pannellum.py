@@ -1,7 +1,9 @@
 """Tours of Pannellum open with their pictures, titles, links and start views, whatever else is broken."""
 
+import contextlib
 import json
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -224,3 +226,36 @@ def test_json_files_of_other_kinds_are_no_tours(tmp_path: Path) -> None:
     ):
         _write(tmp_path, text, name)
     assert find_web_tour(tmp_path) is None
+
+
+HOSTILE_PAGES = {  # file, repetitions, text of n repetitions
+    "calls": ("tour.html", 4000, lambda n: "pannellum.viewer(1);" * n),
+    "calls with variables": ("tour.html", 200, lambda n: "".join(f"pannellum.viewer(1, x{i});" for i in range(n))),
+    "calls in calls": ("tour.html", 40, lambda n: "pannellum.viewer(" * n + ")" * n),
+    "calls with a long variable": ("tour.html", 40, lambda n: f"x={{{'a: 1,' * n}}};" + "pannellum.viewer(1, x);" * n),
+    "settings of a variable": ("tour.html", 400, lambda n: "x = " * n + "pannellum.viewer(1, x);" * n),
+    "frames": ("tour.html", 1000, lambda n: "pannellum.htm?" * n),
+    "frames of other files": ("tour.html", 200, lambda n: "pannellum.htm?a&config=a.json " * n),
+    "digits": ("tour.html", 1000, lambda n: f"pannellum.viewer({'1' * n}a);"),
+    "spaces": ("tour.html", 4000, lambda n: f"pannellum.viewer({' ' * n}"),
+    "assignments": ("data.js", 40, lambda n: "a={" * n + "}" * n),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_PAGES)
+def test_the_time_of_a_page_grows_in_proportion_to_its_size(tmp_path: Path, case: str) -> None:
+    name, count, make_text = HOSTILE_PAGES[case]
+    growth = 10
+
+    def measure(repetitions: int) -> float:
+        (tmp_path / name).write_text(make_text(repetitions))
+        seconds = []
+        for _ in range(3):
+            start = time.process_time()  # of this process only: other programs do not count
+            with contextlib.suppress(InputError):
+                read_web_tour(tmp_path / name)
+            seconds.append(time.process_time() - start)
+        return min(seconds)
+
+    short, long = measure(count), measure(growth * count)
+    assert long < 3 * growth * short, f"{short:.4f} s, {long:.4f} s"

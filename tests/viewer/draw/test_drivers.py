@@ -254,4 +254,3 @@ def test_each_frame_is_waited_for_where_the_driver_measures_no_time(ctx, make, r
     for count in range(1, 4):
         renderer.render(pose, SIZE, SETTINGS, wait=False)
         assert finish.call_count == count - 1
-    assert renderer.stats.frame_ms > 0

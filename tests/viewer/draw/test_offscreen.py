@@ -95,7 +95,7 @@ def test_old_opengl_and_osmesa_render_the_same_images(make_renderer, random_scen
         command = [sys.executable, "-c", _SCRIPT, str(tmp_path / "scene.pt"), str(tmp_path / f"{name}.npz"), backend]
         processes[name] = subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
     for name, process in processes.items():
-        _, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=600)
         assert process.returncode == 0, errors
         with np.load(tmp_path / f"{name}.npz") as images:
             if name != "osmesa":

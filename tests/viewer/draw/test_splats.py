@@ -29,13 +29,13 @@ def test_sorter_skips_requests_that_were_replaced(splats, monkeypatch, wait_unti
     def slow(splats, position):
         positions.append(position)
         started.set()
-        assert go.wait(60)
+        assert go.wait(300)
         return sort_splats(splats, position)
 
     monkeypatch.setattr(splats_module, "sort_splats", slow)
     sorter = SplatSorter()
     sorter.request(splats, (1.0, 0.0, 0.0))
-    assert started.wait(60)
+    assert started.wait(300)
     sorter.request(splats, (2.0, 0.0, 0.0))
     sorter.request(splats, (3.0, 0.0, 0.0))
     assert sorter.take() is None

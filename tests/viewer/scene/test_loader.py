@@ -171,13 +171,13 @@ def test_loader_reports_progress_and_returns_the_result_once(small_scene, wait_u
     def load(entry, progress, show):
         progress("reading", 0.25)
         reported.set()
-        assert go.wait(60)
+        assert go.wait(300)
         return LoadedScene(entry, small_scene)
 
     loader = SceneLoader(load)
     assert loader.progress is None and loader.poll() is None
     loader.request(SceneEntry("kitchen"))
-    assert reported.wait(60)
+    assert reported.wait(300)
     assert loader.progress == ("kitchen", "reading", 0.25) and loader.poll() is None
     go.set()
     assert wait_until(loader.poll, "result").scene is small_scene
@@ -237,7 +237,7 @@ def test_the_prediction_is_returned_before_the_refined_scene(small_scene, wait_u
     def load(entry, progress, show):
         show(LoadedScene(entry, small_scene, is_final=False))
         progress("refining", 0.75)
-        assert go.wait(60)
+        assert go.wait(300)
         return LoadedScene(entry, small_scene)
 
     loader = SceneLoader(load)

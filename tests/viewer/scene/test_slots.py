@@ -19,11 +19,11 @@ def test_a_scene_is_converted_once_and_its_progress_is_reported(random_scene, wa
     def prepare(scene, report):
         report(0.5)
         reported.set()
-        assert go.wait(60)
+        assert go.wait(300)
         return len(scene.gaussians)
 
     preparer, scene = ScenePreparer(prepare), random_scene(20)
-    assert not preparer.is_ready(scene) and reported.wait(60)
+    assert not preparer.is_ready(scene) and reported.wait(300)
     assert preparer.progress == 0.5 and not preparer.is_ready(scene)
     go.set()
     wait_until(lambda: preparer.is_ready(scene), "conversion")
@@ -46,9 +46,9 @@ def test_another_scene_ends_the_conversion_and_errors_are_raised_when_it_is_take
             ended.set()
 
     preparer, scene = ScenePreparer(prepare), random_scene(10)
-    assert not preparer.is_ready(random_scene(20)) and started.wait(60)
+    assert not preparer.is_ready(random_scene(20)) and started.wait(300)
     preparer.is_ready(scene)
-    assert ended.wait(60)
+    assert ended.wait(300)
     wait_until(lambda: preparer.is_ready(scene), "end")
     with pytest.raises(MemoryError):
         preparer.take(scene)
