@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from pansplat.rendering.cpu.runtime import thread_count
+from pansplat.sweep.bend import BendConfig, bend_surfaces
 from pansplat.sweep.matching import (
     AggregationConfig,
     DepthRange,
@@ -42,6 +43,7 @@ from pansplat.sweep.planes import (
 )
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
 from pansplat.sweep.surface import (
+    PosedImages,
     Surface,
     consistency_mask,
     guided_upsample,
@@ -79,34 +81,9 @@ class SearchConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
+    bend: BendConfig = field(default_factory=BendConfig)
     max_neighbours: int = 3
     """Other views, at most, that a view is matched against."""
-
-
-@dataclass(frozen=True, eq=False)
-class PosedImages:
-    """Input of the search: images (v, h, w, 3) float32, poses (v, 4, 4), masks (v, h, w) bool, depth range."""
-
-    images: np.ndarray
-    cam2world: np.ndarray
-    masks: np.ndarray
-    near: float
-    far: float
-
-    def relative_pose(self, view: int, other: int) -> np.ndarray:
-        """Pose (4, 4) from `view`'s camera to `other`'s."""
-        return np.linalg.inv(self.cam2world[other]) @ self.cam2world[view]
-
-    def resize(self, height: int) -> PosedImages:
-        """The input at another height."""
-        if self.images.shape[1] == height:
-            return self
-        images = np.stack([resize_sphere(image, height) for image in self.images])
-        return dataclasses.replace(self, images=images, masks=np.stack([resize_mask(m, height) for m in self.masks]))
-
-    def measure_baseline(self, views: Sequence[int]) -> float:
-        """Largest distance between two cameras of some views, metres."""
-        return float(measure_distances(self.cam2world[list(views)]).max())
 
 
 def search_surfaces(
@@ -186,6 +163,9 @@ def search_surfaces(
             for view, count in enumerate(counts)
         ]
     assert surfaces is not None
+    if estimator is not None:
+        report("bending the single views' surfaces", 0.95)
+        surfaces = bend_surfaces(posed, surfaces, neighbours, estimator.sharpen((low, high)), config.bend)
     return surfaces, neighbours
 
 
