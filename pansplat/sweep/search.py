@@ -4,7 +4,8 @@ The scene's planes are detected first. Three levels of matching follow at 1/4, 1
 paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres
 and with planes across the scene's axes. It runs twice: the first pass, at a smaller size, finds the surfaces which the
 second one uses for occlusion, consistency between views, and the support of planes. Each finer level searches a narrow
-range around the coarser surface.
+range around the coarser surface. With a prior, the surfaces of the finest level and of the result are those of single
+views, bent by the matches (`bend`).
 """
 
 from __future__ import annotations
@@ -153,19 +154,23 @@ def search_surfaces(
             surfaces = _upsample(surfaces, posed.images, rows)
         level = _SearchLevel(posed, rows, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
+    sharp = None if estimator is None else estimator.sharpen((low, high))
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
         surfaces = _upsample(surfaces, posed.images, height)
+        if sharp is not None and height == finest:
+            surfaces = bend_surfaces(posed, surfaces, neighbours, sharp, config.bend)
         level = _SearchLevel(posed, height, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [
-            level.refine(view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
+            level.refine(
+                view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0 or sharp is not None
+            )
             for view, count in enumerate(counts)
         ]
     assert surfaces is not None
-    if estimator is not None:
-        report("bending the single views' surfaces", 0.95)
-        surfaces = bend_surfaces(posed, surfaces, neighbours, estimator.sharpen((low, high)), config.bend)
+    if sharp is not None:
+        surfaces = bend_surfaces(posed, surfaces, neighbours, sharp, config.bend)
     return surfaces, neighbours
 
 
