@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import OptionalOut
+from pansplat.cli.inputs import OptionalOut, Writer
 from pansplat.console import make_table_console, print_message, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import require_output_file, require_output_folder
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Pose:
+class Pose(Writer):
     """Estimate the camera poses of equirectangular panoramas of one place."""
 
     paths: Positional[tuple[Path, ...]]
@@ -34,14 +34,12 @@ class Pose:
     """Two of the files and their distance in metres, instead of the camera's height."""
     frames: Count = 24
     """Largest number of key frames of a video."""
-    overwrite: bool = False
-    """Replace poses, trajectories and pictures that pansplat did not write; the old poses.json stays as .bak."""
 
     def run(self) -> int:
         """Estimate, print the table and write the file."""
         from pansplat.data.folders import VIDEO_FILES
         from pansplat.poses.estimate import estimate_poses
-        from pansplat.poses.files import SUFFIXES, require_replaceable, write_poses
+        from pansplat.poses.files import SUFFIXES, require_mergeable, write_poses
 
         if not self.paths:
             raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
@@ -53,7 +51,7 @@ class Pose:
         out = self.out / "poses.json" if is_video and self.out is not None else self.out
         images = [] if is_video else _list_images(self.paths)
         if out is not None:
-            require_replaceable(out, images, overwrite=self.overwrite)
+            require_mergeable(out, images, overwrite=self.overwrite)
         with progress_bar() as progress:
             images = self._extract_frames(progress) if is_video else images
             estimate = estimate_poses(
