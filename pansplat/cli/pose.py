@@ -45,7 +45,7 @@ class Pose(Writer):
         if not self.paths:
             raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
         is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in VIDEO_FILES
-        out, images = self.out, [] if is_video else _list_images(self.paths)
+        out = self.out
         if is_video:
             if out is None:
                 raise InputError("--out must name a folder for the key frames of a video, got none")
@@ -53,6 +53,7 @@ class Pose(Writer):
             out = out / "poses.json"
         elif out is not None:
             require_output_file("--out", out, SUFFIXES)
+        images = [] if is_video else _list_images(self.paths)
         if out is not None:
             require_mergeable(out, images, overwrite=self.overwrite)
         with progress_bar() as progress:
