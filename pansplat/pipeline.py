@@ -447,7 +447,8 @@ def _run_refinement(
     scene: Scene, views: Views, config: RefineConfig | None, seed: int, **run: Any
 ) -> tuple[Scene, RefineReport]:
     """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`."""
-    refinement = Refinement(scene, views.in_frame(scene.frame), config, seed=seed)
+    poses = scene.frame.localize(views.frame.globalize(views.cam2world))
+    refinement = Refinement(scene, replace(views, cam2world=poses, frame=scene.frame), config, seed=seed)
     if run["steps"] is None and run["seconds"] is None:
         run["seconds"] = choose_refine_seconds(None if config is None else config.gaussians, joint=scene.joint)
     report = refinement.run(**run)

@@ -15,7 +15,11 @@ from pansplat.errors import InputWarning, collect_notes
 from pansplat.threads import worker_threads
 
 ROOT = Path(__file__).resolve().parents[1]
-OWNERS = {"console.py": {"own_warnings", "print_once"}, "batch.py": {"dask_setup"}}  # the frames of processes
+OWNERS = {
+    "console.py": {"own_warnings", "print_once"},
+    "batch.py": {"dask_setup"},
+    "images.py": {""},  # once, at import
+}
 
 
 def warn(text: str) -> None:
@@ -76,7 +80,7 @@ def test_pictures_that_two_threads_read_leave_the_filters_of_warnings(tmp_path, 
     assert list(warnings.filters) == before
 
 
-def test_only_the_frames_of_processes_change_filters_of_warnings() -> None:
+def test_only_imports_and_the_frames_of_processes_change_filters_of_warnings() -> None:
     changed = []
     for source in (*(ROOT / "pansplat").rglob("*.py"), *(ROOT / "viewer").rglob("*.py")):
         function = ""

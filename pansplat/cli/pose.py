@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import OptionalOut
+from pansplat.cli.inputs import OptionalOut, Writer
 from pansplat.console import make_table_console, print_message, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import require_output_file, require_output_folder
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Pose:
+class Pose(Writer):
     """Estimate the camera poses of equirectangular panoramas of one place."""
 
     paths: Positional[tuple[Path, ...]]
@@ -34,28 +34,31 @@ class Pose:
     """Two of the files and their distance in metres, instead of the camera's height."""
     frames: Count = 24
     """Largest number of key frames of a video."""
-    overwrite: bool = False
-    """Replace poses, trajectories and pictures that pansplat did not write; the old poses.json stays as .bak."""
 
     def run(self) -> int:
         """Estimate, print the table and write the file."""
         from pansplat.data.folders import VIDEO_FILES
         from pansplat.poses.estimate import estimate_poses
-        from pansplat.poses.files import SUFFIXES, require_replaceable, write_poses
+        from pansplat.poses.files import SUFFIXES, require_mergeable, write_poses
+        from pansplat.poses.key_frames import extract_key_frames
 
         if not self.paths:
             raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
         is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in VIDEO_FILES
-        if self.out is not None and is_video:
-            require_output_folder("--out", self.out)
-        elif self.out is not None:
-            require_output_file("--out", self.out, SUFFIXES)
-        out = self.out / "poses.json" if is_video and self.out is not None else self.out
+        out = self.out
+        if is_video:
+            if out is None:
+                raise InputError("--out must name a folder for the key frames of a video, got none")
+            require_output_folder("--out", out)
+            out = out / "poses.json"
+        elif out is not None:
+            require_output_file("--out", out, SUFFIXES)
         images = [] if is_video else _list_images(self.paths)
         if out is not None:
-            require_replaceable(out, images, overwrite=self.overwrite)
+            require_mergeable(out, images, overwrite=self.overwrite)
         with progress_bar() as progress:
-            images = self._extract_frames(progress) if is_video else images
+            if is_video and out is not None:
+                images = extract_key_frames(self.paths[0], out.parent, self.frames, progress, overwrite=self.overwrite)
             estimate = estimate_poses(
                 images, camera_height=self.camera_height, baseline=self.baseline, progress=progress
             )
@@ -64,13 +67,6 @@ class Pose:
             write_poses(estimate, out, overwrite=self.overwrite)
             print(out)
         return 0
-
-    def _extract_frames(self, progress) -> list[Path]:
-        from pansplat.poses.key_frames import extract_key_frames
-
-        if self.out is None:
-            raise InputError("--out must name a folder for the key frames of a video, got none")
-        return extract_key_frames(self.paths[0], self.out, self.frames, progress, overwrite=self.overwrite)
 
 
 def _list_images(paths: tuple[Path, ...]) -> list[Path]:

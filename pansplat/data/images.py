@@ -13,7 +13,7 @@ import struct
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -52,6 +52,7 @@ _MAX_BYTES = 1 << 31
 _MAX_PIXELS = 178_956_970  # of Pillow: twice Image.MAX_IMAGE_PIXELS
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _JPEG_MAGIC, _JPEG_END, _PNG_MAGIC = b"\xff\xd8", b"\xff\xd9", b"\x89PNG"
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # panoramas of 100 megapixels are normal
 _TAIL = 4096  # bytes at the end of a file that are read to find the end of a JPEG
 _ORIENTATION, _TURNED = 0x0112, (5, 6, 7, 8)  # tag of EXIF, and its values for a quarter turn
 _ORIENT = {

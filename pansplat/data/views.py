@@ -54,20 +54,6 @@ class Views:
             parts.append("with depths")
         return f"<Views: {', '.join(parts)}>"
 
-    def in_frame(self, frame: WorldFrame) -> Views:
-        """The views in the world of another frame, such as that of a scene file."""
-        if frame == self.frame:
-            return self
-        factor = self.frame.unit / frame.unit
-        return replace(
-            self,
-            cam2world=frame.localize(self.frame.globalize(self.cam2world)),
-            near=self.near * factor,
-            far=self.far * factor,
-            depths=None if self.depths is None else self.depths * factor,
-            frame=frame,
-        )
-
 
 def select_views(views: Views, indices: Sequence[int]) -> Views:
     """The views at `indices`, in that order."""

@@ -86,12 +86,8 @@ def name_mesh_files(path: Path, parts: int) -> list[Path]:
 def save_mesh(mesh: Mesh, path: Path, *, overwrite: bool | None = True) -> tuple[Path, ...]:
     """Write a mesh in the format of the suffix, each file atomically, and return the files, the named one first.
 
-    Textures show only what triangles need of them: the rest has the colours around it.
-
-    Args:
-        mesh: one or more triangles.
-        path: of the mesh.
-        overwrite: see `pansplat.files.require_replaceable`.
+    Textures show only what triangles need of them: the rest has the colours around it. `overwrite` is that of
+    `pansplat.files.require_replaceable`.
 
     Raises:
         InputError: no triangle, another suffix, more than 4 GiB, a file that pansplat did not write, or a folder that

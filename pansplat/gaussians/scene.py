@@ -212,12 +212,7 @@ class Scene:
         return dataclasses.replace(self, gaussians=self.gaussians.rotated(rotation), cam2world=poses, frame=frame)
 
     def moved(self, motion: Float[Tensor, "4 4"], frame: WorldFrame) -> Scene:
-        """The scene after a rigid motion of its world, which becomes that of a frame.
-
-        Args:
-            motion: of places of the world before.
-            frame: of the world after.
-        """
+        """The scene after a rigid motion of its world, which becomes that of a frame."""
         scene = self.rotated(motion[:3, :3])
         poses = scene.cam2world.clone()
         poses[:, :3, 3] += motion[:3, 3].to(poses)

@@ -108,8 +108,7 @@ class PoseEditor:
     def read_suggestions(self) -> dict[tuple[Path, Path], tuple[Suggestion, ...]]:
         """For pairs of panoramas, places of the second one relative to the first, camera heights."""
         images = {name: image for image, name in self._names.items()}
-        estimate, found = self.read().get("estimate"), {}
-        pairs = estimate.get("suggestions") if isinstance(estimate, dict) else None
+        pairs, found = _read_estimate(self.read()).get("suggestions"), {}
         for pair in pairs if isinstance(pairs, list) else []:
             names, places = (pair.get("between"), pair.get("places")) if isinstance(pair, dict) else (None, None)
             if not (isinstance(names, list) and len(names) == 2 and set(map(str, names)) <= set(images)):

@@ -24,6 +24,7 @@ from pansplat.data.stated_files import locate_inside
 from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.descriptions import list_first
 from pansplat.errors import InputError, InputWarning
+from pansplat.files import require_replaceable
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.poses.edit import find_kept, merge_estimate, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
@@ -41,22 +42,18 @@ from pansplat.strict_json import read_json
 SUFFIXES = (".json", ".tum", ".kitti")
 
 
-def require_replaceable(path: Path, images: Sequence[Path], *, overwrite: bool) -> None:
+def require_mergeable(path: Path, images: Sequence[Path], *, overwrite: bool) -> None:
     """Check, before the estimate, the file that `write_poses` is to write; it need not exist.
 
     Raises:
         InputError: a faulty poses.json, or one in another folder than the images; or without `overwrite` a trajectory,
             or poses of all images that stay.
     """
-    is_kept = path.exists()
-    names = set(name_pictures(path, images).values()) if path.suffix.lower() == ".json" else set()
-    if is_kept and path.suffix.lower() == ".json":
-        content = read_pose_content(path)
-        is_kept = bool(names) and names <= find_kept(content, path, names)
-    if is_kept and not overwrite:
-        raise InputError(
-            f"{path}: needed a new file, or poses that pansplat wrote, got others; add --overwrite to replace them."
-        )
+    if path.suffix.lower() == ".json":
+        names = set(name_pictures(path, images).values())
+        if path.exists() and not (names and names <= find_kept(read_pose_content(path), path, names)):
+            return
+    require_replaceable("--out", [path], overwrite)
 
 
 def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) -> None:

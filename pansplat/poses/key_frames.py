@@ -13,9 +13,8 @@ from pansplat.data.folders import require_known_masks
 from pansplat.data.images import write_image
 from pansplat.data.panorama_metadata import read_xmp
 from pansplat.data.video import open_video
-from pansplat.descriptions import list_first
 from pansplat.errors import InputError
-from pansplat.files import make_portable_name
+from pansplat.files import make_portable_name, require_replaceable
 from pansplat.poses.axes import NO_PRIOR
 from pansplat.poses.features import Features, detect_features, match_features
 from pansplat.poses.two_view import estimate_relative_pose
@@ -45,12 +44,8 @@ def extract_key_frames(
         raise InputError(f"`count` must be at least 2 key frames, got {count}")
     numbers = np.unique(np.linspace(0, len(video.stamps) - 1, count * _CANDIDATES_PER_FRAME).round().astype(int))
     files = {int(n): folder / f"{make_portable_name(path.stem) or 'frame'}_{n:06d}.png" for n in numbers}
-    others = [file.name for file in files.values() if file.exists() and b'CreatorTool="pansplat"' not in read_xmp(file)]
-    if others and not overwrite:
-        raise InputError(
-            f"{folder}: needed free names for key frames, got pictures that pansplat did not write, "
-            f"{list_first(others)}; choose another folder, or add --overwrite to replace them."
-        )
+    others = [file for file in files.values() if b'CreatorTool="pansplat"' not in read_xmp(file)]
+    require_replaceable("key frames", others, overwrite)
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     last: Features | None = None

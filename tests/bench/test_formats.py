@@ -42,7 +42,7 @@ def test_lossy_formats_are_smaller_and_lossless_ones_exact(scene: Scene, tmp_pat
         assert 30 < rows[suffix]["psnr_db"] < 90 and "harmonics" not in rows[suffix]
     assert rows[".splat"]["bytes"] == 32 * 50
     assert 0.01 < rows[".spz"]["position_mm"] < 0.25
-    assert len((out / "formats.md").read_text().splitlines()) == 4 + len(rows)
+    assert len((out / "formats.md").read_text().splitlines()) == 5 + len(rows)
     assert "### Scene.ply: 50 Gaussians" in (out / "formats.md").read_text() and (out / "formats.png").is_file()
 
 

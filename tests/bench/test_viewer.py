@@ -77,7 +77,7 @@ def test_the_command_writes_rows_page_and_plot_and_continues(jobs, tmp_path, cap
     assert run(command) == 0
     assert len(jobs) == 3, "nothing is measured again"
     capsys.readouterr()
-    (tmp_path / "viewer.json").write_text("{}")
+    (tmp_path / "viewer.json").write_text('{"software": "pansplat"}')
     assert run(command) == 2
     assert "needed rows of `pansplat bench viewer`" in capsys.readouterr().err
 

@@ -81,6 +81,7 @@ def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstructi
         stated = text_field(frame, "mask_path", where)
         mask = None if stated is None else find_picture(folder, stated)
         if stated is not None and mask is None:
+            locate_inside(folder, stated, where)
             raise InputError(f'{where}: needed the mask {stated}, got no such file; correct or remove "mask_path".')
         lens = _read_lens({**content, **frame}, image, where)
         shots.append(Shot(name, image, undo @ pose, lens, mask))
