@@ -24,7 +24,7 @@ from pansplat.geometry.equirect import row_weights
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.surface import PosedImages, Surface, nearest_pixel, pad_sphere, resize_sphere, world_points
 
-_PASSES = 3  # of a smoothing, over rows and meridians
+_PASSES = 2  # of a smoothing, over rows and meridians
 _MIN_EVIDENCE = 1e-3  # fraction of the sphere with evidence, below which the field is the median of all pixels
 _MAX_ROW_COUPLING = 1e3  # of neighbouring pixels in a row, which are close to each other at the poles
 
@@ -175,7 +175,7 @@ def _smooth(maps: np.ndarray, rows: np.ndarray, meridians: np.ndarray, smoothnes
     return maps
 
 
-@cached_njit(nogil=True)
+@cached_njit(nogil=True, fastmath=True, error_model="numpy")
 def _smooth_line(maps, couplings, strength, line):
     """Smooth line `line` of both maps (2, n, length) in place.
 
@@ -187,10 +187,10 @@ def _smooth_line(maps, couplings, strength, line):
     first, second = maps[0, line], maps[1, line]
     corner = -strength * coupling[length - 1]
     gamma = -(1 + strength * (coupling[length - 1] + coupling[0]))
-    pivot = -2 * gamma
-    upper[0], turn[0] = -strength * coupling[0] / pivot, gamma / pivot
-    first[0] /= pivot
-    second[0] /= pivot
+    inverse = -0.5 / gamma  # of the pivot
+    upper[0], turn[0] = -strength * coupling[0] * inverse, -0.5
+    first[0] *= inverse
+    second[0] *= inverse
     for k in range(1, length):
         lower = -strength * coupling[k - 1]
         diagonal = 1 + strength * (coupling[k - 1] + coupling[k])
@@ -198,11 +198,11 @@ def _smooth_line(maps, couplings, strength, line):
         if k == length - 1:
             diagonal -= corner * corner / gamma
             last = corner
-        pivot = diagonal - lower * upper[k - 1]
-        upper[k] = -strength * coupling[k] / pivot
-        first[k] = (first[k] - lower * first[k - 1]) / pivot
-        second[k] = (second[k] - lower * second[k - 1]) / pivot
-        turn[k] = (last - lower * turn[k - 1]) / pivot
+        inverse = 1 / (diagonal - lower * upper[k - 1])
+        upper[k] = -strength * coupling[k] * inverse
+        first[k] = (first[k] - lower * first[k - 1]) * inverse
+        second[k] = (second[k] - lower * second[k - 1]) * inverse
+        turn[k] = (last - lower * turn[k - 1]) * inverse
     for k in range(length - 2, -1, -1):
         first[k] -= upper[k] * first[k + 1]
         second[k] -= upper[k] * second[k + 1]
