@@ -4,7 +4,7 @@ The depth network sees whole surfaces in one photograph, with its edges, but pla
 too far. The search places what two cameras see, and finds false matches where one does. The single view's surface is
 therefore kept, and multiplied by a smooth field, which the search's reliable matches determine: the logarithm of the
 field is a sum of fields from a nearly constant one to one of some pixels. A field does not cross discontinuities of the
-single view's surface. A finer field follows its evidence only where there is enough of it.
+single view's surface, or those that dense evidence shows. A finer field follows only enough evidence.
 
 Source: the smoother is the fast global smoother of Min et al., IEEE Transactions on Image Processing 23(12), 2014, with
 rows and meridians as closed lines, so that it has neither seam nor pole.
@@ -44,8 +44,11 @@ class BendConfig:
     stiffness: tuple[float, ...] = (0.0, 0.01, 0.02, 0.04, 0.05)
     """Evidence at which a field has half of its amplitude."""
     discontinuity: float = 0.06
-    """Difference of log-depth between pixels that divides their coupling by e."""
-    outlier: tuple[float, ...] = (0.3, 0.2, 0.15, 0.1, 0.06)
+    """Difference of log-depth between pixels that divides their coupling by e: of the single view, or of dense evidence
+    for the field, above `slope`."""
+    slope: float = 0.02
+    """Difference of the field between pixels that is no discontinuity."""
+    outlier: tuple[float, ...] = (1.0, 0.6, 0.3, 0.15, 0.06)
     """Deviation from a field, in log-depth, that halves the weight of a match."""
     iterations: int = 2
     """Weightings of the matches by their deviation, for each field."""
@@ -125,7 +128,7 @@ def fit_field(
     weight = evidence * area
     is_known = weight.sum() > _MIN_EVIDENCE * area.sum() * target.shape[1]
     field = np.full(target.shape, _weighted_median(target, weight if is_known else area + 0 * target))
-    rows, meridians = _couple(log_depth, area, config.discontinuity)
+    rows, meridians = _couple(target, evidence, log_depth, area, config)
     for smoothness, stiffness, outlier in zip(config.smoothness, config.stiffness, config.outlier, strict=True):
         for _ in range(config.iterations):
             rest = target - field
@@ -141,14 +144,20 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(values.ravel()[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
-def _couple(log_depth: np.ndarray, area: np.ndarray, discontinuity: float) -> tuple[np.ndarray, np.ndarray]:
+def _couple(
+    target: np.ndarray, evidence: np.ndarray, log_depth: np.ndarray, area: np.ndarray, config: BendConfig
+) -> tuple[np.ndarray, np.ndarray]:
     """Couplings of each pixel with the next one of its row, and of its meridian as `_as_meridians` has them."""
-    shrink = np.minimum(1 / np.maximum(area, 1e-6) ** 2, _MAX_ROW_COUPLING)
-    rows, meridians = (
-        np.exp(-np.abs(np.roll(lines, -1, axis=1) - lines) / discontinuity)
-        for lines in (log_depth.astype(np.float64), _as_meridians(log_depth.astype(np.float64)))
-    )
-    return rows * shrink, meridians
+    dense = cv2.boxFilter(pad_sphere(evidence.astype(np.float32), 2), -1, (5, 5))[2:-2, 2:-2]
+    found = cv2.medianBlur(pad_sphere(target.astype(np.float32), 2), 5)[2:-2, 2:-2]  # without single false matches
+    maps = np.stack((log_depth, found, dense)).astype(np.float64)
+    couplings = []
+    for lines in (maps, _as_meridians(maps)):
+        following = np.roll(lines, -1, axis=-1)
+        jumps, field_jumps, _ = np.abs(following - lines)
+        field_jumps = np.maximum(field_jumps - config.slope, 0) * np.minimum(lines[2], following[2])
+        couplings.append(np.exp(-(jumps + field_jumps) / config.discontinuity))
+    return couplings[0] * np.minimum(1 / np.maximum(area, 1e-6) ** 2, _MAX_ROW_COUPLING), couplings[1]
 
 
 def _as_meridians(maps: np.ndarray) -> np.ndarray:

@@ -163,9 +163,7 @@ def search_surfaces(
             surfaces = bend_surfaces(posed, surfaces, neighbours, sharp, config.bend)
         level = _SearchLevel(posed, height, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [
-            level.refine(
-                view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0 or sharp is not None
-            )
+            level.refine(view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
             for view, count in enumerate(counts)
         ]
     assert surfaces is not None
