@@ -19,6 +19,7 @@ from pansplat.options import WHOLE, Positive, Range, Threads
 if TYPE_CHECKING:
     from pansplat.bench.raster import BenchScene
     from pansplat.bench.report import Benchmark, Report
+    from pansplat.data.pairs import Pair
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
@@ -208,17 +209,35 @@ class BenchRefine(_Options):
 
     def run(self) -> int:
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
-        from pansplat import pipeline
         from pansplat.bench.refine import REFINE, RefineBench, list_refine_cases
 
-        found = [pair for path in _paths_or_sample(self.paths) for pair in pipeline.load_pairs(path)]
-        pairs = [pair for pair in found if pair.targets]
-        if not pairs:
-            raise InputError(f"none of the {len(found)} pairs has a target view to compare with")
+        pairs = _load_with_targets(self.paths)
         cases = list_refine_cases(quick=self.quick)
         lpips = choose_lpips(self.lpips, min(case.height for case in cases))
         with self._open_report(REFINE, lpips=None if lpips is None else lpips.name) as report:
             RefineBench(report, lpips).run(pairs, cases)
+        return 0
+
+
+@dataclass(frozen=True)
+class BenchFlights(_Options):
+    """Measure pictures on the way between two panoramas: mixed, drawn jointly, and of each panorama alone."""
+
+    paths: Positional[tuple[Path, ...]] = ()
+    """Folders of pairs with targets, such as those of `pansplat data flights`; by default the sample."""
+    model: str = "default"
+    """Name of a predictor, or weights."""
+    height: Annotated[int, Range(64, 8192, "pixels", multiple=8), WHOLE] = 512
+    """Height of the panoramas, pixels."""
+    lpips: LpipsChoice = field(default_factory=LpipsChoice)
+
+    def run(self) -> int:
+        """Measure, print the tables and write the files; an interruption keeps the measured rows."""
+        from pansplat.bench.flights import FLIGHTS, measure_flights
+
+        pairs, lpips = _load_with_targets(self.paths), choose_lpips(self.lpips, self.height)
+        with self._open_report(FLIGHTS, lpips=None if lpips is None else lpips.name, height=self.height) as report:
+            measure_flights(pairs, self.model, self.height, lpips, report)
         return 0
 
 
@@ -311,6 +330,7 @@ class Bench:
         | Annotated[BenchModel, subcommand("model")]
         | Annotated[BenchMemory, subcommand("memory")]
         | Annotated[BenchRefine, subcommand("refine")]
+        | Annotated[BenchFlights, subcommand("flights")]
         | Annotated[BenchViewer, subcommand("viewer")]
         | Annotated[BenchPose, subcommand("pose")]
         | Annotated[BenchFormats, subcommand("formats")]
@@ -326,3 +346,14 @@ def _paths_or_sample(paths: tuple[Path, ...]) -> tuple[Path, ...]:
     if not paths and not _SAMPLE.is_dir():
         raise InputError("give a folder (the sample is in the repository only)")
     return paths or (_SAMPLE,)
+
+
+def _load_with_targets(paths: tuple[Path, ...]) -> list[Pair]:
+    """The pairs of folders, by default of the sample, that have targets."""
+    from pansplat import pipeline
+
+    found = [pair for path in _paths_or_sample(paths) for pair in pipeline.load_pairs(path)]
+    pairs = [pair for pair in found if pair.targets]
+    if not pairs:
+        raise InputError(f"none of the {len(found)} pairs has a target view to compare with")
+    return pairs

@@ -86,6 +86,34 @@ class DataPhotographs:
 
 
 @dataclass(frozen=True)
+class DataFlights:
+    """Render flights through generated homes, with targets on the way, for `pansplat bench flights`."""
+
+    out: Out
+    """Folder for the flights. Flights that are there are kept; run the command again after an interruption."""
+    count: Count = 12
+    """Number of flights."""
+    seed: Seed = 5200
+    """Seed of the homes."""
+    height: Annotated[int, Range(64, 8192, "pixels", multiple=32), WHOLE] = 512
+    """Height of the panoramas, pixels."""
+
+    def run(self) -> int:
+        """Render with a progress bar, and print the mean length."""
+        from rich.progress import track
+
+        from pansplat.data.generated.flights import write_flight
+
+        require_output_folder("--out", self.out)
+        lengths = [
+            write_flight(self.out / f"flight_{number:02d}", (self.seed, number), self.height)
+            for number in track(range(self.count), "rendering flights")
+        ]
+        print(f"{self.out}: {self.count} flights of {sum(lengths) / self.count:.1f} m in the mean")
+        return 0
+
+
+@dataclass(frozen=True)
 class DataMaps:
     """Pack triplets that were rendered from game maps (PNG, depth in millimetres, JSON) into shards."""
 
@@ -112,6 +140,7 @@ class Data:
     kind: (
         Annotated[DataHomes, subcommand("homes")]
         | Annotated[DataPhotographs, subcommand("photographs")]
+        | Annotated[DataFlights, subcommand("flights")]
         | Annotated[DataMaps, subcommand("maps")]
     )
 

@@ -27,10 +27,10 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.rendering.cpu.runtime import cached_njit
-from pansplat.sweep.search import PosedImages
 from pansplat.sweep.surface import (
     CONSISTENT,
     FREE_SPACE,
+    PosedImages,
     Surface,
     classify_point,
     consistency_mask,

@@ -21,7 +21,8 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.source_hash import hash_sources
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
-from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
+from pansplat.sweep.search import SearchConfig, search_surfaces
+from pansplat.sweep.surface import PosedImages
 
 _MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
 

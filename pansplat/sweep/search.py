@@ -4,7 +4,8 @@ The scene's planes are detected first. Three levels of matching follow at 1/4, 1
 paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres
 and with planes across the scene's axes. It runs twice: the first pass, at a smaller size, finds the surfaces which the
 second one uses for occlusion, consistency between views, and the support of planes. Each finer level searches a narrow
-range around the coarser surface.
+range around the coarser surface. With a prior, the surfaces of the finest level and of the result are those of single
+views, bent by the matches (`bend`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import cv2
 import numpy as np
 
 from pansplat.rendering.cpu.runtime import thread_count
+from pansplat.sweep.bend import BendConfig, bend_surfaces
 from pansplat.sweep.matching import (
     AggregationConfig,
     DepthRange,
@@ -42,6 +44,7 @@ from pansplat.sweep.planes import (
 )
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
 from pansplat.sweep.surface import (
+    PosedImages,
     Surface,
     consistency_mask,
     guided_upsample,
@@ -79,34 +82,9 @@ class SearchConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
+    bend: BendConfig = field(default_factory=BendConfig)
     max_neighbours: int = 3
     """Other views, at most, that a view is matched against."""
-
-
-@dataclass(frozen=True, eq=False)
-class PosedImages:
-    """Input of the search: images (v, h, w, 3) float32, poses (v, 4, 4), masks (v, h, w) bool, depth range."""
-
-    images: np.ndarray
-    cam2world: np.ndarray
-    masks: np.ndarray
-    near: float
-    far: float
-
-    def relative_pose(self, view: int, other: int) -> np.ndarray:
-        """Pose (4, 4) from `view`'s camera to `other`'s."""
-        return np.linalg.inv(self.cam2world[other]) @ self.cam2world[view]
-
-    def resize(self, height: int) -> PosedImages:
-        """The input at another height."""
-        if self.images.shape[1] == height:
-            return self
-        images = np.stack([resize_sphere(image, height) for image in self.images])
-        return dataclasses.replace(self, images=images, masks=np.stack([resize_mask(m, height) for m in self.masks]))
-
-    def measure_baseline(self, views: Sequence[int]) -> float:
-        """Largest distance between two cameras of some views, metres."""
-        return float(measure_distances(self.cam2world[list(views)]).max())
 
 
 def search_surfaces(
@@ -176,16 +154,21 @@ def search_surfaces(
             surfaces = _upsample(surfaces, posed.images, rows)
         level = _SearchLevel(posed, rows, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
+    sharp = None if estimator is None else estimator.sharpen((low, high))
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
         surfaces = _upsample(surfaces, posed.images, height)
+        if sharp is not None and height == finest:
+            surfaces = bend_surfaces(posed, surfaces, neighbours, sharp, config.bend)
         level = _SearchLevel(posed, height, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [
             level.refine(view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
             for view, count in enumerate(counts)
         ]
     assert surfaces is not None
+    if sharp is not None:
+        surfaces = bend_surfaces(posed, surfaces, neighbours, sharp, config.bend)
     return surfaces, neighbours
 
 

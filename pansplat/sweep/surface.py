@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -112,6 +113,32 @@ class Surface:
     @property
     def height(self) -> int:
         return self.inverse_depth.shape[0]
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImages:
+    """Input of the search: images (v, h, w, 3) float32, poses (v, 4, 4), masks (v, h, w) bool, depth range."""
+
+    images: np.ndarray
+    cam2world: np.ndarray
+    masks: np.ndarray
+    near: float
+    far: float
+
+    def relative_pose(self, view: int, other: int) -> np.ndarray:
+        """Pose (4, 4) from `view`'s camera to `other`'s."""
+        return np.linalg.inv(self.cam2world[other]) @ self.cam2world[view]
+
+    def resize(self, height: int) -> PosedImages:
+        """The input at another height."""
+        if self.images.shape[1] == height:
+            return self
+        images = np.stack([resize_sphere(image, height) for image in self.images])
+        return dataclasses.replace(self, images=images, masks=np.stack([resize_mask(m, height) for m in self.masks]))
+
+    def measure_baseline(self, views: Sequence[int]) -> float:
+        """Largest distance between two cameras of some views, metres."""
+        return float(measure_distances(self.cam2world[list(views)]).max())
 
 
 def classify_visibility(points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float) -> np.ndarray:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
-from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
+from pansplat.sweep.search import SearchConfig, search_surfaces
+from pansplat.sweep.surface import PosedImages, Surface, ray_grid, resize_sphere
 
 
 def _waves(points: np.ndarray) -> np.ndarray:

@@ -13,8 +13,7 @@ from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import interpolate_poses, quats_from_rotations, rotations_from_quats
 from pansplat.rendering import blend, blend_weights, rasterize
 from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces, _write_quat, lift
-from pansplat.sweep.search import PosedImages
-from pansplat.sweep.surface import Surface
+from pansplat.sweep.surface import PosedImages, Surface
 
 
 @pytest.fixture(scope="module")

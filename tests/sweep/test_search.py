@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
+from pansplat.sweep.search import SearchConfig, search_surfaces
+from pansplat.sweep.surface import PosedImages
 
 
 def _search(posed: PosedImages, **changes) -> np.ndarray:

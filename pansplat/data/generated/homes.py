@@ -97,7 +97,7 @@ class Home:
                 if not _DISTANCE[0] <= min(distances) <= _DISTANCE[1]:
                     continue
             if self.variants[variant].clearance(centre[None])[0] >= _CLEARANCE:
-                cameras.append((variant, _pose(centre, yaw + spread * rng.uniform(-1, 1))))
+                cameras.append((variant, make_pose(centre, yaw + spread * rng.uniform(-1, 1))))
         return cameras
 
     def sample_room_cameras(self, rng: np.random.Generator) -> list[tuple[int, Array]]:
@@ -119,7 +119,7 @@ class Home:
                     centre = np.array((x0 + share[0] * (x1 - x0), -self.camera_height, z0 + share[1] * (z1 - z0)))
                     variant = int(rng.integers(len(self.variants)))
                     if self.variants[variant].clearance(centre[None])[0] >= _CLEARANCE:
-                        cameras.append((variant, _pose(centre, rng.uniform(0, 2 * np.pi))))
+                        cameras.append((variant, make_pose(centre, rng.uniform(0, 2 * np.pi))))
                         break
         return cameras
 
@@ -137,7 +137,8 @@ class Home:
         return rng.uniform(x0, x1), rng.uniform(z0, z1)
 
 
-def _pose(centre: Array, yaw: float) -> Array:
+def make_pose(centre: Array, yaw: float) -> Array:
+    """cam2world (4 4) of an upright camera that is turned to the right by `yaw` radians."""
     pose = np.eye(4)
     cos, sin = np.cos(yaw), np.sin(yaw)
     pose[:3, :3] = ((cos, 0, sin), (0, 1, 0), (-sin, 0, cos))

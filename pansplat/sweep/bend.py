@@ -1,0 +1,224 @@
+"""One surface for each view: that of the single view, bent by matches.
+
+The depth network sees whole surfaces in one photograph, with its edges, but places them by up to a third too near or
+too far. The search places what two cameras see, and finds false matches where one does. The single view's surface is
+therefore kept, and multiplied by a smooth field, which the search's reliable matches determine: the logarithm of the
+field is a sum of fields from a nearly constant one to one of some pixels. A field does not cross discontinuities of the
+single view's surface, or those that dense evidence shows. A finer field follows only enough evidence.
+
+Source: the smoother is the fast global smoother of Min et al., IEEE Transactions on Image Processing 23(12), 2014, with
+rows and meridians as closed lines, so that it has neither seam nor pole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from pansplat.geometry.equirect import row_weights
+from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
+from pansplat.sweep.surface import PosedImages, Surface, nearest_pixel, pad_sphere, resize_sphere, world_points
+
+_PASSES = 2  # of a smoothing, over rows and meridians
+_MIN_EVIDENCE = 1e-3  # fraction of the sphere with evidence, below which the field is the median of all pixels
+_MAX_ROW_COUPLING = 1e3  # of neighbouring pixels in a row, which are close to each other at the poles
+
+
+@dataclass(frozen=True)
+class BendConfig:
+    """Settings of the evidence and of the fields, from the smoothest to the finest."""
+
+    tolerance: float = 0.03
+    """Relative difference of depth of two views' surfaces up to which they agree; evidence ends at twice of it."""
+    max_difference: float = 0.12
+    """Mean difference of colour of 5x5 pixels above which a match is no evidence."""
+    full_parallax: float = 0.25
+    """Angle between the two rays to a point from which a match has full weight, radians."""
+    smoothness: tuple[float, ...] = (1e5, 3e3, 300.0, 30.0, 3.0)
+    """Coupling of neighbouring pixels, relative to full evidence."""
+    stiffness: tuple[float, ...] = (0.0, 0.01, 0.02, 0.04, 0.05)
+    """Evidence at which a field has half of its amplitude."""
+    discontinuity: float = 0.06
+    """Difference of log-depth between pixels that divides their coupling by e: of the single view, or of dense evidence
+    for the field, above `slope`."""
+    slope: float = 0.02
+    """Difference of the field between pixels that is no discontinuity."""
+    outlier: tuple[float, ...] = (1.0, 0.6, 0.3, 0.15, 0.06)
+    """Deviation from a field, in log-depth, that halves the weight of a match."""
+    iterations: int = 2
+    """Weightings of the matches by their deviation, for each field."""
+
+
+def bend_surfaces(
+    posed: PosedImages,
+    surfaces: Sequence[Surface],
+    neighbours: Sequence[Sequence[int]],
+    log_depths: Sequence[Float[np.ndarray, "_ _"]],
+    config: BendConfig,
+) -> list[Surface]:
+    """The surfaces of single views, bent towards those that a search found.
+
+    Args:
+        posed: photographs and poses.
+        surfaces: found by matching.
+        neighbours: the other views that each view was matched against.
+        log_depths: logarithm of each single view's depth, up to a constant.
+    """
+    height = surfaces[0].height
+    small = posed.resize(height)
+    bent = []
+    for view, (surface, own) in enumerate(zip(surfaces, log_depths, strict=True)):
+        evidence = measure_evidence(small, surfaces, view, neighbours[view], config)
+        log_depth = resize_sphere(own, height)
+        field = fit_field(-np.log(surface.inverse_depth) - log_depth, evidence, log_depth, config)
+        bent.append(Surface(np.exp(-log_depth - field).astype(np.float32), np.zeros(log_depth.shape, np.uint8)))
+    return bent
+
+
+def measure_evidence(
+    posed: PosedImages, surfaces: Sequence[Surface], view: int, others: Sequence[int], config: BendConfig
+) -> Float[np.ndarray, "h w"]:
+    """Weight in [0, 1] of each match of a view: surfaces and colours agree, and the rays have parallax.
+
+    Args:
+        posed: at the height of the surfaces.
+        others: views; the best of them counts.
+    """
+    surface, pose = surfaces[view], posed.cam2world[view]
+    points, image = world_points(surface, pose), posed.images[view]
+    evidence = np.zeros(image.shape[:2], np.float32)
+    for other in others:
+        there = posed.cam2world[other]
+        local = (points - there[:3, 3]) @ there[:3, :3]
+        distance = np.linalg.norm(local, axis=-1)
+        pixel = nearest_pixel(local, surface.height)
+        deviation = np.abs(np.log(np.maximum(distance * surfaces[other].inverse_depth[pixel], 1e-6)))
+        weight = np.clip(2 - deviation / config.tolerance, 0, 1) * posed.masks[other][pixel]
+        difference = np.abs(posed.images[other][pixel] - image).mean(axis=2)
+        mean = cv2.boxFilter(pad_sphere(difference, 2), -1, (5, 5))[2:-2, 2:-2]
+        weight *= mean < config.max_difference
+        rays = points - pose[:3, 3]
+        cosine = np.einsum("hwc,hwc->hw", rays, points - there[:3, 3])
+        cosine /= np.maximum(np.linalg.norm(rays, axis=-1) * distance, 1e-9)
+        parallax = np.arccos(np.clip(cosine, -1, 1))
+        np.maximum(evidence, weight * np.minimum(parallax / config.full_parallax, 1), out=evidence)
+    return evidence * posed.masks[view]
+
+
+def fit_field(
+    target: Float[np.ndarray, "h w"],
+    evidence: Float[np.ndarray, "h w"],
+    log_depth: Float[np.ndarray, "h w"],
+    config: BendConfig,
+) -> Float[np.ndarray, "h w"]:
+    """The logarithm of the field by which a view's depth is multiplied.
+
+    Args:
+        target: its value by the match of each pixel.
+        evidence: weights of the matches.
+        log_depth: of the single view.
+    """
+    height = len(target)
+    area = row_weights(height).numpy()[:, None] / row_weights(height).numpy().max()
+    weight = evidence * area
+    is_known = weight.sum() > _MIN_EVIDENCE * area.sum() * target.shape[1]
+    field = np.full(target.shape, _weighted_median(target, weight if is_known else area + 0 * target))
+    rows, meridians = _couple(target, evidence, log_depth, area, config)
+    for smoothness, stiffness, outlier in zip(config.smoothness, config.stiffness, config.outlier, strict=True):
+        for _ in range(config.iterations):
+            rest = target - field
+            weighted = weight / (1 + (rest / outlier) ** 2)
+            sums = _smooth(np.stack((weighted * rest, weighted)), rows, meridians, smoothness)
+            field = field + sums[0] / (sums[1] + stiffness * area + 1e-9)
+    return field
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = values.ravel().argsort()
+    total = weights.ravel()[order].cumsum()
+    return float(values.ravel()[order[np.searchsorted(total, 0.5 * total[-1])]])
+
+
+def _couple(
+    target: np.ndarray, evidence: np.ndarray, log_depth: np.ndarray, area: np.ndarray, config: BendConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Couplings of each pixel with the next one of its row, and of its meridian as `_as_meridians` has them."""
+    dense = cv2.boxFilter(pad_sphere(evidence.astype(np.float32), 2), -1, (5, 5))[2:-2, 2:-2]
+    found = cv2.medianBlur(pad_sphere(target.astype(np.float32), 2), 5)[2:-2, 2:-2]  # without single false matches
+    maps = np.stack((log_depth, found, dense)).astype(np.float64)
+    couplings = []
+    for lines in (maps, _as_meridians(maps)):
+        following = np.roll(lines, -1, axis=-1)
+        jumps, field_jumps, _ = np.abs(following - lines)
+        field_jumps = np.maximum(field_jumps - config.slope, 0) * np.minimum(lines[2], following[2])
+        couplings.append(np.exp(-(jumps + field_jumps) / config.discontinuity))
+    return couplings[0] * np.minimum(1 / np.maximum(area, 1e-6) ** 2, _MAX_ROW_COUPLING), couplings[1]
+
+
+def _as_meridians(maps: np.ndarray) -> np.ndarray:
+    """Panoramas (..., h, 2h) as closed lines (..., h, 2h): down a meridian, and up the opposite one."""
+    half = maps.shape[-1] // 2
+    lines = np.concatenate((maps[..., :half], maps[..., ::-1, half:]), axis=-2)
+    return np.ascontiguousarray(np.swapaxes(lines, -1, -2))
+
+
+def _from_meridians(lines: np.ndarray) -> np.ndarray:
+    """The panoramas of `_as_meridians`."""
+    maps, half = np.swapaxes(lines, -1, -2), lines.shape[-2]
+    return np.ascontiguousarray(np.concatenate((maps[..., :half, :], maps[..., : half - 1 : -1, :]), axis=-1))
+
+
+def _smooth(maps: np.ndarray, rows: np.ndarray, meridians: np.ndarray, smoothness: float) -> np.ndarray:
+    """Panoramas (2, h, w), smoothed by alternate one-dimensional smoothings of falling strength."""
+    for number in range(_PASSES):
+        strength = 1.5 * 4.0 ** (_PASSES - 1 - number) / (4.0**_PASSES - 1) * smoothness
+        parallel_for(partial(_smooth_line, maps, rows, strength), len(rows), thread_count())
+        maps = _as_meridians(maps)
+        parallel_for(partial(_smooth_line, maps, meridians, strength), len(meridians), thread_count())
+        maps = _from_meridians(maps)
+    return maps
+
+
+@cached_njit(nogil=True, fastmath=True, error_model="numpy")
+def _smooth_line(maps, couplings, strength, line):
+    """Smooth line `line` of both maps (2, n, length) in place.
+
+    It solves (1 + strength * L) x = b for the Laplacian L of a closed line: a tridiagonal system with two corners, by
+    the Sherman-Morrison formula.
+    """
+    coupling, length = couplings[line], couplings.shape[1]
+    upper, turn = np.empty(length), np.empty(length)
+    first, second = maps[0, line], maps[1, line]
+    corner = -strength * coupling[length - 1]
+    gamma = -(1 + strength * (coupling[length - 1] + coupling[0]))
+    inverse = -0.5 / gamma  # of the pivot
+    upper[0], turn[0] = -strength * coupling[0] * inverse, -0.5
+    first[0] *= inverse
+    second[0] *= inverse
+    for k in range(1, length):
+        lower = -strength * coupling[k - 1]
+        diagonal = 1 + strength * (coupling[k - 1] + coupling[k])
+        last = 0.0
+        if k == length - 1:
+            diagonal -= corner * corner / gamma
+            last = corner
+        inverse = 1 / (diagonal - lower * upper[k - 1])
+        upper[k] = -strength * coupling[k] * inverse
+        first[k] = (first[k] - lower * first[k - 1]) * inverse
+        second[k] = (second[k] - lower * second[k - 1]) * inverse
+        turn[k] = (last - lower * turn[k - 1]) * inverse
+    for k in range(length - 2, -1, -1):
+        first[k] -= upper[k] * first[k + 1]
+        second[k] -= upper[k] * second[k + 1]
+        turn[k] -= upper[k] * turn[k + 1]
+    ratio = corner / gamma
+    scale = 1 + turn[0] + ratio * turn[length - 1]
+    one, two = (first[0] + ratio * first[length - 1]) / scale, (second[0] + ratio * second[length - 1]) / scale
+    for k in range(length):
+        first[k] -= one * turn[k]
+        second[k] -= two * turn[k]
