@@ -69,7 +69,7 @@ def test_key_frames_of_a_video_have_poses(tmp_path: Path, render_room) -> None:
     # The key frames lie on a straight line, in the order of the frames.
     poses = json.loads((tmp_path / "walk" / "poses.json").read_text())["poses"]
     found = np.stack([np.array(poses[name])[:3, 3] for name in names])
-    truth = np.stack([centres[int(name[6:12])] for name in names])
+    truth = np.stack([centres[int(name.removesuffix(".png")[-6:])] for name in names])
     steps, known = np.diff(found, axis=0), np.diff(truth, axis=0)
     assert math.degrees(angle_between(steps[0], steps[1])) < 2
     ratio = np.linalg.norm(steps, axis=1) / np.linalg.norm(known, axis=1)
