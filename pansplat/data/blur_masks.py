@@ -7,10 +7,12 @@ what is around them: no hidden pixel has an influence on it, so that nothing of 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from pansplat.strict_json import read_json, require_object
 BLUR_SUFFIX, MASK_SUFFIX = "_blur", "_mask"  # of the stem of a mask
 
 _MASK_NAME = re.compile(r"(?:(.*)_)?(blur|mask)(?:\.\w+)*", re.IGNORECASE | re.DOTALL)
+_listed: ContextVar[dict[tuple[Path, str], dict[str, list[Path]]] | None] = ContextVar("listed", default=None)
 _ROWS = 256  # at most, in which the surroundings are blurred
 _MARGIN = 1 / 128  # of the height; a JPEG mixes pixels within blocks of 16
 _LEAST_SHARE = 0.25  # of a cell that is not hidden, for a colour of its own
@@ -47,12 +50,29 @@ def fold_name(name: str) -> str:
     return unicodedata.normalize("NFC", name.casefold())
 
 
-def list_mask_files(folder: Path, kind: str) -> Iterator[tuple[str, Path]]:
-    """The masks of a kind in a folder, with the stems of their pictures; none if the folder cannot be listed."""
+@contextlib.contextmanager
+def list_folders_once() -> Iterator[None]:
+    """List the masks of each folder at most once in the block, in which masks of many pictures are looked up."""
+    token = _listed.set({})
+    try:
+        yield
+    finally:
+        _listed.reset(token)
+
+
+def list_mask_files(folder: Path, kind: str) -> dict[str, list[Path]]:
+    """The masks of a kind in a folder, by the folded stem of their picture; none if the folder cannot be listed."""
+    listed = _listed.get()
+    if listed is not None and (folder, kind) in listed:
+        return listed[folder, kind]
+    masks: dict[str, list[Path]] = {}
     for path in (folder / name for name in sorted(next(os.walk(folder), ("", [], []))[2]) if kind[1:] in name.lower()):
         found = split_mask_name(path)
         if found is not None and found[1] == kind and path.suffix.lower() == ".png" and path.is_file():
-            yield found[0], path
+            masks.setdefault(fold_name(found[0]), []).append(path)
+    if listed is not None:
+        listed[folder, kind] = masks
+    return masks
 
 
 def find_masks_beside(pictures: Iterable[Path], kind: str) -> dict[Path, Path]:
@@ -61,16 +81,16 @@ def find_masks_beside(pictures: Iterable[Path], kind: str) -> dict[Path, Path]:
     Raises:
         InputError: a picture has several.
     """
-    pictures, masks, found = list(pictures), {}, {}
-    for folder in {picture.parent for picture in pictures}:
-        for stem, mask in list_mask_files(folder, kind):
-            masks.setdefault((folder, fold_name(stem)), []).append(mask)
+    pictures, found = list(pictures), {}
+    masks = {folder: list_mask_files(folder, kind) for folder in {picture.parent for picture in pictures}}
     for picture in pictures:
-        found[picture] = masks.get((picture.parent, fold_name(picture.stem)), [])
-        if len(found[picture]) > 1:
-            names = ", ".join(mask.name for mask in found[picture])
+        own = masks[picture.parent].get(fold_name(picture.stem), [])
+        if len(own) > 1:
+            names = ", ".join(mask.name for mask in own)
             raise InputError(f"{picture}: needed one mask {kind}, got {names}; keep the right one.")
-    return {picture: files[0] for picture, files in found.items() if files}
+        if own:
+            found[picture] = own[0]
+    return found
 
 
 def locate_panorama(image: Path) -> Path:

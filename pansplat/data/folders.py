@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.blur_masks import MASK_SUFFIX, fold_name, locate_panorama, split_mask_name
+from pansplat.data.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
 from pansplat.data.images import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
 from pansplat.data.pairs import (
     FAR,
@@ -74,6 +74,7 @@ _IMAGE_FOLDERS = ("image", "images", "panos", "frames", ".")  # of a sequence
 _Z_UP = torch.tensor(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)), dtype=torch.float64)
 
 
+@list_folders_once()
 def load_pairs(
     path: Path | str, *, convention: str | None = None, near: float | None = None, far: float | None = None
 ) -> list[Pair]:

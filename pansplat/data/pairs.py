@@ -386,7 +386,7 @@ def find_mask(image: Path, folder: Path) -> Path | None:
     """The mask file of an image: STEM_mask.png or mask.png in the image's folder, or mask.png in `folder`."""
     own = find_masks(image, MASK_SUFFIX).get(image)
     places = dict.fromkeys((locate_panorama(image).parent, folder))
-    of_folders = (mask for place in places for stem, mask in list_mask_files(place, MASK_SUFFIX) if not stem)
+    of_folders = (mask for place in places for mask in list_mask_files(place, MASK_SUFFIX).get("", []))
     return own or next(of_folders, None)
 
 
