@@ -23,7 +23,7 @@ from numpy import ndarray as Array
 
 from pansplat import pipeline
 from pansplat.bench.harness import time_workload
-from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
+from pansplat.bench.report import MEAN, Benchmark, Column, Header, Report, Row, average_rows, make_axes
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.evaluation.lpips import Lpips
@@ -35,7 +35,6 @@ from pansplat.refinement import fuse_views
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MEAN = "mean"  # scene of the rows that average all pairs
 _ROWS, _FIRST, _LAST = 256, 32, 224  # rows of depth maps in which jumps are counted; those at the poles are left out
 _JUMP = math.log(1.1)  # of depth between two pixels
 
@@ -70,12 +69,8 @@ def measure_flights(pairs: Sequence[Pair], model: str, height: int, lpips: Lpips
         for name, (drawn, blend) in drawings.items():
             errors = _compare(drawn, blend, targets, lpips)
             report.add(Row("flights", pair.name, FlightCase(name), {**errors, **times}))
-    rows = list(report.rows)
-    for case in dict.fromkeys(row.case for row in rows):
-        results = [row.result for row in rows if row.case == case]
-        names = [name for name in results[0] if all(name in result for result in results)]
-        means = {name: statistics.fmean(result[name] for result in results) for name in names}
-        report.add(Row("flights", MEAN, case, means))
+    for row in average_rows(list(report.rows)):
+        report.add(row)
 
 
 @torch.no_grad()

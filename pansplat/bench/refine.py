@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from pansplat import pipeline
 from pansplat.bench.harness import time_workload
-from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
+from pansplat.bench.report import MEAN, Benchmark, Column, Header, Report, Row, average_rows, make_axes
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views, select_views
 from pansplat.evaluation.lpips import Lpips
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CROSS_FADE = "cross-fade"
-MEAN = "mean"  # scene of the rows that average all pairs
 
 
 @dataclass(frozen=True)
@@ -148,14 +147,6 @@ class RefineBench:
         if self._lpips is not None:
             errors["lpips"] = statistics.fmean(self._lpips.distance(*pair) for pair in images)
         return errors
-
-
-def average_rows(rows: Sequence[Row]) -> Iterator[Row]:
-    """For each case, the mean of its rows; values that not all of them have are left out."""
-    for case in dict.fromkeys(row.case for row in rows):
-        results = [row.result for row in rows if row.case == case and row.scene != MEAN]
-        names = [name for name in results[0] if all(name in result for result in results)]
-        yield Row("refine", MEAN, case, {name: statistics.fmean(each[name] for each in results) for name in names})
 
 
 def _get_line(row: Row) -> tuple[str, int, int | None]:

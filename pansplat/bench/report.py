@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import statistics
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
+MEAN = "mean"  # scene of the rows that average all others
 _SETTINGS_TO_CHANGE = ("limit_gib",)  # an interrupted run may continue with another value
 
 
@@ -101,6 +103,14 @@ class Column:
         if value is None or isinstance(value, str):
             return value or ""
         return "exact" if value == math.inf else self.form.format(value)
+
+
+def average_rows(rows: Sequence[Row]) -> Iterator[Row]:
+    """For each case, the mean of its rows; values that not all of them have are left out."""
+    for case in dict.fromkeys(row.case for row in rows):
+        results = [row.result for row in rows if row.case == case and row.scene != MEAN]
+        names = [name for name in results[0] if all(name in result for result in results)]
+        yield Row(rows[0].suite, MEAN, case, {name: statistics.fmean(each[name] for each in results) for name in names})
 
 
 def error_or_reference(name: str) -> Callable[[Row], Any]:
