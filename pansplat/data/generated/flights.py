@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from pansplat.atomic import replacing
 from pansplat.data.generated.camera import CameraEffects, photograph
 from pansplat.data.generated.homes import Furnishing, Home, build_home, make_pose
-from pansplat.data.generated.library import FurnitureLibrary
 from pansplat.data.generated.plans import RoomKind
 from pansplat.data.images import write_depth, write_image
 
@@ -20,16 +18,12 @@ NAMES = ("start", "quarter", "half", "three_quarters", "end")
 _LENGTH = (1.5, 4.0)  # metres
 _CLEARANCE = 0.25  # least distance of a flight to a body, metres
 _LEAST_AREA = 5.0  # of a room, square metres
-_FARTHEST = 65.0  # depth that a file holds, metres
 _ATTEMPTS = 400  # random places in a home before the next home is tried
-_EFFECTS = CameraEffects(jpeg_quality=None)
 # Nothing is fixed to the camera: on the way there is no camera.
-_WITHOUT_CAPS = dataclasses.replace(_EFFECTS, nadir_probability=0.0, zenith_probability=0.0, operator_probability=0.0)
+_EFFECTS = CameraEffects(jpeg_quality=None, nadir_probability=0.0, zenith_probability=0.0, operator_probability=0.0)
 
 
-def write_flight(
-    folder: Path, seed: tuple[int, int], height: int, library: FurnitureLibrary | None = None, samples: int = 2
-) -> float:
+def write_flight(folder: Path, seed: tuple[int, int], height: int, samples: int = 2) -> float:
     """Write `NAMES`.png of one flight with poses.json, pairs.json and the depth of the targets; its length in metres.
 
     Flights of even numbers stay in a room, those of odd ones go to a neighbouring one. The homes are furnished. A
@@ -44,13 +38,13 @@ def write_flight(
         rng, number = np.random.default_rng(seed), seed[1]
         ends = None
         while ends is None:
-            home = build_home(rng, library)
+            home = build_home(rng)
             ends = _sample_ends(home, rng, steps=number % 2) if home.furnishing >= Furnishing.FURNISHED else None
         yaw = rng.uniform(0, 2 * np.pi)
         poses = [make_pose(ends[0] + share * (ends[1] - ends[0]), yaw) for share in np.linspace(0, 1, len(NAMES))]
         views = [home.variants[0].panorama(pose, height, samples) for pose in poses]
         light, depth = (np.stack([view[n] for view in views]).astype(np.float32) for n in (0, 1))
-        _write(folder, photograph(light, depth, rng, _WITHOUT_CAPS).images, depth, poses)
+        _write(folder, photograph(light, depth, rng, _EFFECTS).images, depth, poses)
     stated = json.loads((folder / "poses.json").read_text("utf-8"))["poses"]
     first, last = (np.array(stated[f"{name}.png"]["cam2world"])[:3, 3] for name in (NAMES[0], NAMES[-1]))
     return float(np.linalg.norm(last - first))
@@ -84,7 +78,7 @@ def _write(
     entries = {}
     for name, image, depth, pose in zip(NAMES, images, depths, poses, strict=True):
         write_image(folder / f"{name}.png", image, panorama="photograph")
-        write_depth(folder / f"{name}_depth.png", np.minimum(depth, _FARTHEST), panorama=False)
+        write_depth(folder / f"{name}_depth.png", depth, panorama=False)
         entries[f"{name}.png"] = {"cam2world": pose.tolist(), "depth": f"{name}_depth.png"}
     first, *middle, last = (f"{name}.png" for name in NAMES)
     contents = {
