@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from pansplat.geometry.equirect import row_weights
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
-from pansplat.sweep.surface import PosedImages, Surface, nearest_pixel, pad_sphere, resize_sphere, world_points
+from pansplat.sweep.surface import PosedImages, Surface, nearest_pixel, pad_sphere, world_points
 
 _PASSES = 2  # of a smoothing, over rows and meridians
 _MIN_EVIDENCE = 1e-3  # fraction of the sphere with evidence, below which the field is the median of all pixels
@@ -58,23 +58,20 @@ def bend_surfaces(
     posed: PosedImages,
     surfaces: Sequence[Surface],
     neighbours: Sequence[Sequence[int]],
-    log_depths: Sequence[Float[np.ndarray, "_ _"]],
+    log_depths: Sequence[Float[np.ndarray, "h w"]],
     config: BendConfig,
 ) -> list[Surface]:
     """The surfaces of single views, bent towards those that a search found.
 
     Args:
-        posed: photographs and poses.
+        posed: photographs and poses, at the height of the surfaces.
         surfaces: found by matching.
         neighbours: the other views that each view was matched against.
         log_depths: logarithm of each single view's depth, up to a constant.
     """
-    height = surfaces[0].height
-    small = posed.resize(height)
     bent = []
-    for view, (surface, own) in enumerate(zip(surfaces, log_depths, strict=True)):
-        evidence = measure_evidence(small, surfaces, view, neighbours[view], config)
-        log_depth = resize_sphere(own, height)
+    for view, (surface, log_depth) in enumerate(zip(surfaces, log_depths, strict=True)):
+        evidence = measure_evidence(posed, surfaces, view, neighbours[view], config)
         field = fit_field(-np.log(surface.inverse_depth) - log_depth, evidence, log_depth, config)
         bent.append(Surface(np.exp(-log_depth - field).astype(np.float32), np.zeros(log_depth.shape, np.uint8)))
     return bent

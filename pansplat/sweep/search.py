@@ -154,13 +154,16 @@ def search_surfaces(
             surfaces = _upsample(surfaces, posed.images, rows)
         level = _SearchLevel(posed, rows, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
-    sharp = None if estimator is None else estimator.sharpen((low, high))
+    sharp, finest_posed = None, posed
+    if estimator is not None:
+        sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen((low, high))]
+        finest_posed = posed.resize(finest)
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
         surfaces = _upsample(surfaces, posed.images, height)
         if sharp is not None and height == finest:
-            surfaces = bend_surfaces(posed, surfaces, neighbours, sharp, config.bend)
+            surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
         level = _SearchLevel(posed, height, planes, depths.limits, config, neighbours, surfaces)
         surfaces = [
             level.refine(view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
@@ -168,7 +171,7 @@ def search_surfaces(
         ]
     assert surfaces is not None
     if sharp is not None:
-        surfaces = bend_surfaces(posed, surfaces, neighbours, sharp, config.bend)
+        surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
     return surfaces, neighbours
 
 
