@@ -14,7 +14,7 @@ from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equ
 from pansplat.geometry.pose import invert_pose, orthonormal_error
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "living_room"
-RECIPE = SAMPLE.parent / "recipe"
+RECIPE = SAMPLE.parent / "recipe" / "living_room"
 NAMES = ("left", "middle", "right")
 INPUTS = ("left", "right")
 STRIDE = 6  # of the pixels that are compared

@@ -1,6 +1,6 @@
 """Build a furnished living room with a dining room behind it, and render posed panoramas with exact depth.
 
-    python living_room.py --sources FOLDER --out ../living_room
+    python living_room.py --sources FOLDER --out ../../living_room
 
 FOLDER holds the files that fetch.sh downloads. Needs bpy 4.2.0 (Blender as a Python module), numpy and Pillow; see
 README.md.

@@ -1,6 +1,6 @@
 """Write the sample's README.md: contents, credits, how it was made, checksums.
 
-blender/bin/python readme.py ../living_room
+blender/bin/python readme.py ../../living_room
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _SAMPLES = 14  # paths per pixel of the shipped images
 _TEXT = """# The living room
 
 Two posed panoramas of a furnished room, one metre apart, with a third one midway to compare with, and the
-exact depth of all three. Nobody lives there: it was generated (see [../recipe](../recipe/README.md)).
+exact depth of all three. Nobody lives there: it was generated (see [the recipe](../recipe/living_room/README.md)).
 
 | file | what |
 |---|---|
@@ -56,11 +56,11 @@ counts above its library's name.
 With bpy 4.2.0, numpy 2.4.6 and Pillow 13.0.0 under Python 3.11, from the repository's root:
 
 ```
-bash assets/recipe/fetch.sh sources
+bash assets/recipe/living_room/fetch.sh sources
 python3.11 -m venv blender && blender/bin/pip install bpy==4.2.0 numpy==2.4.6 pillow==13.0.0
-blender/bin/python assets/recipe/living_room.py --sources sources --out assets/living_room \\
+blender/bin/python assets/recipe/living_room/living_room.py --sources sources --out assets/living_room \\
     --seed 0 --height {height} --depth-height {depth_height} --samples {samples}
-blender/bin/python assets/recipe/readme.py assets/living_room
+blender/bin/python assets/recipe/living_room/readme.py assets/living_room
 ```
 
 ## Checksums (SHA-256)
