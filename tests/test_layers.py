@@ -1,6 +1,7 @@
-"""Modules import lower layers only (.importlinter), and the check reports violations."""
+"""Modules import lower layers only (.importlinter) and no recipe, and the checks report violations."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -60,6 +61,21 @@ def test_upward_imports_are_reported(copied: Path) -> None:
     assert "0 kept, 2 broken" in done.stdout
     missed = [violation for violation in VIOLATIONS if " -> ".join(violation) not in done.stdout]
     assert not missed, done.stdout
+
+
+def find_imports_of_recipes(folder: Path) -> list[str]:
+    """The Python files of a folder that import a package of assets/recipe."""
+    pattern = re.compile(r"^\s*(?:from|import) pansplat_homes\b", re.MULTILINE)
+    files = sorted(folder.rglob("*.py"))
+    return [file.relative_to(folder).as_posix() for file in files if pattern.search(file.read_text("utf-8"))]
+
+
+def test_only_recipes_import_recipes(copied: Path) -> None:
+    assert find_imports_of_recipes(copied) == find_imports_of_recipes(ROOT / "tests") == []
+    with open(copied / "pansplat" / "training" / "datasets.py", "a") as source:
+        source.write("\nfrom pansplat_homes.triplets import GeneratedTriplets\n")
+    assert find_imports_of_recipes(copied) == ["pansplat/training/datasets.py"]
+    assert find_imports_of_recipes(ROOT / "assets" / "recipe"), "the recipe is found under its name"
 
 
 def test_public_names_are_callable_after_an_import_of_submodules() -> None:

@@ -29,6 +29,7 @@ _FURNITURE = (
     ((1.6, 0.7, 3.0), (2.6, 1.2, 3.6)),  # chest
     ((-0.3, -1.1, 2.0), (0.3, -0.8, 2.6)),  # lamp
 )
+NUM_SURFACES = 6 * (1 + len(_FURNITURE))
 _FOOTPRINT = (0.5, 1.0)  # standard deviations of discs across the line of sight, in pixels of their level
 _MAX_STRETCH = 4.0  # of a disc seen at a slant
 _THICKNESS = 0.1  # of a disc's width
@@ -89,7 +90,7 @@ def _make_discs(
     view: int,
 ) -> Gaussians:
     """A disc where each ray from a camera meets the room; it looks round along the ray."""
-    distance, axis, body = _trace_room(rays, position)
+    distance, axis, surface = trace_room(rays, position)
     points = position + distance[:, None] * rays
     normals = torch.nn.functional.one_hot(axis, 3).double()
     facing = (rays * normals).sum(dim=1)
@@ -105,16 +106,25 @@ def _make_discs(
         scales=torch.stack((width * stretch, width, width * _THICKNESS), dim=1).float(),
         quats=quats_from_rotations(axes).float(),
         opacities=opacity.float(),
-        harmonics=_make_harmonics(points, 6 * body + 2 * axis + (facing > 0), degree, generator),
+        harmonics=_make_harmonics(points, surface, degree, generator),
         levels=torch.full((len(rays),), level, dtype=torch.uint8),
         views=torch.full((len(rays),), view, dtype=torch.uint8),
     )
 
 
-def _trace_room(
+def trace_room(
     rays: Float[Tensor, "n 3"], position: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """Distance to the first surface, the axis of its normal, and the number of its body (0: room)."""
+    """The first surface of the room or its furniture along rays from a position in the room.
+
+    Args:
+        rays: directions, float64; of any length.
+        position: metres, float64; outside of the furniture.
+
+    Returns:
+        Distance in lengths of the ray, the axis of the surface's normal, and the surface's number below
+        `NUM_SURFACES`: one for each side of each box.
+    """
     inverse = 1 / torch.where(rays.abs() < 1e-12, torch.full_like(rays, 1e-12), rays)
     bounds = torch.tensor(_ROOM, dtype=torch.float64) - position
     distance, axis = torch.maximum(bounds[0] * inverse, bounds[1] * inverse).min(dim=1)
@@ -127,7 +137,8 @@ def _trace_room(
         hit = (enters > 0) & (enters < leaves) & (enters < distance)
         distance, axis = torch.where(hit, enters, distance), torch.where(hit, side, axis)
         body = torch.where(hit, number, body)
-    return distance, axis, body
+    side = rays.gather(1, axis[:, None])[:, 0] > 0
+    return distance, axis, 6 * body + 2 * axis + side
 
 
 def _make_harmonics(

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Protocol, Union
 from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
 
 _COMMANDS = (
-    "predict", "refine", "render", "export", "batch", "evaluate", "pose", "check", "info", "bench", "convert", "data"
+    "predict", "refine", "render", "export", "batch", "evaluate", "pose", "check", "info", "bench", "convert"
 )  # fmt: skip
 """Each is a module with a class of its name, in the order of `pansplat --help`."""
 

@@ -224,7 +224,7 @@ class BenchFlights(_Options):
     """Measure pictures on the way between two panoramas: mixed, drawn jointly, and of each panorama alone."""
 
     paths: Positional[tuple[Path, ...]] = ()
-    """Folders of pairs with targets, such as those of `pansplat data flights`; by default the sample."""
+    """Folders of pairs with targets, such as those of `pansplat-homes flights`; by default the sample."""
     model: str = "default"
     """Name of a predictor, or weights."""
     height: Annotated[int, Range(64, 8192, "pixels", multiple=8), WHOLE] = 512

@@ -8,7 +8,7 @@ the levels before they are enlarged. Both give the numbers of the full map, with
 
 Source: X. Zhao et al., ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable Transformation,
 IEEE TIM 2023 (aliked-n16); J. Dai et al., Deformable Convolutional Networks, ICCV 2017. Batch normalisation is part of
-the convolutions' weights (assets/matcher/convert.py).
+the convolutions' weights (assets/recipe/homes/pansplat_homes/matcher.py).
 """
 
 from __future__ import annotations

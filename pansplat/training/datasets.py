@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TypeVar
 
 from pansplat.data.folders import load_pairs
-from pansplat.data.generated.triplets import GeneratedTriplets
 from pansplat.data.sequences import BoundedSampler, read_insta360, read_loc360
 from pansplat.data.sources import (
     ConcatSource,
@@ -24,6 +23,7 @@ from pansplat.data.sources import (
 )
 from pansplat.errors import InputError
 from pansplat.training.config import DataConfig
+from pansplat.training.room import RoomTriplets
 
 _T = TypeVar("_T")
 
@@ -36,7 +36,7 @@ RESERVED = frozenset(
 """Game maps for evaluation only; their triplets are named NAME_NUMBER. Maps that share rooms are reserved together."""
 
 _NUMBER = re.compile(r"(_\d+)+$")
-_VALIDATION_SEED_OFFSET = 1_000_003  # generated homes differ from those of training
+_VALIDATION_SEED_OFFSET = 1_000_003  # rooms differ from those of training
 _VALIDATION_DRAWS = 4  # frame pairs per sequence
 
 
@@ -49,8 +49,8 @@ def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSour
     Raises:
         InputError: the data are missing or invalid.
     """
-    if config.kind == "generated":
-        return GeneratedTriplets(seed), GeneratedTriplets(seed + _VALIDATION_SEED_OFFSET)
+    if config.kind == "room":
+        return RoomTriplets(seed), RoomTriplets(seed + _VALIDATION_SEED_OFFSET)
     root = config.root
     assert root is not None
     if config.kind == "panogrf":

@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from pansplat.data.augment import Augmentation
-from pansplat.data.generated.triplets import GeneratedTriplets
 from pansplat.data.images import write_image
 from pansplat.data.loader import Loader
-from pansplat.data.sources import TripletSource, read_game_maps
+from pansplat.data.sources import ConcatSource, TripletSource, read_game_maps
 from pansplat.data.views import Batch
 from pansplat.errors import InputError
 
@@ -107,8 +106,8 @@ def test_other_exceptions_of_a_source_are_not_caught() -> None:
         _take(Loader(Broken(), height=8, batch_size=1), 1)
 
 
-def test_empty_sources_and_batches_are_refused() -> None:
+def test_empty_sources_and_batches_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="empty source"):
-        Loader(GeneratedTriplets(count=0), height=8, batch_size=1)
+        Loader(ConcatSource([]), height=8, batch_size=1)
     with pytest.raises(InputError, match="batch_size >= 1"):
-        Loader(GeneratedTriplets(), height=8, batch_size=0)
+        Loader(_triplets(tmp_path, 1), height=8, batch_size=0)

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from pansplat.data.folders import load_pairs
-from pansplat.data.generated.triplets import GeneratedTriplets
 from pansplat.data.sources import ConcatSource, PairSource, TripletSource, read_game_maps, read_panogrf
 from pansplat.data.views import collate
 from pansplat.errors import InputError
@@ -105,8 +104,10 @@ def test_pairs_need_targets_and_a_random_one_is_chosen(
 
 
 def test_concatenated_sources_keep_their_order(tmp_path: Path, write_triplets: Callable) -> None:
-    maps, homes = write_triplets(tmp_path, "a", "b"), GeneratedTriplets(count=3, samples=1)
-    concatenated = ConcatSource([maps, homes, maps])
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    second.mkdir()
+    maps, others = write_triplets(first, "a", "b"), write_triplets(second, "c", "d", "e")
+    concatenated = ConcatSource([maps, ConcatSource([]), others, maps])
     assert len(concatenated) == 7
-    names = [concatenated.sample(i, 8, 0).name for i in range(7)]
-    assert names == ["a", "b", *(f"generated_0_{i:06d}" for i in range(3)), "a", "b"]
+    assert [concatenated.sample(i, 8, 0).name for i in range(7)] == ["a", "b", "c", "d", "e", "a", "b"]

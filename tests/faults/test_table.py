@@ -166,10 +166,6 @@ SIZES = [
     *bad("--heights", "bench memory", "100"),
     *bad("--threads", "bench raster", "0"),
     *bad("--limit-gb", "bench memory", "0"),
-    *bad("--count", "data homes --out shards", "0"),
-    *bad("--cameras", "data homes --out shards", "1"),
-    *bad("--height", "data homes --out shards", "100"),
-    *bad("--workers", "data homes --out shards", "0"),
     *bad("--optimizer.steps", TRAIN, "many"),
     *bad("--optimizer.rate", TRAIN, "inf"),
     *bad("--optimizer.batch-size", TRAIN, "0"),
@@ -529,10 +525,10 @@ FILES = [
     Fault("an output of 250 bytes works", PREDICT.replace("out.ply", f"{'a' * 250}.ply"), status=0),
     Fault("an output in /proc", PREDICT.replace("out.ply", "/proc/out.ply"), says="/proc/out.ply"),
     *(Fault(f"{command[:12]}: an output folder that is a file", command.format("scene.ply"), says="scene.ply") for command in (
-        "evaluate pair --model sphere --out {}", "data homes --out {}", "bench model --out {}", "bench memory --out {}",
+        "evaluate pair --model sphere --out {}", "bench model --out {}", "bench memory --out {}",
         "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
     *(Fault(f"{command[:12]}: an output folder of 300 bytes", command.format(_LONG), says="too long") for command in (
-        "evaluate pair --model sphere --out {}", "data homes --out {}", "bench refine --out {}",
+        "evaluate pair --model sphere --out {}", "bench refine --out {}",
         "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
     *(Fault(f"{command[:12]}: an output folder in a file", command.format("scene.ply/a/b"), says="scene.ply") for command in (
         "evaluate pair --model sphere --out {}", "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),

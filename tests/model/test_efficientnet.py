@@ -1,28 +1,6 @@
-import pytest
 import torch
 
 from pansplat.model.efficientnet import CHANNELS, EfficientNetLite0
-
-_NAMES = {
-    "expand": "_expand_conv",
-    "depthwise": "_depthwise_conv",
-    "project": "_project_conv",
-    "expand_norm": "_bn0",
-    "depthwise_norm": "_bn1",
-    "project_norm": "_bn2",
-}
-
-
-def _official_state(network):
-    """The network's weights under the names of the ImageNet file, with its classifier."""
-    state = {"_fc.weight": torch.ones(2), "_conv_head.weight": torch.ones(2), "_bn1.weight": torch.ones(2)}
-    for name, value in network.state_dict().items():
-        parts = name.split(".")
-        if parts[0] == "blocks":
-            parts[2] = _NAMES[parts[2]]
-        official = {"stem": "_conv_stem", "stem_norm": "_bn0", "blocks": "_blocks"}[parts[0]]
-        state[".".join((official, *parts[1:]))] = value
-    return state
 
 
 def _random_network(seed):
@@ -47,19 +25,3 @@ def test_rolling_the_panorama_rolls_the_features():
     for n, (a, b) in enumerate(zip(features, rolled, strict=True)):
         assert a.std() > 1e-4
         torch.testing.assert_close(a.roll(16 >> n, dims=-1), b, atol=1e-5, rtol=1e-4)
-
-
-@torch.no_grad()
-def test_imagenet_names_map_to_all_weights():
-    source, target = _random_network(2), _random_network(3)
-    target.load_imagenet(_official_state(source))
-    image = torch.rand(1, 3, 64, 128)
-    assert all(torch.equal(a, b) for a, b in zip(source(image), target(image), strict=True))
-
-
-def test_missing_imagenet_weight_is_refused():
-    network = _random_network(4)
-    state = _official_state(network)
-    del state["_blocks.3._depthwise_conv.weight"]
-    with pytest.raises(RuntimeError, match=r"blocks\.3\.depthwise\.weight"):
-        network.load_imagenet(state)
