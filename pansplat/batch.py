@@ -280,11 +280,11 @@ def _connect(tour: TourGraph, folder: Path) -> tuple[TourGraph, Path, bool]:
     path = folder / f"graph-{key}-{_shorten(tour.name)}.json"
     is_new = not path.exists()
     if is_new:
-        overlaps = [[*edge, overlap] for edge, overlap in tours.connect(tour).overlaps.items()]
+        overlaps = tours.connect(tour).list_overlaps()
         with replacing(path) as temporary:
             temporary.write_text(json.dumps({"overlaps": overlaps}), "utf-8")
     rows = list_field(require_object(read_json(path), path), "overlaps", path)
-    return dataclasses.replace(tour, overlaps={(a, b): overlap for a, b, overlap in rows}), path, is_new
+    return tour.with_overlaps(tuple(map(tuple, rows))), path, is_new
 
 
 @lru_cache(maxsize=2)  # that of the batch, and that of single views
@@ -351,7 +351,7 @@ def _choose_for_single_views(unit: _Unit, options: BatchOptions, fingerprint: st
 
 def _list_graph(tour: TourGraph) -> list[Any]:
     """What the scene of a tour states of its graph: edges, and titles, links and start views if there are any."""
-    edges = [[*edge, round(overlap, 6)] for edge, overlap in tour.overlaps.items()]
+    edges = [[*edge, round(overlap, 6)] for *edge, overlap in tour.list_overlaps()]
     stated = [
         [node, view.title, view.start, [dataclasses.astuple(link) for link in view.links]]
         for node, view in enumerate(tour.panoramas)
