@@ -33,7 +33,6 @@ from pansplat.rendering.cpu.display import (
     blend_to_pixels,
     enlarge,
 )
-from pansplat.rendering.cpu.footprints import Footprint
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
 from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
@@ -365,7 +364,6 @@ class CpuRenderer:
             selection=selection,
             cache=cache,
             min_transmittance=self._min_transmittance,
-            footprint=_find_footprint(frame.settings),
         )
 
     def _find_scene(self, settings: DrawSettings) -> DisplayScene:
@@ -395,7 +393,6 @@ class CpuRenderer:
                 len(groups.weights),
                 RasterOptions(near=settings.near),
                 min_transmittance=self._min_transmittance,
-                footprint=_find_footprint(settings),
             )
             _add_stages(stages, layers)
             return layers.sums, layers.statistics.visible
@@ -530,17 +527,13 @@ def _face_key(frame: Frame) -> Hashable:
     return frame.world_position.tobytes(), frame.focal, settings
 
 
-def _find_footprint(settings: DrawSettings) -> Footprint | None:
-    return None if settings.footprint == "gaussian" else settings.footprint
-
-
 def _blend(
     settings: DrawSettings, groups: _Groups, sums: Float[np.ndarray, "layer 5 height width"]
 ) -> tuple[Float[np.ndarray, "height width 4"], Float[np.ndarray, "height width"]]:
     """Colour over the background and coverage, and depth."""
     color, depth = blend_layers(sums, groups.weights, settings.background)
     if settings.display in SCALAR_MAPS:
-        values = {"depth": depth, "opacity": color[..., 3], "count": sums[0, 4]}[settings.display]
+        values = depth if settings.display == "depth" else color[..., 3]
         mapped = map_values(values, settings.display_max, SCALAR_MAPS[settings.display]) / np.float32(255)
         color[..., :3] = np.where(color[..., 3:] > 0, mapped, np.array(settings.background, np.float32))
     return color, depth

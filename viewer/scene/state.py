@@ -25,7 +25,6 @@ from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Pr
 
 FLIGHT_SECONDS = 6.0
 GLIDE_SECONDS = 1.6
-COUNT_MAX = 300.0  # Gaussians per pixel with the last colour, by default
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
@@ -179,7 +178,7 @@ def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True
 
 def choose_display(state: ViewerState, display: Display) -> None:
     """Show a property, in the range of the scene."""
-    largest = {"depth": state.depth_max, "count": COUNT_MAX}.get(display, 1.0)
+    largest = state.depth_max if display == "depth" else 1.0
     state.settings = replace(state.settings, display=display, display_max=largest)
 
 
