@@ -27,9 +27,15 @@ from pansplat_viewer.capture import (
     write_path_film,
     write_screenshot,
 )
-from pansplat_viewer.draw.cpu_renderer import CpuRenderer, create_renderer
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
-from pansplat_viewer.draw.stereo import StereoRenderer, choose_format, get_eye_size, render_image
+from pansplat_viewer.draw.stereo import (
+    WindowRenderer,
+    choose_format,
+    create_window_renderer,
+    get_eye_size,
+    render_image,
+)
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.background import BackgroundWorker, Report
 from pansplat_viewer.scene.camera import Camera
@@ -121,11 +127,11 @@ class Viewer:
         self._scene_slot: int = 0  # that of the scene that was shown last, and its panoramas in a tour
         self._scene_views: tuple[int, ...] = ()
         self._doll_house: tuple[DollHouse, SceneSlot, Camera] | None = None  # with the first camera
-        self._slots = [SceneSlot(StereoRenderer(create_renderer(ctx, renderer), ctx))]
+        self._slots = [SceneSlot(create_window_renderer(ctx, renderer))]
         self._preparer = ScenePreparer(self.renderer.prepare)
         self._incoming: LoadedScene | None = None  # shown when it is prepared
         self.presenter = Presenter(ctx)
-        self._comparer = Comparer(ctx, lambda: StereoRenderer(create_renderer(ctx, renderer), ctx))
+        self._comparer = Comparer(ctx, lambda: create_window_renderer(ctx, renderer))
         self.path: Path | None = None
         self._searched: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
         self._too_large: LoadedScene | None = None
@@ -150,7 +156,7 @@ class Viewer:
         self._last_camera = self.state.camera
 
     @property
-    def renderer(self) -> StereoRenderer:
+    def renderer(self) -> WindowRenderer:
         """The renderer of the scene that is shown, or that was shown before a photograph."""
         return self._slot.renderer
 
@@ -555,7 +561,7 @@ class Viewer:
         tour, state = loaded.entry.tour, self.state
         assert tour is not None
         if len(self._slots) == 1:
-            self._slots.append(SceneSlot(StereoRenderer(create_renderer(self.ctx, self._choice), self.ctx)))
+            self._slots.append(SceneSlot(create_window_renderer(self.ctx, self._choice)))
         self._tour = TourScenes.start(loaded, self._memory)
         enter_tour(state, tour, loaded.scene, plan_route(tour, tour.plan_walk(loaded.entry.start)), at=self._at)
         self._tour.move(np.asarray(state.camera.position))
@@ -695,7 +701,7 @@ class Viewer:
         if not isinstance(found, DollHouse):
             self.state.show_message("no room is known here" if found is None else f"no doll's house: {found}", now)
             return
-        state, slot = self.state, SceneSlot(StereoRenderer(create_renderer(self.ctx, self._choice), self.ctx))
+        state, slot = self.state, SceneSlot(create_window_renderer(self.ctx, self._choice))
         if self._upload(slot, found.scene, self._loaded.entry) is not None:
             slot.renderer.release()
             return
@@ -935,20 +941,18 @@ class Viewer:
     ) -> float:
         """Draw the image of this plan; returns milliseconds, 0 if it is not new."""
         settings = replace(settings, cached=plan.cached)
-        # Both eyes need faces at new places during a turn: the coarsest ones, so that they are finished in time.
-        scale = plan.scale if settings.stereo == "mono" or not plan.cached else self._resolution.coarsest
         if not (plan.cached and slot.renderer.has_faces(cam2world, size, settings)):
-            settings = replace(settings, scale=scale)
+            settings = replace(settings, scale=plan.scale)
         wait = plan.moving and slot.renderer.pacing.waits_while_moving
-        milliseconds = slot.draw(cam2world, size, settings, wait=wait)
-        slot.renderer.prefetch(cam2world, size, settings, scale)
-        return milliseconds
+        return slot.draw(cam2world, size, settings, wait=wait)
 
     def _focus_center(self) -> None:
         """Orbit the point in the centre of the last image."""
         if self._slot.image is None or self._shows_photograph:
             return
-        distance = measure_center_depth(self.renderer.read_eye_depth())
+        depth, stereo = self.renderer.read_depth(), self.state.settings.stereo
+        width, height = get_eye_size(depth.shape[::-1], stereo)
+        distance = measure_center_depth(depth[:height, :width])  # of the left eye
         self._slot.image = None  # `read_depth` may have replaced the texture
         if distance is not None:
             camera = self.state.camera

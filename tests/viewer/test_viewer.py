@@ -68,7 +68,7 @@ IMAGE_WIDGETS = (
     "off##stereo", "pair##stereo", "red/cyan##stereo",
     "2##panorama", "##flight",
 )  # fmt: skip
-PRESETS = get_args(Preset)  # which the processor's renderer does not offer
+OF_OPENGL = (*get_args(Preset), "off##stereo", "pair##stereo", "red/cyan##stereo")  # the processor does not offer them
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
     "joint": {"mode": "deferred"},
@@ -211,9 +211,15 @@ def both(test: Callable[..., None]) -> Callable[..., None]:
     return test
 
 
+def opengl(test: Callable[..., None]) -> Callable[..., None]:
+    """Run a test with OpenGL."""
+    test.renderers = ("gl",)  # type: ignore[attr-defined]
+    return test
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "label" in metafunc.fixturenames:
-        cases = [("gl" if label in PRESETS else "cpu", label) for label in IMAGE_WIDGETS]
+        cases = [("gl" if label in OF_OPENGL else "cpu", label) for label in IMAGE_WIDGETS]
         metafunc.parametrize(("session", "label"), cases, indirect=["session"], scope="module")
     elif "session" in metafunc.fixturenames:
         renderers = getattr(metafunc.function, "renderers", ("cpu",))
@@ -311,7 +317,7 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
     assert 0 < user.state.settings.view_weights[1] < 1
 
 
-@both
+@opengl
 def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 64)
     user.click("pair##stereo")
@@ -1076,6 +1082,7 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
     assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"
 
 
+@opengl
 def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(user, monkeypatch):
     viewer, renderer, drawn, recorded = user.viewer, user.viewer.renderer._eyes[0], [], []
     render = renderer.render
@@ -1092,9 +1099,6 @@ def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(user, monkeypatc
         user.draw_frames(1)
     assert drawn == [1.0, 0.75, 0.5, 0.75, 1.0]
     assert recorded[-4:] == [(scale, True) for scale in drawn[:-1]]
-
-
-test_the_time_of_a_frame_is_recorded_for_its_own_resolution.renderers = ("gl",)  # type: ignore[attr-defined]
 
 
 def test_an_error_of_opengl_is_not_called_exhausted_memory(user, small_scene, monkeypatch):

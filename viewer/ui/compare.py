@@ -10,7 +10,7 @@ import numpy as np
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.draw.stereo import StereoRenderer
+from pansplat_viewer.draw.stereo import WindowRenderer
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.slots import SceneSlot
 from pansplat_viewer.scene.state import ViewerState, fit_settings
@@ -36,7 +36,7 @@ class Comparer:
         error: message of a photograph that cannot be read.
     """
 
-    def __init__(self, ctx: moderngl.Context, create_renderer: Callable[[], StereoRenderer]) -> None:
+    def __init__(self, ctx: moderngl.Context, create_renderer: Callable[[], WindowRenderer]) -> None:
         """`create_renderer` makes the renderer of the pinned image, at the first one."""
         self.photographs = Photographs(ctx)
         self.pinned: PinnedImage | None = None

@@ -333,17 +333,19 @@ class Panels:
     def _draw_settings(self, state: ViewerState, stats: FrameStats) -> None:
         settings = state.settings
         _draw_row_label("preset")
-        imgui.begin_disabled(stats.tier == "cpu")  # which draws preset exact only
+        imgui.begin_disabled(stats.tier == "cpu")  # which draws preset exact and one eye only
         for preset in get_args(Preset):
             imgui.same_line()
             if self._radio(preset, settings.preset == preset):
                 settings = replace(settings, preset=preset)
         imgui.end_disabled()
         _draw_row_label("stereo")
+        imgui.begin_disabled(stats.tier == "cpu")
         for label, stereo in (("off", "mono"), ("pair", "side-by-side"), ("red/cyan", "anaglyph")):
             imgui.same_line()
             if self._radio(f"{label}##stereo", settings.stereo == stereo):
                 settings = replace(settings, stereo=stereo)
+        imgui.end_disabled()
         if settings.stereo != "mono":
             distance = self._slider("eye distance", 1000 * settings.eye_distance, 10.0, 200.0, "%.0f mm")
             settings = replace(settings, eye_distance=distance / 1000)
