@@ -265,7 +265,8 @@ def _run_window(
         except ContextLostError:  # start again with the same scene, camera and settings
             if attempt == _MAX_CONTEXTS - 1:
                 raise
-            entries, first, source = viewer.entries, max(viewer.panel_data.current, 0), viewer.path
+            library = viewer.library
+            entries, first, source = library.entries, max(library.current, 0), library.path
     return None
 
 

@@ -51,7 +51,6 @@ from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
 from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.viewer import Viewer
-from pansplat_viewer.window.input import Commands
 from pansplat_viewer.window.preferences import Preferences
 
 pytestmark = pytest.mark.gl
@@ -90,7 +89,7 @@ class User:
 
     def __init__(self, viewer: Viewer, target: moderngl.Framebuffer, clock: list[float]) -> None:
         self.viewer, self.target, self.clock = viewer, target, clock
-        self.state, self.data, self.panels = viewer.state, viewer.panel_data, viewer.panels
+        self.state, self.panels = viewer.state, viewer.panels
 
     def draw_frames(self, count: int, seconds: float = 1 / 30) -> None:
         for _ in range(count):
@@ -107,7 +106,7 @@ class User:
 
     def wait_for_progress(self, *expected: object) -> None:
         """Draw frames until the panel shows this progress: name, description, fraction."""
-        self.draw_until(lambda: self.data.loading == expected, f"progress {expected}", 0.01)
+        self.draw_until(lambda: self.viewer.loading == expected, f"progress {expected}", 0.01)
 
     def settle(self, *, refining: bool = False) -> None:
         """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
@@ -131,7 +130,7 @@ class User:
 
     def click(self, label: str) -> None:
         self.draw_frames(1)
-        left, top, right, bottom = self.panels.items[label]
+        left, top, right, bottom = self.panels.widgets.items[label]
         x = (left + right) / 2
         if "opacity" in label or label == "field of view":  # the label is right of the slider
             x = left + 0.4 * (right - left)
@@ -157,7 +156,7 @@ class User:
 
     def slide(self, label: str, fraction: float, start: float = 0.2) -> None:
         """Drag a slider to a fraction of its width, which its label is a part of."""
-        left, top, right, bottom = self.panels.items[label]
+        left, top, right, bottom = self.panels.widgets.items[label]
         middle = (top + bottom) / 2
         self.drag((left + start * (right - left), middle), (left + fraction * (right - left), middle))
 
@@ -262,14 +261,14 @@ def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp
 @pytest.fixture
 def user(session, ctx) -> User:
     """The session with scene, state and camera as at the start."""
-    if session.data.entries != NAMES or session.data.current != 0:
+    if session.viewer.library.names != NAMES or session.viewer.library.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
     kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "adaptive", "message", "message_until")
     for name in (field.name for field in fields(ViewerState) if field.name not in kept):
         setattr(state, name, getattr(start, name))
     state.camera, state.adaptive, state.message = state.home, True, ""
-    session.data.error, session.viewer._resolution.budget_ms = None, BUDGET_MS
+    session.viewer.error, session.viewer.stage.resolution.budget_ms = None, BUDGET_MS
     imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
     session.draw_frames(2, SETTLE_AFTER)
     return session
@@ -281,8 +280,8 @@ def changed_fraction(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def test_every_widget_has_a_test_and_fits_without_scrolling(user):
-    assert set(user.panels.items) == set(IMAGE_WIDGETS) | OTHER_WIDGETS
-    assert max(rectangle[3] for rectangle in user.panels.items.values()) < SIZE[1]
+    assert set(user.panels.widgets.items) == set(IMAGE_WIDGETS) | OTHER_WIDGETS
+    assert max(rectangle[3] for rectangle in user.panels.widgets.items.values()) < SIZE[1]
 
 
 @pytest.mark.slow
@@ -319,20 +318,20 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
 
 @opengl
 def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 64)
+    monkeypatch.setattr("pansplat_viewer.recorder.PANORAMA_HEIGHT", 64)
     user.click("pair##stereo")
     user.settle()
-    left, right = np.split(user.viewer.renderer.read_color(), 2, axis=1)
+    left, right = np.split(user.viewer.stage.renderer.read_color(), 2, axis=1)
     assert np.abs(left - right).max() > 0.1
     user.click("red/cyan##stereo")
     near = user.read_image()
     user.slide("eye distance", 0.9)
     assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
     user.click("360 PNG")
-    with Image.open(user.viewer.screenshots[-1]) as file:
+    with Image.open(user.viewer.recorder.files[-1]) as file:
         assert file.size == (128, 64)
     user.click("off##stereo")
-    assert "eye distance" not in user.panels.items
+    assert "eye distance" not in user.panels.widgets.items
 
 
 @pytest.fixture
@@ -342,7 +341,7 @@ def cleaning(user: User) -> Iterator[User]:
     for header in headers:
         user.click(header)
     yield user
-    user.viewer._stop_painting()
+    user.viewer.painting.stop()
     for header in headers[::-1]:
         user.click(header)
 
@@ -352,17 +351,19 @@ def test_a_box_hides_what_is_outside_and_a_saved_scene_lacks_it(cleaning, small_
     whole = user.read_image()
     user.click("crop to a box")
     user.draw_frames(1)
-    assert user.state.settings.box == pytest.approx(user.data.bounds)
+    assert user.state.settings.box == pytest.approx(user.viewer.bounds)
     assert changed_fraction(whole, user.read_image()) == 0
     user.slide("x from", 0.4, start=0.01)
     box = user.state.settings.box
-    assert box is not None and box[0] > user.data.bounds[0] + 0.5
+    assert box is not None and box[0] > user.viewer.bounds[0] + 0.5
     cropped = user.read_image()
     assert changed_fraction(whole, cropped) > 0.05
     user.panels.cleaning.file = str(tmp_path / "small.ply")
     user.state.settings = replace(user.state.settings, opacity_threshold=0.5)
     user.click("Save##clean")
-    user.draw_until(lambda: (tmp_path / "small.ply").exists() and not user.data.cleaning, "saved scene")
+    user.draw_until(
+        lambda: (tmp_path / "small.ply").exists() and not user.viewer.jobs.progress("cleaning"), "saved scene"
+    )
     saved = load_scene(tmp_path / "small.ply")
     means, opacities = small_scene.gaussians.means, small_scene.gaussians.opacities
     inside = (means[:, 0] >= box[0]) & (opacities >= 0.5)
@@ -373,8 +374,8 @@ def test_a_box_hides_what_is_outside_and_a_saved_scene_lacks_it(cleaning, small_
         user.panels.cleaning.file = name
         user.click("Save##clean")
         user.draw_frames(2)
-        assert message in user.data.error
-        user.data.error = None
+        assert message in user.viewer.error
+        user.viewer.error = None
     assert (tmp_path / "own.ply").read_bytes() == b"of the user"
     user.click("crop to a box")
     assert user.state.settings.box is None
@@ -387,7 +388,7 @@ def test_floaters_are_removed_and_the_box_stays(cleaning, small_scene):
     user.draw_until(lambda: "floaters:" in user.state.message, "message")
     expected = len(small_scene.gaussians) - int(find_floaters(small_scene).sum())
     assert f"{len(small_scene.gaussians) - expected:,} of {len(small_scene.gaussians):,}" in user.state.message
-    user.draw_until(lambda: len(user.viewer._slot.scene.gaussians) == expected, "cleaned scene")
+    user.draw_until(lambda: len(user.viewer.stage.slot.scene.gaussians) == expected, "cleaned scene")
     assert user.state.settings.box is not None
     user.show(*user.entries)
 
@@ -397,12 +398,12 @@ def test_a_mask_is_painted_on_the_photograph_and_saved(cleaning, pair):
     mask = pair.folder / "a_blur.png"
     user.click("paint what to hide")
     user.draw_frames(2)
-    assert user.state.comparison == "photograph" and user.state.split == 0 and "Save mask" in user.panels.items
+    assert user.state.comparison == "photograph" and user.state.split == 0 and "Save mask" in user.panels.widgets.items
     user.slide("brush", 0.5)
     before = user.state.camera
     user.drag((400, 300), (480, 320))
     assert user.state.camera == before, "the left button paints"
-    painter = user.viewer._painter
+    painter = user.viewer.painting.painter
     assert painter is not None and painter.is_changed and 0 < painter.hidden.mean() < 0.2
     painted = painter.hidden.copy()
     assert changed_fraction(user.read_screen(), painted_without(user)) > 0, "outlines are drawn"
@@ -416,12 +417,12 @@ def test_a_mask_is_painted_on_the_photograph_and_saved(cleaning, pair):
         user.press(imgui.Key.escape)
         user.draw_frames(1)
         user.click("Drop it")
-        assert user.viewer._painter is None and user.state.comparison == "off" and not user.state.quit
+        assert user.viewer.painting.painter is None and user.state.comparison == "off" and not user.state.quit
         user.click("paint what to hide")
         user.draw_frames(1)
-        assert np.array_equal(user.viewer._painter.hidden, painted), "that of the file"
+        assert np.array_equal(user.viewer.painting.painter.hidden, painted), "that of the file"
         user.click("paint what to hide")
-        assert user.viewer._painter is None
+        assert user.viewer.painting.painter is None
     finally:
         mask.unlink()
 
@@ -435,9 +436,9 @@ def painted(cleaning: User, pair) -> Iterator[User]:
     user.draw_frames(2)
     user.drag((400, 300), (480, 320))
     user.draw_frames(1)
-    assert user.viewer._painter.is_changed
+    assert user.viewer.painting.painter.is_changed
     yield user
-    user.viewer._stop_painting()
+    user.viewer.painting.stop()
     user.show(*user.entries)
 
 
@@ -453,8 +454,8 @@ LEAVING = {
     "Esc": press_escape,
     "untick": lambda user: user.click("paint what to hide"),
     "Reload": lambda user: user.click("Reload"),
-    "another scene": lambda user: user.viewer._execute(Commands(choose=1), SIZE, user.clock[0]),
-    "another path": lambda user: user.viewer._execute(Commands(open="nowhere"), SIZE, user.clock[0]),
+    "another scene": lambda user: user.viewer.choose(1),
+    "another path": lambda user: user.viewer.open_text("nowhere"),
     "export": lambda user: user.click("Save##clean"),
     "quit": press_quit,
     "close the window": lambda user: user.viewer.request_quit(),
@@ -463,32 +464,36 @@ LEAVING = {
 
 @pytest.mark.parametrize("leave", LEAVING.values(), ids=LEAVING)
 def test_an_unsaved_mask_is_dropped_only_after_a_question(painted, leave, pair, tmp_path):
-    user, painter, mask = painted, painted.viewer._painter, pair.folder / "a_blur.png"
+    user, painter, mask = painted, painted.viewer.painting.painter, pair.folder / "a_blur.png"
     user.panels.cleaning.file = str(tmp_path / "clean.ply")
     hidden = painter.hidden.copy()
 
     def ask() -> None:
         leave(user)
-        user.draw_until(lambda: "Go on painting" in user.panels.items, "question")
+        user.draw_until(lambda: "Go on painting" in user.panels.widgets.items, "question")
         user.draw_frames(2)
-        assert user.viewer._painter is painter and np.array_equal(painter.hidden, hidden) and painter.is_changed
+        assert user.viewer.painting.painter is painter and np.array_equal(painter.hidden, hidden) and painter.is_changed
         assert not user.state.quit and not mask.exists() and not (tmp_path / "clean.ply").exists()
-        assert user.viewer.loader.entry is None and not user.viewer.loader.is_searching
+        assert user.viewer.library.loader.entry is None and not user.viewer.library.loader.is_searching
 
     ask()
     user.click("Go on painting")
     user.draw_frames(2)
-    assert "Go on painting" not in user.panels.items and user.viewer._painter is painter and painter.is_changed
+    assert (
+        "Go on painting" not in user.panels.widgets.items
+        and user.viewer.painting.painter is painter
+        and painter.is_changed
+    )
     ask()
     user.click("Drop it")
-    assert user.viewer._painter is None and not mask.exists()
+    assert user.viewer.painting.painter is None and not mask.exists()
     user.state.quit = False
-    user.data.error = None
+    user.viewer.error = None
 
 
 def test_an_unsaved_mask_is_saved_by_the_answer(painted, pair):
     user, mask = painted, pair.folder / "a_blur.png"
-    hidden = user.viewer._painter.hidden.copy()
+    hidden = user.viewer.painting.painter.hidden.copy()
     try:
         user.panels.cleaning.file = str(pair.folder / "clean.ply")
         user.click("Save##clean")
@@ -505,37 +510,37 @@ def test_an_unsaved_mask_is_saved_by_the_answer(painted, pair):
 
 
 def test_a_mask_that_is_painted_stays_when_its_photograph_is_loaded_again(painted, pair):
-    user, painter = painted, painted.viewer._painter
-    hidden, entry = painter.hidden.copy(), user.viewer._loaded.entry
+    user, painter = painted, painted.viewer.painting.painter
+    hidden, entry = painter.hidden.copy(), user.viewer.loaded.entry
     again = replace(pair, context=tuple(replace(view) for view in pair.context))
-    user.viewer._show_loaded(replace(user.viewer._loaded, entry=replace(entry, pair=again)), user.clock[0])
+    user.viewer._show_loaded(replace(user.viewer.loaded, entry=replace(entry, pair=again)))
     user.draw_frames(2)
-    assert user.viewer._painter is painter and painter.is_changed and np.array_equal(painter.hidden, hidden)
+    assert user.viewer.painting.painter is painter and painter.is_changed and np.array_equal(painter.hidden, hidden)
     assert painter.panorama is again.context[0] and user.state.photograph == 0
 
 
 def test_a_scene_that_was_loading_while_a_mask_was_painted_waits_for_the_answer(painted):
-    user, painter = painted, painted.viewer._painter
-    shown = user.viewer._loaded
-    user.viewer.show(user.viewer.entries, 1)
-    user.draw_until(lambda: "Go on painting" in user.panels.items, "question")
-    assert user.viewer._loaded is shown and user.viewer._painter is painter
+    user, painter = painted, painted.viewer.painting.painter
+    shown = user.viewer.loaded
+    user.viewer.show(user.viewer.library.entries, 1)
+    user.draw_until(lambda: "Go on painting" in user.panels.widgets.items, "question")
+    assert user.viewer.loaded is shown and user.viewer.painting.painter is painter
     user.click("Go on painting")
     user.draw_frames(2)
-    assert user.viewer._loaded is shown and user.viewer._painter is painter and user.data.current == 0
-    user.viewer.show(user.viewer.entries, 1)
-    user.draw_until(lambda: "Drop it" in user.panels.items, "question")
+    assert user.viewer.loaded is shown and user.viewer.painting.painter is painter and user.viewer.library.current == 0
+    user.viewer.show(user.viewer.library.entries, 1)
+    user.draw_until(lambda: "Drop it" in user.panels.widgets.items, "question")
     user.click("Drop it")
-    user.draw_until(lambda: user.viewer._loaded is not shown, "the other scene")
-    assert user.viewer._painter is None and user.data.current == 1
+    user.draw_until(lambda: user.viewer.loaded is not shown, "the other scene")
+    assert user.viewer.painting.painter is None and user.viewer.library.current == 1
 
 
 def painted_without(user: User) -> np.ndarray:
     """The screen without the mask that is painted."""
-    painter, user.viewer._painter = user.viewer._painter, None
+    painter, user.viewer.painting.painter = user.viewer.painting.painter, None
     user.draw_frames(2)
     screen = user.read_screen()
-    user.viewer._painter = painter
+    user.viewer.painting.painter = painter
     user.draw_frames(2)
     return screen
 
@@ -597,7 +602,7 @@ def test_keys_and_wheel_move_the_camera_and_r_restores_it(user):
 
 def test_tab_hides_the_panels_and_h_shows_the_keys(user):
     user.press(imgui.Key.tab)
-    assert not user.panels.items
+    assert not user.panels.widgets.items
     plain = user.read_image()
     user.press(imgui.Key.h)
     assert changed_fraction(plain, user.read_image()) > 0.1
@@ -620,7 +625,7 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
     assert user.state.camera == user.state.home
     user.press(imgui.Key.enter)
     user.settle()
-    assert user.data.entries == ["opened"]
+    assert user.viewer.library.names == ["opened"]
 
 
 def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
@@ -630,25 +635,27 @@ def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeyp
         opened.append(path.name)
         return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
 
-    monkeypatch.setattr(user.viewer, "_find", find)
-    monkeypatch.setattr(user.data, "preferences", Preferences())
+    monkeypatch.setattr(user.viewer.library, "_find", find)
+    monkeypatch.setattr(user.viewer, "preferences", Preferences())
     user.panels.path = "kitchen"
     user.click("Open")
     user.settle()
     user.panels.path = ""
-    assert user.data.entries == ["kitchen 1"] and user.data.preferences.recent == (str(Path("kitchen").absolute()),)
+    assert user.viewer.library.names == ["kitchen 1"] and user.viewer.preferences.recent == (
+        str(Path("kitchen").absolute()),
+    )
     user.draw_frames(2)
     user.click("recent")
-    left, _, _, bottom = user.panels.items["recent"]
+    left, _, _, bottom = user.panels.widgets.items["recent"]
     user.click_at(left + 30, bottom + 12)
     user.settle()
-    assert user.data.entries == ["kitchen 2"]
+    assert user.viewer.library.names == ["kitchen 2"]
 
 
 def test_the_background_is_chosen_in_a_picker(user):
     user.state.settings = replace(user.state.settings, levels=frozenset())
     assert user.read_image().max() == 0
-    left, top, _, bottom = user.panels.items["background"]
+    left, top, _, bottom = user.panels.widgets.items["background"]
     user.click_at(left + 5, (top + bottom) / 2)
     user.draw_frames(2)
     user.click_at(left + 60, bottom + 60)
@@ -658,24 +665,24 @@ def test_the_background_is_chosen_in_a_picker(user):
 
 def test_the_list_of_scenes_loads_the_other_pair(user):
     user.click("pair")
-    left, _, _, bottom = user.panels.items["pair"]
+    left, _, _, bottom = user.panels.widgets.items["pair"]
     user.click_at(left + 30, bottom + 36)
     user.settle()
-    assert user.data.current == 1
+    assert user.viewer.library.current == 1
 
 
 def test_errors_are_shown_and_keep_the_scene(user):
     before = user.read_image()
     user.viewer.open(Path("nothing"))
     user.settle()
-    assert "no such file" in user.data.error
+    assert "no such file" in user.viewer.error
     assert changed_fraction(before, user.read_image()) > 0.02, "the message is on the screen"
     user.click("OK")
-    assert user.data.error is None
+    assert user.viewer.error is None
     assert changed_fraction(before, user.read_image()) == 0
     user.show(SceneEntry("damaged"))
-    assert user.data.error.startswith("damaged.ply: 100% unreadable")
-    assert user.data.entries == NAMES and user.data.current == 0
+    assert user.viewer.error.startswith("damaged.ply: 100% unreadable")
+    assert user.viewer.library.names == NAMES and user.viewer.library.current == 0
     user.click("OK")
     assert changed_fraction(before, user.read_image()) == 0
 
@@ -750,7 +757,7 @@ def test_the_error_is_the_mapped_difference_from_the_photograph(user):
 def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
     rendered = user.read_image()
     user.press(imgui.Key.x)
-    assert user.state.comparison == "pinned" and user.data.right_name == "first, joint, color"
+    assert user.state.comparison == "pinned" and user.viewer.right_name == "first, joint, color"
     user.state.split, user.state.message = 0.8, ""
     user.click("view 0")
     compared = user.read_image()
@@ -758,20 +765,22 @@ def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
     assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) > 0.2
     assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) == 0
     user.show(SceneEntry("sphere", pair=user.entries[0].pair), SceneEntry("other"))
-    assert user.data.right_name == "first, joint, color"
+    assert user.viewer.right_name == "first, joint, color"
     user.click("Pin this image")
-    assert user.data.right_name == "sphere, view, color"
+    assert user.viewer.right_name == "sphere, view, color"
 
 
 def test_a_chosen_photograph_is_compared_from_its_own_camera(user):
     user.state.comparison, user.state.photograph = "photograph", 1
     user.draw_frames(2)
-    assert user.data.right_name == "photograph b.png" and user.data.photograph_distance == pytest.approx(0.5)
+    assert user.viewer.right_name == "photograph b.png" and user.viewer.stage.comparer.measure_distance(
+        user.state
+    ) == pytest.approx(0.5)
     user.click("Go")
     assert user.state.camera.position == pytest.approx((0, 0, 0.5)) and user.state.camera.yaw_radians == 0
-    assert user.data.photograph_distance == pytest.approx(0)
+    assert user.viewer.stage.comparer.measure_distance(user.state) == pytest.approx(0)
     user.click("photographs")
-    left, _, _, bottom = user.panels.items["photographs"]
+    left, _, _, bottom = user.panels.widgets.items["photographs"]
     user.click_at(left + 20, bottom + 12)
     assert user.state.photograph is None, "the nearest one"
 
@@ -782,7 +791,7 @@ def test_a_photograph_that_cannot_be_read_is_an_error_and_keeps_the_image(user, 
     before = user.read_image()
     user.click("photograph")
     user.settle()
-    assert "gone.png" in user.data.error
+    assert "gone.png" in user.viewer.error
     user.click("OK")
     assert changed_fraction(before, user.read_image()) == 0
 
@@ -815,14 +824,14 @@ def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, sm
         assert go.wait(300)
         return LoadedScene(entry, small_scene)
 
-    monkeypatch.setattr(viewer.loader, "_load", predict)
-    viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
+    monkeypatch.setattr(viewer.library.loader, "_load", predict)
+    viewer.loaded, user.state.context = None, np.zeros((0, 4, 4))
     viewer.show([SceneEntry("kitchen", pair=pair)], 0)
     user.wait_for_progress("kitchen", "matching", 0.5)
-    user.draw_until(lambda: viewer._comparer.photographs._textures, "photograph")
+    user.draw_until(lambda: viewer.stage.comparer.photographs._textures, "photograph")
     user.draw_frames(1)
     ahead = user.read_screen()
-    assert ahead.mean() > 60 and user.data.loading == ("kitchen", "matching", 0.5)
+    assert ahead.mean() > 60 and user.viewer.loading == ("kitchen", "matching", 0.5)
     user.drag((500, 400), (380, 400))
     turned, camera = user.read_screen(), user.state.camera
     assert camera.yaw_radians > 0.1 and turned[..., 0].mean() > ahead[..., 0].mean() + 8, "more of the red right"
@@ -838,9 +847,9 @@ def test_a_panorama_alone_is_entered_in_a_wide_view(user, tmp_path, monkeypatch)
     image[20:44, 90:106:2] = 0.1  # 0.37 to 0.41 of a turn right of the left border, at 1.67 radians
     write_image(tmp_path / "alone.png", image)
     panorama = Panorama("alone", tmp_path / "alone.png", torch.eye(4, dtype=torch.float64))
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: pytest.fail("not shown"))
+    monkeypatch.setattr(user.viewer.library.loader, "_load", lambda entry, progress, show: pytest.fail("not shown"))
     for start, yaw in ((None, 2 * np.pi * (98 / 128 - 0.5)), ((0.5, 0.0), 0.5)):
-        user.viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
+        user.viewer.loaded, user.state.context = None, np.zeros((0, 4, 4))
         pair = Pair("alone", tmp_path, (replace(panorama, start=start),), (), 0.45, 10.0)
         user.viewer._preview(SceneEntry("alone", pair=pair))
         assert user.state.camera == user.state.home
@@ -880,11 +889,11 @@ def test_a_scene_without_photographs_has_no_comparison_with_one(user):
 
 @both
 def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 128)
+    monkeypatch.setattr("pansplat_viewer.recorder.PANORAMA_HEIGHT", 128)
     image = user.read_image()
     user.click("PNG")
     user.click("360 PNG")
-    png, panorama = user.viewer.screenshots[-2:]
+    png, panorama = user.viewer.recorder.files[-2:]
     with Image.open(png) as file:
         assert file.size == SIZE
         pixels = np.asarray(file).astype(int)
@@ -900,20 +909,20 @@ def test_screenshot_without_memory_is_reported(user, monkeypatch):
     def fail(*args, **options):
         raise MemoryError("no memory")
 
-    written = len(user.viewer.screenshots)
-    monkeypatch.setattr("pansplat_viewer.viewer.write_screenshot", fail)
+    written = len(user.viewer.recorder.files)
+    monkeypatch.setattr("pansplat_viewer.recorder.write_screenshot", fail)
     user.click("PNG")
-    assert user.data.error == "no screenshot written: the memory is exhausted (MemoryError: no memory)"
-    assert len(user.viewer.screenshots) == written
+    assert user.viewer.error == "no screenshot written: the memory is exhausted (MemoryError: no memory)"
+    assert len(user.viewer.recorder.files) == written
     user.click("OK")
-    assert user.data.error is None
+    assert user.viewer.error is None
 
 
 @both
 def test_exr_screenshot_holds_color_and_radial_depth(user):
     user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
     user.click("EXR + depth")
-    by_key, path = user.viewer.screenshots[-2:]
+    by_key, path = user.viewer.recorder.files[-2:]
     assert by_key.suffix == path.suffix == ".exr"
     with OpenEXR.File(str(path)) as file:
         depth = file.channels()["Z"].pixels
@@ -932,18 +941,18 @@ def test_focus_orbits_the_point_in_the_centre(user):
 
 @both
 def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
-    user.viewer._resolution.budget_ms = 1e-3
-    monkeypatch.setattr(user.viewer.renderer, "pacing", SMALL)
+    user.viewer.stage.resolution.budget_ms = 1e-3
+    monkeypatch.setattr(user.viewer.stage.renderer, "pacing", SMALL)
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
     user.draw_frames(8)
-    assert user.data.size[0] < SIZE[0]
+    assert user.viewer.stage.image_size[0] < SIZE[0]
     io.add_key_event(imgui.Key.w, False)
     user.settle()
-    assert user.data.size == SIZE
+    assert user.viewer.stage.image_size == SIZE
     user.click("coarser while moving")
     user.press(imgui.Key.w, frames=4)
-    assert user.data.size == SIZE
+    assert user.viewer.stage.image_size == SIZE
 
 
 def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_scene, monkeypatch):
@@ -955,18 +964,18 @@ def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_s
         assert go.wait(300)
         return LoadedScene(entry, small_scene)
 
-    monkeypatch.setattr(user.viewer.loader, "_load", slow)
+    monkeypatch.setattr(user.viewer.library.loader, "_load", slow)
     user.viewer.show([SceneEntry("slow")], 0)
     assert reported.wait(300)
     user.draw_frames(2)
-    assert user.data.loading == ("slow", "searching depth", 0.5)
-    left, top, right, bottom = user.panels.items["Cancel##loading"]
+    assert user.viewer.loading == ("slow", "searching depth", 0.5)
+    left, top, right, bottom = user.panels.widgets.items["Cancel##loading"]
     assert 0 < left < right < SIZE[0] and 0 < top < bottom < SIZE[1], "next to a progress bar at the bottom"
     user.press(imgui.Key.w, frames=3)
     assert user.state.camera.position[2] > 0
     go.set()
     user.settle()
-    assert user.data.loading is None
+    assert user.viewer.loading is None
 
 
 def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(user, small_scene, monkeypatch):
@@ -979,15 +988,15 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
         assert go.wait(300)
         return LoadedScene(entry, replace(small_scene, gaussians=gaussians))
 
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    monkeypatch.setattr(user.viewer.library.loader, "_load", load)
     user.viewer.show([SceneEntry("kitchen")], 0)
-    user.draw_until(lambda: user.viewer.loader.refinement is not None, "refinement")
+    user.draw_until(lambda: user.viewer.library.loader.refinement is not None, "refinement")
     user.press(imgui.Key.w, frames=2)
     user.settle(refining=True)
     predicted, camera = user.read_screen(), user.state.camera
-    assert 0 < user.data.refinement < 1 and "Cancel" in user.panels.items
+    assert 0 < user.viewer.refinement < 1 and "Cancel" in user.panels.widgets.items
     go.set()
-    user.draw_until(lambda: user.viewer.loader.refinement is None, "refined scene")
+    user.draw_until(lambda: user.viewer.library.loader.refinement is None, "refined scene")
     user.settle()
     refined = user.read_image()
     assert user.state.camera == camera and changed_fraction(predicted, refined) > 0.2
@@ -1010,14 +1019,14 @@ def test_a_cancelled_refinement_keeps_the_prediction(user, small_scene, monkeypa
         finally:
             cancelled.set()
 
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    monkeypatch.setattr(user.viewer.library.loader, "_load", load)
     user.viewer.show([SceneEntry("kitchen")], 0)
-    user.draw_until(lambda: user.viewer.loader.refinement is not None, "refinement")
+    user.draw_until(lambda: user.viewer.library.loader.refinement is not None, "refinement")
     user.draw_frames(2)
     user.click("Cancel")
     assert cancelled.wait(300)
     user.settle()
-    assert user.data.refinement is None and user.data.error is None
+    assert user.viewer.refinement is None and user.viewer.error is None
 
 
 # --- window, memory and files ---
@@ -1034,17 +1043,17 @@ def test_a_search_and_a_prediction_can_be_cancelled(user, monkeypatch):
         finally:
             ended.append(1)
 
-    monkeypatch.setattr(user.viewer, "_find", lambda path, progress: wait(progress))
+    monkeypatch.setattr(user.viewer.library, "_find", lambda path, progress: wait(progress))
     user.viewer.open(Path("unposed"))
     user.wait_for_progress("unposed", "estimating poses", 0.3)
     user.click("Cancel##loading")
-    assert user.data.loading is None and user.data.current == 0, "the scene is still the current one"
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: wait(progress))
+    assert user.viewer.loading is None and user.viewer.library.current == 0, "the scene is still the current one"
+    monkeypatch.setattr(user.viewer.library.loader, "_load", lambda entry, progress, show: wait(progress))
     user.click("Reload")
-    user.wait_for_progress(user.data.entries[0], "estimating poses", 0.3)
+    user.wait_for_progress(user.viewer.library.names[0], "estimating poses", 0.3)
     user.click("Cancel##loading")
     user.settle()
-    assert user.data.loading is None and user.data.error is None
+    assert user.viewer.loading is None and user.viewer.error is None
     user.draw_until(lambda: len(ended) == 2, "end of both threads")
     user.state.message = ""
     assert changed_fraction(before, user.read_image()) == 0
@@ -1067,24 +1076,26 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
 
     monkeypatch.setattr(SplatRasterizer, "_allocate", refuse)
     monkeypatch.setattr("pansplat_viewer.draw.cpu_renderer.DisplayScene", refuse_rows)
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, twice))
+    monkeypatch.setattr(user.viewer.library.loader, "_load", lambda entry, progress, show: LoadedScene(entry, twice))
     user.show(SceneEntry("large"))
-    assert "the memory is exhausted" in user.data.error and user.data.reduced == len(small_scene.gaussians) // 2
-    assert user.data.entries == ["large"]
+    assert "the memory is exhausted" in user.viewer.error and user.viewer.reduced == len(small_scene.gaussians) // 2
+    assert user.viewer.library.names == ["large"]
     user.click("OK")
-    assert changed_fraction(before, user.read_image()) == 0 and user.data.entries == NAMES, "the scene before is kept"
+    assert changed_fraction(before, user.read_image()) == 0 and user.viewer.library.names == NAMES, (
+        "the scene before is kept"
+    )
     user.show(SceneEntry("large again"))
     user.click("Reduce")
     after = user.read_image()
-    assert user.data.error is None and len(user.viewer._slot.scene.gaussians) == 600
-    assert user.data.entries == ["large again"]
+    assert user.viewer.error is None and len(user.viewer.stage.slot.scene.gaussians) == 600
+    assert user.viewer.library.names == ["large again"]
     assert changed_fraction(before, after) > 0.02
     assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"
 
 
 @opengl
 def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(user, monkeypatch):
-    viewer, renderer, drawn, recorded = user.viewer, user.viewer.renderer._eyes[0], [], []
+    viewer, renderer, drawn, recorded = user.viewer, user.viewer.stage.renderer._eyes[0], [], []
     render = renderer.render
 
     def log(cam2world, size, settings, *, wait=True):
@@ -1092,9 +1103,9 @@ def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(user, monkeypatc
         return render(cam2world, size, settings, wait=wait)
 
     monkeypatch.setattr(renderer, "render", log)
-    monkeypatch.setattr(viewer._resolution, "record", lambda plan, ms: recorded.append((plan.scale, ms > 0)))
+    monkeypatch.setattr(viewer.stage.resolution, "record", lambda plan, ms: recorded.append((plan.scale, ms > 0)))
     for step in (0, 1, 2, 1, 0):
-        viewer._resolution.step = step
+        viewer.stage.resolution.step = step
         user.state.camera = replace(user.state.camera, position=(0.0, 0.0, 0.01 + 0.01 * len(drawn)))
         user.draw_frames(1)
     assert drawn == [1.0, 0.75, 0.5, 0.75, 1.0]
@@ -1105,35 +1116,35 @@ def test_an_error_of_opengl_is_not_called_exhausted_memory(user, small_scene, mo
     def refuse(*_: object) -> None:
         raise moderngl.Error("GLSL Compiler failed")
 
-    monkeypatch.setattr(user.viewer._slots[0], "upload", refuse)
+    monkeypatch.setattr(user.viewer.stage.slots[0], "upload", refuse)
     user.show(SceneEntry("refused"))
-    assert user.data.error == "refused: OpenGL failed: GLSL Compiler failed" and user.data.reduced is None
+    assert user.viewer.error == "refused: OpenGL failed: GLSL Compiler failed" and user.viewer.reduced is None
     user.click("OK")
 
 
 @both
 def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_scene, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.scene.slots._SMALL_SCENE", 0)
-    go, prepare = threading.Event(), user.viewer.renderer.prepare
+    go, prepare = threading.Event(), user.viewer.stage.renderer.prepare
 
     def slow(scene, report):
         report(0.25)
         assert go.wait(300)
         return prepare(scene, report)
 
-    monkeypatch.setattr(user.viewer._preparer, "_prepare", slow)
-    before, shown = user.read_image(), user.viewer._slot.scene
+    monkeypatch.setattr(user.viewer.stage.preparer, "_prepare", slow)
+    before, shown = user.read_image(), user.viewer.stage.slot.scene
     other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
+    monkeypatch.setattr(user.viewer.library.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
     user.viewer.show([SceneEntry("large")], 0)
     user.wait_for_progress("large", "preparing 600 Gaussians", 0.25)
-    assert user.viewer.busy and user.viewer._slot.scene is shown
+    assert user.viewer.busy and user.viewer.stage.slot.scene is shown
     yaw = user.state.camera.yaw_radians
     user.drag((450, 300), (480, 300))
     assert user.state.camera.yaw_radians != yaw, "the window accepts input"
     go.set()
     user.settle()
-    assert user.viewer._slot.scene is other and user.data.loading is None
+    assert user.viewer.stage.slot.scene is other and user.viewer.loading is None
     assert changed_fraction(before, user.read_image()) > 0.1
 
 
@@ -1142,13 +1153,13 @@ def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair,
     before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
     monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(300) and draw(*arguments))
     other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
+    monkeypatch.setattr(user.viewer.library.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
     user.viewer.show([SceneEntry("large", pair=pair)], 0)
     user.draw_until(
-        lambda: user.viewer._slot.scene is other and user.viewer._comparer.photographs._textures, "photograph"
+        lambda: user.viewer.stage.slot.scene is other and user.viewer.stage.comparer.photographs._textures, "photograph"
     )
     user.draw_frames(1)
-    assert user.viewer.pending is not None and user.viewer.busy and user.data.error is None
+    assert user.viewer.pending is not None and user.viewer.busy and user.viewer.error is None
     photograph = user.read_screen()
     assert changed_fraction(before, photograph) > 0.3 and photograph.mean() > 60
     go.set()
@@ -1165,8 +1176,8 @@ def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(user, mo
     with monkeypatch.context() as patch:
         patch.setattr(CpuRenderer, "_draw", fail)
         user.state.camera = replace(user.state.camera, yaw_radians=0.5)
-        user.draw_until(lambda: user.data.error and not user.viewer.moving, "error", SETTLE_AFTER)
-        assert "the memory is exhausted" in user.data.error
+        user.draw_until(lambda: user.viewer.error and not user.viewer.moving, "error", SETTLE_AFTER)
+        assert "the memory is exhausted" in user.viewer.error
     user.state.camera = user.state.home
     user.click("OK")
     assert changed_fraction(before, user.read_image()) == 0
@@ -1175,16 +1186,16 @@ def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(user, mo
 def test_a_changed_file_is_announced_and_read_again(user, room):
     user.show(SceneEntry("room", file=room))
     user.draw_frames(1, 3.0)
-    assert not user.data.changed
+    assert not user.viewer.library.watch.changed
     room.write_bytes(room.read_bytes() + b"0")
     user.draw_frames(2, 3.0)
-    assert user.data.changed
+    assert user.viewer.library.watch.changed
     user.click("Reload")
     user.settle()
-    assert not user.data.changed
+    assert not user.viewer.library.watch.changed
     room.unlink()
     user.draw_frames(2, 3.0)
-    assert user.data.changed, "a missing file has changed, too"
+    assert user.viewer.library.watch.changed, "a missing file has changed, too"
 
 
 def test_a_folder_that_changes_is_announced_and_searched_again(user, pair, tmp_path, monkeypatch):
@@ -1196,22 +1207,22 @@ def test_a_folder_that_changes_is_announced_and_searched_again(user, pair, tmp_p
         found.append(path)
         return [SceneEntry(name, pair=pair) for name in ("new", "pair 1", "pair 2")[len(found) == 1 :]]
 
-    monkeypatch.setattr(user.viewer, "_find", find)
+    monkeypatch.setattr(user.viewer.library, "_find", find)
     user.viewer.open(tmp_path)
     user.settle()
-    assert user.data.entries == ["pair 1", "pair 2"]
+    assert user.viewer.library.names == ["pair 1", "pair 2"]
     for name in ("poses.json", "b.png"):
         (tmp_path / ".pansplat").mkdir(exist_ok=True)
         user.draw_frames(2, 3.0)
-        assert not user.data.changed
+        assert not user.viewer.library.watch.changed
         (tmp_path / name).write_bytes(b"1")
         user.draw_frames(2, 3.0)
-        assert user.data.changed, name
+        assert user.viewer.library.watch.changed, name
         user.click("Reload")
         user.settle()
         (tmp_path / ".pansplat").rmdir()
     assert found == [tmp_path] * 3
-    assert user.data.entries[user.data.current] == "pair 1" and user.data.current == 1
+    assert user.viewer.library.names[user.viewer.library.current] == "pair 1" and user.viewer.library.current == 1
 
 
 def test_theme_scale_and_layout_change_the_panels(user):
@@ -1225,7 +1236,7 @@ def test_theme_scale_and_layout_change_the_panels(user):
         pixels = np.frombuffer(user.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
         return pixels[::-1][panel].astype(int)
 
-    dark, height = read_panel(), user.panels.items["joint"][3] - user.panels.items["joint"][1]
+    dark, height = read_panel(), user.panels.widgets.items["joint"][3] - user.panels.widgets.items["joint"][1]
     user.click("light")
     assert read_panel().mean() > dark.mean() + 80
     user.click("dark")
@@ -1237,7 +1248,7 @@ def test_theme_scale_and_layout_change_the_panels(user):
     assert np.abs(read_panel() - dark).mean() < 2
     user.viewer.gui.set_scale(1.5)
     user.draw_frames(3)
-    _, top, _, bottom = user.panels.items["joint"]
+    _, top, _, bottom = user.panels.widgets.items["joint"]
     assert bottom - top == pytest.approx(1.5 * height, abs=2)
     user.viewer.gui.set_scale(1.0)
     user.draw_frames(3)
@@ -1270,14 +1281,14 @@ def tour_user(user, house, monkeypatch) -> User:
     """The session in the tour, at its first panorama, with all that is next in memory."""
     user.show(SceneEntry(house.name, tour=house))
     user.settle()
-    for slot in user.viewer._slots:
+    for slot in user.viewer.stage.slots:
         monkeypatch.setattr(slot.renderer, "pacing", SMALL)
     return user
 
 
 def fly(user: User, seconds: float = 1 / 5) -> list[float]:
     """Draw frames until the flight ends; returns the mean change from each frame to the next."""
-    user.viewer._resolution.budget_ms = 1e-3  # coarse images save time
+    user.viewer.stage.resolution.budget_ms = 1e-3  # coarse images save time
     steps, shown = [], [user.read_screen()]
 
     def has_ended() -> bool:
@@ -1308,39 +1319,41 @@ def test_o_flies_out_to_the_dolls_house_and_a_click_on_a_mark_flies_in(user):
     beside = np.asarray(turned.position) - 1.2 * turned.rotation[:, 0]  # the mark is right of the panel
     user.state.camera = replace(turned, position=tuple(beside.tolist()))
     user.draw_frames(2)
-    (mark,) = [mark for mark in user.data.hotspots if mark.node == 1]
+    (mark,) = [mark for mark in user.viewer.hotspots if mark.node == 1]
     user.click_at(*mark.center)
     user.draw_until(lambda: not user.state.doll_house, "end of the flight", 1 / 5)
     assert user.state.camera.position == (0, 0, 0.5)
-    assert user.state.camera.vertical_fov_degrees == inside.vertical_fov_degrees and user.viewer._doll_house is None
+    assert (
+        user.state.camera.vertical_fov_degrees == inside.vertical_fov_degrees and user.viewer.doll_house.house is None
+    )
 
 
 def test_the_dolls_house_has_a_widget_and_the_start_leaves_it(user):
     user.click("doll's house")
     user.draw_until(lambda: user.state.doll_house and user.state.glide is None, "doll's house", 1 / 5)
     user.press(imgui.Key.r)
-    assert not user.state.doll_house and user.state.camera == user.state.home and user.viewer._doll_house is None
+    assert not user.state.doll_house and user.state.camera == user.state.home and user.viewer.doll_house.house is None
 
 
 def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titles(tour_user):
     user = tour_user
-    user.draw_until(lambda: len(user.viewer._tour.loaded) == 3, "all scenes")
+    user.draw_until(lambda: len(user.viewer.tour.loaded) == 3, "all scenes")
     enter_doll_house(user)
-    house = user.viewer._doll_house[0]
+    house = user.viewer.doll_house.house
     assert house.nodes == (0, 1, 2, 3) and set(house.scene.gaussians.views.tolist()) == {0, 1, 2, 3}
-    assert {mark.label for mark in user.data.hotspots} <= {"room0", "room1", "room2", "room3"}
+    assert {mark.label for mark in user.viewer.hotspots} <= {"room0", "room1", "room2", "room3"}
     user.press(imgui.Key._4)
     user.draw_until(lambda: not user.state.doll_house, "end of the flight", 1 / 5)
     assert find_node(user) == 3
 
 
 def find_node(user: User) -> int:
-    return int(np.linalg.norm(user.viewer._tour.tour.positions - user.state.camera.position, axis=1).argmin())
+    return int(np.linalg.norm(user.viewer.tour.tour.positions - user.state.camera.position, axis=1).argmin())
 
 
 def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
     user = tour_user
-    assert user.viewer._tour.tour.name == "house tour" and user.data.hotspots
+    assert user.viewer.tour.tour.name == "house tour" and user.viewer.hotspots
     images = [user.read_image()]
     for label in ("hotspots", "floor plan"):
         user.click(label)
@@ -1354,7 +1367,7 @@ def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
     assert changed_fraction(images[0], user.read_image()) == 0
     imgui.set_window_pos("Tour", (SIZE[0] - 20, 200))  # as remembered from a larger window
     user.draw_frames(3)
-    assert user.panels.items["hotspots"][2] < SIZE[0]
+    assert user.panels.widgets.items["hotspots"][2] < SIZE[0]
 
 
 @pytest.mark.slow
@@ -1362,15 +1375,15 @@ def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     user = tour_user
     user.state.camera = replace(user.state.camera, yaw_radians=-0.25)  # the hotspot is right of the panel
     user.draw_frames(2)
-    (hotspot,) = [spot for spot in user.data.hotspots if spot.node == 2]
-    first, color = user.viewer._slot.scene, user.read_image().mean((0, 1))
+    (hotspot,) = [spot for spot in user.viewer.hotspots if spot.node == 2]
+    first, color = user.viewer.stage.slot.scene, user.read_image().mean((0, 1))
     user.click_at(*hotspot.center)
     assert user.state.playing and not user.state.points
     fly(user)
-    assert np.linalg.norm(user.state.camera.position - user.viewer._tour.tour.positions[2]) < 1e-6
+    assert np.linalg.norm(user.state.camera.position - user.viewer.tour.tour.positions[2]) < 1e-6
     user.click_at(*user.panels.minimap.nodes[3])
     steps = fly(user)
-    assert find_node(user) == 3 and user.viewer._slot.scene is not first
+    assert find_node(user) == 3 and user.viewer.stage.slot.scene is not first
     exchanged = np.abs(user.read_image().mean((0, 1)) - color).mean()
     assert exchanged > 30, "the scenes have different colours"
     assert max(steps) < 0.5 * exchanged, "no jump: a fade changes 30 % in 0.2 s at most"
@@ -1380,11 +1393,11 @@ def test_hotspots_are_where_they_are_clicked_on_a_screen_with_two_pixels_a_point
     user = tour_user
     user.state.camera = replace(user.state.camera, yaw_radians=-0.25)  # the hotspot is right of the panel
     user.draw_frames(2)
-    expected = [(spot.node, spot.center) for spot in user.data.hotspots]
+    expected = [(spot.node, spot.center) for spot in user.viewer.hotspots]
     target = ctx.simple_framebuffer((2 * SIZE[0], 2 * SIZE[1]), components=3)
     monkeypatch.setattr(user, "target", target)
     user.draw_frames(2)
-    assert [(spot.node, spot.center) for spot in user.data.hotspots] == expected
+    assert [(spot.node, spot.center) for spot in user.viewer.hotspots] == expected
     user.click_at(*dict(expected)[2])
     assert user.state.playing and not user.state.points
     user.state.playing = False
@@ -1413,19 +1426,19 @@ def test_a_flight_fades_between_photographs_where_no_scene_is_ready(user, house,
                 progress("predicting", 0.5)
         return load_house(entry)
 
-    monkeypatch.setattr(viewer.loader, "_load", load)
+    monkeypatch.setattr(viewer.library.loader, "_load", load)
     viewer.show([SceneEntry(house.name, tour=house)], 0)
-    user.draw_until(lambda: viewer._tour is not None and not viewer.loader.is_searching, "tour")
-    first = viewer._slot.scene
+    user.draw_until(lambda: viewer.tour is not None and not viewer.library.loader.is_searching, "tour")
+    first = viewer.stage.slot.scene
     user.press(imgui.Key._4)
     shown = [user.read_screen()]
-    viewer._resolution.budget_ms = 1e-3
+    viewer.stage.resolution.budget_ms = 1e-3
     contents = []
 
     def has_ended() -> bool:
         shown.append(user.read_screen())
-        contents.append(viewer._fade.contents[viewer._fade.front])
-        return not (user.state.playing or viewer._is_animated)
+        contents.append(viewer.stage.fade.contents[viewer.stage.fade.front])
+        return not (user.state.playing or viewer.stage.is_animated(user.clock[0]))
 
     user.draw_until(has_ended, "end of the flight", 1 / 10)
     assert find_node(user) == 3, "it does not wait"
@@ -1438,9 +1451,9 @@ def test_a_flight_fades_between_photographs_where_no_scene_is_ready(user, house,
     user.press(imgui.Key.p)
     assert "no scene" in user.state.message
     go.set()
-    user.draw_until(lambda: not viewer._shows_photograph, "scene")
+    user.draw_until(lambda: viewer.stage.photograph is None, "scene")
     user.settle()
-    assert viewer._slot.scene is viewer._tour.get((2, 3)).scene
+    assert viewer.stage.slot.scene is viewer.tour.get((2, 3)).scene
 
 
 def test_a_tour_shows_its_photographs_before_the_first_scene(user, house, load_house, monkeypatch):
@@ -1452,36 +1465,40 @@ def test_a_tour_shows_its_photographs_before_the_first_scene(user, house, load_h
                 progress("predicting", 0.5)
         return load_house(entry)
 
-    monkeypatch.setattr(viewer.loader, "_load", load)
-    viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
+    monkeypatch.setattr(viewer.library.loader, "_load", load)
+    viewer.loaded, user.state.context = None, np.zeros((0, 4, 4))
     viewer.show([SceneEntry(house.name, tour=house)], 0)
     user.draw_frames(1)
     assert (user.read_screen().max(-1) > 8).all(), "the first frame is a photograph"
     assert user.state.camera.yaw_radians == 0 and house.plan_walk()[:2] == [0, 1], "towards its neighbour"
-    assert "visit" in user.panels.items and match_photograph(user, 0) < 1
+    assert "visit" in user.panels.widgets.items and match_photograph(user, 0) < 1
     user.press(imgui.Key._3)
-    user.draw_until(lambda: not (user.state.playing or viewer._is_animated), "end of the flight", 1 / 10)
+    user.draw_until(
+        lambda: not (user.state.playing or viewer.stage.is_animated(user.clock[0])), "end of the flight", 1 / 10
+    )
     assert find_node(user) == 2 and match_photograph(user, 2) < 1
     user.press(imgui.Key.space)
     user.draw_frames(5, 1 / 10)
     assert user.state.playing
     go.set()
-    user.draw_until(lambda: viewer._loaded is not None, "first scene", 1e-3)
+    user.draw_until(lambda: viewer.loaded is not None, "first scene", 1e-3)
     assert user.state.playing, "the flight goes on"
-    assert viewer._fade.contents[viewer._fade.front] == 2, "the scene of panoramas 0 and 1 is not shown from here"
-    user.draw_until(lambda: not viewer._shows_photograph, "scene", 1 / 10)
-    assert 2 in viewer._scene_views
+    assert viewer.stage.fade.contents[viewer.stage.fade.front] == 2, (
+        "the scene of panoramas 0 and 1 is not shown from here"
+    )
+    user.draw_until(lambda: viewer.stage.photograph is None, "scene", 1 / 10)
+    assert 2 in viewer.stage.scene_views
 
 
 def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user):
     user = tour_user
-    user.viewer._tour._budget, user.viewer._resolution.budget_ms = 0, 1e-3
+    user.viewer.tour._budget, user.viewer.stage.resolution.budget_ms = 0, 1e-3
     user.press(imgui.Key.space)
     visited = set()
 
     def has_ended() -> bool:
         visited.add(find_node(user))
-        assert len(user.viewer._tour.loaded) <= 3, "a scene, that of the camera and the one before"
+        assert len(user.viewer.tour.loaded) <= 3, "a scene, that of the camera and the one before"
         return not user.state.playing
 
     user.draw_until(has_ended, "end of the tour", 1 / 4)
@@ -1496,51 +1513,51 @@ def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user)
 
 def test_a_file_of_a_tour_is_flown_along_its_edges(user, house_file, monkeypatch):
     options = LoadOptions()
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, *rest: load_entry(entry, options, *rest))
+    monkeypatch.setattr(user.viewer.library.loader, "_load", lambda entry, *rest: load_entry(entry, options, *rest))
     user.show(SceneEntry("home", file=house_file))
     user.settle()
     user.state.camera = replace(user.state.camera, pitch_radians=-1.1)
-    first, before = user.viewer._slot.scene, user.read_image()
-    assert 2 in [hotspot.node for hotspot in user.data.hotspots] and "floor plan" in user.panels.items
+    first, before = user.viewer.stage.slot.scene, user.read_image()
+    assert 2 in [hotspot.node for hotspot in user.viewer.hotspots] and "floor plan" in user.panels.widgets.items
     assert first.gaussians.views.unique().tolist() == [0, 1], "only the views of the edge are blended"
     user.click_at(*user.panels.minimap.nodes[3])
-    for slot in user.viewer._slots:
+    for slot in user.viewer.stage.slots:
         monkeypatch.setattr(slot.renderer, "pacing", SMALL)
     fly(user, seconds=0.5)
-    assert find_node(user) == 3 and np.allclose(user.viewer._slot.scene.cam2world, user.state.context[2:])
+    assert find_node(user) == 3 and np.allclose(user.viewer.stage.slot.scene.cam2world, user.state.context[2:])
     assert changed_fraction(before, user.read_image()) > 0.5
     user.press(imgui.Key.c)
-    assert user.data.right_name is None, "there are no photographs"
+    assert user.viewer.right_name is None, "there are no photographs"
 
 
 def test_a_click_on_a_link_fades_to_a_panorama_without_a_place_and_the_list_leads_back(user, parted_house, monkeypatch):
     notes = ("room3.png: no pose was found; it is a part of its own",)
     user.show(SceneEntry(parted_house.name, tour=parted_house, notes=notes))
     user.settle()
-    assert user.data.notes == notes and "Notes" in user.panels.items
-    for slot in user.viewer._slots:
+    assert user.viewer.library.notes == notes and "Notes" in user.panels.widgets.items
+    for slot in user.viewer.stage.slots:
         monkeypatch.setattr(slot.renderer, "pacing", SMALL)
     user.state.target = 2
     fly(user, 1.0)
     user.state.camera = replace(user.state.camera, pitch_radians=-0.25, yaw_radians=-0.1)
     user.draw_frames(2)
-    (spot,) = user.data.hotspots
+    (spot,) = user.viewer.hotspots
     assert (spot.node, spot.label, spot.is_fade) == (3, "to the hall", True)
-    left = user.viewer._slot.scene
+    left = user.viewer.stage.slot.scene
     user.click_at(*spot.center)
     shown: list[np.ndarray] = []
 
     def has_begun() -> bool:
         shown.append(user.read_screen())
-        return user.viewer._tour.part == 1
+        return user.viewer.tour.part == 1
 
     user.draw_until(has_begun, "fade", 0.2)
     assert np.abs(shown[-1] - shown[-2]).mean() < 5, "without a jump"
-    poses, front = user.viewer._fade.poses, user.viewer._fade.front
+    poses, front = user.viewer.stage.fade.poses, user.viewer.stage.fade.front
     assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 0.71, "the scene before stays"
-    assert np.allclose(poses[front], user.state.camera.cam2world) and user.viewer._slots[1 - front].scene is left
+    assert np.allclose(poses[front], user.state.camera.cam2world) and user.viewer.stage.slots[1 - front].scene is left
     fly(user, 0.5)
-    assert find_node(user) == 3 and user.viewer._slot.scene is not left
+    assert find_node(user) == 3 and user.viewer.stage.slot.scene is not left
     assert changed_fraction(shown[-1], user.read_image()) > 0.5
     user.click("visit")
     user.click("visit 1")
@@ -1585,22 +1602,22 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
         np.log(1 / np.abs(rays).max(axis=-1), out=depth.log_depth)  # a cube
         return Piece(Surroundings(np.full((32, 64, 3), 0.5), depth), 0.0)
 
-    monkeypatch.setattr(user.viewer, "_find", find)
+    monkeypatch.setattr(user.viewer.library, "_find", find)
     monkeypatch.setattr("pansplat_viewer.scene.placing.read_piece", read)
     user.viewer.open(tmp_path)
-    user.draw_until(lambda: user.viewer._tour is not None and not user.viewer.loader.is_searching, "tour")
+    user.draw_until(lambda: user.viewer.tour is not None and not user.viewer.library.loader.is_searching, "tour")
     user.settle()
     yield user
-    user.viewer._placing.stop()
+    user.viewer.placing.stop()
 
 
 def test_states_of_photographs_are_listed_and_drawn_on_the_floor_plan(placing_user):
     user = placing_user
-    assert user.data.placing.panoramas[3].placement.reason == "no door in d"
-    tour = user.viewer._tour.tour
+    assert user.viewer.placing.panoramas[3].placement.reason == "no door in d"
+    tour = user.viewer.tour.tour
     assert describe_panoramas(tour) == "2 placed, 1 probably, 1 not placed"
     assert [describe_panorama(tour, node) for node in range(4)] == ["a", "b", "c (probably placed)", "d (not placed)"]
-    labels = {label for label in user.panels.items if "##" in label}
+    labels = {label for label in user.panels.widgets.items if "##" in label}
     assert {"Place##0", "Place##1", "Place##2", "Place##3", "Reject##2"} <= labels
     assert not {"Reject##0", "Reject##1", "Reject##3", "Restore##2"} & labels
     pixels = np.frombuffer(user.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)[::-1].astype(int)
@@ -1615,22 +1632,22 @@ def test_a_probable_photograph_is_rejected_restored_and_the_rejection_undone(pla
     user.click("Reject##2")
     assert "c.png" not in json.loads((tmp_path / "poses.json").read_text())["poses"]
     user.draw_frames(2)
-    assert "Restore##2" in user.panels.items and "Reject##2" not in user.panels.items
-    user.draw_until(lambda: user.data.changed, "note of the changed file")  # it moves the button
+    assert "Restore##2" in user.panels.widgets.items and "Reject##2" not in user.panels.widgets.items
+    user.draw_until(lambda: user.viewer.library.watch.changed, "note of the changed file")  # it moves the button
     user.click("Load the changed poses")
-    user.draw_until(lambda: not user.data.placing.is_changed, "loaded poses")
+    user.draw_until(lambda: not user.viewer.placing.is_changed, "loaded poses")
     user.settle()
-    assert describe_panoramas(user.viewer._tour.tour) == "2 placed, 2 not placed"
-    assert "Restore##2" in user.panels.items
+    assert describe_panoramas(user.viewer.tour.tour) == "2 placed, 2 not placed"
+    assert "Restore##2" in user.panels.widgets.items
     user.click("Undo##poses")  # also after loading
     assert (tmp_path / "poses.json").read_bytes() == before
-    assert user.data.placing.panoramas[2].placement.state == "probable"
+    assert user.viewer.placing.panoramas[2].placement.state == "probable"
 
 
 def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(placing_user, tmp_path):
     user = placing_user
     user.click("Place##3")
-    placing, window, io = user.data.placing, user.panels.placing, imgui.get_io()
+    placing, window, io = user.viewer.placing, user.panels.placing, imgui.get_io()
     user.draw_until(lambda: not placing.missing and placing.places, "pieces")
     user.draw_frames(2)
     assert placing.shown.suggestion == 0
@@ -1676,7 +1693,7 @@ def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(plac
     user.click("Load the changed poses##pose")
     user.draw_until(lambda: not placing.is_changed, "loaded poses")
     user.settle()
-    tour = user.viewer._tour.tour
+    tour = user.viewer.tour.tour
     assert describe_panorama(tour, 3) == "d (placed by hand)" and (3, 3) not in tour.overlaps
     user.press(imgui.Key.escape)
     assert placing.node is None and not user.state.quit
@@ -1685,7 +1702,7 @@ def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(plac
 def test_alt_disables_snapping_and_the_knob_turns_the_piece(placing_user):
     user = placing_user
     user.click("Place##3")
-    placing, window, io = user.data.placing, user.panels.placing, imgui.get_io()
+    placing, window, io = user.viewer.placing, user.panels.placing, imgui.get_io()
     user.draw_until(lambda: not placing.missing and placing.places, "pieces")
     user.draw_frames(2)
     scale, start = window.view.pixels_per_metre, placing.shown.place
@@ -1706,9 +1723,9 @@ def test_a_pose_that_cannot_be_written_is_an_error_in_the_window(placing_user, t
     (tmp_path / "poses.json").write_text("{")
     user.click("Reject##2")
     user.draw_frames(1)
-    assert "poses.json: needed JSON" in user.data.error
+    assert "poses.json: needed JSON" in user.viewer.error
     user.click("OK")
-    assert user.data.error is None
+    assert user.viewer.error is None
 
 
 # --- tours ---
@@ -1721,17 +1738,17 @@ def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(user, house
         requested.append(entry.name)
         return LoadedScene(entry, small_scene) if entry.tour is None else load_house(entry)
 
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    monkeypatch.setattr(user.viewer.library.loader, "_load", load)
     user.show(SceneEntry(house.name, tour=house))
-    user.viewer._tour._loaded.popitem()  # a scene of the tour is still missing
+    user.viewer.tour._loaded.popitem()  # a scene of the tour is still missing
     ready = threading.Event()
-    is_ready = user.viewer._preparer.is_ready
+    is_ready = user.viewer.stage.preparer.is_ready
     monkeypatch.setattr(
-        user.viewer._preparer,
+        user.viewer.stage.preparer,
         "is_ready",
         lambda scene: is_ready(scene) and (scene is not small_scene or ready.is_set()),
     )
-    user.viewer.loader.cancel()
+    user.viewer.library.loader.cancel()
     requested.clear()
     user.viewer.show([SceneEntry("large")], 0)
     user.draw_until(lambda: user.viewer._incoming is not None, "scene that is prepared")
@@ -1739,7 +1756,7 @@ def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(user, house
     ready.set()
     user.settle()
     assert requested == ["large"], "the tour requests nothing"
-    assert user.viewer._loaded.entry.name == "large" and user.viewer._tour is None
+    assert user.viewer.loaded.entry.name == "large" and user.viewer.tour is None
 
 
 def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, monkeypatch):
@@ -1751,13 +1768,13 @@ def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, 
             raise InputError("room2.png: no such file")
         return load_house(entry)
 
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    monkeypatch.setattr(user.viewer.library.loader, "_load", load)
     user.viewer.show([SceneEntry(house.name, tour=house)], 0)
-    user.draw_until(lambda: user.data.error, "error")
-    user.data.error = None
+    user.draw_until(lambda: user.viewer.error, "error")
+    user.viewer.error = None
     user.draw_frames(5)
     user.settle()
-    assert failed == ["room1-room2"] and user.data.error is None
+    assert failed == ["room1-room2"] and user.viewer.error is None
     user.press(imgui.Key._3)
     fly(user, 0.25)
     assert find_node(user) == 2 and match_photograph(user, 2) < 1, "there is no scene of the edge"
@@ -1767,12 +1784,12 @@ def test_a_scene_after_a_tour_does_not_fade_from_it(tour_user, pair):
     user = tour_user
     user.click_at(*user.panels.minimap.nodes[3])
     fly(user, 1.0)
-    while user.viewer._fade.front == 0:
+    while user.viewer.stage.fade.front == 0:
         user.click_at(*user.panels.minimap.nodes[2 if find_node(user) == 0 else 0])
         fly(user, 1.0)
     user.viewer.show(user.entries, 0)
-    user.draw_until(lambda: user.viewer._tour is None, "pair")
-    assert user.viewer._fade.compute_weight(user.clock[0]) == 1
+    user.draw_until(lambda: user.viewer.tour is None, "pair")
+    assert user.viewer.stage.fade.compute_weight(user.clock[0]) == 1
 
 
 def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
@@ -1780,7 +1797,7 @@ def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
     before = user.read_image()
     user.click("photograph")
     assert changed_fraction(before, user.read_image()) > 0.3
-    assert user.data.right_name == "photograph room0"
+    assert user.viewer.right_name == "photograph room0"
 
 
 # --- camera paths ---
@@ -1815,7 +1832,7 @@ def test_the_buttons_of_key_frames_show_replace_and_delete_them(path_user):
     user.click("Delete##0")
     assert [frame.seconds for frame in user.state.path.key_frames] == [1.0]
     user.click("Delete##0")
-    assert len(user.state.path) == 0 and "Play path" not in user.panels.items
+    assert len(user.state.path) == 0 and "Play path" not in user.panels.widgets.items
 
 
 def test_the_path_is_played_and_its_time_is_dragged(path_user):
@@ -1844,19 +1861,19 @@ def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
     user.click("Load")
     assert user.state.path == path
     user.click("Save")
-    assert user.data.error is None, "pansplat wrote the file"
+    assert user.viewer.error is None, "pansplat wrote the file"
     (tmp_path / "own.json").write_text("{}")
     for name, button in (("missing.json", "Load"), ("own.json", "Save")):
         user.panels.path_file = str(tmp_path / name)
         user.click(button)
-        assert name in user.data.error
+        assert name in user.viewer.error
         user.click("OK")
     assert (tmp_path / "own.json").read_text() == "{}"
     user.state.film_fps = 2.0
     user.click(".png")
     user.click("Write film")
     user.settle()
-    files = user.viewer.screenshots[-3:]
+    files = user.viewer.recorder.files[-3:]
     assert [file.name[-9:] for file in files] == [f"_{i:04d}.png" for i in range(3)]
     user.state.message = ""
     shown = user.read_image()
@@ -1867,7 +1884,7 @@ def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
 def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
     user, films = path_user, []
     monkeypatch.setattr(
-        "pansplat_viewer.viewer.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
+        "pansplat_viewer.recorder.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
     )
     user.slide("frames per second", 0.6)
     for suffix, projection in ((".webm", "equirect"), (".exr", "cubemap"), (".mp4", "perspective")):
@@ -1883,33 +1900,37 @@ def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
 def test_a_film_can_be_cancelled(path_user):
     user = path_user
     user.state.path = user.state.path.add(replace(user.state.path.key_frames[0], seconds=600.0))
-    written = len(user.viewer.screenshots)
+    written = len(user.viewer.recorder.files)
     user.click("Write film")
     user.draw_frames(2)
-    assert 0 <= user.data.film < 1
+    assert 0 <= user.viewer.jobs.progress("film")[1] < 1
     user.click("Cancel##film")
     user.settle()
-    assert user.data.film is None and user.data.error is None and len(user.viewer.screenshots) == written
+    assert (
+        user.viewer.jobs.progress("film") is None
+        and user.viewer.error is None
+        and len(user.viewer.recorder.files) == written
+    )
 
 
 def test_a_film_of_a_tour_is_cancelled_during_a_prediction(user, house, load_house, monkeypatch):
     predicting, go = threading.Event(), threading.Event()
 
     def load(entry, progress, show):
-        if threading.current_thread().name.startswith("film-writer"):
+        if threading.current_thread().name.startswith("film"):
             predicting.set()
             while not go.wait(0.005):
                 progress("searching depth", 0.5)
         return load_house(entry)
 
     user.show(SceneEntry(house.name, tour=house))
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
-    user.viewer._tour._loaded.clear()
+    monkeypatch.setattr(user.viewer.library.loader, "_load", load)
+    user.viewer.tour._loaded.clear()
     user.state.path = CameraPath((KeyFrame.of_camera(user.state.camera, 0.0),))
-    user.viewer._start_film(SIZE)
+    user.viewer.start_film()
     assert predicting.wait(300)
     timer = threading.Timer(300, go.set)  # the end of a prediction that is not cancelled
     timer.start()
-    user.viewer._films.cancel(join=True)
+    user.viewer.jobs.cancel("film", join=True)
     assert not go.is_set(), "it waited for the prediction"
     timer.cancel()

@@ -106,7 +106,8 @@ class ViewerState:
     levels: tuple[int, ...] = ()  # pyramid levels of the scene, ascending
     brush_degrees: float = 4.0  # radius of the brush that paints what to hide
     points: list[PickedPoint] = field(default_factory=list)  # the last picked points, two at most
-    message: str = ""  # a text to show until `message_until` (seconds of the viewer's clock)
+    now: float = 0.0  # time of the frame, seconds of the viewer's clock
+    message: str = ""  # a text to show until `message_until`
     message_until: float = 0.0
     quit: bool = False  # whether to close the viewer
 
@@ -116,9 +117,9 @@ class ViewerState:
         settings = replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
         return replace(settings, mode="joint", outside=True) if self.doll_house else settings
 
-    def show_message(self, message: str, now: float) -> None:
+    def show_message(self, message: str) -> None:
         """Show a message for four seconds."""
-        self.message, self.message_until = message, now + 4
+        self.message, self.message_until = message, self.now + 4
 
 
 def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
