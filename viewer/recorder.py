@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float
-
 from pansplat_viewer.capture import find_free_name, open_frames, write_path_film, write_screenshot
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.stereo import choose_format, render_image
@@ -37,47 +34,36 @@ class Recorder:
         self.files: list[Path] = []
 
     def write_screenshot(self, loaded: LoadedScene, suffix: str, *, panorama: bool = False) -> None:
-        """Write the image, or the panorama at the camera.
+        """Write the image, or the panorama at the camera; in stereo of both eyes, in a panorama the left one above.
 
         Args:
             loaded: the scene.
             suffix: `png`, or `exr` with depth in metres.
             panorama: whether all directions are shown.
         """
-        stage, settings, depth = self._stage, self._state.draw_settings, None
+        stage, settings = self._stage, self._state.draw_settings
+        image_format = choose_format("equirect" if panorama else "perspective", settings)
+        size = (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT) if panorama else stage.eye_size
+        on_processor = CpuRenderer(None) if image_format.is_omnidirectional else None
         stage.slot.image = None  # the texture will hold the screenshot
         try:
-            if panorama:
-                color = self._render_panorama()
-            else:
-                stage.renderer.render(self._state.camera.cam2world, stage.size, settings, wait=True)
-                color = stage.renderer.read_color()[..., :3]
-                if suffix == "exr":
-                    depth = loaded.scene.frame.unit * stage.renderer.read_depth()
-            file = write_screenshot(self._folder / loaded.entry.folder_name, suffix, color, depth, panorama=panorama)
+            image_format.check(size, settings.preset)
+            if on_processor is not None and stage.slot.scene is not None:
+                on_processor.upload(stage.slot.scene)
+            renderer, pose = on_processor or stage.renderer, self._state.camera.cam2world
+            color, depth = render_image(renderer, pose, size, settings, image_format, with_depth=suffix == "exr")
+            depth = None if depth is None else loaded.scene.frame.unit * depth
+            folder = self._folder / loaded.entry.folder_name
+            self._report([write_screenshot(folder, suffix, color, depth, panorama=panorama)])
         except (*DRAW_ERRORS, OSError) as error:
             self._show_error(f"no screenshot written: {describe_error(error)}")
-        else:
-            self._report([file])
+        finally:
+            if on_processor is not None:
+                on_processor.release()
 
     def _report(self, files: list[Path]) -> None:
         self.files += files
         self._state.show_message(f"wrote {files[-1]}")
-
-    def _render_panorama(self) -> Float[np.ndarray, "height width 3"]:
-        """The panorama at the camera; in stereo, both eyes', the left one at the top, drawn on the processor."""
-        settings, size = self._state.draw_settings, (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT)
-        cam2world, image_format = self._state.camera.cam2world, choose_format("equirect", settings)
-        image_format.check(size, settings.preset)
-        if not image_format.is_omnidirectional:
-            return render_image(self._stage.renderer, cam2world, size, settings, image_format)[0]
-        assert self._stage.slot.scene is not None
-        renderer = CpuRenderer(None)
-        try:
-            renderer.upload(self._stage.slot.scene)
-            return render_image(renderer, cam2world, size, settings, image_format)[0]
-        finally:
-            renderer.release()
 
     def start_film(self, loaded: LoadedScene, tour: TourScenes | None, loader: SceneLoader) -> None:
         """Write the film of the path in a worker thread, drawn on the processor, so that the window stays free.

@@ -284,20 +284,12 @@ class StereoRenderer:
         """Draw nothing: OpenGL draws a face when it is read."""
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
-        """Return the last image, float32, top row first: RGB over the background, and coverage."""
-        if self._stereo == "mono":
-            return self._eyes[0].read_color()
-        colors = [eye.read_color() for eye in self._eyes]
-        color = arrange_eyes([color[..., :3] for color in colors], self._stereo)
-        if self._stereo == "anaglyph":
-            return np.concatenate((color, np.maximum(colors[0][..., 3:], colors[1][..., 3:])), axis=-1)
-        return np.concatenate((color, arrange_eyes([color[..., 3:] for color in colors], self._stereo)), axis=-1)
+        """As the renderer's, of the left eye; `render_image` reads both."""
+        return self._eyes[0].read_color()
 
     def read_depth(self) -> Float[np.ndarray, "height width"]:
-        """Return the radial depth of the last image in metres; that of an anaglyph is the left eye's."""
-        if self._stereo in ("mono", "anaglyph"):
-            return self._eyes[0].read_depth()
-        return arrange_eyes([eye.read_depth()[..., None] for eye in self._eyes], self._stereo)[..., 0]
+        """As the renderer's, of the left eye."""
+        return self._eyes[0].read_depth()
 
     def release(self) -> None:
         """Release the renderers, and free the textures."""

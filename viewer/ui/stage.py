@@ -278,8 +278,7 @@ class Stage:
             return None
         depth = self.renderer.read_depth()
         self.slot.image = None  # `read_depth` may have replaced the texture
-        width, height = get_eye_size(depth.shape[::-1], self._state.settings.stereo)
-        row, column = height // 2, width // 2  # of the left eye
+        row, column = depth.shape[0] // 2, depth.shape[1] // 2
         for reach in _CENTER_REACHES:
             near = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
             if (near > 0).any():
