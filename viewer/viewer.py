@@ -116,7 +116,7 @@ class Viewer:
         self.loaded: LoadedScene | None = None
         self.tour: TourScenes | None = None
         self.hotspots: list[Hotspot] = []
-        self._queue: list[Callable[[], None]] = []
+        self._queue: list[Callable[[], object]] = []
         self._incoming: LoadedScene | None = None  # shown when it is prepared
         self._refined: Scene | None = None
         self._too_large: tuple[LoadedScene, int] | None = None  # a scene, and the number of Gaussians to offer
@@ -235,7 +235,8 @@ class Viewer:
         `new_frame` passes the window's size and pointer to imgui; without it the caller has set imgui's io.
         """
         start, state, stage = time.perf_counter(), self.state, self.stage
-        state.now, stage.size = self._clock(), target.viewport[2:]
+        _, _, width, height = target.viewport
+        state.now, stage.size = self._clock(), (width, height)
         self._take_loaded()
         self.jobs.poll()
         self.library.watch.look(state.now)

@@ -265,14 +265,14 @@ class StereoRenderer:
             raise InputError(f"stereo of a window is perspective, got layout {settings.layout}; use `render_image`")
         if len(self._eyes) == 1:
             self._eyes.append(self._eyes[0].create_sibling())
-        right = cam2world[:3, 0]
-        if self._axis is None or not settings.cached or float(right @ self._axis) <= math.cos(MAX_TURN):
-            self._axis = right.copy()
+        right, axis = cam2world[:3, 0], self._axis
+        if axis is None or not settings.cached or float(right @ axis) <= math.cos(MAX_TURN):
+            axis = self._axis = right.copy()
         eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
         textures = []
         for eye, sign in zip(self._eyes, (-0.5, 0.5), strict=True):
             pose = cam2world.copy()
-            pose[:3, 3] += sign * settings.eye_distance * self._axis
+            pose[:3, 3] += sign * settings.eye_distance * axis
             textures.append(eye.render(pose, eye_size, eye_settings, wait=wait))
         return self._arrange(*textures, settings.stereo)
 

@@ -48,7 +48,8 @@ class Stage:
         self, ctx: moderngl.Context, choice: RendererChoice, state: ViewerState, show_error: Callable[[str], None]
     ) -> None:
         """Create GL objects on the current context."""
-        self._ctx, self._choice, self._state, self._show_error = ctx, choice, state, show_error
+        self._ctx, self._state, self._show_error = ctx, state, show_error
+        self._choice: RendererChoice = choice
         self.slots = [self._create_slot()]
         self._scene_slot = 0  # that of the scene that was shown last
         self.scene_views: tuple[int, ...] = ()
@@ -59,7 +60,8 @@ class Stage:
         self.comparer = Comparer(ctx, lambda: create_window_renderer(ctx, choice), show_error)
         self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
         self.resolution = self._create_resolution()
-        self.size = self.image_size = (1, 1)
+        self.size: tuple[int, int] = (1, 1)
+        self.image_size: tuple[int, int] = (1, 1)
         self.has_failed = False
         self._last_camera = state.camera
 
