@@ -444,7 +444,7 @@ class Viewer:
             stage.fade.show(1 if is_here else 0, photograph, state.now, part)
         if is_here or photograph is None:
             stage.fade.show(0, loaded.scene, state.now, part)
-        stage.rest()
+        stage.last_camera = self.state.camera
         state.show_message(f"{entry.name}   (H shows the keys)")
 
     def _preview(self, entry: SceneEntry) -> None:
@@ -469,7 +469,7 @@ class Viewer:
         if nearest is not None:
             comparer.photographs.wait(nearest)  # else the first frames are black
             self._face_open_view(entry, nearest)
-        self.stage.rest()
+        self.stage.last_camera = self.state.camera
 
     def _face_open_view(self, entry: SceneEntry, index: int) -> None:
         """Turn the start to a wide view, if the panorama has neither a neighbour to look at nor a start view."""

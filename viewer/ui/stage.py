@@ -42,6 +42,7 @@ class Stage:
         size: of the window, pixels.
         image_size: of the rendered image, pixels; smaller than the window while the camera moves.
         has_failed: whether drawing has failed; nothing is drawn until this is False.
+        last_camera: of the last frame; a change since then is a movement.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class Stage:
         self.size: tuple[int, int] = (1, 1)
         self.image_size: tuple[int, int] = (1, 1)
         self.has_failed = False
-        self._last_camera = state.camera
+        self.last_camera = state.camera
 
     def _create_slot(self) -> SceneSlot:
         return SceneSlot(create_window_renderer(self._ctx, self._choice))
@@ -130,10 +131,6 @@ class Stage:
         """Show nothing; the next scene is that of the first slot."""
         self.fade.clear()
         self._scene_slot, self.resolution = 0, self._create_resolution()
-
-    def rest(self) -> None:
-        """Take the camera as it is, without a movement."""
-        self._last_camera = self._state.camera
 
     def add_slot(self) -> None:
         """Make the slot that the scenes of a tour fade to."""
@@ -236,9 +233,9 @@ class Stage:
     def _plan_resolution(self) -> ResolutionPlan:
         """The plan of the frame, from the movement since the last one."""
         camera = self._state.camera
-        moved = camera.position != self._last_camera.position
-        turned = not moved and camera != self._last_camera
-        self._last_camera = camera
+        moved = camera.position != self.last_camera.position
+        turned = not moved and camera != self.last_camera
+        self.last_camera = camera
         self.resolution.limit(self.size, self.renderer.pacing.min_size)
         return self.resolution.plan(self._state.now, moved=moved, turned=turned, adaptive=self._state.adaptive)
 

@@ -121,9 +121,7 @@ KEYS = (
     KeyRow("V", "orbit or fly", {"v": _toggle("orbiting")}),
     KeyRow("F", "focus the point in the centre", {"f": _queue("focus_center")}),
     KeyRow(
-        "1 2 ... 9",
-        "jump to a panorama (tour: fly there)",
-        {str(view + 1): _change(jump_to_view, view) for view in range(9)},
+        "1 2 ... 9", "jump to a panorama (tour: fly there)", {str(n + 1): _change(jump_to_view, n) for n in range(9)}
     ),
     KeyRow(
         "PgDn, PgUp",
@@ -134,9 +132,7 @@ KEYS = (
     KeyRow("M", "floor plan and hotspots of a tour", {"m": _change(_toggle_plan)}),
     KeyRow("O", "doll's house: all rooms from outside", {"o": _queue("toggle_doll_house")}),
     KeyRow(
-        ", .",
-        "step along the flight (placing: turn)",
-        {",": _change(step_flight, -1), ".": _change(step_flight, 1)},
+        ", .", "step along the flight (placing: turn)", {",": _change(step_flight, -1), ".": _change(step_flight, 1)}
     ),
     KeyRow("C", "compare with the nearest photograph", {"c": _change(_compare)}),
     KeyRow("X", "pin the image, to compare others with it", {"x": _queue("pin")}),
