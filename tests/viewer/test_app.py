@@ -96,6 +96,7 @@ def test_without_the_libraries_of_window_and_opengl_a_fly_through_is_written(roo
         (["room.ply", "--projection", "equirect", "--size", "64x64"], "must be 2:1 for projection equirect"),
         (["room.ply", "--projection", "cubemap", "--size", "64x32"], "must be 3:2, of an even height"),
         (["room.ply", "--preset", "3dgs", "--renderer", "cpu"], "--preset 3dgs needs OpenGL, got --renderer cpu"),
+        (["room.ply", "--stereo", "anaglyph", "--renderer", "cpu"], "--stereo in a window needs OpenGL"),
         (["room.ply", "--ipd", "0"], "--ipd must be a number above 0 to 1 metres"),
         (["room.ply", "--refine", "-1"], "--refine must be a number of 0 to 1000000 seconds"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),
