@@ -7,7 +7,6 @@ import signal
 import sys
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -85,24 +84,6 @@ def test_weights_keep_no_hold_of_their_file(tmp_path: Path, small_config: object
         file.seek(0)
         file.write(b"\xff" * size)
     assert torch.equal(tensors["weight"], numbers)
-
-
-def test_a_second_batch_is_refused_on_windows(tmp_path: Path, windows: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    locked: list[tuple[int, int]] = []
-
-    def lock(_: int, mode: int, count: int) -> None:
-        if locked:
-            raise PermissionError(errno.EACCES, "Permission denied")
-        locked.append((mode, count))
-
-    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(LK_NBLCK=2, locking=lock))
-    with (
-        batch.lock_folder(tmp_path),
-        pytest.raises(InputError, match="got one that another batch writes to"),
-        batch.lock_folder(tmp_path),
-    ):
-        pass
-    assert locked == [(2, 1)]
 
 
 # Processes
