@@ -9,11 +9,10 @@ Source: PanSplat, section 4; docs/official.md, sections 2.1 to 2.5 and 13.
 from __future__ import annotations
 
 import functools
-import math
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -194,8 +193,7 @@ def measure_depth(context: Views, scene: Scene, depth: Float[Tensor, "view _ _"]
             ]
         depth = torch.stack(depths)
     unit = context.frame.unit
-    errors = depth_errors(depth * unit, context.depths * unit, context.near * unit, context.far * unit)
-    return asdict(errors) if math.isfinite(errors.rmse) else {}
+    return depth_errors(depth * unit, context.depths * unit, context.near * unit, context.far * unit)
 
 
 ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"]
