@@ -163,9 +163,7 @@ SIZES = [
     *bad("--height", "refine pair -o out.ply", "10"),
     *bad("--height", "bench raster", "20"),
     *bad("--height", "bench model", "100"),
-    *bad("--heights", "bench memory", "100"),
     *bad("--threads", "bench raster", "0"),
-    *bad("--limit-gb", "bench memory", "0"),
     *bad("--optimizer.steps", TRAIN, "many"),
     *bad("--optimizer.rate", TRAIN, "inf"),
     *bad("--optimizer.batch-size", TRAIN, "0"),
@@ -525,7 +523,7 @@ FILES = [
     Fault("an output of 250 bytes works", PREDICT.replace("out.ply", f"{'a' * 250}.ply"), status=0),
     Fault("an output in /proc", PREDICT.replace("out.ply", "/proc/out.ply"), says="/proc/out.ply"),
     *(Fault(f"{command[:12]}: an output folder that is a file", command.format("scene.ply"), says="scene.ply") for command in (
-        "evaluate pair --model sphere --out {}", "bench model --out {}", "bench memory --out {}",
+        "evaluate pair --model sphere --out {}", "bench model --out {}",
         "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
     *(Fault(f"{command[:12]}: an output folder of 300 bytes", command.format(_LONG), says="too long") for command in (
         "evaluate pair --model sphere --out {}", "bench refine --out {}",
