@@ -38,7 +38,8 @@ from pansplat.gaussians.scene import Scene
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
 from pansplat.strict_json import list_field, number_field, read_json, require_object, text_field
-from pansplat.tours import TourGraph, find_tours, merge_scenes, write_floor_plan
+from pansplat.tours import TourGraph, find_tours, merge_scenes
+from pansplat.tours.plan_files import write_picture
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
@@ -319,7 +320,7 @@ def _process_unit(
 
             write_page(scene, path, gaussians=int(_count_of_page(options)), title=name.replace("_", " "))
         elif options.suffix == ".png":
-            write_floor_plan(scene, path)
+            write_picture(scene, path)
         elif pipeline.can_stream(predictor):
             pipeline.save(scene, path)  # networks are trained for joint drawing
         elif tour is not None:
