@@ -27,6 +27,7 @@ from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceilin
 from pansplat.tours.graph import TourGraph
 
 _RAYS = 360
+_SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it
 _BAND = 0.6, 0.85  # of a wall above doors and below beams, fractions of the ceiling's height over the camera
 _LEAST_CEILING = 0.25  # height over the camera, below which doors may reach into the band
 _SURFACE = 0.12  # largest difference from the distance of a surface, as a fraction
@@ -111,13 +112,11 @@ class Plan:
     num_heights: int
     num_walls: int
 
-    def area_error(self, room: Room) -> float | None:
-        """Standard deviation of a room's area by those of the scale and of its walls, square metres, if known."""
-        if self.scale_error is None and self.wall_error is None:
-            return None
+    def area_error(self, room: Room) -> float:
+        """Standard deviation of a room's area, square metres, by those of the scale, of its walls and of its shape."""
         edges = np.linalg.norm(np.roll(room.outline, -1, axis=0) - room.outline, axis=1)
         walls = (self.wall_error or 0.0) * float(np.linalg.norm(edges))
-        return math.hypot(walls, 2 * (self.scale_error or 0.0) * room.area)
+        return math.hypot(walls, 2 * (self.scale_error or 0.0) * room.area, _SHAPE_ERROR * room.area)
 
 
 @dataclass(frozen=True, eq=False)

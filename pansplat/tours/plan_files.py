@@ -133,9 +133,7 @@ def describe_plan(plan: Plan) -> list[str]:
 
 def _describe_area(plan: Plan, number: int) -> str:
     room = plan.rooms[number]
-    error = plan.area_error(room)
-    known = plan.wall_error is not None and error is not None
-    return f"{room.area:.1f} m²" + (f" ± {error:.1f}" if known else "")
+    return f"{room.area:.1f} m² ± {plan.area_error(room):.1f}"
 
 
 @dataclass(frozen=True, eq=False)
