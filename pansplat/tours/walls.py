@@ -6,18 +6,16 @@ import math
 from collections.abc import Iterable, Sequence
 
 import torch
-from torch.nn import functional
 
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.equirect import pad_equirect, uv_from_directions
-from pansplat.rendering import rasterize
 
-_HEIGHT = 128  # rows of the depth of a panorama
-_WINDOW = 2  # pixels around the direction of the other camera, 3 degrees
+_COSINE = math.cos(math.radians(3))  # of the Gaussians around the direction of the other camera
+_SHARE = 0.9  # of them that are nearer than what is seen beyond a door
 _DEPTH = 0.95  # of the distance of the other camera, the largest depth of a wall
+_OPAQUE = 0.5  # least opacity of a surface
+_BACKGROUND_LEVEL = 2  # behind all surfaces
 
 
-@torch.no_grad()
 def find_walls(scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
     """The edges that lead through a surface: each camera sees one in front of the other camera.
 
@@ -27,19 +25,15 @@ def find_walls(scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int
         edges: pairs of panoramas; those with another panorama are left out.
     """
     view = {panorama: number for number, panorama in enumerate(panoramas)}
-    inside = [(a, b) for a, b in edges if a != b and a in view and b in view]
-    reaches = {}
-    for node in {node for edge in inside for node in edge}:
-        own = scene.gaussians.select(scene.gaussians.views == view[node])
-        drawn = rasterize(own, scene.cam2world[view[node]], size=(_HEIGHT, 2 * _HEIGHT))
-        depth = pad_equirect(torch.where(drawn.alpha > 0, drawn.depth, math.inf), _WINDOW)
-        reaches[node] = functional.max_pool2d(depth[None], 2 * _WINDOW + 1, stride=1)[0]
+    gaussians, centers = scene.gaussians, scene.cam2world[:, :3, 3].to(scene.gaussians.means)
+    is_surface = (gaussians.opacities >= _OPAQUE) & (gaussians.levels < _BACKGROUND_LEVEL)
 
     def is_blocked(node: int, other: int) -> bool:
-        pose, target = scene.cam2world[view[node]].double(), scene.cam2world[view[other], :3, 3].double()
-        offset = (target - pose[:3, 3]) @ pose[:3, :3]
-        u, v = uv_from_directions(offset).tolist()
-        row, column = min(int(v * _HEIGHT), _HEIGHT - 1), int(u * 2 * _HEIGHT) % (2 * _HEIGHT)
-        return float(reaches[node][row, column]) < _DEPTH * float(offset.norm())
+        start, way = centers[view[node]], centers[view[other]] - centers[view[node]]
+        offsets = gaussians.means[is_surface & (gaussians.views == view[node])] - start
+        distances, length = offsets.norm(dim=1), way.norm()
+        ahead = distances[offsets @ way > _COSINE * distances * length]
+        return len(ahead) > 0 and bool(ahead.quantile(_SHARE) < _DEPTH * length)
 
+    inside = [(a, b) for a, b in edges if a != b and a in view and b in view]
     return [(a, b) for a, b in inside if is_blocked(a, b) and is_blocked(b, a)]
