@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-import torch
-
 from pansplat.gaussians.scene import Scene
 
 _COSINE = math.cos(math.radians(3))  # of the Gaussians around the direction of the other camera
-_SHARE = 0.9  # of them that are nearer than what is seen beyond a door
+_SHARE = 0.98  # of them on a wall; others are seen beyond a door, or stray
 _DEPTH = 0.95  # of the distance of the other camera, the largest depth of a wall
 _OPAQUE = 0.5  # least opacity of a surface
 _BACKGROUND_LEVEL = 2  # behind all surfaces
