@@ -334,10 +334,11 @@ def parse_arguments(parse: Callable[[], _T], program: str, arguments: Sequence[s
 
         print(f"{program} {__version__}")
         raise SystemExit(0)
-    message, script = io.StringIO(), io.StringIO()
-    is_script = given[:1] == [_COMPLETION]
+    message, script = io.StringIO(), io.StringIO() if given[:1] == [_COMPLETION] else None
+    from pansplat.options import NUMBERS
+
     try:
-        with contextlib.redirect_stderr(message), contextlib.redirect_stdout(script if is_script else sys.stdout):
+        with NUMBERS, contextlib.redirect_stderr(message), contextlib.redirect_stdout(script or sys.stdout):
             return parse()
     except SystemExit as stop:
         text = message.getvalue()
@@ -346,7 +347,7 @@ def parse_arguments(parse: Callable[[], _T], program: str, arguments: Sequence[s
         elif text:
             print(text, file=sys.stderr, end="")
         # The shell would read the second line of a description as another word.
-        print(re.sub(r"\\n(?=.*'type':)", " ", script.getvalue()), end="")
+        print(re.sub(r"\\n(?=.*'type':)", " ", script.getvalue() if script else ""), end="")
         raise
 
 

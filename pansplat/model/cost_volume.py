@@ -10,10 +10,11 @@ Source: PanSplat, section 3.2 and Figure 3; docs/official.md, sections 6 and 7.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -27,6 +28,7 @@ from pansplat.model.layers import (
     PerView,
     Poses,
     Precision,
+    Size,
     ViewMaps,
     Volume,
     attend,
@@ -50,13 +52,13 @@ _HEAD_CHANNELS = 32
 class SweepLevel:
     """Shape of one level of the cost volume."""
 
-    level: int
+    level: Annotated[int, Meta(ge=0, le=3)]
     """Pyramid level of the features; the map has 2^-level of the image's size."""
-    channels: int
+    channels: Size
     """Channels of the features."""
-    candidates: int
+    candidates: Size
     """Depth candidates per pixel."""
-    width: int
+    width: Size
     """Channels of the U-Net."""
 
 
@@ -73,7 +75,7 @@ class CostVolumeConfig:
 
     sweep: Literal["hierarchical", "single"] = "hierarchical"
     """All levels, or the coarsest level only."""
-    mono_channels: int = 32
+    mono_channels: Annotated[int, Meta(ge=0, le=4096)] = 32
     """Channels of the monocular features; 0 for none."""
     refinement: Literal["unet", "none"] = "unet"
     """Refine the volume by a U-Net plus a 1x1 convolution, or by the convolution only."""
@@ -306,9 +308,9 @@ def regress_depth(level: int, logits: Volume, candidates: Volume) -> LevelDepth:
 class UNetConfig:
     """Shape of a U-Net."""
 
-    channels: int
+    channels: Size
     """Channels of every map."""
-    scales: int = 3
+    scales: Annotated[int, Meta(ge=1, le=6)] = 3
     """Number of map sizes, each half of the previous one; attention is at the last."""
 
 

@@ -12,15 +12,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu
 
 from pansplat.model.efficientnet import CHANNELS, EfficientNetLite0
-from pansplat.model.layers import PanoramaConv2d, attend, convolve_and_normalize
+from pansplat.model.layers import PanoramaConv2d, Size, attend, convolve_and_normalize
 
 MAX_LOG_SCALE = 3.0  # bound of the logarithm of the Laplace scale
 MEAN_LOG_DEPTH = 0.6  # of generated homes, in camera heights
@@ -30,11 +31,11 @@ MEAN_LOG_DEPTH = 0.6  # of generated homes, in camera heights
 class DepthNetworkConfig:
     """Widths of the depth network."""
 
-    room_channels: int = 192
+    room_channels: Size = 192
     """Channels of the cells at 1/32."""
-    attention_layers: int = 2
-    attention_heads: int = 6
-    decoder_channels: tuple[int, int, int, int] = field(default=(128, 80, 48, 32))
+    attention_layers: Annotated[int, Meta(ge=0, le=64)] = 2
+    attention_heads: Size = 6
+    decoder_channels: tuple[Size, Size, Size, Size] = field(default=(128, 80, 48, 32))
     """Channels at 1/16, 1/8, 1/4 and 1/2."""
 
 

@@ -32,7 +32,7 @@ from pansplat.model.depth_network import (
     UpsampleAndMerge,
 )
 from pansplat.model.efficientnet import CHANNELS
-from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize, to_channels_last
+from pansplat.model.layers import Factor, PanoramaConv2d, Size, convolve_and_normalize, to_channels_last
 
 _PATCH, _DILATION = 3, 2  # pixels of a patch, and their distance
 _PATCH_NOISE = 0.02  # standard deviation of a patch below which its correlation fades
@@ -44,13 +44,13 @@ class RefinementConfig:
     """Settings of the refinement."""
 
     mono: DepthNetworkConfig = field(default_factory=DepthNetworkConfig)
-    candidates: int = 27
-    reach: float = 1.2
+    candidates: Size = 27
+    reach: Factor = 1.2
     """Logarithm of the ratio of the outermost candidates to the present depth."""
-    concentration: float = 0.7
+    concentration: Factor = 0.7
     """Fraction of the reach that grows with the square of the candidate's index."""
-    matching_channels: int = 16
-    channels: tuple[int, int, int] = (40, 64, 96)
+    matching_channels: Size = 16
+    channels: tuple[Size, Size, Size] = (40, 64, 96)
     """Channels of the U-Net at 1/2, 1/4 and 1/8."""
 
 

@@ -10,16 +10,18 @@ Source of the weighted upsampling: Teed and Deng, https://arxiv.org/abs/2003.120
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pixel_shuffle, pixel_unshuffle, relu, unfold
 
 from pansplat.geometry.equirect import pad_equirect, resize_equirect
 from pansplat.model.depth_network import MAX_LOG_SCALE, MEAN_LOG_DEPTH, DepthEstimate, RoomAttention
 from pansplat.model.efficientnet import CHANNELS, EfficientNetLite0
-from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize
+from pansplat.model.layers import PanoramaConv2d, Size, convolve_and_normalize
 
 _ESTIMATE_CHANNELS = 3  # log-depth, its log-scale, latitude
 _NEIGHBOURS = 9  # whose depths a pixel chooses from
@@ -29,14 +31,14 @@ _NEIGHBOURS = 9  # whose depths a pixel chooses from
 class SharpeningConfig:
     """Widths of the network, and the size that it is trained for."""
 
-    height: int = 384
+    height: Size = 384
     """Height of the panoramas, pixels."""
-    room_channels: int = 192
-    attention_layers: int = 2
-    attention_heads: int = 6
-    decoder_channels: tuple[int, int, int, int] = field(default=(128, 80, 48, 32))
+    room_channels: Size = 192
+    attention_layers: Annotated[int, Meta(ge=0, le=64)] = 2
+    attention_heads: Size = 6
+    decoder_channels: tuple[Size, Size, Size, Size] = field(default=(128, 80, 48, 32))
     """Channels at 1/16, 1/8, 1/4 and 1/2."""
-    selection_channels: int = 48
+    selection_channels: Size = 48
     """Channels from which the weights of the neighbours follow."""
 
 

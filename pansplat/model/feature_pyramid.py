@@ -9,9 +9,11 @@ Source: PanSplat, section 3.1 and Figure 3; docs/official.md, section 4.
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 
 from pansplat.geometry.equirect import Border
@@ -21,6 +23,7 @@ from pansplat.model.layers import (
     Maps,
     PanoramaConv2d,
     Precision,
+    Size,
     ViewMaps,
     attend,
     autocast_convolutions,
@@ -41,11 +44,11 @@ _STD = (0.229, 0.224, 0.225)
 class TransformerConfig:
     """Shape of the transformer; shipped weights fix all of it."""
 
-    channels: int = 128
-    blocks: int = 6
-    splits: int = 2
+    channels: Size = 128
+    blocks: Annotated[int, Meta(ge=1, le=64)] = 6
+    splits: Annotated[int, Meta(ge=1, le=2)] = 2
     """Windows along each side of the map."""
-    expansion: int = 4
+    expansion: Annotated[int, Meta(ge=1, le=16)] = 4
     """Hidden channels of the feed-forward part, in multiples of its input."""
 
 
@@ -53,7 +56,7 @@ class TransformerConfig:
 class FeaturePyramidConfig:
     """Shape of the feature pyramid; shipped weights fix all of it."""
 
-    channels: tuple[int, int, int, int] = (32, 64, 96, 128)
+    channels: tuple[Size, Size, Size, Size] = (32, 64, 96, 128)
     """Channels of levels 0 (finest) to 3."""
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
 

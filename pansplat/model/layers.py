@@ -6,10 +6,11 @@ at half-integers and continues every map across the seam and the poles.
 Source: PanSplat, section 3.1; docs/official.md, sections 4, 6 and 7.
 """
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -19,6 +20,11 @@ from pansplat.geometry.pose import orthonormal_error
 
 Compat = Literal["official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
+
+Size = Annotated[int, Meta(ge=1, le=4096)]
+"""A number of channels, candidates or rows in the settings of a network; larger ones take gigabytes."""
+Factor = Annotated[float, Meta(ge=1e-6, le=4096)]
+"""A number in the settings of a network."""
 
 Images = Float[Tensor, "batch view 3 height width"]
 """Panoramas, RGB in [0, 1]."""

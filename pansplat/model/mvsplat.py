@@ -39,6 +39,7 @@ from pansplat.model.layers import (
     PerView,
     Poses,
     Precision,
+    Size,
     ViewMaps,
     require_size,
     require_views,
@@ -54,13 +55,13 @@ _ENCODER_CHANNELS = (64, 64, 96, 96, 128, 128)  # of the residual blocks
 class MVSplatConfig:
     """Shape of the network; shipped weights fix all of it."""
 
-    channels: int = 128
+    channels: Size = 128
     """Channels of the features."""
-    candidates: int = 128
+    candidates: Size = 128
     """Depth candidates per pixel."""
-    width: int = 128
+    width: Size = 128
     """Channels of the cost volume's U-Net."""
-    refine_width: int = 32
+    refine_width: Size = 32
     """Channels of the U-Net at the image's size."""
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     adapter: AdapterConfig = field(default_factory=AdapterConfig)
