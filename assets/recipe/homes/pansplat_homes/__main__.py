@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from msgspec import Meta
 from tyro.conf import Positional, subcommand
 
 from pansplat.cli.inputs import Out
-from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
+from pansplat.console import own_warnings, parse_arguments, run_command
 from pansplat.files import require_output_folder
 from pansplat.options import Count, Seed, Threads, check_numbers
 from pansplat_homes.depth import DepthTrainConfig
@@ -205,7 +206,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 def main() -> None:
     """Run the command line and exit."""
-    exit_process(run())
+    sys.exit(run())
 
 
 if __name__ == "__main__":
