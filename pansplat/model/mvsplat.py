@@ -249,11 +249,12 @@ class SweptDepth(LevelRefinement):
         sweep = SweepLevel(2, config.channels, config.candidates, config.width)
         border, without_mono = _choose_border(compat), CostVolumeConfig(mono_channels=0)
         super().__init__(sweep, without_mono, first=True, compat=compat, precision=precision, border=border)
+        self.candidates = config.candidates
 
     def regress(self, features: ViewMaps, cam2world: Poses, near: PerView, far: PerView) -> LevelDepth:
         """The inverse depth of all views, from their features at 1/4 scale."""
         height, width = features.shape[-2:]
-        candidates = make_first_candidates((1 / far, 1 / near), self.head[-1].out_channels, (height, width))
+        candidates = make_first_candidates((1 / far, 1 / near), self.candidates, (height, width))
         volume = correlate_views(features, candidates, cam2world, self.compat)
         return regress_depth(2, self(volume, features, None, None), candidates)
 
