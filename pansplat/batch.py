@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import itertools
 import json
 import math
 import os
@@ -22,7 +21,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -44,7 +43,7 @@ from pansplat.strict_json import read_json
 from pansplat.tours import TourGraph, find_tours, merge_scenes, write_floor_plan
 
 if TYPE_CHECKING:
-    from distributed import Client, Future, LocalCluster
+    from distributed import LocalCluster
 
 STEPS = ("predict", "refine", "export")
 EXPORT_SUFFIXES = (".html", ".png", *SCENE_SUFFIXES)
@@ -52,9 +51,6 @@ REPORT_NAME = "report.jsonl"
 MIN_MEMORY = 1 << 29  # bytes of a worker; torch and the kernels take half of it
 
 _LAYOUT = "2"  # of the outputs; part of their hashes
-_MAX_DEATHS = 2  # worker processes that may end during one task before the item counts as failed
-_MAX_LOSSES = 3  # of the connection to a scheduler without a finished item in between
-_CONNECT_SECONDS = 60.0
 _BYTES_PER_PIXEL = 40  # of panoramas, in the .ply of their prediction; most predictors write more
 _MAX_NAME = 80  # characters of a pair's name in the name of an output
 # Temporary names (pansplat.atomic) of outputs.
@@ -187,20 +183,6 @@ def _read_entry(entry: str | _Entry, manifest: Path, source: str) -> Item:
     return Item(name, folder, entry.pair, entry.convention, entry.near, entry.far)
 
 
-def require_cluster() -> None:
-    """Check that Dask is installed.
-
-    Raises:
-        InputError: it is not.
-    """
-    try:
-        import distributed  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            "pansplat batch: needed the package distributed, got none; run pip install 'pansplat[cluster]'"
-        ) from error
-
-
 # The work of a task
 
 
@@ -211,23 +193,46 @@ def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path)
         fingerprint: of the predictor that the batch was started with.
         out: folder of the batch.
     """
-    began = time.perf_counter()
-    outputs: list[str] = []
-    num_written, error = 0, None
+    began, outputs, error = time.perf_counter(), _Outputs(out / item.name), None
     with collect_notes() as caught:
         try:
-            folder = out / item.name
-            folder.mkdir(parents=True, exist_ok=True)
-            _remove_unfinished(folder)
-            for unit in _list_units(item, options, folder):
-                for path, is_new in itertools.chain(unit.files, _process_unit(unit, options, fingerprint, folder)):
-                    outputs.append(path.relative_to(out).as_posix())
-                    num_written += is_new
+            outputs.folder.mkdir(parents=True, exist_ok=True)
+            _remove_unfinished(outputs.folder)
+            predictor = load_predictor(options)
+            if predictor.fingerprint != fingerprint:
+                raise InputError(
+                    f"worker: needed the predictor {options.model} of the machine that started the batch, got another "
+                    "one; install the same version of pansplat and the same weights on all machines"
+                )
+            for pairs, tour in _list_units(item, options.camera_height, pipeline.find_max_views(predictor), outputs):
+                _process_unit(pairs, tour, predictor, options, outputs)
         except Exception as problem:  # whatever it is, other items go on
             error = _describe(problem)
-    status = "failed" if error else "done" if num_written else "skipped"
+    status = "failed" if error else "done" if outputs.num_written else "skipped"
+    files = tuple(path.relative_to(out).as_posix() for path in outputs.files)
     notes = tuple(" ".join(note.splitlines()) for note in caught)
-    return ItemReport(item.name, status, round(time.perf_counter() - began, 3), tuple(outputs), notes, error)
+    return ItemReport(item.name, status, round(time.perf_counter() - began, 3), files, notes, error)
+
+
+class _Outputs:
+    """The files of an item.
+
+    Attributes:
+        files: those that were made or exist.
+        num_written: number of those that were made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.files, self.num_written = folder, list[Path](), 0
+
+    def make(self, step: str, key: str, name: str, suffix: str, write: Callable[[Path], object]) -> Path:
+        """The file of a step, written if it does not exist."""
+        path = self.folder / f"{step}-{key}-{_shorten(name)}{suffix}"
+        if not path.exists():
+            write(path)
+            self.num_written += 1
+        self.files.append(path)
+        return path
 
 
 def _describe(error: BaseException) -> str:
@@ -240,199 +245,149 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text[:400]}"
 
 
-@dataclass(frozen=True, eq=False)
-class _Unit:
-    """What one file is exported of: a pair, or a tour with its scenes as pairs.
-
-    Attributes:
-        name: for the name of the file.
-        pairs: that are predicted.
-        tour: the graph of a tour, or None.
-        files: that hold the graph, and whether they were written.
-    """
-
-    name: str
-    pairs: tuple[Pair, ...]
-    tour: TourGraph | None = None
-    files: tuple[tuple[Path, bool], ...] = ()
-
-
-def _list_units(item: Item, options: BatchOptions, folder: Path) -> list[_Unit]:
-    """The tours of an item, and the pairs that belong to none. The graphs of the tours are written to the folder."""
+def _list_units(
+    item: Item, camera_height: float, max_views: int, outputs: _Outputs
+) -> list[tuple[Sequence[Pair], TourGraph | None]]:
+    """What one file is exported of: a tour with its scenes as pairs, or a pair that belongs to none."""
     pairs = pipeline.load_pairs(
-        item.folder, convention=item.convention, near=item.near, far=item.far, camera_height=options.camera_height
+        item.folder, convention=item.convention, near=item.near, far=item.far, camera_height=camera_height
     )
     if item.pair is not None:
         chosen = [pair for pair in pairs if pair.name == item.pair]
         if not chosen:
             names = ", ".join(pair.name for pair in pairs[:8])
             raise InputError(f"{item.folder}: needed a pair {item.pair!r}, got {names}; correct the manifest.")
-        return [_Unit(pair.name, (pair,)) for pair in chosen]
-    units, images = [], set()
+        return [([pair], None) for pair in chosen]
+    units: list[tuple[Sequence[Pair], TourGraph | None]] = []
+    images = set()
     for tour in find_tours(pairs):
         images |= {panorama.image for panorama in tour.panoramas}
-        graph, *file = _connect(tour, folder)
-        sources = graph.choose_sources(_find_max_views(options))
-        pairs_of_scenes = tuple(graph.make_pair(views) for views in sources)
-        units.append(_Unit(graph.name, pairs_of_scenes, graph, (tuple(file),)))
-    return units + [_Unit(pair.name, (pair,)) for pair in pairs if pair.context[0].image not in images]
+        graph = _connect(tour, outputs)
+        units.append(([graph.make_pair(views) for views in graph.choose_sources(max_views)], graph))
+    return units + [([pair], None) for pair in pairs if pair.context[0].image not in images]
 
 
-def _connect(tour: TourGraph, folder: Path) -> tuple[TourGraph, Path, bool]:
-    """The connected graph of a tour, its file in the folder, and whether the file was written."""
+def _connect(tour: TourGraph, outputs: _Outputs) -> TourGraph:
+    """The connected graph of a tour, from its file."""
     panoramas = [[view.name, view.cam2world.tolist(), *_hash_image(view.image)] for view in tour.panoramas]
     key = _join_hash(_LAYOUT, "graph", [panoramas, tour.near, tour.far, list(tour.overlaps)])
-    path = folder / f"graph-{key}-{_shorten(tour.name)}.json"
-    is_new = not path.exists()
-    if is_new:
-        overlaps = [[*edge, overlap] for edge, overlap in tours.connect(tour).overlaps.items()]
+
+    def write(path: Path) -> None:
+        overlaps = tours.connect(tour).list_overlaps()
         with replacing(path) as temporary:
             temporary.write_text(json.dumps({"overlaps": overlaps}), "utf-8")
-    rows = read_json(path, dict[str, list[tuple[int, int, float]]])["overlaps"]
-    return dataclasses.replace(tour, overlaps={(a, b): overlap for a, b, overlap in rows}), path, is_new
+
+    path = outputs.make("graph", key, tour.name, ".json", write)
+    return tour.with_overlaps(tuple(read_json(path, dict[str, list[tuple[int, int, float]]])["overlaps"]))
 
 
-@lru_cache(maxsize=2)  # that of the batch, and that of single views
+def load_predictor(options: BatchOptions) -> Predictor:
+    """The predictor of a batch.
+
+    Raises:
+        InputError: it cannot be loaded.
+    """
+    return _load_model(options.model, options.compat, options.precision)
+
+
+@lru_cache(maxsize=1)
 def _load_model(model: str, compat: pipeline.CompatChoice, precision: pipeline.Precision) -> Predictor:
     return pipeline.load_model(model, compat=compat, precision=precision)
 
 
-def _find_max_views(options: BatchOptions) -> int:
-    return pipeline.find_max_views(_load_model(options.model, options.compat, options.precision))
-
-
-def read_fingerprint(options: BatchOptions) -> str:
-    """The fingerprint of the batch's predictor.
-
-    Raises:
-        InputError: the predictor cannot be loaded.
-    """
-    return _load_model(options.model, options.compat, options.precision).fingerprint
-
-
-def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: Path) -> Iterator[tuple[Path, bool]]:
-    """Yield each output of a pair or tour, and whether it was written."""
-    part = None if unit.tour is None else _count_of_page(options) / len(unit.tour)
-    alone = sum(len(pair.context) == 1 for pair in unit.pairs)
+def _process_unit(
+    pairs: Sequence[Pair], tour: TourGraph | None, predictor: Predictor, options: BatchOptions, outputs: _Outputs
+) -> None:
+    """Predict, refine and export a pair, or a tour with its scenes as pairs."""
+    name, part = (pairs[0].name, None) if tour is None else (tour.name, _count_of_page(options) / len(tour))
+    alone = sum(len(pair.context) == 1 for pair in pairs)
     if alone and "refine" in options.steps:
         count = f"{alone} single views are" if alone > 1 else "a single view is"
-        warnings.warn(f"{unit.name}: {count} not refined.", InputWarning, stacklevel=2)
-    of_single_views = _choose_for_single_views(unit, options, fingerprint)
-    made = [
-        _PairSteps(pair, part, *(of_single_views if len(pair.context) == 1 else (options, fingerprint)), folder)
-        for pair in unit.pairs
-    ]
-    for steps in made:
-        yield from steps.run()
+        warnings.warn(f"{name}: {count} not refined.", InputWarning, stacklevel=2)
+    if tour is not None:
+        pipeline.warn_of_single_views(tour, predictor)
+    predictors = [predictor if tour is None else pipeline.choose_predictor(pair, predictor) for pair in pairs]
+    made = [_process_pair(pair, part, each, options, outputs) for pair, each in zip(pairs, predictors, strict=True)]
     if "export" not in options.steps:
         return
-    settings = [__version__, options.suffix, options.gaussians, [] if unit.tour is None else _list_graph(unit.tour)]
-    key = _join_hash(",".join(steps.key for steps in made), "export", settings)
-    path = folder / f"export-{key}-{_shorten(unit.name)}{options.suffix}"
-    is_new = not path.exists()
-    if is_new:
-        if unit.tour is None:
-            scene = made[0].read()
+
+    def export(path: Path) -> None:
+        if tour is None:
+            scene = made[0][1]()
         else:
-            max_views = _find_max_views(options)
-            of_views = dict(zip(unit.tour.choose_sources(max_views), made, strict=True))
-            scene = merge_scenes(unit.tour, lambda views: of_views[views].read(), max_views)
-        _export(scene, path, unit, options)
-    yield path, is_new
+            max_views = pipeline.find_max_views(predictor)
+            readers = dict(zip(tour.choose_sources(max_views), (read for _, read in made), strict=True))
+            scene = merge_scenes(tour, lambda views: readers[views](), max_views)
+        if options.suffix == ".html":
+            from pansplat.web import write_page
+
+            write_page(scene, path, gaussians=int(_count_of_page(options)), title=name.replace("_", " "))
+        elif options.suffix == ".png":
+            write_floor_plan(scene, path)
+        elif pipeline.can_stream(predictor):
+            pipeline.save(scene, path)  # networks are trained for joint drawing
+        elif tour is not None:
+            pipeline.save(pipeline.fuse_tour(tour, scene), path)
+        else:
+            pipeline.save(pipeline.fuse(scene, pairs[0].load_context(scene.height)), path)
+
+    settings = [__version__, options.suffix, options.gaussians, [] if tour is None else _list_graph(tour)]
+    key = _join_hash(",".join(key for key, _ in made), "export", settings)
+    outputs.make("export", key, name, options.suffix, export)
 
 
-def _choose_for_single_views(unit: _Unit, options: BatchOptions, fingerprint: str) -> tuple[BatchOptions, str]:
-    """Options and fingerprint for the single views of a tour; a warning states another predictor than the batch's."""
-    alone = [pair for pair in unit.pairs if len(pair.context) == 1]
-    if unit.tour is None or not alone:
-        return options, fingerprint
-    predictor = _load_model(options.model, options.compat, options.precision)
-    if pipeline.choose_predictor(alone[0], predictor) is predictor:
-        return options, fingerprint
-    pipeline.warn_of_single_views(unit.tour, predictor)
-    options = dataclasses.replace(options, model="default", compat="trained", precision="float32")
-    return options, read_fingerprint(options)
+def _process_pair(
+    pair: Pair, part: float | None, predictor: Predictor, options: BatchOptions, outputs: _Outputs
+) -> tuple[str, Callable[[], Scene]]:
+    """Predict and refine a pair, or a scene of a tour. A single view is predicted only.
+
+    Args:
+        part: number of Gaussians that the export of a tour needs of each panorama; None for a pair.
+
+    Returns:
+        Hash of all that the scene depends on, and a function that reads it, or computes it if no step writes a file.
+    """
+    height, count = options.height, None
+    if part is not None:
+        height, count = pipeline.choose_tour_size(pair, part, options.height)
+    key = _join_hash(_hash_pair(pair), "predict", [predictor.name, predictor.fingerprint, height])
+    read = partial(pipeline.predict, pair, predictor, height=height, cache=False)
+    is_refined = "refine" in options.steps and len(pair.context) > 1
+    if "predict" in options.steps or ("refine" in options.steps and not is_refined):
+
+        def predict(path: Path) -> None:
+            rows = height or pipeline.choose_height(pair, predictor)
+            needed, free = _BYTES_PER_PIXEL * len(pair.context) * 2 * rows**2, shutil.disk_usage(outputs.folder).free
+            if free < needed:  # a full disk must not cost the time of the prediction
+                raise InputError(
+                    f"{outputs.folder}: needed at least {needed / 1e6:,.1f} MB of free disk space for {pair.name}, "
+                    f"got {free / 1e6:,.1f} MB; free some and run the command again"
+                )
+            pipeline.predict_to_file(pair, path, predictor, height=rows)
+
+        read = partial(pipeline.load, outputs.make("predict", key, pair.name, ".ply", predict))
+    if is_refined:
+        read_prediction, seconds = read, pipeline.scale_seconds(options.refine_seconds, pair)
+
+        def refine(path: Path) -> None:
+            scene = read_prediction()
+            views = pipeline.load_photographs(pair, scene.height, count)
+            pipeline.refine_to_file(scene, views, path, seconds=seconds, config=RefineConfig(gaussians=count))
+
+        key = _join_hash(key, "refine", [refinement_fingerprint(), seconds, count])
+        read = partial(pipeline.load, outputs.make("refine", key, pair.name, ".ply", refine))
+    return key, read
 
 
 def _list_graph(tour: TourGraph) -> list[Any]:
     """What the scene of a tour states of its graph: edges, and titles, links and start views if there are any."""
-    edges = [[*edge, round(overlap, 6)] for edge, overlap in tour.overlaps.items()]
+    edges = [[*edge, round(overlap, 6)] for *edge, overlap in tour.list_overlaps()]
     stated = [
         [node, view.title, view.start, [dataclasses.astuple(link) for link in view.links]]
         for node, view in enumerate(tour.panoramas)
         if view.title or view.start or view.links
     ]
     return edges + stated
-
-
-class _PairSteps:
-    """The prediction and refinement of a pair, or of a scene of a tour. A single view is predicted only.
-
-    Attributes:
-        key: hash of all that the result depends on.
-    """
-
-    def __init__(self, pair: Pair, part: float | None, options: BatchOptions, fingerprint: str, folder: Path) -> None:
-        """`part` is the number of Gaussians that the export of a tour needs of each panorama."""
-        self._pair, self._options, self._fingerprint, self._folder = pair, options, fingerprint, folder
-        self._height, self._gaussians = options.height, None
-        if part is not None:
-            self._height, self._gaussians = pipeline.choose_tour_size(pair, part, options.height)
-        self._file: Path | None = None
-        self._refine_seconds = pipeline.scale_seconds(options.refine_seconds, pair)
-        self.key = _hash_pair(pair)
-
-    def run(self) -> Iterator[tuple[Path, bool]]:
-        """Do the steps whose files are missing; yield each file, and whether it was written."""
-        options = self._options
-        name = options.model.rsplit("/", 1)[-1]
-        self.key = _join_hash(self.key, "predict", [name, self._fingerprint, self._height])
-        is_refined = "refine" in options.steps and len(self._pair.context) > 1
-        if "predict" in options.steps or ("refine" in options.steps and not is_refined):
-            yield self._write("predict", self._predict_to)
-        if is_refined:
-            self.key = _join_hash(self.key, "refine", [refinement_fingerprint(), self._refine_seconds, self._gaussians])
-            yield self._write("refine", self._refine_to)
-
-    def read(self) -> Scene:
-        """The scene of the last step. It is computed in memory if no step writes a file."""
-        if self._file is not None:
-            return pipeline.load(self._file)
-        return pipeline.predict(self._pair, self._load_predictor(), height=self._height, cache=False)
-
-    def _write(self, step: str, write: Callable[[Path], object]) -> tuple[Path, bool]:
-        path = self._folder / f"{step}-{self.key}-{_shorten(self._pair.name)}.ply"
-        is_new = not path.exists()
-        if is_new:
-            write(path)
-        self._file = path
-        return path, is_new
-
-    def _predict_to(self, path: Path) -> None:
-        predictor = self._load_predictor()
-        height = self._height or pipeline.choose_height(self._pair, predictor)
-        needed, free = _BYTES_PER_PIXEL * len(self._pair.context) * 2 * height**2, shutil.disk_usage(self._folder).free
-        if free < needed:  # a full disk must not cost the time of the prediction
-            raise InputError(
-                f"{self._folder}: needed at least {needed / 1e6:,.1f} MB of free disk space for {self._pair.name}, "
-                f"got {free / 1e6:,.1f} MB; free some and run the command again"
-            )
-        pipeline.predict_to_file(self._pair, path, predictor, height=height)
-
-    def _refine_to(self, path: Path) -> None:
-        scene = self.read()
-        views = pipeline.load_photographs(self._pair, scene.height, self._gaussians)
-        config = RefineConfig(gaussians=self._gaussians)
-        pipeline.refine_to_file(scene, views, path, seconds=self._refine_seconds, config=config)
-
-    def _load_predictor(self) -> Predictor:
-        predictor = _load_model(self._options.model, self._options.compat, self._options.precision)
-        if predictor.fingerprint != self._fingerprint:
-            raise InputError(
-                f"worker: needed the predictor {self._options.model} of the machine that started the batch, got "
-                "another one; install the same version of pansplat and the same weights on all machines"
-            )
-        return predictor
 
 
 def _count_of_page(options: BatchOptions) -> float:
@@ -442,22 +397,6 @@ def _count_of_page(options: BatchOptions) -> float:
     from pansplat.web import DEFAULT_GAUSSIANS
 
     return options.gaussians or DEFAULT_GAUSSIANS
-
-
-def _export(scene: Scene, path: Path, unit: _Unit, options: BatchOptions) -> None:
-    if options.suffix == ".html":
-        from pansplat.web import write_page
-
-        count, title = int(_count_of_page(options)), unit.name.replace("_", " ")
-        write_page(scene, path, gaussians=count, title=title)
-    elif options.suffix == ".png":
-        write_floor_plan(scene, path)
-    elif pipeline.can_stream(_load_model(options.model, options.compat, options.precision)):
-        pipeline.save(scene, path)  # networks are trained for joint drawing
-    elif unit.tour is not None:
-        pipeline.save(pipeline.fuse_tour(unit.tour, scene), path)
-    else:
-        pipeline.save(pipeline.fuse(scene, unit.pairs[0].load_context(scene.height)), path)
 
 
 def _hash_pair(pair: Pair) -> str:
@@ -489,10 +428,9 @@ def _hash_content(path: Path, size: int, changed: int) -> str:
 
 
 def _hash_file(path: Path) -> str:
-    try:
-        state = os.stat(path)
-    except OSError:
-        return hashlib.blake2b(read_file(path), digest_size=16).hexdigest()  # raises the error that names the file
+    if not os.path.exists(path):
+        return _hash_content(path, 0, 0)  # raises the error that names the file
+    state = os.stat(path)
     return _hash_content(path, state.st_size, state.st_mtime_ns)
 
 
@@ -512,6 +450,12 @@ def _remove_unfinished(folder: Path) -> None:
                 path.unlink()
 
 
+def remove_unfinished(items: Sequence[Item], out: Path) -> None:
+    """Remove the temporary files of workers that have ended."""
+    for item in items:
+        _remove_unfinished(out / item.name)
+
+
 # The workers
 
 
@@ -523,7 +467,6 @@ def start_workers(workers: int | None = None, memory: int | None = None) -> Iter
         workers: number of processes; by default one per two cores with at least 4 GiB each. They share the cores.
         memory: limit of each, bytes; a worker above 95 % of it is killed and replaced. By default an equal part.
     """
-    require_cluster()
     import logging
 
     from dask import config as dask_config
@@ -532,13 +475,12 @@ def start_workers(workers: int | None = None, memory: int | None = None) -> Iter
     from distributed.system import MEMORY_LIMIT
 
     workers = workers or max(1, min(CPU_COUNT // 2, MEMORY_LIMIT // (memory or _DEFAULT_MEMORY)))
-    threads = max(1, CPU_COUNT // workers)
+    memory = min(memory or MEMORY_LIMIT // workers, MEMORY_LIMIT)
+    print(f"workers: {workers}, of at most {memory / 2**30:.1f} GiB each", file=sys.stderr)
     variables = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
     settings = {
         # A worker's memory is the work of one task, which Dask cannot spill.
         **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
-        "distributed.worker.memory.terminate": 0.95,
-        "distributed.scheduler.allowed-failures": _MAX_DEATHS,
         "distributed.scheduler.worker-ttl": None,  # a compiled kernel may hold Python's lock for minutes
         # Dask sets these variables in this process, too: numba fails if its number of threads changes. With Dask's
         # MALLOC_TRIM_THRESHOLD_ each large array is returned to the system, and page faults take a quarter of the time.
@@ -548,21 +490,14 @@ def start_workers(workers: int | None = None, memory: int | None = None) -> Iter
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
             dashboard_address=None,  # pyright: ignore[reportArgumentType]
-            memory_limit=memory or MEMORY_LIMIT // workers,
+            memory_limit=memory,
             silence_logs=logging.CRITICAL,
             preload=["pansplat.batch"],
-            env=dict.fromkeys(variables, str(threads)),
+            env=dict.fromkeys(variables, str(max(1, CPU_COUNT // workers))),
         )
-        try:
+        with cluster:
             yield cluster
-        except BaseException:
-            _kill_workers(cluster)
-            raise
-        finally:
-            cluster.close()
 
 
 def dask_setup(worker: Any) -> None:
@@ -576,36 +511,6 @@ def dask_setup(worker: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _kill_workers(cluster: LocalCluster) -> None:
-    """End the workers at once; Dask waits for the ends of their tasks."""
-    for nanny in list(cluster.workers.values()):
-        nanny.auto_restart = False
-        with contextlib.suppress(OSError, TypeError):
-            os.kill(nanny.pid, getattr(signal, "SIGKILL", signal.SIGTERM))  # Windows has no SIGKILL
-
-
-def connect(address: str) -> Client:
-    """A client of a scheduler.
-
-    Raises:
-        InputError: nothing answers at the address.
-    """
-    require_cluster()
-    import logging
-
-    from distributed import Client
-
-    for name in ("distributed", "distributed.client"):  # it logs the traceback of a lost connection
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    try:
-        return Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(
-            f"--scheduler {address}: needed a running Dask scheduler, got '{_describe(error)[:200]}'; "
-            "check the address, such as tcp://host:8786"
-        ) from error
-
-
 @contextlib.contextmanager
 def lock_folder(out: Path) -> Iterator[None]:
     """Make the folder of a batch and lock it against a second batch on this machine.
@@ -613,36 +518,23 @@ def lock_folder(out: Path) -> Iterator[None]:
     Raises:
         InputError: another batch writes to it, or it cannot be written.
     """
+    import locket  # Dask needs it, too
+
     out.mkdir(parents=True, exist_ok=True)
-    with open(out / ".lock", "ab") as file:
-        try:
-            _lock(file.fileno())
-        except (BlockingIOError, PermissionError) as error:
-            message = f"--out {out}: needed a folder of its own, got one that another batch writes to"
-            raise InputError(message) from error
+    lock = locket.lock_file(str(out / ".lock"), timeout=0)
+    try:
+        lock.acquire()
+    except locket.LockError as error:
+        message = f"--out {out}: needed a folder of its own, got one that another batch writes to"
+        raise InputError(message) from error
+    try:
         yield
-
-
-def _lock(descriptor: int) -> None:
-    """Lock a file until it is closed; a BlockingIOError or, on Windows, a PermissionError if another process has."""
-    if sys.platform == "win32":
-        import msvcrt
-
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def remove_unfinished(items: Sequence[Item], out: Path) -> None:
-    """Remove the temporary files of workers that have ended."""
-    for item in items:
-        _remove_unfinished(out / item.name)
+    finally:
+        lock.release()
 
 
 def run_items(address: str, items: Sequence[Item], options: BatchOptions, out: Path) -> Iterator[ItemReport]:
-    """Yield the report of each item when its task ends. If the scheduler is restarted, unfinished tasks are sent again.
+    """Yield the report of each item when its task ends.
 
     Args:
         address: of the scheduler. The workers must see the items' folders and `out` under the same paths.
@@ -651,46 +543,39 @@ def run_items(address: str, items: Sequence[Item], options: BatchOptions, out: P
     Raises:
         InputError: the predictor cannot be loaded, or the scheduler is lost.
     """
-    fingerprint = read_fingerprint(options)
-    remaining = {item.name: item for item in items}
-    losses = 0
-    while remaining:
-        before = len(remaining)
-        with connect(address) as client:
-            for report in _run_once(client, list(remaining.values()), options, fingerprint, out):
-                del remaining[report.item]
-                yield report
-        losses = 0 if len(remaining) < before else losses + 1
-        if losses == _MAX_LOSSES:
-            raise InputError(
-                f"--scheduler {address}: needed a scheduler that keeps running, got {losses} lost connections in a "
-                "row; run the command again, finished items are kept"
-            )
+    import logging
 
+    from distributed import Client, as_completed
 
-def _run_once(
-    client: Client, items: Sequence[Item], options: BatchOptions, fingerprint: str, out: Path
-) -> Iterator[ItemReport]:
-    """Send one task per item; items of tasks that a lost scheduler forgot have no report."""
-    from distributed import as_completed
-
+    for name in ("distributed", "distributed.client"):  # it logs the traceback of a lost connection
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"--scheduler {address}: needed a running Dask scheduler, got '{_describe(error)[:200]}'; "
+            "check the address, such as tcp://host:8786"
+        ) from error
     run = secrets.token_hex(4)  # the scheduler would answer a repeated key with an old report
-    names: dict[str, str] = {}
-    futures: list[Future] = []
-    for item in items:
-        key = f"pansplat-{run}-{item.name}"
-        names[key] = item.name
-        futures.append(client.submit(process_item, item, options, fingerprint, out, key=key, pure=False))
-    for future in as_completed(futures, loop=client.loop):
-        if future.status == "finished":
-            yield future.result()
-        elif future.status == "error":
-            error = future.exception()
-            text = f"worker: {_describe(error)}"
-            if type(error).__name__ == "KilledWorker":
-                text = (
-                    f"{_MAX_DEATHS + 1} worker processes ended during this item, probably for lack of memory; "
-                    "choose a smaller --height, fewer --workers or more --memory"
+    names = {f"pansplat-{run}-{item.name}": item.name for item in items}
+    arguments = {"options": options, "fingerprint": load_predictor(options).fingerprint, "out": out}
+    with client:
+        futures = client.map(process_item, items, key=list(names), pure=False, **arguments)
+        for future in as_completed(futures, loop=client.loop):
+            if future.status == "finished":
+                yield future.result()
+            elif future.status == "error":
+                error = future.exception()
+                text = f"worker: {_describe(error)}"
+                if type(error).__name__ == "KilledWorker":
+                    text = (
+                        "several worker processes ended during this item, probably for lack of memory; "
+                        "choose a smaller --height, fewer --workers or more --memory"
+                    )
+                yield ItemReport(names[future.key], "failed", 0.0, error=text)
+            else:
+                raise InputError(
+                    f"--scheduler {address}: needed a scheduler that keeps running, got a lost connection; run the "
+                    "command again, finished items are kept"
                 )
-            yield ItemReport(names[future.key], "failed", 0.0, error=text)
-        future.release()
+            future.release()

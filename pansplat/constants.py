@@ -10,7 +10,6 @@ FILTER_VARIANCE = {"angular": 0.1, "3dgs": 0.3}  # pixel^2, added by the low-pas
 NEAR = 0.05  # metres, by default; Gaussians whose mean is nearer are not rasterised
 EWA_NEAR_FACTOR = 0.2  # of `near`: 3DGS culls at this depth along the optical axis
 EWA_CLAMP = 1.3  # half sides of the image: 3DGS evaluates its Jacobian no farther from the centre
-ELLIPSOID_AMBIENT = 0.35  # brightness at the border of an ellipsoid; 1 where its surface faces the camera
 
 # Early termination: a tile is finished once no pixel's transmittance exceeds this.
 TRANSMITTANCE_CUT = {"numba": 1e-7, "triton": 1e-4}

@@ -39,13 +39,13 @@ _POSTER = re.compile(r'src="data:image/jpeg;base64,([^"]+)"')
 _BUNDLE = dict[str, str]  # data by MIME type; pictures in base64
 
 
-def show(scene: Scene, *, gaussians: int = DISPLAY_GAUSSIANS, height: int = _FRAME_HEIGHT) -> Path | None:
+def show(scene: Scene | str | Path, *, gaussians: int = DISPLAY_GAUSSIANS, height: int = _FRAME_HEIGHT) -> Path | None:
     """Show a scene in the viewer of web pages: below the cell of a notebook, elsewhere in the browser.
 
     In larger scenes similar Gaussians are merged, without the fit to the photographs of `pansplat.web.write_page`.
 
     Args:
-        scene: the scene.
+        scene: the scene, or its file.
         gaussians: largest number of Gaussians. In a notebook they are a part of its file, about 24 bytes each.
         height: of the frame in a notebook, pixels.
 
@@ -55,6 +55,10 @@ def show(scene: Scene, *, gaussians: int = DISPLAY_GAUSSIANS, height: int = _FRA
     Raises:
         InputError: the scene has no visible Gaussians, or too many for a page.
     """
+    if isinstance(scene, (str, Path)):
+        from pansplat.gaussians.formats import load_scene
+
+        scene = load_scene(scene)
     if is_notebook():
         from IPython.display import display
 

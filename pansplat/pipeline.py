@@ -9,7 +9,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -83,6 +83,8 @@ _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which h
 _GAUSSIANS_OF_ROWS = 0.75  # of a panorama, over the square of its height
 _ENOUGH_STEPS = 40  # of a refinement; more change little
 _STARVED_SHARE = 1 / 3  # of the processor's threads, below which a refinement of fewer steps is starved by load
+_ONE_PLACE = 1e-3  # of the distance of cameras, relative to near
+_BRIGHTEST = 1.5  # value of an image in [0, 1], after any filter
 _MAX_MERGERS = 4  # Gaussians that become one on average
 
 
@@ -281,7 +283,7 @@ def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
 
 @with_progress_bar
 def predict(
-    source: Pair | Views | str | Path,
+    source: Pair | Views | str | Path | Sequence[str | Path],
     model: str | Path | Predictor = "default",
     *,
     compat: CompatChoice = "trained",
@@ -300,7 +302,8 @@ def predict(
     steps, which shared the processor with other work, is run once more, and the one of more steps is kept.
 
     Args:
-        source: a pair, the path of a folder that holds exactly one pair, or loaded panoramas (never cached).
+        source: a pair; the path of a panorama or of a folder that holds exactly one pair; the panoramas of one folder
+            to use, whose poses are estimated if they have none; or loaded panoramas (never cached).
         model: the name of a predictor, a file of weights, or a predictor.
         compat, precision: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
@@ -320,7 +323,7 @@ def predict(
         raise InputError(f"`refine_seconds` must be at least 0, got {refine_seconds}")
     config = RefineConfig(gaussians=gaussians)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
-    pair = _load_only_pair(source, progress) if isinstance(source, (str, Path)) else source
+    pair = _load_source(source, progress)
     _require_views(pair, predictor)
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
@@ -565,7 +568,7 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
 
 @with_progress_bar
 def predict_to_file(
-    source: Pair | Views | str | Path,
+    source: Pair | Views | str | Path | Sequence[str | Path],
     path: str | Path,
     model: str | Path | Predictor = "default",
     *,
@@ -599,7 +602,7 @@ def predict_to_file(
     """
     suffix = find_scene_suffix(path)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
-    pair = _load_only_pair(source, progress) if isinstance(source, (str, Path)) else source
+    pair = _load_source(source, progress)
     _require_views(pair, predictor)
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     if can_stream(predictor) and not joint and not refine_seconds and not (cache and height <= _MAX_CACHED_HEIGHT):
@@ -657,6 +660,8 @@ def render(
         InputError: `blend` names no view of the scene, or `drawing` does not fit the other arguments.
     """
     pose = torch.as_tensor(cam2world, dtype=torch.float64, device=scene.gaussians.means.device)
+    if pose.shape != (4, 4):
+        raise InputError(f"`cam2world` must be a pose (4, 4), such as scene.pose_between(0.5), got {tuple(pose.shape)}")
     if eye_distance is not None:
         if raster.get("eye_offset") or not 0 < eye_distance < math.inf:
             raise InputError(f"`eye_distance` must be above 0, without `eye_offset`, got {eye_distance}")
@@ -728,6 +733,67 @@ def load(path: str | Path) -> Scene:
         InputError: unknown suffix, or a missing or damaged file.
     """
     return load_scene(path)
+
+
+def _load_source(source: Pair | Views | str | Path | Sequence[str | Path], progress: Progress | None) -> Pair | Views:
+    """The pair of a path or of listed panoramas; a pair or views as they are, with tensors in place of arrays."""
+    if isinstance(source, (str, Path)):
+        return _load_only_pair(source, progress)
+    if isinstance(source, Pair):
+        return source
+    if isinstance(source, Views):
+        return _as_tensors(source)
+    if not isinstance(source, (list, tuple)) or not all(isinstance(path, (str, Path)) for path in source):
+        raise InputError(
+            f"needed a pair, a path, a list of paths or Views, got {type(source).__name__}; "
+            "give arrays as Views(images, cam2world, masks, near, far, names)"
+        )
+    return _load_only_pair(source[0], progress) if len(source) == 1 else _load_listed(source, progress)
+
+
+def _as_tensors(views: Views) -> Views:
+    images, masks = torch.as_tensor(views.images), torch.as_tensor(views.masks, dtype=torch.bool)
+    images = images / 255 if images.dtype == torch.uint8 else images.float()
+    if images.numel() and float(images.nan_to_num().max()) > _BRIGHTEST:
+        raise InputError(
+            f"`images` must be RGB in [0, 1], got values up to {float(images.max()):g}; divide them by 255"
+        )
+    poses = torch.as_tensor(views.cam2world, dtype=torch.float64)
+    if len(poses) > 1 and float(torch.cdist(poses[:, :3, 3], poses[:, :3, 3]).max()) < _ONE_PLACE * views.near:
+        warnings.warn(
+            f"{', '.join(views.names)}: the cameras are at one place, so that depth is that of each photograph alone; "
+            "check the poses.",
+            InputWarning,
+            stacklevel=4,
+        )
+    return replace(views, images=images, masks=masks, cam2world=poses)
+
+
+def _load_listed(paths: Sequence[str | Path], progress: Progress | None) -> Pair:
+    """The pair of some panoramas of one folder, by the folder's poses, or by poses that are estimated of them alone."""
+    files = [expand_home(path).absolute() for path in paths]
+    others = {file.parent for file in files} - {files[0].parent} if files else {Path()}
+    if others:
+        raise InputError(
+            f"needed panoramas of one folder, got {', '.join(map(str, paths)) or 'none'}; put them into one"
+        )
+    folder = files[0].parent
+    try:
+        pairs = folders.load_pairs(folder)
+    except folders.UnposedPanoramasError as error:
+        listed = [panorama for panorama in error.panoramas if panorama.image.absolute() in files]
+        pairs = estimate_pairs(folder, listed, progress=progress) if len(listed) > 1 else []
+    found = {view.image.absolute(): view for pair in pairs for view in (*pair.context, *pair.targets)}
+    missing = [file for file in files if file not in found]
+    if missing:
+        raise InputError(f"{missing[0]}: needed a panorama of the folder, got none of this name; check the list")
+    views = tuple(found[file] for file in dict.fromkeys(files))
+    if len({view.world for view in views}) > 1:
+        names = ", ".join(view.name for view in views)
+        raise InputError(f"{folder}: needed panoramas whose relative poses are known, got {names}; see `pansplat pose`")
+    own = [pair for pair in pairs if {view.image for view in pair.context} & {view.image for view in views}]
+    near, far = min(pair.near for pair in own), max(pair.far for pair in own)
+    return Pair("-".join(view.name for view in views), folder, views, (), near, far, own[0].siblings)
 
 
 def _load_only_pair(path: str | Path, progress: Progress | None) -> Pair:

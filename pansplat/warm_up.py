@@ -105,7 +105,6 @@ def _draw_display_image() -> None:
     labels = np.arange(9, dtype=np.int16) % 2
     selection = Selection(np.eye(3), 0.01)
     layers = scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection)
-    scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection, footprint="count")
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), faces.pixels[0])
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), pixels, bottom_up=True)
     enlarge(faces.pixels[0], np.zeros((24, 24), np.uint32))

@@ -1,8 +1,4 @@
 // Alpha of one footprint at one pixel: docs/rendering.md, sections 3 and 4.
-#ifdef INSPECT
-uniform int footprint;      // 0 Gaussian, 1 count (the blend function adds), 2 ellipsoid of one standard deviation
-#endif
-
 #ifdef PARTS
 uniform float focal;        // pixels
 flat in vec2 v_principal;   // window coordinates of the centre of the part
@@ -32,18 +28,6 @@ void main() {
     float response = q / (front * front + v_a.w * q);
     float alpha = min(MAX_ALPHA, v_l.w * exp(-0.5 * response));
     if (!(front > 0.0) || !(alpha >= ALPHA_CUT)) discard;
-    vec3 rgb = v_color;
-#ifdef INSPECT
-    if (footprint == 1) {
-        out_color = out_depth = vec4(COUNT_STEP);
-        return;
-    }
-    if (footprint == 2) {
-        if (response > 1.0) discard;
-        rgb *= mix(ELLIPSOID_AMBIENT, 1.0, sqrt(1.0 - response));
-        alpha = 1.0;
-    }
-#endif
-    out_color = vec4(rgb * alpha, alpha);
+    out_color = vec4(v_color * alpha, alpha);
     out_depth = vec4(v_b.w * alpha, 0.0, 0.0, alpha);
 }

@@ -210,8 +210,10 @@ def _write_tour(folder: Path, count: int = 3, *, height: int = 16) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     random = np.random.default_rng(0)
     poses, names = {}, [f"p{index}.png" for index in range(count)]
+    halves = random.integers(0, 255, (count + 1, height, height, 3), dtype=np.uint8)
     for index, name in enumerate(names):
-        Image.fromarray(random.integers(0, 255, (height, 2 * height, 3), dtype=np.uint8)).save(folder / name)
+        even, odd = index + index % 2, index + 1 - index % 2
+        Image.fromarray(np.concatenate((halves[even], halves[odd]), axis=1)).save(folder / name)
         pose = np.eye(4)
         pose[2, 3] = 0.5 * index
         poses[name] = {"cam2world": pose.tolist()}
@@ -223,7 +225,7 @@ def _write_tour(folder: Path, count: int = 3, *, height: int = 16) -> Path:
 
 @pytest.fixture(scope="session")
 def write_tour() -> Callable[..., Path]:
-    """Write noise panoramas in a row, 0.5 m apart; each and the next one are a pair."""
+    """Write noise panoramas in a row, 0.5 m apart; each and the next one are a pair, and have a half in common."""
     return _write_tour
 
 

@@ -21,7 +21,7 @@ import pytest
 from pansplat import batch, pipeline, tours
 from pansplat.batch import BatchOptions, Item, list_items, process_item
 from pansplat.cli import run
-from pansplat.cli.batch import Batch, ReportFile
+from pansplat.cli.batch import Batch, _write_report
 from pansplat.errors import InputError
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
@@ -242,19 +242,21 @@ def test_without_space_for_its_file_an_item_is_not_predicted(
 
 def test_lines_of_the_report_wait_while_the_disk_is_full(tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
-    limits, lines = resource.getrlimit(resource.RLIMIT_FSIZE), [f"line {k}\n" for k in range(4)]
-    with open(tmp_path / "report.jsonl", "wb", 0) as file:
-        report = ReportFile(file)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
-        try:
-            for line in lines[:3]:
-                report.add(line)
-            assert report.problem is not None and "report.jsonl: needed free disk space" in report.problem
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        report.add(lines[3])
-        assert report.problem is None
-    assert (tmp_path / "report.jsonl").read_text() == "".join(lines)
+    limits, path = resource.getrlimit(resource.RLIMIT_FSIZE), tmp_path / "report.jsonl"
+
+    def end_items(last: int) -> Iterator[batch.ItemReport]:
+        for index in range(4):
+            full = index < last
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10 if full else limits[0], limits[1]))
+            yield batch.ItemReport(f"room{index}", "done", 1.0)
+
+    try:
+        count, problem = _write_report(end_items(4), 4, path)
+        assert count["done"] == 4 and problem is not None and "report.jsonl: needed free disk space" in problem
+        assert _write_report(end_items(3), 4, path) == (count, None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(read_report(tmp_path)) == [f"room{index}" for index in range(4)]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -280,14 +282,6 @@ def test_without_dask_the_message_names_the_command_that_installs_it(
     assert run(["batch", str(rooms), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.endswith("run pip install 'pansplat[cluster]'\n")
     assert not (tmp_path / "out").exists()
-
-
-def test_workers_end_on_a_system_without_sigkill(monkeypatch: pytest.MonkeyPatch) -> None:
-    killed: list[tuple[int, int]] = []
-    monkeypatch.delattr(signal, "SIGKILL")  # Windows
-    monkeypatch.setattr(os, "kill", lambda *call: killed.append(call))
-    batch._kill_workers(SimpleNamespace(workers={0: SimpleNamespace(pid=7)}))
-    assert killed == [(7, signal.SIGTERM)]
 
 
 def test_two_batches_do_not_share_a_folder(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ else:
 pytestmark = pytest.mark.lint
 
 ROOT = Path(__file__).resolve().parents[1]
-SUFFIXES = ".py .glsl .vert .frag .geom .comp .safetensors .html .css .js"
+SUFFIXES = ".py .json .glsl .vert .frag .geom .comp .safetensors .html .css .js"
 FOLDERS = {
     "pansplat": "pansplat",
     "pansplat.default_model": "assets/default",

@@ -500,3 +500,49 @@ def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin
     assert float((moved.cam2world - scene.cam2world).abs().max()) == 512
     refined = pipeline.refine(scene, moved, steps=1)
     assert refined.frame == scene.frame and torch.equal(refined.cam2world, scene.cam2world)
+
+
+def test_listed_panoramas_of_a_folder_are_one_scene(
+    write_tour: Callable[..., Path], tmp_path: Path, sphere_predictor
+) -> None:
+    house = write_tour(tmp_path / "house", 3)
+    scene = predict([house / "p2.png", str(house / "p0.png")], sphere_predictor(), height=HEIGHT, cache=False)
+    assert scene.names == ("p2", "p0") and scene.cam2world[:, 2, 3].tolist() == [1.0, 0.0], "with the folder's poses"
+    one = predict([house / "p1.png"], sphere_predictor(), height=HEIGHT, cache=False)
+    assert len(one.cam2world) == 1
+    (tmp_path / "other").mkdir()
+    shutil.copy(house / "p0.png", tmp_path / "other" / "p0.png")
+    for paths, message in (
+        ([house / "p0.png", tmp_path / "other" / "p0.png"], "of one folder"),
+        ([house / "p0.png", house / "p9.png"], "p9.png: needed a panorama"),
+        ([], "of one folder, got none"),
+    ):
+        with pytest.raises(InputError, match=message):
+            predict(paths, sphere_predictor(), height=HEIGHT, cache=False)
+
+
+def test_views_of_arrays_and_of_bytes_are_those_of_tensors(pair_folder: Path, sphere_predictor) -> None:
+    (pair,) = load_pairs(pair_folder)
+    views = pair.load_context(HEIGHT)
+    expected = predict(views, sphere_predictor()).gaussians.harmonics
+    arrays = replace(
+        views,
+        images=(views.images * 255).round().numpy().astype(np.uint8),
+        cam2world=views.cam2world.numpy(),
+        masks=views.masks.numpy(),
+    )
+    assert "masks show 100 %" in repr(arrays)
+    assert torch.allclose(predict(arrays, sphere_predictor()).gaussians.harmonics, expected, atol=1e-5)
+    with pytest.raises(InputError, match=r"in \[0, 1\], got values up to 2.*divide them by 255"):
+        predict(replace(views, images=views.images * 255), sphere_predictor())
+    with pytest.warns(InputWarning, match="left, right: the cameras are at one place"):
+        predict(replace(views, cam2world=views.cam2world[:1].repeat(2, 1, 1)), sphere_predictor())
+
+
+def test_what_is_no_pose_is_named(scene: Scene) -> None:
+    for call, message in (
+        (lambda: scene.pose_between(50), "from 0, the first camera, to 1, the last one, got 50"),
+        (lambda: render(scene, np.eye(3)), r"a pose \(4, 4\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()

@@ -82,8 +82,8 @@ class Options:
     preset: Preset = "exact"
     """Draw Gaussians exactly on each ray and by distance, or as 3DGS does: linearised and by depth (OpenGL only)."""
     renderer: RendererChoice = "auto"
-    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU and for preset 3dgs, and cpu where OpenGL is
-    software."""
+    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, for preset 3dgs and for
+    stereo in a window, and cpu where OpenGL is software."""
     at: Annotated[float, Meta(ge=0, le=1)] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     projection: Projection = "perspective"
@@ -226,6 +226,10 @@ def _run_window(
     options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int], path: "CameraPath | None"
 ) -> str | None:
     """Run the viewer in a window; if no window can be opened, returns the reason."""
+    if options.stereo != "mono":
+        if options.renderer == "cpu":
+            raise InputError("--stereo in a window needs OpenGL, got --renderer cpu; use --renderer gl")
+        options = replace(options, renderer="gl")
     from pansplat_viewer.scene.key_frames import CameraPath
     from pansplat_viewer.scene.state import ViewerState
 
@@ -262,7 +266,8 @@ def _run_window(
         except ContextLostError:  # start again with the same scene, camera and settings
             if attempt == _MAX_CONTEXTS - 1:
                 raise
-            entries, first, source = viewer.entries, max(viewer.panel_data.current, 0), viewer.path
+            library = viewer.library
+            entries, first, source = library.entries, max(library.current, 0), library.path
     return None
 
 

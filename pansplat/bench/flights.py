@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import math
 import statistics
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import cv2
@@ -22,13 +20,14 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat import pipeline
-from pansplat.bench.harness import time_workload
-from pansplat.bench.report import MEAN, Benchmark, Column, Header, Report, Row, average_rows, make_axes
+from pansplat.bench.harness import MEAN, Header, Suite, announce, make_axes
+from pansplat.bench.refine import time_prediction
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import ws_psnr
 from pansplat.evaluation.report import warm_up
+from pansplat.evaluation.results import Column, Row, average_rows
 from pansplat.gaussians.scene import Scene
 from pansplat.refinement import fuse_views
 
@@ -39,15 +38,8 @@ _ROWS, _FIRST, _LAST = 256, 32, 224  # rows of depth maps in which jumps are cou
 _JUMP = math.log(1.1)  # of depth between two pixels
 
 
-@dataclass(frozen=True)
-class FlightCase:
-    """A way to draw: "deferred", "joint", "view 0" or "view 1"."""
-
-    drawing: str
-
-
-def measure_flights(pairs: Sequence[Pair], model: str, height: int, lpips: Lpips | None, report: Report) -> None:
-    """Add a row for each pair and way to draw, then the means over the pairs.
+def measure_flights(pairs: Sequence[Pair], model: str, height: int, lpips: Lpips | None) -> Iterator[Row]:
+    """Yield a row for each pair and way to draw, then the means over the pairs.
 
     Args:
         model: name of a predictor, or a file of weights.
@@ -56,21 +48,20 @@ def measure_flights(pairs: Sequence[Pair], model: str, height: int, lpips: Lpips
     """
     predictor = pipeline.load_model(model)
     warm_up(predictor)
+    rows = []
     for pair in pairs:
-        report.step(pair.name)
+        announce(pair.name)
         context, targets = pair.load_context(height), pair.load_targets(height)
-        workload_s, start = time_workload(), time.perf_counter()
-        scene = pipeline.predict(context, predictor)
-        seconds = time.perf_counter() - start
-        times = {"predict_s": seconds, "predict_ratio": seconds / workload_s}
+        scene, times = time_prediction(context, predictor)
         drawings: dict[str, tuple[Scene, str | int]] = {"deferred": (scene, "deferred")}
         drawings["joint"] = fuse_views(scene), "joint"
         drawings |= {f"view {view}": (scene, view) for view in range(len(context.images))}
         for name, (drawn, blend) in drawings.items():
             errors = _compare(drawn, blend, targets, lpips)
-            report.add(Row("flights", pair.name, FlightCase(name), {**errors, **times}))
-    for row in average_rows(list(report.rows)):
-        report.add(row)
+            rows.append(Row({"suite": "flights", "scene": pair.name, "drawing": name}, {**errors, **times}))
+            yield rows[-1]
+    for row in average_rows(rows, ("suite", "drawing")):
+        yield Row({"scene": MEAN, **row.case}, row.values)
 
 
 @torch.no_grad()
@@ -103,13 +94,13 @@ def measure_jumps(depth: Float[Array, "h w"]) -> float:
 def plot_flights(rows: Sequence[Row], header: Header) -> Figure:
     """Plot LPIPS and the fraction of jumps of each pair, by way to draw."""
     figure, axes = make_axes(2, (12, 4))
-    pairs = [row for row in rows if row.scene != MEAN]
-    for case in dict.fromkeys(row.case for row in pairs):
-        chosen = [row for row in pairs if row.case == case]
+    pairs = [row for row in rows if row.get("scene") != MEAN]
+    for drawing in dict.fromkeys(row.get("drawing") for row in pairs):
+        chosen = [row for row in pairs if row.get("drawing") == drawing]
         for axis, name in zip(axes, ("lpips", "jumps"), strict=True):
-            axis.plot([row.scene for row in chosen], [row.get(name) for row in chosen], "o", label=case.drawing)
-    truth = [row for row in pairs if row.case.drawing == "deferred"]
-    axes[1].plot([row.scene for row in truth], [row.get("true_jumps") for row in truth], "k_", label="truth")
+            axis.plot([row.get("scene") for row in chosen], [row.get(name) for row in chosen], "o", label=drawing)
+    truth = [row for row in pairs if row.get("drawing") == "deferred"]
+    axes[1].plot([row.get("scene") for row in truth], [row.get("true_jumps") for row in truth], "k_", label="truth")
     for axis, label in zip(
         axes, (header["lpips"] or "LPIPS", "fraction of pixels beside a jump of depth"), strict=True
     ):
@@ -119,18 +110,18 @@ def plot_flights(rows: Sequence[Row], header: Header) -> Figure:
     return figure
 
 
-FLIGHTS = Benchmark(
+FLIGHTS = Suite(
     "flights",
     (
         Column("drawing", "drawing"),
-        Column("WS-PSNR dB", "ws_psnr_db", "{:.2f}"),
-        Column("LPIPS", "lpips", "{:.3f}"),
-        Column("jumps", "jumps", "{:.4f}"),
-        Column("true jumps", "true_jumps", "{:.4f}"),
-        Column("predict s", "predict_s", "{:.1f}"),
-        Column("predict ratio", "predict_ratio", "{:.0f}"),
+        Column("WS-PSNR dB", "ws_psnr_db", ".2f"),
+        Column("LPIPS", "lpips", ".3f"),
+        Column("jumps", "jumps", ".4f"),
+        Column("true jumps", "true_jumps", ".4f"),
+        Column("predict s", "predict_s", ".1f"),
+        Column("predict ratio", "predict_ratio", ".0f"),
     ),
-    lambda row: row.scene,
+    lambda row: row.get("scene"),
     plot_flights,
     width=110,
 )

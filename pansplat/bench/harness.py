@@ -1,6 +1,6 @@
-"""Time, memory and errors of one call, in this process or in a child process.
+"""The harness of all benchmarks: a suite is a function that yields rows; `run` prints and writes them.
 
-In a child process, memory of earlier cases does not count, and the number of threads is its own.
+Time, memory and errors of single calls are measured here, too.
 """
 
 from __future__ import annotations
@@ -8,32 +8,126 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import importlib.metadata
-import json
 import math
-import os
 import platform
 import re
-import signal
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-import safetensors.torch
 import torch
 from torch import Tensor
 
-from pansplat.console import describes_out_of_memory
+from pansplat.atomic import replacing
+from pansplat.console import make_table_console
+from pansplat.evaluation.results import Column, Row, markdown_table, rich_table, write_json
+from pansplat.files import SOFTWARE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 T = TypeVar("T")
+Header = Mapping[str, Any]
 
+MEAN = "mean"  # scene of the rows that average all others
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _PACKAGES = ("pansplat", "torch", "numpy", "numba")
-_POLL_INTERVAL = 0.05  # seconds between two checks of a child process
+
+
+@dataclass(frozen=True)
+class Suite:
+    """What the rows of one benchmark have in common.
+
+    Attributes:
+        name: of its files: NAME.json, NAME.md and NAME.png.
+        columns: of its tables.
+        section: title of the table that a row belongs to.
+        plot: a function that plots the rows, given also the header of the JSON file; None if there is nothing to plot.
+        findings: sentences about all rows, for the terminal and the page.
+        width: characters of a printed line if there is no terminal.
+    """
+
+    name: str
+    columns: Sequence[Column]
+    section: Callable[[Row], str]
+    plot: Callable[[Sequence[Row], Header], Figure | None]
+    findings: Callable[[Sequence[Row]], list[str]] = lambda rows: []
+    width: int = 190
+
+    def sections(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
+        """The rows of each table by its title."""
+        sections: dict[str, list[Row]] = {}
+        for row in rows:
+            sections.setdefault(self.section(row), []).append(row)
+        return sections
+
+
+def run(
+    suite: Suite, measured: Iterable[Row], header: Header, json_file: Path | None = None, out: Path | None = None
+) -> list[Row]:
+    """Measure the rows, print their tables and findings, and write the files; return the rows.
+
+    The rows so far are written after each one, and printed if the run is interrupted.
+
+    Args:
+        measured: rows as they are measured; a changed row may be yielded again.
+        header: values of the JSON file beside the rows and the machine.
+        json_file: by default NAME.json in `out`, if that is given.
+        out: folder for the page and the plot.
+    """
+    header = {"machine": describe_machine(), **header}
+    json_file = json_file or (out and out / f"{suite.name}.json")
+    rows: list[Row] = []
+    try:
+        for row in measured:
+            rows += [] if any(row is known for known in rows) else [row]
+            if json_file is not None:
+                write_json({**header, "rows": [known.as_json() for known in rows]}, json_file)
+    finally:
+        machine, sections, findings = header["machine"], suite.sections(rows), suite.findings(rows)
+        print(f"{machine['cpu']}, GPU: {machine['gpu'] or 'none'}, {format_threads(machine['threads'])}")
+        console = make_table_console(suite.width)
+        for title, part in sections.items():
+            console.print(rich_table(title, suite.columns, part))
+        for line in (*findings, *([json_file] if json_file and rows else [])):
+            print(line)
+        if out is not None and rows:
+            tables = [markdown_table(title, suite.columns, part) for title, part in sections.items()]
+            text = "\n".join([*(f"* {sentence}" for sentence in findings), *([""] if findings else []), *tables])
+            with replacing(out / f"{suite.name}.md") as partial:
+                partial.write_text(f"<!-- {SOFTWARE} -->\n{text}", "utf-8")
+            print(out / f"{suite.name}.md")
+            if figure := suite.plot(rows, header):
+                with replacing(out / f"{suite.name}.png") as partial:
+                    figure.savefig(partial, dpi=110, metadata={"Software": "pansplat"})
+                print(out / f"{suite.name}.png")
+    return rows
+
+
+def announce(text: object) -> None:
+    """Show what is measured next."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def format_threads(count: int) -> str:
+    """A number of threads in words."""
+    return "one thread" if count == 1 else f"{count} threads"
+
+
+def make_axes(count: int, size: tuple[float, float], **options: Any) -> tuple[Figure, list[Axes]]:
+    """A figure of this size in inches with plots side by side."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    axes = list(figure.subplots(1, count, squeeze=False, **options)[0])
+    for each in axes:
+        each.grid(alpha=0.25)
+    return figure, axes
 
 
 class Timing(NamedTuple):
@@ -76,25 +170,25 @@ def time_workload() -> float:
     return statistics.median(time_call(work, cpu)[0].wall for _ in range(51))
 
 
-def measure_peak_memory(call: Callable[[], T], device: torch.device) -> tuple[float | None, T]:
-    """Largest additional memory during a call, 10^6 bytes, and the result of the call.
+def measure_peak_memory(call: Callable[[], T], device: torch.device) -> tuple[dict[str, float], T]:
+    """Largest additional memory during a call, `peak_mb` in 10^6 bytes, and the result of the call.
 
     On the CPU it is the kernel's high-water mark of the resident memory, reset before the call; on CUDA that of
-    the allocator. None if the system has no such mark (not Linux).
+    the allocator. It is missing if the system has no such mark (not Linux).
     """
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
         result = call()
-        return (torch.cuda.max_memory_allocated(device) - before) / 1e6, result
-    if not reset_resident_peak():
-        return None, call()
-    before = read_resident_memory()
+        return {"peak_mb": (torch.cuda.max_memory_allocated(device) - before) / 1e6}, result
+    if not _reset_resident_peak():
+        return {}, call()
+    before = _read_status_bytes("VmRSS")
     result = call()
-    return max(0, read_resident_peak() - before) / 1e6, result
+    return {"peak_mb": max(0, _read_status_bytes("VmHWM") - before) / 1e6}, result
 
 
-def reset_resident_peak() -> bool:
+def _reset_resident_peak() -> bool:
     """Return freed memory to the system and restart the high-water mark; False if there is none (not Linux)."""
     if sys.platform == "win32":  # where the libraries of the process have no common handle
         return False
@@ -108,19 +202,9 @@ def reset_resident_peak() -> bool:
     return True
 
 
-def read_resident_peak() -> int:
-    """Largest resident memory of the process since the last reset, bytes."""
-    return _read_status_bytes(_STATUS, "VmHWM")
-
-
-def read_resident_memory() -> int:
-    """Resident memory of the process, bytes."""
-    return _read_status_bytes(_STATUS, "VmRSS")
-
-
-def _read_status_bytes(status: Path, field: str) -> int:
-    found = re.search(rf"{field}:\s+(\d+) kB", status.read_text(encoding="utf-8"))
-    return 1024 * int(found[1]) if found else 0  # a process that has just ended has no such line
+def _read_status_bytes(field: str) -> int:
+    found = re.search(rf"{field}:\s+(\d+) kB", _STATUS.read_text(encoding="utf-8"))
+    return 1024 * int(found[1]) if found else 0
 
 
 def quartile_range(times: Sequence[float]) -> float:
@@ -155,24 +239,6 @@ def compare_images(image: Tensor, reference: Tensor) -> dict[str, float]:
     return {"psnr_db": psnr_db, "max_error": float(error.abs().max())}
 
 
-def relative_deviation(result: Mapping[str, Tensor], reference: Mapping[str, Tensor], *, together: bool) -> float:
-    """|result - reference| / |reference|, Euclidean norms.
-
-    Args:
-        together: of all tensors as one vector; else the largest value among the tensors.
-
-    Raises:
-        ValueError: the names differ.
-    """
-    if result.keys() != reference.keys():
-        raise ValueError(f"`result` must hold {sorted(reference)}, got {sorted(result)}")
-    errors = {name: float((result[name].double() - reference[name].double()).norm()) for name in reference}
-    norms = {name: float(reference[name].double().norm()) for name in reference}
-    if together:
-        return math.hypot(*errors.values()) / max(math.hypot(*norms.values()), 1e-300)
-    return max(errors[name] / max(norms[name], 1e-300) for name in reference)
-
-
 def describe_machine() -> dict[str, object]:
     """The processor with its widest vector extension, the GPU (or None), torch's number of threads, and versions."""
     facts: dict[str, str] = {}
@@ -189,85 +255,3 @@ def describe_machine() -> dict[str, object]:
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
     }
-
-
-class CaseFailedError(Exception):
-    """A child process failed; the text is its last message."""
-
-
-class OverLimitError(CaseFailedError):
-    """A child process took more memory than allowed or available."""
-
-
-def run_child(
-    module: str, job: Mapping[str, object], *, threads: int, limit_gib: float | None = None
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Run `python -m module`, which calls `serve_job`, and return its numbers and tensors.
-
-    Args:
-        module: name of the module.
-        job: JSON values that the child receives.
-        threads: of torch and OpenMP in the child.
-        limit_gib: the child is ended if its resident memory exceeds this, 2^30 bytes.
-
-    Raises:
-        OverLimitError: it exceeded the limit or the available memory.
-        CaseFailedError: it failed otherwise.
-    """
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "job.json").write_text(json.dumps({**job, "threads": threads}), "utf-8")
-        with open(folder / "log", "wb") as log:
-            child = subprocess.Popen(
-                [sys.executable, "-m", module, name],
-                env=os.environ | {"OMP_NUM_THREADS": str(threads)},
-                stdout=log,
-                stderr=log,
-            )
-        try:
-            over_limit = _exceeds_limit(child, limit_gib)
-        finally:
-            child.kill()
-            child.wait()
-        if over_limit:
-            raise OverLimitError(f"ended at {limit_gib:g} GiB")
-        if child.returncode:
-            raise _make_error(child.returncode, (folder / "log").read_text("utf-8", "replace"))
-        numbers = json.loads((folder / "numbers.json").read_text("utf-8"))
-        # `load_file` would map the file, and Windows cannot remove a mapped one.
-        return numbers, safetensors.torch.load((folder / "tensors.safetensors").read_bytes())
-
-
-def _exceeds_limit(child: subprocess.Popen[bytes], limit_gib: float | None) -> bool:
-    """Wait for the end of a child; True at once if its resident memory exceeds the limit."""
-    if limit_gib is None:
-        child.wait()
-        return False
-    status = Path(f"/proc/{child.pid}/status")
-    while child.poll() is None:
-        time.sleep(_POLL_INTERVAL)
-        with contextlib.suppress(OSError):  # it has just ended, or the system has no such file
-            if _read_status_bytes(status, "VmRSS") > limit_gib * 2**30:
-                return True
-    return False
-
-
-def _make_error(status: int, log: str) -> CaseFailedError:
-    """The error of a child with this exit status and output."""
-    message = (log.strip() or "no message").splitlines()[-1]
-    if describes_out_of_memory(message):
-        return OverLimitError(f"no memory left: {message[:120]}")
-    if status < 0:
-        return CaseFailedError(f"ended by {signal.Signals(-status).name}")
-    return CaseFailedError(message[:160])
-
-
-def serve_job(measure: Callable[[dict[str, Any]], tuple[Mapping[str, object], Mapping[str, Tensor]]]) -> None:
-    """Main function of a child process: measure its job and write the result for `run_child`."""
-    folder = Path(sys.argv[1])
-    job = json.loads((folder / "job.json").read_text("utf-8"))
-    torch.set_num_threads(job["threads"])
-    numbers, tensors = measure(job)
-    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    safetensors.torch.save_file(contiguous, folder / "tensors.safetensors")
-    (folder / "numbers.json").write_text(json.dumps(numbers), "utf-8")

@@ -1,50 +1,48 @@
 """`pansplat bench model`: time, memory and error of each way to run the network.
 
-Every case runs in a process of its own, `python -m pansplat.bench.model`.
-
 Values of a row: `height` of the panoramas, pixels; `stages_s`, the seconds of each of `STAGES`; `total_s`, their sum;
 `total_ratio`, it over the seconds of `harness.time_workload` just before, so that figures of different machines
-compare; `processor_s` of all threads together, which other load on the machine hardly affects; `peak_gib`, the largest
-resident memory of the process, 2^30 bytes; `depth_median_error` and `depth_max_error`, |depth - reference| / reference
-of the finest sphere sweep; `psnr_db` between the images at the middle pose, rendered by numba, infinite if they are
-equal.
+compare; `processor_s` of all threads together, which other load on the machine hardly affects; `taken_gib`, the largest
+additional memory, beyond Python, libraries, weights and input, 2^30 bytes; `depth_median_error` and `depth_max_error`,
+|depth - reference| / reference of the finest sphere sweep; `psnr_db` between the images at the middle pose, rendered by
+numba, infinite if they are equal.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import safetensors.torch
 import torch
 from torch import Tensor, nn
 
 from pansplat.bench.harness import (
-    CaseFailedError,
-    read_resident_peak,
-    reset_resident_peak,
-    run_child,
-    serve_job,
+    Header,
+    Suite,
+    announce,
+    format_threads,
+    make_axes,
+    measure_peak_memory,
+    time_call,
     time_workload,
 )
-from pansplat.bench.report import Benchmark, Column, Header, Report, Row, error_or_reference, format_threads, make_axes
 from pansplat.data.views import Views
-from pansplat.errors import InputError
 from pansplat.evaluation.metrics import psnr
-from pansplat.gaussians.scene import Scene
+from pansplat.evaluation.results import Column, Row
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.model.heads import merge_tiles
 from pansplat.model.layers import Compat, Precision
 from pansplat.model.network import build_network
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import render
+from pansplat.rendering.cpu.runtime import release_idle_memory
 from pansplat.training.network import network_config
 
 if TYPE_CHECKING:
@@ -91,29 +89,21 @@ def list_model_cases(threads: int, *, bfloat16: bool, quick: bool) -> list[Model
     return [case for case in cases if bfloat16 or case.precision == "float32"]
 
 
-def measure_model(cases: Sequence[ModelCase], views: Views, weights: Path, report: Report, *, scene: str) -> None:
-    """Measure the cases one after another and add their rows to the report.
+def measure_model(cases: Sequence[ModelCase], views: Views, weights: Path, scene: str) -> Iterator[Row]:
+    """Yield the row of each case; its errors are against the first case of its `compat`.
 
     Args:
         weights: file of the network's weights.
         scene: name of the views' pair.
-
-    Raises:
-        InputError: a case failed, for example because of too little memory.
     """
     references: dict[str, dict[str, Tensor]] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "views.safetensors")
-        tensors = {"images": views.images.contiguous(), "cam2world": views.cam2world.contiguous()}
-        safetensors.torch.save_file(tensors, file)
-        for index, case in enumerate(cases, start=1):
-            report.step(f"{index} of {len(cases)}: {case}")
-            result, tensors = measure_case(case, weights, file, near=views.near, far=views.far)
-            row = Row("model", scene, case, result, is_reference=case.compat not in references)
-            reference = references.setdefault(case.compat, tensors)
-            if not row.is_reference:
-                result |= compare_predictions(tensors, reference)
-            report.add(row)
+    for index, case in enumerate(cases, start=1):
+        announce(f"{index} of {len(cases)}: {case}")
+        values, prediction = measure_case(case, weights, views)
+        is_reference = case.compat not in references
+        errors = compare_predictions(prediction, references.setdefault(case.compat, prediction))
+        entries = {"suite": "model", "scene": scene, "is_reference": is_reference, "name": str(case)}
+        yield Row(entries | dataclasses.asdict(case), values if is_reference else values | errors)
 
 
 def compare_predictions(prediction: Mapping[str, Tensor], reference: Mapping[str, Tensor]) -> dict[str, float]:
@@ -126,59 +116,37 @@ def compare_predictions(prediction: Mapping[str, Tensor], reference: Mapping[str
     }
 
 
-def measure_case(
-    case: ModelCase, weights: Path, views: Path, *, near: float, far: float
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The values of a case from a child process; `depth` of the finest sphere sweep and `image` at the middle pose.
-
-    Args:
-        weights: file of the network's weights.
-        views: safetensors file with `images` (view 3 height width) and `cam2world` (view 4 4).
-
-    Raises:
-        InputError: the child failed; with its last message.
-    """
-    job = {"case": dataclasses.asdict(case), "near": near, "far": far, "weights": str(weights), "views": str(views)}
-    try:
-        return run_child("pansplat.bench.model", job, threads=case.threads)
-    except CaseFailedError as error:
-        raise InputError(f"a row of the bench failed ({error}); try a smaller --height, or more tiles") from error
-
-
 @torch.no_grad()
-def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, Tensor]]:
-    """Measure the job of a child process."""
-    case, near, far = ModelCase(**job["case"]), job["near"], job["far"]
-    views = safetensors.torch.load_file(job["views"])
-    images, cam2world = views["images"], views["cam2world"]
+def measure_case(
+    case: ModelCase, weights: Path, views: Views
+) -> tuple[dict[str, float | dict[str, float]], dict[str, Tensor]]:
+    """The values of a case, and its prediction: `depth` of the finest sphere sweep, `image` at the middle pose."""
     network = build_network(
-        load_weights(Path(job["weights"])),
-        case.compat,
-        job["weights"],
-        precision=case.precision,
-        attention_precision=case.attention,
+        load_weights(weights), case.compat, weights, precision=case.precision, attention_precision=case.attention
     )
     assert isinstance(network, PanSplat)
     _warm_up(case)
-    bounds = [torch.full((1, len(images)), bound) for bound in (near, far)]
+    bounds = [torch.full((1, len(views.images)), bound) for bound in (views.near, views.far)]
     stages: dict[str, float] = {}
-    workload_s = time_workload()
-    has_peak, before = reset_resident_peak(), time.process_time()
-    with _timed_stages(network, stages):
-        matched = network.match_views(images[None], cam2world[None].float(), *bounds)
-    began = time.perf_counter()
-    (gaussians,) = merge_tiles(list(network.lift_gaussians(matched, tiles=case.tiles)), case.compat)
-    stages["heads"] = time.perf_counter() - began
-    processor = time.process_time() - before
-    peak = {"peak_gib": read_resident_peak() / 2**30} if has_peak else {}
-    depth = matched.depths.depth[-1][0]
-    del matched
-    scene = Scene(gaussians, cam2world.double(), near, far, height=images.shape[-2])
+
+    def predict() -> tuple[Tensor, Gaussians]:
+        with _timed_stages(network, stages):
+            matched = network.match_views(views.images[None], views.cam2world[None].float(), *bounds)
+        began = time.perf_counter()
+        (gaussians,) = merge_tiles(list(network.lift_gaussians(matched, tiles=case.tiles)), case.compat)
+        stages["heads"] = time.perf_counter() - began
+        return matched.depths.depth[-1][0].clone(), gaussians
+
+    workload_s, cpu = time_workload(), torch.device("cpu")
+    release_idle_memory()  # buffers that numba keeps
+    taken, (timing, (depth, gaussians)) = measure_peak_memory(lambda: time_call(predict, cpu), cpu)
+    scene = Scene(gaussians, views.cam2world.double(), views.near, views.far, height=views.images.shape[-2])
     image = render(scene, scene.pose_between(0.5), backend="numba").color
     total_s = sum(stages.values())
-    times = {"stages_s": stages, "total_s": total_s, "total_ratio": total_s / workload_s, "processor_s": processor}
+    times = {"stages_s": stages, "total_s": total_s, "total_ratio": total_s / workload_s, "processor_s": timing.cpu}
+    memory = {"taken_gib": taken["peak_mb"] * 1e6 / 2**30} if taken else {}
     size = {"height": scene.height, "num_gaussians": len(gaussians)}
-    return {**size, **times, **peak}, {"depth": depth, "image": image}
+    return {**size, **times, **memory}, {"depth": depth, "image": image}
 
 
 def _warm_up(case: ModelCase) -> None:
@@ -221,7 +189,7 @@ def _timed_stages(network: PanSplat, stages: dict[str, float]) -> Iterator[None]
 def plot_model(rows: Sequence[Row], header: Header) -> Figure:
     """Plot each row's seconds by stage and its memory as bars."""
     figure, (left, right) = make_axes(2, (11, 1.5 + 0.4 * len(rows)), sharey=True, width_ratios=(2, 1))
-    names = [str(row.case) for row in rows]
+    names = [row.get("name") for row in rows]
     starts = [0.0] * len(rows)
     for stage, color in zip(STAGES, _STAGE_COLORS, strict=True):
         widths = [row.get("stages_s").get(stage, 0.0) for row in rows]
@@ -231,33 +199,37 @@ def plot_model(rows: Sequence[Row], header: Header) -> Figure:
     left.set(xlabel="seconds")
     left.set_title(f"{rows[0].get('height')}x{2 * rows[0].get('height')}, {header['machine']['cpu']}", loc="left")
     left.legend(fontsize=8)
-    right.barh(names, [row.get("peak_gib") or 0.0 for row in rows], color="#888888")
-    right.set(xlabel="largest resident memory, GiB")
+    right.barh(names, [row.get("taken_gib") or 0.0 for row in rows], color="#888888")
+    right.set(xlabel="GiB beyond Python, weights and input")
     return figure
 
 
 def _stage_column(stage: str) -> Column:
-    return Column(f"{stage} s", lambda row: row.get("stages_s").get(stage), "{:.1f}")
+    return Column(f"{stage} s", lambda row: row.get("stages_s").get(stage), ".1f")
 
 
-MODEL = Benchmark(
+MODEL = Suite(
     "model",
     (
         Column("compat", "compat"),
         Column("precision", "precision"),
         Column("attention", "attention"),
-        Column("tiles", lambda row: f"{row.case.tiles}x{row.case.tiles}", "{:s}"),
-        Column("threads", "threads", "{:d}"),
+        Column("tiles", lambda row: "{0}x{0}".format(row.get("tiles")), ">"),
+        Column("threads", "threads", "d"),
         *map(_stage_column, STAGES),
-        Column("total s", "total_s", "{:.1f}"),
-        Column("ratio", "total_ratio", "{:.0f}"),
-        Column("processor s", "processor_s", "{:.1f}"),
-        Column("peak GiB", "peak_gib", "{:.2f}"),
-        Column("depth median", error_or_reference("depth_median_error"), "{:.1e}"),
-        Column("depth max", "depth_max_error", "{:.1e}"),
-        Column("PSNR dB", "psnr_db", "{:.1f}"),
+        Column("total s", "total_s", ".1f"),
+        Column("ratio", "total_ratio", ".0f"),
+        Column("processor s", "processor_s", ".1f"),
+        Column("taken GiB", "taken_gib", ".2f"),
+        Column(
+            "depth median", lambda row: "reference" if row.get("is_reference") else row.get("depth_median_error"), ".1e"
+        ),
+        Column("depth max", "depth_max_error", ".1e"),
+        Column("PSNR dB", "psnr_db", ".1f"),
     ),
-    lambda row: f"{row.scene}, {row.get('height')}x{2 * row.get('height')}, {row.get('num_gaussians'):,} Gaussians",
+    lambda row: (
+        f"{row.get('scene')}, {row.get('height')}x{2 * row.get('height')}, {row.get('num_gaussians'):,} Gaussians"
+    ),
     plot_model,
 )
 
@@ -290,7 +262,3 @@ def _gain(name: str) -> float:
         return _RECTIFIER_GAIN
     is_logits = name.startswith("cost_volume.levels") and name.endswith(".head.2.weight")
     return _LOGIT_GAIN if is_logits else 1.0
-
-
-if __name__ == "__main__":
-    serve_job(_measure_job)

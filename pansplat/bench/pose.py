@@ -16,8 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,10 +24,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
+from pansplat.bench.harness import Header, Suite, announce, make_axes
 from pansplat.data.folders import load_pairs
 from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
+from pansplat.evaluation.results import Column, Row
 from pansplat.poses.estimate import PoseEstimate, estimate_poses
 from pansplat.poses.solvers import angle_between, rotation_angle
 
@@ -39,21 +39,8 @@ _WRONG_ROTATION, _WRONG_DIRECTION = 3.0, 10.0  # degrees, of a pair
 _WRONG_TURN, _WRONG_PLACE = 5.0, 30.0  # degrees and centimetres, of a tour
 
 
-@dataclass(frozen=True)
-class PoseCase:
-    """Panoramas whose poses are estimated together.
-
-    Attributes:
-        count: number of panoramas.
-        baseline_m: distance of a pair's cameras; for a tour, the median distance to the nearest other camera.
-    """
-
-    count: int
-    baseline_m: float
-
-
-def measure_folder(path: Path, report: Report, *, camera_height: float, pairs: bool, tours: bool) -> None:
-    """Add a row for each pair of a folder, and for all its panoramas together.
+def measure_folder(path: Path, *, camera_height: float, pairs: bool, tours: bool) -> Iterator[Row]:
+    """Yield a row for each pair of a folder, and for all its panoramas together.
 
     Args:
         camera_height: mean height of the cameras over the floor, metres.
@@ -63,29 +50,33 @@ def measure_folder(path: Path, report: Report, *, camera_height: float, pairs: b
     loaded = [pair for pair in load_pairs(path) if len(pair.context) > 1]  # a single view has nothing to compare with
     contexts = {frozenset(view.image for view in pair.context): pair for pair in loaded}
     for pair in contexts.values() if pairs else ():
-        report.step(pair.name)
-        report.add(measure_poses(pair.name, pair.context, camera_height))
+        announce(pair.name)
+        yield measure_poses(pair.name, pair.context, camera_height)
     if tours:
         views = {view.image: view for pair in loaded for view in (*pair.context, *pair.targets)}
-        report.step(f"all {len(views)} panoramas")
-        report.add(measure_poses(path.resolve().name, list(views.values()), camera_height, "tour"))
+        announce(f"all {len(views)} panoramas")
+        yield measure_poses(path.resolve().name, list(views.values()), camera_height, "tour")
 
 
 def measure_poses(name: str, panoramas: Sequence[Panorama], camera_height: float, suite: str = "pair") -> Row:
-    """Estimate the poses of panoramas and compare them with the known ones."""
+    """Estimate the poses of panoramas and compare them with the known ones.
+
+    The case of the row has their `count`, and `baseline_m`, the median distance to the nearest other camera.
+    """
     truth = {panorama.image: panorama.cam2world.numpy() for panorama in panoramas}
     centres = np.stack([pose[:3, 3] for pose in truth.values()])
     distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + 1e9 * np.eye(len(centres))
-    case = PoseCase(len(truth), float(np.median(distances.min(axis=1))))
+    baseline_m = float(np.median(distances.min(axis=1)))
+    row = Row({"suite": suite, "scene": name, "count": len(truth), "baseline_m": baseline_m})
     start = time.perf_counter()
     try:
         estimate = estimate_poses(list(truth), camera_height=camera_height)
     except InputError as error:
-        flagged = {"outcome": "flagged", "seconds": time.perf_counter() - start}
-        return Row(suite, name, case, flagged, note=str(error))
-    result = {"seconds": time.perf_counter() - start, **_compare(estimate, truth)}
-    note = "; ".join(f"{image.name}: {reason}" for image, reason in estimate.unplaced.items())
-    return Row(suite, name, case, result, note=note)
+        row.values = {"outcome": "flagged", "seconds": time.perf_counter() - start, "note": str(error)}
+        return row
+    row.values = {"seconds": time.perf_counter() - start, **_compare(estimate, truth)}
+    row.values["note"] = "; ".join(f"{image.name}: {reason}" for image, reason in estimate.unplaced.items())
+    return row
 
 
 def _compare(estimate: PoseEstimate, truth: Mapping[Path, Array]) -> dict[str, Any]:
@@ -125,7 +116,7 @@ def _aligned_errors(found: Float[Array, "n 3"], known: Float[Array, "n 3"]) -> F
 
 def summarise(rows: Sequence[Row]) -> list[str]:
     """One line about the pairs: outcomes, medians and 95 % quantiles of the solved ones."""
-    results = [row.result for row in rows if row.suite == "pair"]
+    results = [row.values for row in rows if row.get("suite") == "pair"]
     solved = [result for result in results if result["outcome"] == "solved"]
     counts = {name: sum(result["outcome"] == name for result in results) for name in ("solved", "flagged", "wrong")}
     parts = [", ".join(f"{count} {name}" for name, count in counts.items())]
@@ -133,9 +124,9 @@ def summarise(rows: Sequence[Row]) -> list[str]:
         median, high = np.quantile([result[f"{name}_degrees"] for result in solved], (0.5, 0.95))
         parts.append(f"{name} median {median:.3f}, 95 % {high:.3f} degrees")
     lines = ["; ".join(parts)] if results else []
-    tours = [row for row in rows if row.suite == "tour"]
+    tours = [row for row in rows if row.get("suite") == "tour"]
     if tours:
-        placed, count = sum(row.get("placed") or 0 for row in tours), sum(row.case.count for row in tours)
+        placed, count = sum(row.get("placed") or 0 for row in tours), sum(row.get("count") for row in tours)
         wrong = sum(row.get("outcome") == "wrong" for row in tours)
         lines.append(
             f"{len(tours)} tours: {placed} of {count} panoramas ({placed / count:.0%}) are in the two largest groups; "
@@ -148,10 +139,10 @@ def plot_poses(rows: Sequence[Row], header: Header) -> Figure:
     """Plot the errors of rotation and direction over the baseline, and the cumulative distributions."""
     figure, axes = make_axes(2, (12, 4))
     for outcome, marker in (("solved", "o"), ("wrong", "x")):
-        chosen = [row for row in rows if row.get("outcome") == outcome and row.case.count == 2]
+        chosen = [row for row in rows if row.get("outcome") == outcome and row.get("count") == 2]
         for name in ("rotation", "direction") if chosen else ():
             values = [row.get(f"{name}_degrees") for row in chosen]
-            axes[0].semilogy([row.case.baseline_m for row in chosen], values, marker, label=f"{name}, {outcome}")
+            axes[0].semilogy([row.get("baseline_m") for row in chosen], values, marker, label=f"{name}, {outcome}")
             axes[1].plot(np.sort(values), np.linspace(0, 1, len(values)), ".-", label=f"{name}, {outcome}")
             axes[0].legend(fontsize=8)
     axes[0].set(xlabel="distance of the cameras, m", ylabel="error, degrees")
@@ -160,22 +151,22 @@ def plot_poses(rows: Sequence[Row], header: Header) -> Figure:
     return figure
 
 
-POSE = Benchmark(
+POSE = Suite(
     "pose",
     (
-        Column("panoramas", lambda row: row.scene),
-        Column("baseline m", "baseline_m", "{:.2f}"),
+        Column("panoramas", "scene"),
+        Column("baseline m", "baseline_m", ".2f"),
         Column("outcome", "outcome"),
-        Column("placed", "placed", "{:.0f}"),
-        Column("rotation deg", "rotation_degrees", "{:.3f}"),
-        Column("worst", "worst_degrees", "{:.2f}"),
-        Column("direction deg", "direction_degrees", "{:.2f}"),
-        Column("scale %", "scale_percent", "{:+.1f}"),
-        Column("position cm", "position_cm", "{:.1f}"),
-        Column("places", "places", "{:.0f}"),
-        Column("s", "seconds", "{:.1f}"),
+        Column("placed", "placed", ".0f"),
+        Column("rotation deg", "rotation_degrees", ".3f"),
+        Column("worst", "worst_degrees", ".2f"),
+        Column("direction deg", "direction_degrees", ".2f"),
+        Column("scale %", "scale_percent", "+.1f"),
+        Column("position cm", "position_cm", ".1f"),
+        Column("places", "places", ".0f"),
+        Column("s", "seconds", ".1f"),
     ),
-    lambda row: row.suite,
+    lambda row: row.get("suite"),
     plot_poses,
     summarise,
     width=150,

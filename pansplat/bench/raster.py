@@ -14,8 +14,8 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,16 +24,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.bench.harness import (
+    Header,
+    Suite,
     Timing,
+    announce,
     compare_images,
+    format_threads,
+    make_axes,
     measure_peak_memory,
     quartile_range,
     restore_threads,
     time_call,
 )
-from pansplat.bench.report import Benchmark, Column, Header, Report, Row, format_threads, make_axes
 from pansplat.bench.scenes import full_lattice_room, lattice_room_size
 from pansplat.constants import NEAR
+from pansplat.evaluation.results import Column, Row
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import rasterize
@@ -239,128 +244,94 @@ def _multiple_of_8(height: float) -> int:
     return max(8, 8 * round(height / 8))
 
 
-@dataclass(eq=False)
-class _Measurement:
-    """A row and its timings by pass, "forward" and "backward"."""
+def measure_raster(groups: Iterable[Group], *, budget: float = 2.0, slow: float = 5.0) -> Iterator[Row]:
+    """Yield the row of each case, and yield it again after each repeat.
 
-    row: Row
-    repeats: int = 1
-    timings: dict[str, list[Timing]] = field(default_factory=dict)
+    Args:
+        groups: of cases, each with its scene.
+        budget: seconds for the repeats of a case.
+        slow: seconds; a case whose first image takes longer is not repeated.
 
-    @property
-    def unfinished(self) -> list[str]:
-        """The passes that still have to be timed."""
-        return [name for name, timings in self.timings.items() if len(timings) < self.repeats]
-
-    def add(self, name: str, timing: Timing) -> None:
-        """Add the timing of a pass and update the row."""
-        self.timings[name].append(timing)
-        walls = [1e3 * each.wall for each in self.timings[name]]
-        self.row.result |= {
-            f"{name}_ms": statistics.median(walls),
-            f"{name}_min_ms": min(walls),
-            f"{name}_spread_ms": quartile_range(walls),
-            f"{name}_cpu_ms": 1e3 * min(each.cpu for each in self.timings[name]),
-            "repeats": len(walls),
-        }
+    Raises:
+        InputError: a scene cannot be read.
+    """
+    exact: dict[tuple[str, RasterCase], Tensor] = {}
+    for group in groups:
+        with restore_threads():
+            yield from _measure_group(group, exact, budget, slow)
 
 
-class RasterBench:
-    """Measures groups of cases and adds their rows to a report."""
-
-    def __init__(self, report: Report, *, budget: float = 2.0, slow: float = 5.0) -> None:
-        """Begin a run.
-
-        Args:
-            report: gets the rows.
-            budget: seconds for the repeats of a case.
-            slow: seconds; a case whose first image takes longer is not repeated.
-        """
-        self._report, self._budget, self._slow = report, budget, slow
-        self._exact: dict[tuple[str, RasterCase], Tensor] = {}  # by the name of the scene
-        self._scene: BenchScene | None = None
-        self._gaussians: Gaussians | None = None
-
-    def run(self, groups: Iterable[Group]) -> None:
-        """Measure all groups; the rows are saved after every image, so that an interruption loses nothing.
-
-        Raises:
-            InputError: the file of rows cannot be written, or a scene cannot be read.
-        """
-        for group in groups:
-            if self._scene is None or group.scene.name != self._scene.name:
-                self._report.step(f"{group.scene.name}: making the scene")
-                self._gaussians = None  # two large scenes might not fit in memory
-                self._gaussians = group.scene.load()
-            self._scene = group.scene
-            with restore_threads():
-                self._measure(group)
-
-    def _measure(self, group: Group) -> None:
-        assert self._gaussians is not None
-        has_reference = len(self._gaussians) <= _MAX_TORCH_GAUSSIANS
-        measurements = []
-        for case in group.cases:
-            exact = self._exact_image(group, case.exact) if has_reference else None
-            self._report.step(str(case))
-            measurement, color = self._render_first(group, case)
-            if exact is not None:
-                measurement.row.result |= compare_images(color, exact)
-            self._report.add(measurement.row)
-            measurements.append(measurement)
-        while unfinished := [measurement for measurement in measurements if measurement.unfinished]:
-            for measurement in unfinished:
-                for name in measurement.unfinished:
-                    measurement.add(name, self._time(measurement.row.case, name)[0])
-                self._report.save()
-
-    def _exact_image(self, group: Group, case: RasterCase) -> Tensor:
-        """The float64 image; rendered once for each scene, which is a row as well."""
-        key = group.scene.name, case
-        if key not in self._exact:
-            self._report.step(f"{case}, float64")
-            measurement, color = self._render_first(group, case)
-            measurement.row.result |= compare_images(color, color)
-            measurement.row.is_reference = True
-            self._report.add(measurement.row)
-            self._exact[key] = color
-        return self._exact[key]
-
-    def _render_first(self, group: Group, case: RasterCase) -> tuple[_Measurement, Tensor]:
-        """Render the first image: measure the memory, choose the number of repeats."""
-        assert self._gaussians is not None
-        row = Row(group.suite, group.scene.name, case, {"num_gaussians": len(self._gaussians)})
-        measurement = _Measurement(row, timings={"forward": [], "backward": []} if case.backward else {"forward": []})
-        render = self._prepare(case, "forward")
+def _measure_group(
+    group: Group, exact: dict[tuple[str, RasterCase], Tensor], budget: float, slow: float
+) -> Iterator[Row]:
+    """Add the exact images of the cases, render each case once, and then all in turns."""
+    announce(f"{group.scene.name}: making the scene")
+    scene, gaussians, cases = group.scene, group.scene.load(), list(group.cases)
+    if len(gaussians) <= _MAX_TORCH_GAUSSIANS:
+        references = dict.fromkeys(case.exact for case in cases)
+        cases = [case for case in references if (scene.name, case) not in exact] + cases
+    repeats: list[tuple[Row, RasterCase, int, dict[str, list[Timing]]]] = []
+    for case in cases:
+        announce(case)
+        entries = {"suite": group.suite, "scene": scene.name, **asdict(case), "layout_name": case.layout_name}
+        row = Row({**entries, "is_reference": case.precision == "float64"}, {"num_gaussians": len(gaussians)})
+        render = _prepare(case, "forward", gaussians, scene.pose)
         release_idle_memory()  # buffers that numba keeps for the next image
         with torch.no_grad():
-            peak_mb, (forward, color) = measure_peak_memory(lambda: time_call(render, case.device), case.device)
-        if peak_mb is not None:
-            row.result["peak_mb"] = peak_mb
-        first = {"forward": forward} | ({"backward": self._time(case, "backward")[0]} if case.backward else {})
-        if case.precision != "float64" and max(timing.wall for timing in first.values()) <= self._slow:
-            seconds = sum(timing.wall for timing in first.values())
-            measurement.repeats = min(_MAX_REPEATS, max(_MIN_REPEATS, int(self._budget / seconds)))
-        else:
-            for name, timing in first.items():
-                measurement.add(name, timing)
-        return measurement, color
+            peak, (forward, color) = measure_peak_memory(lambda r=render, d=case.device: time_call(r, d), case.device)
+        first = {"forward": forward} | (
+            {"backward": _time(case, "backward", gaussians, scene)} if case.backward else {}
+        )
+        if case.precision == "float64":
+            exact[scene.name, case] = color
+        if (scene.name, case.exact) in exact:
+            row.values |= compare_images(color, exact[scene.name, case.exact])
+        seconds = [timing.wall for timing in first.values()]
+        count, timings = 1, {name: [timing] for name, timing in first.items()}
+        if case.precision != "float64" and max(seconds) <= slow:
+            count = min(_MAX_REPEATS, max(_MIN_REPEATS, int(budget / sum(seconds))))
+            timings = {name: [] for name in first}  # the first image may have waited for memory
+        row.values |= peak | _summarise(timings)
+        repeats.append((row, case, count, timings))
+        yield row
+    for _ in range(_MAX_REPEATS):
+        for row, case, count, timings in repeats:
+            for name, measured in timings.items():
+                if len(measured) < count:
+                    measured.append(_time(case, name, gaussians, scene))
+                    row.values |= _summarise(timings)
+                    yield row
 
-    def _time(self, case: RasterCase, name: str) -> tuple[Timing, Any]:
-        """Time the "forward" or "backward" pass."""
-        with torch.set_grad_enabled(name == "backward"):
-            return time_call(self._prepare(case, name), case.device)
 
-    def _prepare(self, case: RasterCase, name: str) -> Callable[[], Any]:
-        """Set the number of threads, warm up, and return the pass to time, which renders the loaded scene."""
-        assert self._scene is not None and self._gaussians is not None
-        torch.set_num_threads(case.threads)
-        gaussians = self._gaussians.to(dtype=getattr(torch, case.precision), device=case.device)
-        return _make_pass(case, name, gaussians, self._scene.pose)
+def _summarise(timings: Mapping[str, Sequence[Timing]]) -> dict[str, float]:
+    """The values of a row, by pass."""
+    values: dict[str, float] = {}
+    for name, measured in timings.items():
+        walls = [1e3 * timing.wall for timing in measured]
+        if walls:
+            values |= {
+                f"{name}_ms": statistics.median(walls),
+                f"{name}_min_ms": min(walls),
+                f"{name}_spread_ms": quartile_range(walls),
+                f"{name}_cpu_ms": 1e3 * min(timing.cpu for timing in measured),
+                "repeats": len(walls),
+            }
+    return values
 
 
-def _make_pass(case: RasterCase, name: str, gaussians: Gaussians, pose: Tensor) -> Callable[[], Any]:
-    """The pass to time, warmed up by one Gaussian: kernels are compiled, tables of the image size computed."""
+def _time(case: RasterCase, name: str, gaussians: Gaussians, scene: BenchScene) -> Timing:
+    """Time the "forward" or "backward" pass."""
+    with torch.set_grad_enabled(name == "backward"):
+        return time_call(_prepare(case, name, gaussians, scene.pose), case.device)[0]
+
+
+def _prepare(case: RasterCase, name: str, gaussians: Gaussians, pose: Tensor) -> Callable[[], Any]:
+    """Set the number of threads, and return the pass to time.
+
+    It is warmed up by one Gaussian: kernels are compiled, tables of the image size computed.
+    """
+    torch.set_num_threads(case.threads)
+    gaussians = gaussians.to(dtype=getattr(torch, case.precision), device=case.device)
     single = gaussians.select(torch.zeros(1, dtype=torch.int64, device=gaussians.means.device))
     if name == "backward":
         case.prepare_backward(single, pose)()
@@ -385,16 +356,16 @@ def _format_time(name: str) -> Callable[[Row], str]:
 
 def list_findings(rows: Sequence[Row]) -> list[str]:
     """Speed against torch, as sentences."""
-    direct = [row for row in rows if (row.suite, row.case.layout, row.case.precision) == _HEADLINE]
-    slow = next((row for row in direct if row.case.backend == "torch" and row.get("forward_ms")), None)
+    direct = [row for row in rows if tuple(map(row.get, ("suite", "layout", "precision"))) == _HEADLINE]
+    slow = next((row for row in direct if row.get("backend") == "torch" and row.get("forward_ms")), None)
     if slow is None:
         return []
     return [
-        f"{row.case.backend} on {format_threads(row.case.threads)} is {_quotient('forward_ms', slow, row)} times as "
-        f"fast forward and {_quotient('backward_ms', slow, row)} times backward as torch on one (processor time: "
+        f"{row.get('backend')} on {format_threads(row.get('threads'))} is {_quotient('forward_ms', slow, row)} times "
+        f"as fast forward and {_quotient('backward_ms', slow, row)} times backward as torch on one (processor time: "
         f"{_quotient('forward_cpu_ms', slow, row)} and {_quotient('backward_cpu_ms', slow, row)} times less), "
         f"{_describe_size(row)}."
-        for row in sorted(direct, key=lambda row: (row.case.backend, row.case.threads))
+        for row in sorted(direct, key=lambda row: (row.get("backend"), row.get("threads")))
         if row is not slow and row.get("forward_ms")
     ]
 
@@ -404,35 +375,37 @@ def _quotient(name: str, slow: Row, fast: Row) -> str:
 
 
 def _describe_size(row: Row) -> str:
-    return f"{row.case.height}x{2 * row.case.height}, {row.get('num_gaussians'):,} Gaussians"
+    return f"{row.get('height')}x{2 * row.get('height')}, {row.get('num_gaussians'):,} Gaussians"
 
 
 def plot_choices(rows: Sequence[Row], header: Header) -> Figure | None:
     """Plot PSNR over time; None if there is nothing to plot."""
-    shown = [row for row in rows if row.suite == "choices" and row.case.layout != "pinhole"]
-    shown = [row for row in shown if row.case.precision == "float32" and row.get("psnr_db") is not None]
+    shown = [row for row in rows if row.get("suite") == "choices" and row.get("layout") != "pinhole"]
+    shown = [row for row in shown if row.get("precision") == "float32" and row.get("psnr_db") is not None]
     if not shown:
         return None
     figure, (axes,) = make_axes(1, (10, 6))
-    for backend, layout in dict.fromkeys((row.case.backend, row.case.layout_name) for row in shown):
-        group = [row for row in shown if (row.case.backend, row.case.layout_name) == (backend, layout)]
+    for backend, layout in dict.fromkeys((row.get("backend"), row.get("layout_name")) for row in shown):
+        group = [row for row in shown if (row.get("backend"), row.get("layout_name")) == (backend, layout)]
         x, y = [row.get("forward_ms") for row in group], [min(_MAX_PSNR, row.get("psnr_db")) for row in group]
         axes.plot(x, y, _MARKERS[backend], label=f"{backend}, {layout}")
         for row, *point in zip(group, x, y, strict=True):
-            choice, above = f"{row.case.kernel} {row.case.order} {row.case.filter}", len(axes.texts) % 2  # in turns
+            choice, above = " ".join(map(row.get, ("kernel", "order", "filter"))), len(axes.texts) % 2  # in turns
             axes.annotate(choice, point, xytext=(6, 5 if above else -11), textcoords="offset points", fontsize=7)
     axes.set(xscale="log", xlabel="forward, milliseconds", ylabel=f"PSNR, dB (at most {_MAX_PSNR:g})")
-    axes.set_title(f"{shown[0].scene}: {_describe_size(shown[0])}; {header['machine']['cpu']}", loc="left", fontsize=9)
+    axes.set_title(
+        f"{shown[0].get('scene')}: {_describe_size(shown[0])}; {header['machine']['cpu']}", loc="left", fontsize=9
+    )
     axes.margins(x=0.15)
     axes.legend(fontsize=8, loc="center")
     return figure
 
 
 def _describe_renderer(row: Row) -> str:
-    return row.case.backend if row.case.precision == "float32" else f"{row.case.backend} {row.case.precision}"
+    return row.get("backend") + (" float64" if row.get("is_reference") else "")
 
 
-RASTER = Benchmark(
+RASTER = Suite(
     "raster",
     (
         Column("renderer", _describe_renderer),
@@ -440,18 +413,18 @@ RASTER = Benchmark(
         Column("order", "order"),
         Column("filter", "filter"),
         Column("layout", "layout_name"),
-        Column("height", "height", "{:d}"),
-        Column("Gaussians", "num_gaussians", "{:,}"),
-        Column("threads", "threads", "{:d}"),
-        Column("forward ms", _format_time("forward_ms"), "{:s}"),
-        Column("CPU", _format_time("forward_cpu_ms"), "{:s}"),
-        Column("backward ms", _format_time("backward_ms"), "{:s}"),
-        Column("CPU", _format_time("backward_cpu_ms"), "{:s}"),
-        Column("peak MB", "peak_mb", "{:,.0f}"),
-        Column("PSNR dB", "psnr_db", "{:.1f}"),
-        Column("max error", "max_error", "{:.1e}"),
+        Column("height", "height", "d"),
+        Column("Gaussians", "num_gaussians", ","),
+        Column("threads", "threads", "d"),
+        Column("forward ms", _format_time("forward_ms"), ">"),
+        Column("CPU", _format_time("forward_cpu_ms"), ">"),
+        Column("backward ms", _format_time("backward_ms"), ">"),
+        Column("CPU", _format_time("backward_cpu_ms"), ">"),
+        Column("peak MB", "peak_mb", ",.0f"),
+        Column("PSNR dB", "psnr_db", ".1f"),
+        Column("max error", "max_error", ".1e"),
     ),
-    lambda row: f"{row.suite}: {row.scene}",
+    lambda row: f"{row.get('suite')}: {row.get('scene')}",
     plot_choices,
     list_findings,
     width=210,

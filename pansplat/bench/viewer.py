@@ -18,20 +18,20 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pansplat import pipeline
-from pansplat.bench.harness import compare_images, quartile_range
+from pansplat.bench.harness import Header, Suite, announce, compare_images, make_axes, quartile_range
 from pansplat.bench.raster import make_room_scene
-from pansplat.bench.report import Benchmark, Column, Header, Report, Row, make_axes
 from pansplat.bench.scenes import make_room_cameras
 from pansplat.errors import InputError
+from pansplat.evaluation.results import Column, Row
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Scene
 
@@ -104,94 +104,64 @@ def list_viewer_cases(size: tuple[int, int], renderers: Sequence[str] = RENDERER
     ]
 
 
-class ViewerBench:
-    """Measures cases on rooms.
+def measure_viewer(height: int, cases: Sequence[ViewerCase], *, repeats: int, threads: int) -> Iterator[Row]:
+    """Yield the row of each case on the room of a height.
 
     Args:
-        report: receives the rows; cases that it has are not measured again.
-        repeats: frames of each case.
+        repeats: frames of each case; OpenGL draws a third.
         threads: of numba and of software OpenGL.
+
+    Raises:
+        InputError: the viewer is not installed, or there is no OpenGL.
     """
-
-    def __init__(self, report: Report, *, repeats: int, threads: int) -> None:
-        self._report, self._repeats, self._threads = report, repeats, threads
-
-    def run(self, height: int, cases: Sequence[ViewerCase]) -> None:
-        """Measure the cases on the room of this height.
-
-        Raises:
-            InputError: the viewer is not installed, or there is no OpenGL.
-        """
-        if importlib.util.find_spec(_VIEWER_PACKAGE) is None:
-            raise InputError("the viewer is not installed; install all of pansplat to measure it")
-        room = make_room_scene(height)
-        measured = {row.case for row in self._report.rows if row.scene == room.name}
-        cases = [case for case in cases if case not in measured]
-        if not cases:
-            return
-        scene = Scene(room.load(), make_room_cameras(), near=0.1, far=100.0)
-        self._report.step(f"{room.name}: {len(scene.gaussians):,} Gaussians, float64 images")
-        images = _render_exact(scene, room.pose, cases) if len(scene.gaussians) <= _MAX_REFERENCE else {}
-        with tempfile.TemporaryDirectory() as folder:
-            save_ply(scene, Path(folder, "scene.ply"))
-            for renderer in dict.fromkeys(case.renderer for case in cases):
-                self._report.step(f"{room.name}: {renderer}")
-                chosen = [case for case in cases if case.renderer == renderer]
-                for case, result in self._measure(Path(folder), room.pose, chosen):
-                    result["num_gaussians"] = len(scene.gaussians)
-                    if case.image_key in images:
-                        result |= compare_images(result["image"], images[case.image_key])
-                    del result["image"]
-                    self._report.add(Row("viewer", room.name, case, result))
-
-    def _measure(
-        self, folder: Path, pose: Tensor, cases: Sequence[ViewerCase]
-    ) -> Iterator[tuple[ViewerCase, dict[str, Any]]]:
-        """Run the viewer for cases of one renderer; yield the values of each case, with its `image`."""
-        repeats = self._repeats if cases[0].renderer == "cpu" else max(self._repeats // 3, 1)
-        job = {
-            "scene": str(folder / "scene.ply"),
-            "pose": pose.tolist(),
-            "size": [cases[0].width, cases[0].height],
-            "repeats": repeats,
-            "folder": str(folder),
-            "tiers": [cases[0].renderer],
-            "settings": [case.settings() for case in cases],
-        }
-        (folder / "job.json").write_text(json.dumps(job), "utf-8")
-        for line in read_viewer_output(folder / "job.json", self._threads):
-            times = line["frame_ms"]
-            yield (
-                cases[line["settings"]],
-                {
+    if importlib.util.find_spec(_VIEWER_PACKAGE) is None:
+        raise InputError("the viewer is not installed; install all of pansplat to measure it")
+    room = make_room_scene(height)
+    scene = Scene(room.load(), make_room_cameras(), near=0.1, far=100.0)
+    count = len(scene.gaussians)
+    announce(f"{room.name}: {count:,} Gaussians, float64 images")
+    images = _render_exact(scene, room.pose, cases) if count <= _MAX_REFERENCE else {}
+    with tempfile.TemporaryDirectory() as folder:
+        save_ply(scene, Path(folder, "scene.ply"))
+        for renderer in dict.fromkeys(case.renderer for case in cases):
+            announce(f"{room.name}: {renderer}")
+            chosen = [case for case in cases if case.renderer == renderer]
+            job = Path(folder, "job.json")
+            content = {
+                "scene": str(Path(folder, "scene.ply")),
+                "pose": room.pose.tolist(),
+                "size": [chosen[0].width, chosen[0].height],
+                "repeats": repeats if renderer == "cpu" else max(repeats // 3, 1),
+                "folder": folder,
+                "tiers": [renderer],
+                "settings": [case.settings() for case in chosen],
+            }
+            job.write_text(json.dumps(content), "utf-8")
+            for line in map(json.loads, run_viewer(job, threads)):
+                case, times = chosen[line["settings"]], line["frame_ms"]
+                values = {
+                    "num_gaussians": count,
                     "frame_ms": statistics.median(times),
                     "spread_ms": quartile_range(times) / 2,
                     "best_ms": min(times),
                     "stages": line["stages"],
                     "device": line["renderer"],
-                    "image": torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1),
-                },
-            )
+                }
+                if case.image_key in images:
+                    image = torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1)
+                    values |= compare_images(image, images[case.image_key])
+                yield Row({"suite": "viewer", "scene": room.name, **asdict(case)}, values)
 
 
-def read_viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
-    """Yield the lines that the viewer's command prints, each as soon as it is printed."""
+def run_viewer(job: Path, threads: int) -> list[str]:
+    """The lines that the viewer's command prints for a job."""
     environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # of Mesa's software OpenGL
     command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.draw.timing", str(job)]
-    with (
-        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors,
-        subprocess.Popen(command, env=environment, encoding="utf-8", stdout=subprocess.PIPE, stderr=errors) as program,
-    ):
-        assert program.stdout is not None
-        try:
-            for line in program.stdout:
-                yield json.loads(line)
-        finally:
-            program.terminate()
-        if program.wait() != 0:
-            errors.seek(0)
-            messages = errors.read().strip().splitlines()
-            raise InputError(f"the viewer rendered nothing: {messages[-1] if messages else 'no message'}")
+    ended = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8", errors="replace")
+    if ended.returncode:
+        messages = ended.stderr.strip().splitlines()
+        raise InputError(f"the viewer rendered nothing: {messages[-1] if messages else 'no message'}")
+    return ended.stdout.splitlines()
 
 
 @torch.no_grad()
@@ -217,7 +187,7 @@ def list_findings(rows: Sequence[Row]) -> list[str]:
     sentences = []
     for count in dict.fromkeys(row.get("num_gaussians") for row in rows):
         of_scene = [row for row in rows if row.get("num_gaussians") == count]
-        best = {(row.case.renderer, row.case.view, row.case.mode): row.get("best_ms") for row in of_scene}
+        best = {tuple(map(row.get, ("renderer", "view", "mode"))): row.get("best_ms") for row in of_scene}
         cpu, parts = best.get(("cpu", "perspective", "joint")), []
         gl = [best[key] for name in ("gl33", "gl43") if (key := (name, "perspective", "joint")) in best]
         if cpu and gl:
@@ -235,19 +205,19 @@ def plot_viewer(rows: Sequence[Row], header: Header) -> Figure:
     """Plot the time of a frame over the number of Gaussians, for each view, renderer and mode."""
     from matplotlib.ticker import NullFormatter
 
-    views = list(dict.fromkeys(row.case.view for row in rows))
+    views = list(dict.fromkeys(row.get("view") for row in rows))
     figure, axes = make_axes(len(views), (3.6 * len(views), 4.2), sharey=True)
     for ax, view in zip(axes, views, strict=True):
-        of_view = [row for row in rows if row.case.view == view]
-        for renderer, mode in dict.fromkeys((row.case.renderer, row.case.mode) for row in of_view):
-            line = [row for row in of_view if (row.case.renderer, row.case.mode) == (renderer, mode)]
+        of_view = [row for row in rows if row.get("view") == view]
+        for renderer, mode in dict.fromkeys((row.get("renderer"), row.get("mode")) for row in of_view):
+            line = [row for row in of_view if (row.get("renderer"), row.get("mode")) == (renderer, mode)]
             points = sorted((row.get("num_gaussians"), row.get("frame_ms")) for row in line)
             style, color = "o-" if mode == "joint" else "s--", f"C{RENDERERS.index(renderer)}"
             ax.loglog(*zip(*points, strict=True), style, color=color, label=f"{renderer}, {mode}")
         for rate in _RATES:
             ax.axhline(1000 / rate, color="grey", linewidth=0.8)
             ax.annotate(f"{rate} fps", (1, 1000 / rate), xycoords=("axes fraction", "data"), ha="right", va="bottom")
-        ax.set(title=f"{view}, {of_view[0].case.width}x{of_view[0].case.height}", xlabel="Gaussians")
+        ax.set(title=f"{view}, {of_view[0].get('width')}x{of_view[0].get('height')}", xlabel="Gaussians")
         ax.xaxis.set_minor_formatter(NullFormatter())  # they would overlap
         ax.legend(fontsize=7)
     axes[0].set_ylabel("frame, ms")
@@ -259,21 +229,21 @@ def _format_stages(row: Row) -> str:
     return ", ".join(f"{name} {value:.1f}" for name, value in row.get("stages").items() if value >= 0.05)
 
 
-VIEWER = Benchmark(
+VIEWER = Suite(
     "viewer",
     (
         Column("renderer", "renderer"),
         Column("view", "view"),
         Column("mode", "mode"),
-        Column("pixels", lambda row: f"{row.case.width}x{row.case.height}", "{:s}"),
-        Column("frame ms", lambda row: f"{row.get('frame_ms'):,.1f} ±{row.get('spread_ms'):.1f}", "{:s}"),
-        Column("fastest", "best_ms", "{:,.1f}"),
-        Column("fps", lambda row: 1000 / row.get("frame_ms"), "{:,.1f}"),
-        Column("PSNR dB", "psnr_db", "{:.1f}"),
-        Column("max error", "max_error", "{:.1e}"),
+        Column("pixels", lambda row: f"{row.get('width')}x{row.get('height')}", ">"),
+        Column("frame ms", lambda row: f"{row.get('frame_ms'):,.1f} ±{row.get('spread_ms'):.1f}", ">"),
+        Column("fastest", "best_ms", ",.1f"),
+        Column("fps", lambda row: 1000 / row.get("frame_ms"), ",.1f"),
+        Column("PSNR dB", "psnr_db", ".1f"),
+        Column("max error", "max_error", ".1e"),
         Column("stages, ms", _format_stages),
     ),
-    lambda row: f"{row.get('num_gaussians'):,} Gaussians ({row.scene})",
+    lambda row: f"{row.get('num_gaussians'):,} Gaussians ({row.get('scene')})",
     plot_viewer,
     list_findings,
 )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
-import sys
 import time
+from collections import Counter
 from contextlib import nullcontext
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,7 +21,9 @@ from pansplat.files import expand_home, require_output_folder, require_replaceab
 from pansplat.options import Count, Height, Positive, Seconds, Threads
 
 if TYPE_CHECKING:
-    from pansplat.batch import BatchOptions, Item, ItemReport
+    from collections.abc import Iterator
+
+    from pansplat.batch import BatchOptions, ItemReport
 
 
 @dataclass(frozen=True)
@@ -68,18 +70,25 @@ class Batch(Writer):
         require_output_folder("--out", self.out)
         require_replaceable("--out", [expand_home(self.out) / batch.REPORT_NAME], self.overwrite)
         options = self._make_options()
-        batch.require_cluster()
+        if importlib.util.find_spec("distributed") is None:
+            raise InputError(
+                "pansplat batch: needed the package distributed, got none; run pip install 'pansplat[cluster]'"
+            )
         memory = self._parse_memory()
         items = batch.list_items(self.path)
-        batch.read_fingerprint(options)  # an unknown model is an error of the command, not of each item
+        batch.load_predictor(options)  # an unknown model is an error of the command, not of each item
         out = expand_home(self.out).absolute()
         with batch.lock_folder(out):
             try:
-                reports, seconds, problem = self._run_items(items, options, out, memory)
+                with batch.start_workers(self.workers, memory) if self.scheduler is None else nullcontext() as local:
+                    began = time.perf_counter()  # the workers have started
+                    address = self.scheduler if local is None else local.scheduler_address
+                    found = batch.run_items(str(address), items, options, out)
+                    count, problem = _write_report(found, len(items), out / batch.REPORT_NAME)
+                    seconds = time.perf_counter() - began
             finally:
                 if self.scheduler is None:
                     batch.remove_unfinished(items, out)
-        count = {status: sum(r.status == status for r in reports) for status in ("done", "skipped", "failed")}
         print(
             f"{self.out}: {len(items):,} items: {count['done']:,} done, {count['skipped']:,} already there, "
             f"{count['failed']:,} failed, in {seconds:.1f} s; {self.out / batch.REPORT_NAME}"
@@ -133,61 +142,28 @@ class Batch(Writer):
             raise InputError(f"--memory must be at least {MIN_MEMORY >> 20}MiB, such as 4GiB, got {self.memory!r:.40}")
         return memory
 
-    def _run_items(
-        self, items: list[Item], options: BatchOptions, out: Path, memory: int | None
-    ) -> tuple[list[ItemReport], float, str | None]:
-        """Run the items, and write a line of the report at the end of each.
 
-        Returns:
-            The reports, the seconds since the workers of this machine have started, and a message if the report could
-            not be written.
-        """
-        from pansplat import batch
+def _write_report(reports: Iterator[ItemReport], total: int, path: Path) -> tuple[Counter[str], str | None]:
+    """Write a line of the report at the end of each item. While the disk is full, lines wait, and the items go on.
 
-        reports = []
-        cluster = batch.start_workers(self.workers, memory) if self.scheduler is None else nullcontext()
-        with cluster as local, progress_bar() as progress, open(out / batch.REPORT_NAME, "wb", 0) as file:
-            lines = ReportFile(file)
-            address = self.scheduler or ""
-            if local is not None:
-                workers = list(local.workers.values())
-                limit = workers[0].memory_manager.memory_limit / 2**30
-                address = local.scheduler_address
-                print(f"workers: {len(workers)}, of at most {limit:.1f} GiB each", file=sys.stderr)
-            began = time.perf_counter()
-            for report in batch.run_items(address, items, options, out):
-                reports.append(report)
-                lines.add(json.dumps({"software": "pansplat", **dataclasses.asdict(report)}) + "\n")
-                progress(f"{len(reports)} of {len(items)}: {report.item[-30:]}", len(reports) / len(items))
-                if report.error is not None:
-                    print_message("note", f"{report.item}: {report.error}")
-            return reports, time.perf_counter() - began, lines.problem
-
-
-class ReportFile:
-    """The report. While the disk is full, lines wait, and the items go on.
-
-    Args:
-        file: without a buffer.
+    Returns:
+        The number of items of each status, and a message if lines could not be written.
     """
-
-    def __init__(self, file: FileIO) -> None:
-        self._file, self._waiting, self._reason = file, b"", "No space left on device"
-
-    def add(self, line: str) -> None:
-        """Write the lines that wait, and another one."""
-        self._waiting += line.encode()
-        try:
-            self._waiting = self._waiting[self._file.write(self._waiting) :]
-        except OSError as error:
-            self._reason = error.strerror or str(error)
-
-    @property
-    def problem(self) -> str | None:
-        """What prevents that lines are written; None if none waits."""
-        if not self._waiting:
-            return None
-        return (
-            f"{self._file.name}: needed free disk space for the report, got {self._reason!r}; the items are finished: "
-            "free some space and run the same command again"
-        )
+    count, waiting, reason = Counter[str](), b"", ""
+    with progress_bar() as progress, open(path, "wb", 0) as file:
+        for report in reports:
+            count[report.status] += 1
+            waiting += json.dumps({"software": "pansplat", **dataclasses.asdict(report)}).encode() + b"\n"
+            try:
+                waiting = waiting[file.write(waiting) :]
+            except OSError as error:
+                reason = error.strerror
+            progress(f"{count.total()} of {total}: {report.item[-30:]}", count.total() / total)
+            if report.error is not None:
+                print_message("note", f"{report.item}: {report.error}")
+    if not waiting:
+        return count, None
+    return count, (
+        f"{path}: needed free disk space for the report, got {reason!r}; the items are finished: "
+        "free some space and run the same command again"
+    )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,15 +19,17 @@ from pansplat.files import is_scene_file, require_output_folder, require_replace
 from pansplat.options import Positive, Threads
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pansplat.bench.harness import Suite
     from pansplat.bench.raster import BenchScene
-    from pansplat.bench.report import Benchmark, Report
     from pansplat.data.pairs import Pair
+    from pansplat.evaluation.results import Row
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
 _LatticeHeight = Annotated[int, Meta(ge=16, le=4096, multiple_of=8)]
 _WindowSide = Annotated[int, Meta(ge=64, le=8192)]
-_TiledHeight = Annotated[int, Meta(ge=64, le=8192, multiple_of=32)]  # 4x4 tiles must fit the four levels
 
 
 @dataclass(frozen=True)
@@ -40,29 +43,27 @@ class _Options(Writer):
     threads: Threads | None = None
     """The largest number of threads to use; by default torch's."""
 
-    def _open_report(self, benchmark: Benchmark, **header: object) -> Report:
-        """Refuse missing folders, set the number of threads, and begin a report."""
-        from pansplat.bench.harness import describe_machine
-        from pansplat.bench.report import Report
+    def _check(self, name: str) -> int:
+        """Refuse files and folders that cannot be written; set the number of threads, and return it."""
+        import torch
 
         require_replaceable("--json", filter(None, [self.json]), self.overwrite)
         if self.out is not None:
             require_output_folder("--out", self.out)
-            files = [self.out / f"{benchmark.name}{suffix}" for suffix in (".json", ".md", ".png")]
+            files = [self.out / f"{name}{suffix}" for suffix in (".json", ".md", ".png")]
             require_replaceable("--out", files, self.overwrite)
             self.out.mkdir(parents=True, exist_ok=True)
         if self.json is not None and not self.json.resolve().parent.is_dir():
             raise InputError(f"cannot write {self.json}: its folder does not exist; create it first")
-        self._set_threads()
-        return Report(benchmark, {"machine": describe_machine(), **header}, json_file=self.json, out=self.out)
-
-    def _set_threads(self) -> int:
-        """Set torch's number of threads, and return it."""
-        import torch
-
         if self.threads is not None:
             torch.set_num_threads(self.threads)
         return torch.get_num_threads()
+
+    def _run(self, suite: Suite, rows: Iterable[Row], **header: object) -> list[Row]:
+        """Measure, print the tables and write the files; an interruption keeps the measured rows."""
+        from pansplat.bench.harness import run
+
+        return run(suite, rows, header, self.json, self.out)
 
 
 @dataclass(frozen=True)
@@ -80,27 +81,19 @@ class BenchRaster(_Options):
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
         import torch
 
-        from pansplat.bench.raster import (
-            RASTER,
-            RasterBench,
-            choice_height,
-            list_raster_groups,
-            make_room_scene,
-            make_sample_group,
-        )
+        from pansplat.bench import raster
 
-        report = self._open_report(RASTER)
-        threads, small = self._set_threads(), choice_height(self.height, quick=self.quick)
+        threads, small = self._check("raster"), raster.choice_height(self.height, quick=self.quick)
         backends = ["numba", "triton"] if torch.cuda.is_available() else ["numba"]
         whole = None if self.scene is None else self._open_scene(self.scene, self.height)
         if len(backends) == 1:
             print("without triton: there is no CUDA device")
-        with report:
-            bench = RasterBench(report, budget=1.0 if self.quick else 8.0, slow=3.0 if self.quick else 5.0)
-            scene_of = make_room_scene if whole is None else lambda height: whole
-            bench.run(list_raster_groups(scene_of, self.height, backends, threads, quick=self.quick))
-            if whole is None and _SAMPLE.is_dir():
-                bench.run([make_sample_group(self._open_scene(_SAMPLE, small), small, backends, threads)])
+        scene_of = raster.make_room_scene if whole is None else lambda height: whole
+        groups = raster.list_raster_groups(scene_of, self.height, backends, threads, quick=self.quick)
+        if whole is None and _SAMPLE.is_dir():
+            groups.append(raster.make_sample_group(self._open_scene(_SAMPLE, small), small, backends, threads))
+        budget, slow = (1.0, 3.0) if self.quick else (8.0, 5.0)
+        self._run(raster.RASTER, raster.measure_raster(groups, budget=budget, slow=slow))
         return 0
 
     def _open_scene(self, path: Path, height: int) -> BenchScene:
@@ -139,13 +132,13 @@ class BenchModel(_Options):
         from pansplat.model.weights import load_weights
 
         weights = "random (seed 0): images are meaningless" if self.model is None else self.model.name
-        report = self._open_report(MODEL, weights=weights)
+        threads = self._check("model")
         folder = self.pair or _SAMPLE
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; give one with --pair (the sample is in the repository only)")
         views = choose_pair(folder, PairChoice()).load_context(self.height)
         bfloat16 = has_bfloat16()
-        cases = list_model_cases(self._set_threads(), bfloat16=bfloat16, quick=self.quick)
+        cases = list_model_cases(threads, bfloat16=bfloat16, quick=self.quick)
         with tempfile.TemporaryDirectory() as temporary:
             file = self.model or Path(temporary, "random.safetensors")
             if self.model is None:
@@ -154,47 +147,7 @@ class BenchModel(_Options):
                 raise InputError(f"{self.model}: the benchmark needs weights of PanSplat, got those of {found}")
             if not bfloat16:
                 print("without bfloat16: this processor has no instructions for it")
-            with report:
-                measure_model(cases, views, file, report, scene=folder.name)
-        return 0
-
-
-@dataclass(frozen=True)
-class BenchMemory(_Options):
-    """Measure the memory of a training step and of a prediction over resolutions, for each way of backpropagation.
-
-    Every row runs in a process of its own. With --out, the same command continues an interrupted run.
-    """
-
-    preset: Literal["tiny", "small", "paper"] = "small"
-    """Size of the network; weights are random."""
-    heights: tuple[_TiledHeight, ...] = (128, 256, 512, 1024)
-    """Heights of the panoramas, pixels; multiples of 32. Above 512 only the heads are trained, as in the paper."""
-    quick: bool = False
-    """Without one-step and 4 tiles."""
-    limit_gb: Positive = 8.0
-    """Largest memory of a row, 10^9 bytes. Rows that exceed it are ended, and measured again if another
-    limit is given."""
-    style: Literal["panorama", "cubemap", "original"] = "cubemap"
-    """How images are rendered; as training's --memory.style."""
-    perceptual: Literal["structure", "lpips-vgg", "lpips-alex", "lpips-squeeze"] = "structure"
-    """Part of the loss; LPIPS needs its weights."""
-
-    def run(self) -> int:
-        """Measure, print the table and write the files; an interruption keeps the measured rows."""
-        from pansplat.bench.memory import MEMORY, MemoryBench, MemoryCase, MemorySetting, list_memory_cases
-        from pansplat.bench.model import save_random_weights
-        from pansplat.training.network import network_config
-
-        limit_gib = self.limit_gb * 1e9 / 2**30
-        setting = MemorySetting(self.preset, self.style, self.perceptual, self._set_threads(), limit_gib)
-        cases = list_memory_cases(self.heights, quick=self.quick)
-        report = self._open_report(MEMORY, setting=asdict(setting))
-        retry = not report.resume(MemoryCase)
-        with tempfile.TemporaryDirectory() as folder, report:
-            weights = Path(folder, "random.safetensors")
-            save_random_weights(weights, network_config(setting.network))
-            MemoryBench(setting, weights, report, retry).run(cases)
+            self._run(MODEL, measure_model(cases, views, file, folder.name), weights=weights)
         return 0
 
 
@@ -210,13 +163,13 @@ class BenchRefine(_Options):
 
     def run(self) -> int:
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
-        from pansplat.bench.refine import REFINE, RefineBench, list_refine_cases
+        from pansplat.bench.refine import REFINE, list_refine_cases, measure_refine
 
+        self._check("refine")
         pairs = _load_with_targets(self.paths)
         cases = list_refine_cases(quick=self.quick)
         lpips = choose_lpips(self.lpips, min(case.height for case in cases))
-        with self._open_report(REFINE, lpips=None if lpips is None else lpips.name) as report:
-            RefineBench(report, lpips).run(pairs, cases)
+        self._run(REFINE, measure_refine(pairs, cases, lpips), lpips=None if lpips is None else lpips.name)
         return 0
 
 
@@ -236,18 +189,16 @@ class BenchFlights(_Options):
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
         from pansplat.bench.flights import FLIGHTS, measure_flights
 
+        self._check("flights")
         pairs, lpips = _load_with_targets(self.paths), choose_lpips(self.lpips, self.height)
-        with self._open_report(FLIGHTS, lpips=None if lpips is None else lpips.name, height=self.height) as report:
-            measure_flights(pairs, self.model, self.height, lpips, report)
+        rows, name = measure_flights(pairs, self.model, self.height, lpips), None if lpips is None else lpips.name
+        self._run(FLIGHTS, rows, lpips=name, height=self.height)
         return 0
 
 
 @dataclass(frozen=True)
 class BenchViewer(_Options):
-    """Measure the viewer's frames: each renderer, moving and turning, joint and deferred, over counts of Gaussians.
-
-    With --out, the same command continues an interrupted run, and further --heights add rows.
-    """
+    """Measure the viewer's frames: each renderer, moving and turning, joint and deferred, over counts of Gaussians."""
 
     heights: tuple[_LatticeHeight, ...] = (256, 512, 1024)
     """Heights of the panoramas whose lattices hold the Gaussians: 221,642, 886,580 and 3,546,326; multiples of 8."""
@@ -260,14 +211,13 @@ class BenchViewer(_Options):
 
     def run(self) -> int:
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
-        from pansplat.bench.viewer import VIEWER, ViewerBench, ViewerCase, list_viewer_cases
+        from pansplat.bench.viewer import VIEWER, list_viewer_cases, measure_viewer
 
-        report = self._open_report(VIEWER)
-        report.resume(ViewerCase)
-        with report:
-            bench = ViewerBench(report, repeats=3 if self.quick else 9, threads=self._set_threads())
-            for height in sorted(self.heights)[: 1 if self.quick else None]:
-                bench.run(height, list_viewer_cases(self.size, self.renderers))
+        threads, repeats = self._check("viewer"), 3 if self.quick else 9
+        cases = list_viewer_cases(self.size, self.renderers)
+        heights = sorted(self.heights)[: 1 if self.quick else None]
+        rows = (measure_viewer(height, cases, repeats=repeats, threads=threads) for height in heights)
+        self._run(VIEWER, itertools.chain.from_iterable(rows))
         return 0
 
 
@@ -286,40 +236,10 @@ class BenchPose(_Options):
         """Measure, print the tables and write the files; exit status 1 if a wrong pose passed the check."""
         from pansplat.bench.pose import POSE, measure_folder
 
-        paths = _paths_or_sample(self.paths)
-        with self._open_report(POSE) as report:
-            for path in paths:
-                measure_folder(
-                    path, report, camera_height=self.camera_height, pairs=self.tours != "only", tours=self.tours != "no"
-                )
-        return int(any(row.get("outcome") == "wrong" for row in report.rows))
-
-
-@dataclass(frozen=True)
-class BenchFormats(_Options):
-    """Compare the file formats of scenes: size, error of each field, error of the image, time."""
-
-    path: Positional[Path] = field(kw_only=True)
-    """A scene file."""
-    degree: Annotated[int, Meta(ge=0, le=3)] | None = None
-    """Degree of the harmonics that are written; by default that of the scene. Missing ones are made at random."""
-    height: Annotated[int, Meta(ge=16, le=4096)] = 256
-    """Of the panoramas that are compared, pixels."""
-
-    def run(self) -> int:
-        """Measure each format, print the table and write the files."""
-        from pansplat import pipeline
-        from pansplat.bench.formats import FORMATS, measure_formats, set_degree
-
-        report = self._open_report(FORMATS)
-        scene = pipeline.load(self.path)
-        if not len(scene.gaussians):
-            raise InputError(f"{self.path}: needed Gaussians, got none; give another scene")
-        if self.degree is not None:
-            scene = set_degree(scene, self.degree)
-        with report:
-            measure_formats(scene, self.height, report, name=f"{self.path.name}: {len(scene.gaussians):,} Gaussians")
-        return 0
+        self._check("pose")
+        options = {"camera_height": self.camera_height, "pairs": self.tours != "only", "tours": self.tours != "no"}
+        found = itertools.chain.from_iterable(measure_folder(path, **options) for path in _paths_or_sample(self.paths))
+        return int(any(row.get("outcome") == "wrong" for row in self._run(POSE, found)))
 
 
 @dataclass(frozen=True)
@@ -329,12 +249,10 @@ class Bench:
     what: (
         Annotated[BenchRaster, subcommand("raster")]
         | Annotated[BenchModel, subcommand("model")]
-        | Annotated[BenchMemory, subcommand("memory")]
         | Annotated[BenchRefine, subcommand("refine")]
         | Annotated[BenchFlights, subcommand("flights")]
         | Annotated[BenchViewer, subcommand("viewer")]
         | Annotated[BenchPose, subcommand("pose")]
-        | Annotated[BenchFormats, subcommand("formats")]
     )
 
     def run(self) -> int:

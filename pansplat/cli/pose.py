@@ -60,7 +60,11 @@ class Pose(Writer):
             if is_video and out is not None:
                 images = extract_key_frames(self.paths[0], out.parent, self.frames, progress, overwrite=self.overwrite)
             estimate = estimate_poses(
-                images, camera_height=self.camera_height, baseline=self.baseline, progress=progress
+                images,
+                camera_height=self.camera_height,
+                baseline=self.baseline,
+                cache_folder=images[0].parent,
+                progress=progress,
             )
         _print_estimate(estimate)
         if out is not None:

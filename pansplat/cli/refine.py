@@ -61,7 +61,7 @@ class Refine(Writer):
     def run(self) -> int:
         """Refine, write the scene and print the errors of held-out pixels."""
         from pansplat import pipeline
-        from pansplat.evaluation.report import write_json
+        from pansplat.evaluation.results import write_json
         from pansplat.refinement import RefineConfig, fuse_views
 
         self._refuse_invalid_arguments()

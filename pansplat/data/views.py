@@ -49,7 +49,7 @@ class Views:
             f"near and far {describe_range(self.near, self.far, 'm')}",
         ]
         if count:
-            parts.append(f"masks show {100 * float(self.masks.float().mean()):.3g} %")
+            parts.append(f"masks show {100 * float(torch.as_tensor(self.masks).float().mean()):.3g} %")
         if self.depths is not None:
             parts.append("with depths")
         return f"<Views: {', '.join(parts)}>"

@@ -8,7 +8,6 @@ Source: PanSplat, section 4; the official protocol (docs/official.md, section 13
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -103,25 +102,13 @@ def _check_shapes(prediction: Tensor, target: Tensor, mask: Tensor | None) -> No
         raise ValueError(f"`mask` must be {tuple(target.shape[1:])}, got {tuple(mask.shape)}")
 
 
-@dataclass(frozen=True)
-class DepthErrors:
-    """Errors over all views of one scene; NaN without any true depth.
-
-    Attributes:
-        abs_rel: mean of |error| / truth.
-        sq_rel: mean of error^2 / truth, metres.
-        rmse: root of the mean of error^2, metres.
-    """
-
-    abs_rel: float
-    sq_rel: float
-    rmse: float
-
-
 def depth_errors(
     depth: Float[Tensor, "view h w"], true_depth: Float[Tensor, "view height width"], near: float, far: float
-) -> DepthErrors:
-    """Errors over the pixels whose true depth is strictly between `near` and `far`.
+) -> dict[str, float]:
+    """Errors over the pixels whose true depth is strictly between `near` and `far`; empty if there are none.
+
+    `abs_rel` is the mean of |error| / truth, `sq_rel` that of error^2 / truth in metres, and `rmse` the root of the
+    mean of error^2 in metres.
 
     Args:
         depth: radial, metres; resized to the truth bilinearly, without wrapping.
@@ -131,14 +118,14 @@ def depth_errors(
     large = functional.interpolate(depth[:, None].double(), size, mode="bilinear", align_corners=False)[:, 0]
     known = (true_depth > near) & (true_depth < far)
     if not known.any():
-        return DepthErrors(math.nan, math.nan, math.nan)
+        return {}
     truth = true_depth[known].double()
     error = large.to(truth)[known] - truth
-    return DepthErrors(
-        abs_rel=float((error.abs() / truth).mean()),
-        sq_rel=float((error.square() / truth).mean()),
-        rmse=math.sqrt(float(error.square().mean())),
-    )
+    return {
+        "abs_rel": float((error.abs() / truth).mean()),
+        "sq_rel": float((error.square() / truth).mean()),
+        "rmse": math.sqrt(float(error.square().mean())),
+    }
 
 
 def cross_fade(

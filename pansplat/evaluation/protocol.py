@@ -8,9 +8,7 @@ Source: PanSplat, section 4; docs/official.md, sections 2.1 to 2.5 and 13.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import math
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -36,8 +34,9 @@ from pansplat.data.sources import TripletSet, panogrf_folder, read_panogrf
 from pansplat.data.views import Sample, Views
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
-from pansplat.evaluation.metrics import DepthErrors, depth_errors, psnr, ssim, ws_psnr
-from pansplat.evaluation.report import error_image, finite_json, make_folder, warm_up, write_json
+from pansplat.evaluation.metrics import depth_errors
+from pansplat.evaluation.report import error_image, measure_image, warm_up
+from pansplat.evaluation.results import Row, average_rows, make_folder, write_json
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.model.network import NetworkPredictor
 from pansplat.pipeline import Drawing
@@ -156,44 +155,16 @@ class Method:
     drawing: Drawing = "exact"
 
 
-@dataclass(frozen=True)
-class Score:
-    """Metrics of one target; PSNR in dB, LPIPS None if it was not measured."""
-
-    case: str
-    target: str
-    ws_psnr: float
-    psnr: float
-    ssim: float
-    lpips: float | None
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """The prediction of a case.
-
-    Attributes:
-        depth: radial depth of the inputs at the network's finest level, metres; None for other predictors.
-        seconds: duration of the prediction.
-    """
-
-    scene: Scene
-    depth: Float[Tensor, "view _ _"] | None
-    seconds: float
-
-
-def predict_case(context: Views, predictor: Predictor) -> Prediction:
-    """The scene of a case's inputs, and their depth if the predictor is a network."""
+def predict_case(context: Views, predictor: Predictor) -> tuple[Scene, Float[Tensor, "view _ _"] | None]:
+    """The scene of a case's inputs, and their radial depth at the finest level in metres if a network predicts it."""
     masks = None if bool(context.masks.all()) else context.masks
     inputs = (context.images, context.cam2world, context.near, context.far)
-    start = time.perf_counter()
     depth = None
     if isinstance(predictor, NetworkPredictor):
         gaussians, depths = predictor.predict_with_depths(*inputs, masks=masks)
         depth = depths[-1]
     else:
         gaussians = predictor(*inputs, masks=masks)
-    seconds = time.perf_counter() - start
     assert isinstance(gaussians, Gaussians)  # a list is returned for a batch only
     scene = Scene(
         gaussians,
@@ -204,36 +175,21 @@ def predict_case(context: Views, predictor: Predictor) -> Prediction:
         model=predictor.name,
         height=context.images.shape[-2],
     )
-    return Prediction(scene, depth, seconds)
+    return scene, depth
 
 
-def score_target(sample: Sample, index: int, image: Float[Tensor, "3 height width"], lpips: Lpips | None) -> Score:
-    """Metrics of the image of a target, without masks; only PSNR clamps."""
-    target = sample.targets.images[index]
-    return Score(
-        case=sample.name,
-        target=sample.targets.names[index],
-        ws_psnr=ws_psnr(image, target),
-        psnr=psnr(image, target),
-        ssim=ssim(image, target),
-        lpips=None if lpips is None else lpips.distance(image, target),
-    )
-
-
-def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
-    """Errors of the inputs' depth; None without true depth.
+def measure_depth(context: Views, scene: Scene, depth: Float[Tensor, "view _ _"] | None) -> dict[str, float]:
+    """Errors of the inputs' depth by name; empty without true depth.
 
     For a predictor without depth maps, the depth at each input is rendered from the Gaussians of that input.
     """
     if context.depths is None:
-        return None
-    depth = prediction.depth
+        return {}
     if depth is None:
         size = (context.images.shape[-2], context.images.shape[-1])
         with torch.no_grad():
             depths = [
-                pipeline.render(prediction.scene, pose, blend=view, size=size).depth
-                for view, pose in enumerate(context.cam2world)
+                pipeline.render(scene, pose, blend=view, size=size).depth for view, pose in enumerate(context.cam2world)
             ]
         depth = torch.stack(depths)
     unit = context.frame.unit
@@ -272,45 +228,7 @@ class ProtocolOptions:
     gaps: tuple[int, ...] = (4, 8, 12, 16, 20, 24, 28, 32)
 
 
-@dataclass
-class SetResult:
-    """Results of one method on one set.
-
-    Attributes:
-        depth: errors of each case whose inputs have a true depth.
-        gaussians: number of Gaussians of each case.
-        predict_seconds, render_seconds: of each prediction, and of each target.
-    """
-
-    set: str
-    method: str
-    scores: list[Score] = field(default_factory=list)
-    depth: list[DepthErrors] = field(default_factory=list)
-    gaussians: list[int] = field(default_factory=list)
-    predict_seconds: list[float] = field(default_factory=list)
-    render_seconds: list[float] = field(default_factory=list)
-
-    def mean(self, metric: str) -> float | None:
-        """Mean of a metric over the set's images, or of a depth metric over its scenes; None if it was not measured."""
-        if metric == "gaussians":
-            return _mean(self.gaussians)
-        if metric in ("abs_rel", "sq_rel", "rmse"):
-            return _mean([getattr(errors, metric) for errors in self.depth])
-        values = [getattr(score, metric) for score in self.scores]
-        return None if None in values else _mean(values)
-
-    def as_json(self) -> dict[str, object]:
-        """The entry in results.json."""
-        metrics = ("psnr", "ws_psnr", "ssim", "lpips", "abs_rel", "sq_rel", "rmse", "gaussians")
-        return {
-            "set": self.set,
-            "method": self.method,
-            "images": len(self.scores),
-            **{metric: self.mean(metric) for metric in metrics},
-            "predict_seconds": _mean(self.predict_seconds),
-            "render_seconds": _mean(self.render_seconds),
-            "scores": [dataclasses.asdict(score) for score in self.scores],
-        }
+_METRICS = ("psnr", "ws_psnr", "ssim", "lpips", "abs_rel", "sq_rel", "rmse", "gaussians")
 
 
 @dataclass
@@ -319,6 +237,8 @@ class ProtocolResult:
 
     Attributes:
         lpips: name of the LPIPS metric, such as "lpips-vgg"; None without.
+        rows: one for each set, method, case and target. Times in seconds, the number of Gaussians and errors of depth
+            are those of the case.
         missing: a message for each set without data.
         skipped: a message for each case that could not be read.
     """
@@ -326,20 +246,32 @@ class ProtocolResult:
     protocol: str
     height: int
     lpips: str | None
-    sets: list[SetResult] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
 
+    def means(self) -> list[Row]:
+        """The mean over the images of each set and method, with the number of `images`."""
+        means = average_rows(self.rows, ("set", "method"))
+        for mean in means:
+            mean.case["images"] = len(self._list_rows(mean))
+        return means
+
+    def _list_rows(self, mean: Row) -> list[Row]:
+        return [row for row in self.rows if all(row.get(name) == mean.get(name) for name in ("set", "method"))]
+
     def as_json(self) -> dict[str, object]:
-        """The content of results.json; non-finite numbers become null."""
-        return {
-            "protocol": self.protocol,
-            "height": self.height,
-            "lpips": self.lpips,
-            "results": finite_json([result.as_json() for result in self.sets]),
-            "missing": self.missing,
-            "skipped": self.skipped,
-        }
+        """The content of results.json."""
+        results = [
+            {
+                **mean.case,
+                **{metric: mean.get(metric) for metric in (*_METRICS, "predict_seconds", "render_seconds")},
+                "scores": [row.as_json() for row in self._list_rows(mean)],
+            }
+            for mean in self.means()
+        ]
+        head = {"protocol": self.protocol, "height": self.height, "lpips": self.lpips}
+        return {**head, "results": results, "missing": self.missing, "skipped": self.skipped}
 
 
 def list_methods(
@@ -413,55 +345,61 @@ def run_protocol(
         warm_up(predictor)
     done = 0
     for test_set, cases in chosen:
-        rows = [SetResult(test_set.name, method.name) for method in methods]
-        result.sets += rows
         for number, case in enumerate(cases):
             if progress is not None:
                 progress(f"{test_set.name}: {case.name}", done / total)
             folder = out / _slugify(test_set.name) / _slugify(case.name) if number < options.image_cases else None
             try:
-                _run_case(case, methods, rows, options.height, lpips, folder)
+                result.rows += _run_case(case, test_set.name, methods, options.height, lpips, folder)
             except InputError as error:
                 result.skipped.append(f"{test_set.name}, {case.name}: {error}")
             done += 1
             make_folder(out)
             write_json(result.as_json(), out / "results.json")
-    if not any(row.scores for row in result.sets):
+    if not result.rows:
         raise InputError(f"{root}: none of the {total} cases can be used. The first: {result.skipped[0]}")
     return result
 
 
 def _run_case(
     case: EvaluationCase,
+    set_name: str,
     methods: Sequence[Method],
-    rows: Sequence[SetResult],
     height: int,
     lpips: Lpips | None,
     folder: Path | None,
-) -> None:
-    """Add a case to the rows of the methods; methods with the same predictor share its prediction."""
+) -> list[Row]:
+    """The rows of a case; methods with the same predictor share its prediction."""
     sample = case.read(height)
-    predictions = {}
-    for method, row in zip(methods, rows, strict=True):
+    predictions: dict[int, tuple[Scene, dict[str, float]]] = {}
+    rows = []
+    for method in methods:
         key = id(method.predictor)
         if key not in predictions:
-            predictions[key] = predict_case(sample.context, method.predictor)
-        prediction = predictions[key]
-        row.predict_seconds.append(prediction.seconds)
-        row.gaussians.append(len(prediction.scene.gaussians))
-        if row.set == _DEPTH_SET:
-            errors = measure_depth(sample.context, prediction)
-            row.depth += [errors] if errors is not None and math.isfinite(errors.rmse) else []
+            start = time.perf_counter()
+            scene, depth = predict_case(sample.context, method.predictor)
+            values = {"predict_seconds": time.perf_counter() - start, "gaussians": len(scene.gaussians)}
+            if set_name == _DEPTH_SET:
+                values |= measure_depth(sample.context, scene, depth)
+            predictions[key] = scene, values
+        scene, values = predictions[key]
         for index, target in enumerate(sample.targets.images):
             pose, size = sample.targets.cam2world[index], (target.shape[-2], target.shape[-1])
             start = time.perf_counter()
             with torch.no_grad():
-                drawn = pipeline.render(prediction.scene, pose, blend=method.blend, size=size, drawing=method.drawing)
-            image = drawn.color.float()
-            row.render_seconds.append(time.perf_counter() - start)
-            row.scores.append(score_target(sample, index, image, lpips))
+                image = pipeline.render(
+                    scene, pose, blend=method.blend, size=size, drawing=method.drawing
+                ).color.float()
+            seconds, name = time.perf_counter() - start, sample.targets.names[index]
+            rows.append(
+                Row(
+                    {"set": set_name, "method": method.name, "case": sample.name, "target": name},
+                    {**measure_image(image, target, lpips), **values, "render_seconds": seconds},
+                )
+            )
             if folder is not None:
-                _write_images(folder, _slugify(sample.targets.names[index]), _slugify(method.name), image, target)
+                _write_images(folder, _slugify(name), _slugify(method.name), image, target)
+    return rows
 
 
 def _write_images(folder: Path, target_name: str, method: str, image: Tensor, target: Tensor) -> None:
@@ -480,7 +418,3 @@ def _take_evenly(cases: Sequence[EvaluationCase], limit: int | None) -> Sequence
 
 def _slugify(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9.]+", "_", name).strip("._").lower() or "case"
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return sum(values) / len(values) if values else None

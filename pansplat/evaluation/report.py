@@ -5,75 +5,38 @@ Source: PanSplat, section 4 (metrics of the views between the inputs).
 
 from __future__ import annotations
 
-import dataclasses
-import json
-import math
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from rich.table import Table
 from torch import Tensor
 
 from pansplat import pipeline
-from pansplat.atomic import replacing
 from pansplat.data.images import write_image
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import cross_fade, psnr, ssim, ws_psnr
+from pansplat.evaluation.results import Column, Row, average_rows, make_folder, rich_table, write_json
 from pansplat.gaussians.scene import Scene
 from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor, Progress
 from pansplat.rendering import Rendering
 
+_CROSS_FADE = {  # metrics of the cross-fade, by those of the prediction
+    "ws_psnr": "cross_fade_ws_psnr",
+    "masked_ws_psnr": "masked_cross_fade_ws_psnr",
+    "lpips": "cross_fade_lpips",
+}
 ERROR_SCALE = 0.25  # mean absolute colour error that the brightest colour of an error image shows
-
-
-@dataclass(frozen=True)
-class Case:
-    """Metrics of one target view (PSNR in dB), and the paths of its images.
-
-    Attributes:
-        own_ws_psnr: mean WS-PSNR of the scene's images at the input cameras, over unmasked pixels.
-        refine_seconds: 0 without refinement.
-        masked_ws_psnr: WS-PSNR of the unmasked pixels; None without a mask.
-        lpips: None if it was not measured.
-        cross_fade_ws_psnr, masked_cross_fade_ws_psnr, cross_fade_lpips: the same metrics of the cross-fade.
-    """
-
-    name: str
-    model: str
-    height: int
-    ws_psnr: float
-    psnr: float
-    ssim: float
-    cross_fade_ws_psnr: float
-    predict_seconds: float
-    render_seconds: float
-    num_gaussians: int
-    prediction: Path
-    target: Path
-    own_ws_psnr: float
-    refine_seconds: float
-    masked_ws_psnr: float | None = field(default=None, compare=False)
-    masked_cross_fade_ws_psnr: float | None = field(default=None, compare=False)
-    lpips: float | None = field(default=None, compare=False)
-    cross_fade_lpips: float | None = field(default=None, compare=False)
-
-    def as_json(self) -> dict[str, object]:
-        """The entry in results.json, without the metrics that were not measured; non-finite numbers become null."""
-        values = {key: value for key, value in dataclasses.asdict(self).items() if value is not None}
-        return {key: str(value) if isinstance(value, Path) else finite_json(value) for key, value in values.items()}
 
 
 def evaluate(
@@ -87,8 +50,12 @@ def evaluate(
     drawing: Drawing = "exact",
     lpips: Lpips | None = None,
     progress: Progress | None = None,
-) -> list[Case]:
+) -> list[Row]:
     """Evaluate every target of the pairs, and write results.json and images into `out`.
+
+    The case of a row has the name, the model, the height, and the paths of the images. Its values are those of
+    `measure_image`; `own_ws_psnr`, the mean at the input cameras over unmasked pixels; `masked_ws_psnr` of the unmasked
+    pixels, if the target has a mask; the same metrics of the cross-fade; times in seconds; and the number of Gaussians.
 
     For correct times, predictions are not read from the cache and the predictor runs once before the first pair.
     results.json is written after each pair, so that an interruption keeps the results so far.
@@ -107,18 +74,18 @@ def evaluate(
     make_folder(out)
     warm_up(predictor)
     render = partial(pipeline.render, blend=blend, size=(height, 2 * height), drawing=drawing)
-    cases: list[Case] = []
+    rows: list[Row] = []
     for index, pair in enumerate(with_targets):
 
         def report(what: str, fraction: float, pair: Pair = pair, index: int = index) -> None:
             if progress is not None:
                 progress(f"{pair.name}: {what}", (index + fraction) / len(with_targets))
 
-        taken = {case.prediction.parent.name for case in cases}
+        taken = {row.case["name"] for row in rows}
         joint = blend == "joint" and not pipeline.can_stream(predictor)
-        cases += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, joint, render, lpips, report)
-        write_json([case.as_json() for case in cases], out / "results.json")
-    return cases
+        rows += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, joint, render, lpips, report)
+        write_json([row.as_json() for row in rows], out / "results.json")
+    return rows
 
 
 def warm_up(predictor: Predictor) -> None:
@@ -140,7 +107,7 @@ def _evaluate_pair(
     render: Callable[[Scene, Tensor], Rendering],
     lpips: Lpips | None,
     progress: Progress,
-) -> Iterator[Case]:
+) -> Iterator[Row]:
     context, targets = pair.load_context(height), pair.load_targets(height)
     start = time.perf_counter()
     scene = pipeline.predict(context, predictor, joint=joint, progress=progress)
@@ -165,26 +132,40 @@ def _evaluate_pair(
         write_image(folder / "error.png", error_image(image, target))
         faded = cross_fade(context.images, context.cam2world, pose)
         mask = None if bool(targets.masks[view].all()) else targets.masks[view]
-        yield Case(
-            name=folder.name,
-            model=predictor.name,
-            height=height,
-            ws_psnr=ws_psnr(image, target),
-            psnr=psnr(image, target),
-            ssim=ssim(image, target),
-            cross_fade_ws_psnr=ws_psnr(faded, target),
-            own_ws_psnr=own_ws_psnr,
-            predict_seconds=predict_seconds,
-            refine_seconds=refine_seconds,
-            render_seconds=render_seconds,
-            num_gaussians=len(scene.gaussians),
-            prediction=(folder / "prediction.png").resolve(),
-            target=(folder / "target.png").resolve(),
-            masked_ws_psnr=None if mask is None else ws_psnr(image, target, mask=mask),
-            masked_cross_fade_ws_psnr=None if mask is None else ws_psnr(faded, target, mask=mask),
-            lpips=None if lpips is None else lpips.distance(image, target),
-            cross_fade_lpips=None if lpips is None else lpips.distance(faded, target),
+        faded_values = measure_image(faded, target, lpips, mask)
+        yield Row(
+            {
+                "name": folder.name,
+                "model": predictor.name,
+                "height": height,
+                "prediction": str((folder / "prediction.png").resolve()),
+                "target": str((folder / "target.png").resolve()),
+            },
+            {
+                **measure_image(image, target, lpips, mask),
+                **{new: faded_values[old] for old, new in _CROSS_FADE.items() if old in faded_values},
+                "own_ws_psnr": own_ws_psnr,
+                "predict_seconds": predict_seconds,
+                "refine_seconds": refine_seconds,
+                "render_seconds": render_seconds,
+                "num_gaussians": len(scene.gaussians),
+            },
         )
+
+
+def measure_image(
+    image: Float[Tensor, "3 height width"],
+    target: Float[Tensor, "3 height width"],
+    lpips: Lpips | None = None,
+    mask: Bool[Tensor, "height width"] | None = None,
+) -> dict[str, float]:
+    """Metrics of an image by name: WS-PSNR and PSNR in dB, SSIM, and LPIPS if it is given.
+
+    Only PSNR clamps. With a mask, there is the WS-PSNR of its pixels, too.
+    """
+    values = {"ws_psnr": ws_psnr(image, target), "psnr": psnr(image, target), "ssim": ssim(image, target)}
+    masked = {} if mask is None else {"masked_ws_psnr": ws_psnr(image, target, mask=mask)}
+    return values | masked | ({} if lpips is None else {"lpips": lpips.distance(image, target)})
 
 
 def measure_own_views(scene: Scene, context: Views, render: Callable[[Scene, Tensor], Rendering]) -> float:
@@ -194,7 +175,7 @@ def measure_own_views(scene: Scene, context: Views, render: Callable[[Scene, Ten
             ws_psnr(render(scene, pose).color.float(), image, mask=mask)
             for image, pose, mask in zip(context.images, scene.cam2world, context.masks, strict=True)
         ]
-    return sum(values) / len(values)
+    return fmean(values)
 
 
 def error_image(
@@ -208,88 +189,34 @@ def error_image(
     return torch.from_numpy(heat).permute(2, 0, 1)
 
 
-def write_json(value: Mapping[str, Any] | Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write an object, or a list of objects, without non-finite numbers as JSON, atomically."""
-    mark = {"software": "pansplat"}
-    marked = {**mark, **value} if isinstance(value, dict) else [{**mark, **row} for row in value]
-    text = json.dumps(marked, indent=1, allow_nan=False)
-    with replacing(path) as unfinished:
-        unfinished.write_text(text + "\n", encoding="utf-8")
+_COLUMNS = (
+    Column("case", "name"),
+    Column("WS-PSNR", "ws_psnr", ".2f"),
+    Column("masked", "masked_ws_psnr", ".2f"),
+    Column("PSNR", "psnr", ".2f"),
+    Column("SSIM", "ssim", ".4f"),
+    Column("LPIPS", "lpips", ".4f"),
+    Column("cross-fade", "cross_fade_ws_psnr", ".2f"),
+    Column("at inputs", "own_ws_psnr", ".2f"),
+    Column("predict s", "predict_seconds", ".1f"),
+    Column("refine s", "refine_seconds", ".1f"),
+    Column("render s", "render_seconds", ".1f"),
+    Column("Gaussians", "num_gaussians", ",.0f"),
+)
+_OPTIONAL = ("masked_ws_psnr", "lpips", "refine_seconds")  # columns without values, or with zeros only, are left out
 
 
-@dataclass(frozen=True)
-class _Column:
-    """A column of the table: the field of a case, the format, and the field of the cross-fade if it has one."""
-
-    field: str
-    format_spec: str
-    cross_fade: str = ""
-
-
-_COLUMNS = {
-    "WS-PSNR": _Column("ws_psnr", ".2f", "cross_fade_ws_psnr"),
-    "masked": _Column("masked_ws_psnr", ".2f", "masked_cross_fade_ws_psnr"),
-    "PSNR": _Column("psnr", ".2f"),
-    "SSIM": _Column("ssim", ".4f"),
-    "LPIPS": _Column("lpips", ".4f", "cross_fade_lpips"),
-    "cross-fade": _Column("cross_fade_ws_psnr", ".2f"),
-    "at inputs": _Column("own_ws_psnr", ".2f"),
-    "predict s": _Column("predict_seconds", ".1f"),
-    "refine s": _Column("refine_seconds", ".1f"),
-    "render s": _Column("render_seconds", ".1f"),
-    "Gaussians": _Column("num_gaussians", ",.0f"),
-}
-_NOT_MEASURED = {"masked_ws_psnr": None, "lpips": None, "refine_seconds": 0.0}  # columns of these values are left out
-
-
-def results_table(cases: Sequence[Case]) -> Table:
+def results_table(rows: Sequence[Row]) -> Table:
     """A printable table of the cases, their mean, and the mean of the cross-fade of the same cases."""
-    columns = {head: column for head, column in _COLUMNS.items() if _is_measured(cases, column.field)}
-    table = Table(title=f"{cases[0].model}, {cases[0].height}x{2 * cases[0].height}" if cases else None)
-    table.add_column("case")
-    for head in columns:
-        table.add_column(head, justify="right")
-    for case in cases:
-        table.add_row(case.name, *(_format_mean([case], c.field, c.format_spec) for c in columns.values()))
-    if cases:
-        table.add_section()
-        if len(cases) > 1:
-            table.add_row("mean", *(_format_mean(cases, c.field, c.format_spec) for c in columns.values()))
-        table.add_row("cross-fade", *(_format_mean(cases, c.cross_fade, c.format_spec) for c in columns.values()))
-    return table
-
-
-def _is_measured(cases: Sequence[Case], name: str) -> bool:
-    return name not in _NOT_MEASURED or any(getattr(case, name) != _NOT_MEASURED[name] for case in cases)
-
-
-def _format_mean(cases: Sequence[Case], field: str, format_spec: str) -> str:
-    return format(fmean(_read_value(case, field) for case in cases), format_spec) if field else ""
-
-
-def _read_value(case: Case, field: str) -> float:
-    """A metric; without a mask the masked one is that of all pixels."""
-    value = getattr(case, field)
-    if value is None and field.startswith("masked_"):
-        value = getattr(case, field.removeprefix("masked_"))
-    return math.nan if value is None else value
-
-
-def finite_json(value: object) -> object:
-    """The value with null for numbers that JSON cannot represent."""
-    if isinstance(value, dict):
-        return {key: finite_json(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [finite_json(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder and its parents; an InputError if it cannot be made."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make {folder} ({error.strerror}); choose another --out") from error
+    columns = [c for c in _COLUMNS if c.value not in _OPTIONAL or any(row.get(str(c.value)) for row in rows)]
+    # Without a mask, all pixels count.
+    unmasked = {"masked_ws_psnr": "ws_psnr", "masked_cross_fade_ws_psnr": "cross_fade_ws_psnr"}
+    rows = [Row(row.case, {new: row.values[old] for new, old in unmasked.items()} | row.values) for row in rows]
+    (mean,) = average_rows(rows, ())
+    faded = {old: mean.values[new] for old, new in _CROSS_FADE.items() if new in mean.values}
+    below = [Row({"name": "mean"}, mean.values)] if len(rows) > 1 else []
+    title = "{model}, {height}x{width}".format(**rows[0].case, width=2 * rows[0].case["height"])
+    return rich_table(title, columns, rows, [*below, Row({"name": "cross-fade"}, faded)])
 
 
 def _choose_folder_name(name: str, taken: set[str]) -> str:

@@ -138,12 +138,6 @@ def load_scene(path: str | Path) -> Scene:
     return load_glb(path) if suffix == ".glb" else load_ply(path)
 
 
-def sort_as_written(gaussians: Gaussians, path: Path) -> Gaussians:
-    """The Gaussians in the order of a file that `save_scene` writes."""
-    coded = _CODED.get(find_scene_suffix(path))
-    return sort_by_label(gaussians) if coded is None else coded.order(gaussians)
-
-
 def _save_coded(scene: Scene, path: Path, coded: _Coded) -> None:
     gaussians = select_finite(scene.gaussians, path)
     if not 0 < len(gaussians) <= coded.max_gaussians:

@@ -223,6 +223,8 @@ class Scene:
 
     def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
         """The pose at a fraction from the first context camera (0) to the last (1); an InputError without cameras."""
+        if not 0 <= fraction <= 1:
+            raise InputError(f"`fraction` must be from 0, the first camera, to 1, the last one, got {fraction}")
         if not len(self.cam2world):
             raise InputError("the scene has no input cameras to interpolate; give a pose instead")
         return interpolate_poses(self.cam2world[0], self.cam2world[-1], fraction)

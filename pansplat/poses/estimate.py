@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
 from pansplat.console import with_progress_bar
@@ -24,9 +24,10 @@ from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import require_file
+from pansplat.guided_sweep import load_default_sweep
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes, with_hints
 from pansplat.poses.dense import Surroundings
-from pansplat.poses.depth import estimate_depth
+from pansplat.poses.depth import DepthMap, estimate_depth
 from pansplat.poses.features import (
     DIAGONAL,
     FACE_ROTATIONS,
@@ -46,11 +47,13 @@ from pansplat.poses.learned import (
     match_learned,
 )
 from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
+from pansplat.poses.pose_cache import PoseCache, hash_parts
 from pansplat.poses.tour import Group, Pair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.ways import NO_WAYS, Ways
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
 from pansplat.predictor import Progress, part_of
+from pansplat.source_hash import hash_sources
 from pansplat.threads import one_thread, worker_threads
 
 _HEIGHT = 1024  # pixels; larger panoramas are reduced
@@ -58,6 +61,7 @@ _MIN_HEIGHT = 256
 _QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared thoroughly
 _THOROUGH = 6  # pairs of each panorama that are compared with all features
 _FEW = 6  # up to this number of panoramas, all pairs are compared with all features
+_MOST = 0.6  # of the panoramas whose common mask is kept when others are added
 _DARK = 8.0  # mean grey value of an image that shows nothing
 _LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
 _SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
@@ -185,6 +189,7 @@ class _View:
         axes: gravity and walls.
         small: grey, for the search of the floor.
         surroundings: all that it shows, with estimated depth.
+        key: a hash of all that it was computed from.
     """
 
     features: Features
@@ -193,6 +198,7 @@ class _View:
     axes: SceneAxes
     small: Float[Array, "height width"]
     surroundings: Surroundings
+    key: str = ""
 
     @functools.cached_property
     def matched(self) -> Features:
@@ -229,6 +235,7 @@ def estimate_poses(
     camera_height: float = CAMERA_HEIGHT,
     baseline: tuple[Path | str, Path | str, float] | None = None,
     seed: int = 0,
+    cache_folder: Path | None = None,
     progress: Progress | None = None,
 ) -> PoseEstimate:
     """Camera poses of two or more equirectangular panoramas of one place.
@@ -240,6 +247,8 @@ def estimate_poses(
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images and their distance in metres, instead of the camera's height.
         seed: of the random samples.
+        cache_folder: folder whose cache keeps features and relative poses, so that a further panorama costs its own
+            only; none by default.
         progress: called with a description of the current work and the completed fraction.
 
     Returns:
@@ -273,13 +282,15 @@ def estimate_poses(
         raise _no_poses(paths, unplaced | {n: "no other panorama is left" for n in kept})
     with one_thread():  # panoramas and pairs are divided among threads
         files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
-        views = _describe_views(paths, files, pixels, hints, kept, report)
+        fingerprint = "" if cache_folder is None else hash_sources(__name__) + load_default_sweep().fingerprint
+        cache = PoseCache(cache_folder, _CACHED, fingerprint)
+        views = _describe_views(paths, files, pixels, hints, kept, cache, report)
         ways = links or {}
         yaws = {
             (i, j): Ways(ways.get(paths[a], {}).get(paths[b]), ways.get(paths[b], {}).get(paths[a]))
             for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
         }
-        relations = _relate_views(views, yaws, seed, report)
+        relations = _relate_views(views, yaws, seed, cache, report)
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
@@ -417,43 +428,82 @@ def _describe_views(
     pixels: dict[int, Array],
     hints: Sequence[Hints],
     kept: Sequence[int],
+    cache: PoseCache,
     report: Progress,
 ) -> list[_View]:
     headings = {hints[n].heading for n in kept} - {None}
     is_compass = len(headings) > 1  # one value for all pictures is a program's default
-    static = scene_mask_of_files(tuple(paths[n] for n in kept), _HEIGHT).numpy()
-
+    stems = {n: hash_parts(pixels[n]) for n in kept}
+    static = _find_scene_mask([paths[n] for n in kept], [stems[n] for n in kept], cache)
     matcher = _load_matcher()
 
-    def describe(n: int) -> _View:
+    def look_up(n: int) -> _View:
         mask = masks.get(paths[n])
         scene = static if mask is None else read_mask(mask, _HEIGHT).numpy()
         grey = pixels[n]
         pixels_of_view, opaque = read_panorama(paths[n], len(grey))
         if not opaque.all():
             scene = scene & (cv2.resize(opaque.numpy().astype(np.uint8), scene.shape[::-1]) > 0)
-        small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
-        axes = with_hints(find_axes(grey), hints[n].down, hints[n].heading if is_compass else None)
-        turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
         image = pixels_of_view.permute(1, 2, 0).numpy()
+        heading = hints[n].heading if is_compass else None
+        stated = f"{hints[n].down} {heading} {matcher is None}"
+        key = hash_parts(image, np.packbits(scene), stated)
+        return cache.get(f"view-{stems[n]}", key, lambda: describe(key, grey, scene, image, hints[n].down, heading))
+
+    def describe(key: str, grey: Array, scene: Array, image: Array, down: Array | None, heading: float | None) -> _View:
+        small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
+        axes = with_hints(find_axes(grey), down, heading)
+        turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
         learned = None
         if matcher is not None:
             learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
-        image = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
-        depth = estimate_depth(image, axes.axes[0] if axes.has_down else None)
-        surroundings = Surroundings(image, depth)
-        return _View(detect_features(grey, scene), turned, learned, axes, small, surroundings)
+        shown = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
+        depth = estimate_depth(shown, axes.axes[0] if axes.has_down else None)
+        return _View(detect_features(grey, scene), turned, learned, axes, small, Surroundings(shown, depth), key)
 
     views = []
     with worker_threads() as pool:
-        for position, view in enumerate(pool.map(describe, kept)):
+        for position, view in enumerate(pool.map(look_up, kept)):
             report("finding features", 0.4 * position / len(kept))
             views.append(view)
     return views
 
 
+@dataclass(frozen=True, eq=False)
+class _SceneMask:
+    """Where panoramas show the scene and not what is fixed to the camera.
+
+    Attributes:
+        stems: hashes of the panoramas.
+        bits: the mask, packed.
+    """
+
+    stems: tuple[str, ...]
+    bits: UInt8[Array, "byte"]
+
+
+_CACHED = (_View, _SceneMask, Features, LearnedFeatures, SceneAxes, Surroundings, DepthMap, RelativePose, Hypotheses)
+
+
+def _find_scene_mask(paths: Sequence[Path], stems: Sequence[str], cache: PoseCache) -> Bool[Array, "height width"]:
+    """Where the panoramas show the scene; as found before, if most of them are those of before.
+
+    So the features of these stay when others are added.
+    """
+
+    def detect() -> _SceneMask:
+        mask = scene_mask_of_files(tuple(paths), _HEIGHT).numpy()
+        return _SceneMask(tuple(stems), np.packbits(mask))
+
+    earlier = [mask for mask in cache.list_values("scene-") if set(mask.stems) <= set(stems)]
+    best = max(earlier, key=lambda mask: len(mask.stems), default=None)
+    if best is None or len(best.stems) < _MOST * len(stems):
+        best = cache.get(f"scene-{hash_parts(*stems)}", "", detect)
+    return np.unpackbits(best.bits, count=2 * _HEIGHT**2).reshape(_HEIGHT, 2 * _HEIGHT).astype(bool)
+
+
 def _relate_views(
-    views: Sequence[_View], ways: Mapping[Pair, Ways], seed: int, report: Progress
+    views: Sequence[_View], ways: Mapping[Pair, Ways], seed: int, cache: PoseCache, report: Progress
 ) -> dict[Pair, RelativePose]:
     """Relative poses of the pairs that have most in common, and of those that links connect."""
     pairs = list(itertools.combinations(range(len(views)), 2))
@@ -486,9 +536,13 @@ def _relate_views(
         every = matches.joined(further.shifted(len(first.matched), len(second.matched)))
         return polish_relative_pose(relation, first.joined, second.joined, every, prior)
 
+    def look_up(pair: Pair) -> RelativePose:
+        stem = hash_parts(*(views[view].key for view in pair))
+        return cache.get(f"pair-{stem}", f"{ways[pair]} {seed}", lambda: relate(pair))
+
     relations = {}
     with worker_threads() as pool:
-        for position, (pair, relation) in enumerate(zip(pairs, pool.map(relate, pairs), strict=True)):
+        for position, (pair, relation) in enumerate(zip(pairs, pool.map(look_up, pairs), strict=True)):
             report("comparing pairs", 0.5 + 0.4 * position / len(pairs))
             relations[pair] = relation
     return relations

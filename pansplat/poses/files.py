@@ -129,7 +129,7 @@ def estimate_pairs(
     folders = cache_folders(folder)
     source = next((cache / name for cache in folders if (cache / name).is_file()), None)
     if source is None:
-        content = _estimate(panoramas, camera_height, progress)
+        content = _estimate(folder, panoramas, camera_height, progress)
         source = write_cache_file(folders, name, json.dumps(content).encode())
         if source is None:
             raise InputError(
@@ -138,7 +138,9 @@ def estimate_pairs(
     return _make_pairs(folder, panoramas, read_json(source), source, near, far)
 
 
-def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Progress | None) -> dict[str, Any]:
+def _estimate(
+    folder: Path, panoramas: Sequence[Panorama], camera_height: float, progress: Progress | None
+) -> dict[str, Any]:
     """What is cached: worlds of placed panoramas, and the reasons for the others, by name."""
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
@@ -148,7 +150,14 @@ def _estimate(panoramas: Sequence[Panorama], camera_height: float, progress: Pro
             panorama.image: {images[link.target]: link.yaw for link in panorama.links if link.target in images}
             for panorama in panoramas
         }
-        estimate = estimate_poses(list(names), masks=masks, links=links, camera_height=camera_height, progress=progress)
+        estimate = estimate_poses(
+            list(names),
+            masks=masks,
+            links=links,
+            camera_height=camera_height,
+            cache_folder=folder,
+            progress=progress,
+        )
     except NoPosesError as error:
         worlds, summary, unplaced, pairs, suggestions = [], "", error.reasons, [], error.suggestions
     else:

@@ -35,6 +35,7 @@ from pansplat.tours.graph import (
 from pansplat.tours.links import find_link_ring, find_way_along_link
 from pansplat.tours.overlap import connect
 from pansplat.tours.route import FADE_SECONDS, Route, find_angles, plan_route
+from pansplat.tours.walls import find_walls
 
 __all__ = [
     "EDGE_HYSTERESIS",
@@ -60,6 +61,7 @@ __all__ = [
     "find_rooms",
     "find_storeys",
     "find_tours",
+    "find_walls",
     "find_way_along_link",
     "fit_box",
     "list_starts",

@@ -316,7 +316,7 @@ def _paint_storey(
             cv2.polylines(image, [centers[list(edge)]], False, (170, 180, 190), 1, cv2.LINE_AA)
     for node in np.flatnonzero(inside).tolist():
         panorama, (x, y) = tour.panoramas[node], centers[node].tolist()
-        if (node, node) in tour.overlaps:
+        if not tour.is_placed(node):
             cv2.rectangle(image, (x - 5, y - 5), (x + 5, y + 5), (90, 204, 255), -1)
         else:
             is_probable = panorama.placement.state == "probable"

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,9 +20,10 @@ from torch import Tensor
 
 from pansplat.data.pairs import FAR, NEAR, Link, Pair, Panorama
 from pansplat.descriptions import describe_count, describe_range, list_first
-from pansplat.gaussians.scene import Gains, Gaussians, Scene, Starts
+from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, Starts
 from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
 from pansplat.tours.layout import REACH, lay_out
+from pansplat.tours.walls import find_walls
 
 Edge = tuple[int, int]
 """Indices of two panoramas, the smaller one first; a panorama without another one has a self-edge, twice its index."""
@@ -57,6 +58,7 @@ class TourGraph:
             self-edge is 1.
         originals: the panoramas with poses in their own worlds, which scenes are predicted from; none if these
             are `panoramas`.
+        walls: pairs of panoramas of one world between which is a wall or a closed door; they are no edges.
     """
 
     name: str
@@ -67,6 +69,7 @@ class TourGraph:
     siblings: tuple[Path, ...] = ()
     overlaps: dict[Edge, float] = field(default_factory=dict)
     originals: tuple[Panorama, ...] = ()
+    walls: tuple[Edge, ...] = ()
 
     def __repr__(self) -> str:
         names = list_first([panorama.label for panorama in self.panoramas])
@@ -99,11 +102,40 @@ class TourGraph:
     @cached_property
     def parts(self) -> tuple[int, ...]:
         """The part of each node; parts are numbered in the order of their first nodes."""
-        ends = np.array([*self.overlaps], int).reshape(-1, 2).T
+        return self._number_components([*self.overlaps])
+
+    @cached_property
+    def worlds(self) -> tuple[int, ...]:
+        """The world of each node: parts with walls between them have known relative places."""
+        return self._number_components([*self.overlaps, *self.walls])
+
+    def _number_components(self, edges: Sequence[Edge]) -> tuple[int, ...]:
+        ends = np.array(edges, int).reshape(-1, 2).T
         graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(self), len(self)))
         labels = connected_components(graph, directed=False)[1].tolist()
         numbers = {label: number for number, label in enumerate(dict.fromkeys(labels))}
         return tuple(numbers[label] for label in labels)
+
+    def is_placed(self, node: int) -> bool:
+        """Whether the place of a node relative to another one is known."""
+        return self.worlds.count(self.worlds[node]) > 1
+
+    def with_walls(self, walls: Iterable[Edge]) -> TourGraph:
+        """The graph with further walls in place of edges; a node without another edge gets a self-edge."""
+        every = tuple(dict.fromkeys((*self.walls, *walls)))
+        overlaps = {edge: overlap for edge, overlap in self.overlaps.items() if edge not in every}
+        joined = {node for edge in overlaps for node in edge}
+        overlaps |= {(node, node): 1.0 for edge in every for node in edge if node not in joined}
+        return dataclasses.replace(self, overlaps=overlaps, walls=every)
+
+    def list_overlaps(self) -> Overlaps:
+        """The edges with their overlaps, as a scene keeps them; walls are edges without overlap."""
+        return (*((a, b, overlap) for (a, b), overlap in self.overlaps.items()), *((a, b, 0.0) for a, b in self.walls))
+
+    def with_overlaps(self, overlaps: Overlaps) -> TourGraph:
+        """The graph with the edges and walls of `list_overlaps`."""
+        graph = dataclasses.replace(self, overlaps={(a, b): overlap for a, b, overlap in overlaps}, walls=())
+        return graph.with_walls((a, b) for a, b, overlap in overlaps if a != b and overlap == 0)
 
     def list_parts(self) -> list[Views]:
         """The nodes of each part."""
@@ -246,13 +278,13 @@ class TourGraph:
     def leave_out(self, node: int) -> Pair:
         """A pair whose target is a panorama, and whose context is what the tour without it would show at its position.
 
-        That is the scene of the nearest edge of its part.
+        That is the scene of the nearest edge of its world.
         """
         overlaps = {edge: overlap for edge, overlap in self.overlaps.items() if node not in edge}
         joined = {*itertools.chain(*overlaps), node}
         overlaps |= {(other, other): 1.0 for other in range(len(self)) if other not in joined}
         others = dataclasses.replace(self, overlaps=overlaps)
-        near = [edge for edge in overlaps if self.parts[edge[0]] == self.parts[node]]
+        near = [edge for edge in overlaps if self.worlds[edge[0]] == self.worlds[node]]
         edge = min(near, key=lambda edge: others.measure_distance(edge, self.positions[node]))
         pair = self.make_pair(others.choose_scene_views()[edge])
         target = (self.originals or self.panoramas)[node]
@@ -379,7 +411,7 @@ class TourGraph:
             longest = ways[is_near].max()
             fade = 0.5 * longest + _LINKED_FADE * self.far
             costs[~is_near] = _UNLINKED_FADE * fade + longest
-            for a, b in self.links:
+            for a, b in (*self.links, *self.walls):
                 if self.is_fade(a, b):
                     costs[a, b] = costs[b, a] = fade
             ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
@@ -417,7 +449,7 @@ def _improve_order(order: Int[np.ndarray, "node"], costs: Float[np.ndarray, "nod
 
 
 def find_tours(pairs: Sequence[Pair]) -> list[TourGraph]:
-    """Tours of the pairs of folders; their edges are the pairs, without overlaps (0).
+    """Tours of the pairs of folders; their edges are the pairs, with overlaps that are not measured (1).
 
     Three or more panoramas that pairs connect are a tour. But if a panorama of a folder is in no pair with another one,
     or the folder has several worlds, all its panoramas are one tour; a panorama without another one has a self-edge.
@@ -462,7 +494,7 @@ def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
         for pair in pairs
         for a, b in itertools.combinations(pair.context, 2)
     }
-    overlaps = dict.fromkeys(sorted(edges), 0.0)
+    overlaps = dict.fromkeys(sorted(edges), 1.0)
     overlaps |= {(node, node): 1.0 for node in sorted(set(range(len(images))) - {*itertools.chain(*edges)})}
     measured = [pair for pair in pairs if len(pair.context) > 1] or pairs  # the range of a single view is a default
     near, far = min(pair.near for pair in measured), max(pair.far for pair in measured)
@@ -497,7 +529,7 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene], max_views: int
             panorama = tour.panoramas[node]
             names[node] = panorama.title or (scene.names[view] if view < len(scene.names) else panorama.name)
     assert scene is not None
-    return dataclasses.replace(
+    merged = dataclasses.replace(
         scene,
         gaussians=Gaussians.cat([parts[node] for node in range(len(tour))]),
         cam2world=tour.cam2world,
@@ -505,11 +537,13 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene], max_views: int
         far=tour.far,
         names=tuple(names[node] for node in range(len(tour))),
         gains=_join_gains(gains, tour.parts),
-        overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
         links=tuple(
             (a, b, wrap_angle(link.yaw), wrap_angle(link.pitch), link.text) for (a, b), link in tour.links.items()
         ),
         starts=list_starts(tour.panoramas),
+    )
+    return dataclasses.replace(
+        merged, overlaps=tour.with_walls(find_walls(merged, range(len(tour)), tour.overlaps)).list_overlaps()
     )
 
 
@@ -583,5 +617,4 @@ def make_graph(scene: Scene) -> TourGraph:
         )
         for k, pose in enumerate(scene.cam2world.double())
     )
-    overlaps = {(a, b): overlap for a, b, overlap in scene.overlaps}
-    return TourGraph("", Path(), panoramas, scene.near, scene.far, overlaps=overlaps)
+    return TourGraph("", Path(), panoramas, scene.near, scene.far).with_overlaps(scene.overlaps)

@@ -18,6 +18,7 @@ from pansplat.tours.graph import TourGraph
 _HEIGHT = 48
 _CANDIDATES = 24
 _MIN_OVERLAP = 0.12
+_MIN_GIVEN_OVERLAP = 0.03  # of an edge that is given; flights of furnished homes with a free way have .1 or more
 _MAX_BASELINE = 0.4  # of an edge that is not given, as a fraction of far
 _MAX_NEIGHBOURS = 6  # nearest panoramas that are compared
 
@@ -26,7 +27,7 @@ def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = Non
     """The tour with measured overlaps, and with edges between further panoramas that overlap.
 
     Each panorama is compared with its nearest neighbours within 0.4 far, of those with poses in the same world. Given
-    edges are kept whatever their overlap.
+    edges are walls if their panoramas show nothing in common.
 
     Raises:
         InputError: an image cannot be read.
@@ -44,16 +45,18 @@ def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = Non
     for node in sorted({node for edge in compared for node in edge}):
         report("comparing panoramas", 0.5 * node / len(tour))
         features[node] = _compute_features(read_panorama(tour.panoramas[node].image, _HEIGHT)[0])
-    overlaps = {}
+    overlaps, walls = {}, []
     for index, (a, b) in enumerate(sorted(compared)):
         report("comparing panoramas", 0.5 + 0.5 * index / len(compared))
         poses = tour.cam2world[[a, b]]
         overlap = _measure_overlap(features[a], features[b], poses, tour.near, tour.far)
-        if overlap >= _MIN_OVERLAP or (a, b) in tour.overlaps:
-            overlaps[a, b] = max(overlap, 0.0)
-    joined = {node for edge in overlaps for node in edge}
+        if overlap >= (_MIN_GIVEN_OVERLAP if (a, b) in tour.overlaps else _MIN_OVERLAP):
+            overlaps[a, b] = overlap
+        elif (a, b) in tour.overlaps:
+            walls.append((a, b))
+    joined = {node for edge in (*overlaps, *walls) for node in edge}
     overlaps |= {(a, b): overlap for (a, b), overlap in tour.overlaps.items() if a == b and a not in joined}
-    return dataclasses.replace(tour, overlaps=overlaps)
+    return dataclasses.replace(tour, overlaps=overlaps).with_walls(walls)
 
 
 def _compute_features(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "feature height width"]:

@@ -159,7 +159,7 @@ def make_plan(scene: Scene, tour: TourGraph) -> Plan:
         return Plan(tour, (), (), math.nan, None, None, 0, 0)
     unit = float(np.median(known))
     sights = [_look(scene, view, level, heights[view] or unit) for view in range(count)]
-    storeys, parts = assign_storeys(tour), tour.parts if tour.overlaps else (0,) * count  # a pair has no edges
+    storeys, parts = assign_storeys(tour), tour.worlds if tour.overlaps else (0,) * count  # a pair has no edges
     rooms: list[Room] = []
     for part, storey in sorted({*zip(parts, storeys, strict=True)}):
         members = [k for k in range(count) if sights[k] is not None and (parts[k], storeys[k]) == (part, storey)]
@@ -167,7 +167,7 @@ def make_plan(scene: Scene, tour: TourGraph) -> Plan:
         if members:
             normals = _find_directions(in_part, unit)
             for nodes, outline in _outline_rooms(sights, members, normals, unit):
-                is_placed = (nodes[0], nodes[0]) not in tour.overlaps or len(tour) == 1
+                is_placed = not tour.overlaps or tour.is_placed(nodes[0]) or len(tour) == 1
                 rooms.append(Room(_name_room(tour, nodes), nodes, outline, storey, is_placed))
     disagreement, num_walls = _measure_walls(rooms, sights, parts, unit)
     scale = float(1.4826 * np.median(np.abs(known - unit)) / unit) if len(known) > 2 else None

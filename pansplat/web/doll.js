@@ -1,6 +1,13 @@
-"use strict";
 // The doll's house view: the camera turns around the rooms from outside, and nothing is drawn that shows its back. docs/web.md
 // describes it. The rooms are those of the part and the storey of the panorama that the camera leaves.
+
+import { camera, nearestNode, parts, tangentOf } from "./camera.js";
+import { byId, calm } from "./dom.js";
+import { ease, freeze, isWaiting, jump, jumpTo, setTouring } from "./flight.js";
+import { clamp, column, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
+import { changed, measureAt, rayOf } from "./loop.js";
+import { DEGREE } from "./share.js";
+import { headset } from "./xr.js";
 
 const DOLL_FOV = 45;                               // degrees, vertical, of a landscape picture
 const DOLL_PITCH = -45 * Math.PI / 180;            // of the first view
@@ -10,9 +17,8 @@ const DOLL_ZOOM = [0.15, 2];                       // of the first distance
 const DOLL_TURN = Math.PI / 2;                     // radians a second, by keys
 
 class DollHouse {
-  // `page`: the functions of page.js that are used below.
-  constructor(page) {
-    Object.assign(this, { page, isOn: false, node: 0, flight: null, center: null, distance: 0, first: 0, fov: 0 });
+  constructor() {
+    Object.assign(this, { isOn: false, node: 0, flight: null, center: null, distance: 0, first: 0, fov: 0 });
   }
 
   get isPossible() {
@@ -37,11 +43,10 @@ class DollHouse {
 
   // Flies out of the panorama at the camera.
   enter() {
-    const { page } = this, { camera } = page;
-    if (!this.isPossible || page.isInHeadset) return;
-    page.setTouring(false);
-    this.node = page.nearestNode(camera.position);
-    page.freeze();
+    if (!this.isPossible || headset.session) return;
+    setTouring(false);
+    this.node = nearestNode(camera.position);
+    freeze();
     this.setOn(true);
     camera.roll = 0;
     this.fov = camera.fov;
@@ -54,24 +59,23 @@ class DollHouse {
 
   // Flies to a panorama, and ends there.
   visit(node) {
-    const { page } = this;
     if (!this.shows(node)) {
-      page.jumpTo(node);
+      jumpTo(node);
       return;
     }
     this.node = node;
-    this.flyTo({ position: [...HEADER.spots[node].position], yaw: page.camera.yaw, pitch: 0, fov: this.fov }, () => {
-      page.jump(HEADER.spots[node].position, { yaw: page.camera.yaw, pitch: 0 });
+    this.flyTo({ position: [...HEADER.spots[node].position], yaw: camera.yaw, pitch: 0, fov: this.fov }, () => {
+      jump(HEADER.spots[node].position, { yaw: camera.yaw, pitch: 0 });
     });
   }
 
   // Without a flight.
   setOn(value) {
-    if (this.isOn && !value) this.page.camera.fov = this.fov;
+    if (this.isOn && !value) camera.fov = this.fov;
     this.isOn = value;
     this.flight = null;
-    document.getElementById("doll").setAttribute("aria-pressed", value);
-    this.page.changed();
+    byId("doll").setAttribute("aria-pressed", value);
+    changed();
   }
 
   // Corners of the box around the rooms, in level axes.
@@ -83,7 +87,7 @@ class DollHouse {
   // The distance from which a box fits into the picture.
   fit(box, yaw, pitch) {
     const rotation = this.turned(yaw, pitch), middle = scaled(plus(...box), 0.5);
-    const tall = this.page.tangentOf(innerWidth, innerHeight, DOLL_FOV), wide = tall * innerWidth / innerHeight;
+    const tall = tangentOf(innerWidth, innerHeight, DOLL_FOV), wide = tall * innerWidth / innerHeight;
     let distance = 0;
     for (let corner = 0; corner < 8; corner++) {
       const offset = minus([0, 1, 2].map((k) => box[corner >> k & 1][k]), middle);
@@ -106,7 +110,6 @@ class DollHouse {
 
   orbit(yaw, pitch) {
     if (this.flight) return;
-    const { camera } = this.page;
     camera.yaw += yaw;
     camera.pitch = clamp(camera.pitch + pitch, -89.9 * DEGREE, LOWEST);
     this.stay();
@@ -119,9 +122,8 @@ class DollHouse {
   }
 
   stay() {
-    const { camera } = this.page;
     Object.assign(camera, this.place(camera.yaw, camera.pitch));
-    this.page.changed();
+    changed();
   }
 
   // The keys that walk: sideways and up turn, forward comes nearer.
@@ -132,31 +134,33 @@ class DollHouse {
 
   // Goes to the panorama nearest to what a point of the window shows.
   take(left, top) {
-    const { page } = this, distance = page.measureAt(left, top);
+    const distance = measureAt(left, top);
     if (this.flight || distance === null) return;
-    const point = plus(page.camera.position, scaled(page.rayOf(left, top), distance));
+    const point = plus(camera.position, scaled(rayOf(left, top), distance));
     const away = HEADER.spots.map(({ position }, node) => this.shows(node) ? distanceOf(position, point) : Infinity);
     this.visit(away.indexOf(Math.min(...away)));
   }
 
   flyTo(target, then = () => {}) {
-    const start = { ...this.page.camera, position: [...this.page.camera.position] };
-    this.flight = { start, target, then, began: null, seconds: this.page.isCalm ? 0 : DOLL_SECONDS };
-    this.page.changed();
+    const start = { ...camera, position: [...camera.position] };
+    this.flight = { start, target, then, began: null, seconds: calm.matches ? 0 : DOLL_SECONDS };
+    changed();
   }
 
   advance(now) {
-    const { flight } = this, { camera } = this.page;
-    if (!flight || this.page.isWaiting) return;
+    const { flight } = this;
+    if (!flight || isWaiting()) return;
     flight.began = flight.began === null ? now : flight.began;
-    const t = flight.seconds ? clamp((now - flight.began) / (1000 * flight.seconds), 0, 1) : 1, part = this.page.ease(t);
+    const t = flight.seconds ? clamp((now - flight.began) / (1000 * flight.seconds), 0, 1) : 1, part = ease(t);
     const mix = (from, to) => from + part * (to - from);
     const { start, target } = flight;
     camera.position = start.position.map((from, k) => mix(from, target.position[k]));
     for (const name of ["yaw", "pitch", "fov"]) camera[name] = mix(start[name], target[name]);
-    this.page.changed();
+    changed();
     if (t < 1) return;
     this.flight = null;
     flight.then();
   }
 }
+
+export const doll = new DollHouse();

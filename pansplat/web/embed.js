@@ -1,4 +1,3 @@
-"use strict";
 // The page in other pages and for scripts (docs/web.md, Embedding): messages, arrivals, and whose the wheel is.
 // A page may show what only its visitor can open, so messages are exchanged with stated origins only (HEADER.embed).
 
@@ -66,3 +65,5 @@ class Embed {
     this.waiting = null;
   }
 }
+
+export const embed = new Embed();

@@ -1,4 +1,3 @@
-"use strict";
 // Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of the methods of
 // pansplat.tours.TourGraph that they name; tests/web/test_browser.py compares them.
 //
@@ -6,17 +5,17 @@
 // on the way from one (row) to another one (column); the `hysteresis` of a change of edge; and the `reach` around a part,
 // within which a camera that has jumped is in it. Edges are numbers in `edges`.
 
-const minus = (a, b) => a.map((value, i) => value - b[i]);
-const plus = (a, b) => a.map((value, i) => value + b[i]);
-const scaled = (a, factor) => a.map((value) => value * factor);
-const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
-const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, value, i) => sum + value * b[i][k], 0)));
-const column = (matrix, k) => matrix.map((row) => row[k]);
-const distanceOf = (a, b) => Math.hypot(...minus(a, b));
-const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
-const lengthOf = (path) => path.slice(1).reduce((sum, point, i) => sum + distanceOf(point, path[i]), 0);
+export const minus = (a, b) => a.map((value, i) => value - b[i]);
+export const plus = (a, b) => a.map((value, i) => value + b[i]);
+export const scaled = (a, factor) => a.map((value) => value * factor);
+export const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+export const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, value, i) => sum + value * b[i][k], 0)));
+export const column = (matrix, k) => matrix.map((row) => row[k]);
+export const distanceOf = (a, b) => Math.hypot(...minus(a, b));
+export const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+export const lengthOf = (path) => path.slice(1).reduce((sum, point, i) => sum + distanceOf(point, path[i]), 0);
 
-function closestOnEdge(graph, edge, position) {
+export function closestOnEdge(graph, edge, position) {
   const [from, to] = graph.edges[edge].slice(0, 2).map((node) => graph.positions[node]);
   const along = minus(to, from);
   const fraction = clamp(dot(minus(position, from), along) / Math.max(dot(along, along), 1e-12), 0, 1);
@@ -26,10 +25,10 @@ function closestOnEdge(graph, edge, position) {
 // measure_distance
 const distanceToEdge = (graph, edge, position) => distanceOf(position, closestOnEdge(graph, edge, position));
 
-const partOfEdge = (graph, edge) => graph.parts[graph.edges[edge][0]];
+export const partOfEdge = (graph, edge) => graph.parts[graph.edges[edge][0]];
 
 // find_nearest_edge, without the distance; of one part if it is given
-function nearestEdge(graph, position, part = null) {
+export function nearestEdge(graph, position, part = null) {
   const distances = graph.edges.map((_, edge) => {
     return part === null || part === partOfEdge(graph, edge) ? distanceToEdge(graph, edge, position) : Infinity;
   });
@@ -37,7 +36,7 @@ function nearestEdge(graph, position, part = null) {
 }
 
 // follow_edge
-function followEdge(graph, position, current) {
+export function followEdge(graph, position, current) {
   const part = partOfEdge(graph, current);
   let nearest = nearestEdge(graph, position);
   if (partOfEdge(graph, nearest) !== part && distanceToEdge(graph, nearest, position) > graph.reach) {
@@ -48,16 +47,16 @@ function followEdge(graph, position, current) {
 }
 
 // list_reachable
-function isReachable(graph, edge, node) {
+export function isReachable(graph, edge, node) {
   const ends = graph.edges[edge].slice(0, 2);
   return graph.edges.some(([a, b]) => (a === node && ends.includes(b)) || (b === node && ends.includes(a)));
 }
 
 // is_fade
-const isFade = (graph, from, to) => graph.parts[from] !== graph.parts[to];
+export const isFade = (graph, from, to) => graph.parts[from] !== graph.parts[to];
 
 // find_way
-function findWay(graph, position, node, part = null) {
+export function findWay(graph, position, node, part = null) {
   const ways = graph.edges[nearestEdge(graph, position, part)].slice(0, 2).map((start) => {
     const way = [start];
     while (way.at(-1) !== node) way.push(graph.next[way.at(-1)][node]);

@@ -81,7 +81,9 @@ _ORIGIN = re.compile(r"(https?)://([a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::([0-9]{1,5}
 _DEFAULT_PORTS = {"http": 80, "https": 443}
 
 _WORKER = ("unpack.js", "sorter.js")
-_PROGRAMS = ("graph.js", "renderer.js", "xr.js", "share.js", "embed.js", "plan.js", "doll.js", "measure.js", "page.js")
+_LIBRARIES = ("graph.js", "renderer.js")  # which know nothing of the page; scripts of their own
+_IMPORT = re.compile(r'^import \{[^}]*\} from "\./(\w+\.js)";\n', re.MULTILINE)
+_EXPORT = re.compile(r"^export ", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -353,7 +355,7 @@ def _describe_scene(
     flights: _Flights,
     tour: TourGraph,
 ) -> dict[str, Any]:
-    """The numbers of a page, without those of single Gaussians; page.js reads them as HEADER."""
+    """The numbers of a page, without those of single Gaussians; its modules read them as HEADER."""
     level = flights.level
     positions = scene.cam2world[:, :3, 3].numpy() - origin
     known = [find_camera_height(scene, view, level) for view in range(len(positions))]
@@ -520,7 +522,7 @@ def _write_files(
         header=_to_script(header | {"dataParts": len(parts)}),
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         worker=_to_script("".join(map(_read, _WORKER))),
-        programs="\n".join(f"<script>\n{_read(name)}</script>" for name in _PROGRAMS),
+        programs=_bundle_programs(),
         parts="\n".join(
             tags or (f'<script type="text/plain">{part}</script><script>addPart()</script>' for part in parts)
         ),
@@ -587,6 +589,27 @@ def _remove_old_parts(folder: Path, kept: set[str]) -> None:
         if file.name not in kept and re.fullmatch(r"[0-9a-f]{16}\.js", file.name) and is_written(file):
             with suppress(OSError):
                 file.unlink()
+
+
+def _bundle_programs() -> str:
+    """The modules of the page as scripts: a page from disk cannot import files.
+
+    Modules follow those that they import, as in a browser. All share one scope, so their names differ.
+    """
+    seen: set[str] = set()
+    texts: dict[str, str] = {}
+
+    def add(name: str) -> None:
+        seen.add(name)  # modules may import each other
+        text = _read(name)
+        for other in _IMPORT.findall(text):
+            if other not in seen:
+                add(other)
+        texts[name] = _EXPORT.sub("", _IMPORT.sub("", text))
+
+    add("page.js")
+    libraries = "\n".join(f'<script>\n"use strict";\n{texts.pop(name)}</script>' for name in _LIBRARIES)
+    return f'{libraries}\n<script>\n(() => {{\n"use strict";\n{"".join(texts.values())}}})();\n</script>'
 
 
 def _fill_template(**values: str) -> str:

@@ -1,14 +1,21 @@
-"use strict";
 // The floor plan: panoramas, edges and links from above, and the camera. Forward of the level axes is up.
+
+import { camera } from "./camera.js";
+import { byId } from "./dom.js";
+import { goTo } from "./flight.js";
+import { column, dot, minus, plus, scaled } from "./graph.js";
+import { changed } from "./loop.js";
+import { drawSvg } from "./measure.js";
+import { here, isSingle } from "./rings.js";
+import { DEGREE } from "./share.js";
 
 const PLAN_MARGIN = 20;        // pixels
 const LARGEST_PLAN_SCALE = 60; // pixels for a metre
 const STOREY = 1.5;            // metres: panoramas with a larger difference in height from the camera are faint
 
 class Plan {
-  // `page`: the functions of page.js that are used below.
-  constructor(page) {
-    Object.assign(this, { page, panel: document.getElementById("plan"), buttons: [] });
+  constructor() {
+    Object.assign(this, { panel: byId("plan"), buttons: [] });
   }
 
   get isOpen() {
@@ -17,9 +24,9 @@ class Plan {
 
   toggle() {
     this.panel.hidden = this.isOpen;
-    document.getElementById("map").setAttribute("aria-pressed", this.isOpen);
+    byId("map").setAttribute("aria-pressed", this.isOpen);
     if (this.isOpen && !this.buttons.length) this.make();
-    this.page.changed();
+    changed();
   }
 
   // To the right, down, and forward, in metres.
@@ -34,21 +41,21 @@ class Plan {
     const scale = Math.min((size - 2 * PLAN_MARGIN) / Math.max(extent, 1e-6), LARGEST_PLAN_SCALE);
     const center = scaled(plus(low, high), 0.5);
     this.toPlan = ([right, , forward]) => [0.5 * size + scale * (right - center[0]), 0.5 * size - scale * (forward - center[1])];
-    const svg = draw("svg", { width: size, height: size, "aria-hidden": true });
+    const svg = drawSvg("svg", { width: size, height: size, "aria-hidden": true });
     const line = (from, to, kind) => {
       const [[x1, y1], [x2, y2]] = [from, to].map((node) => this.toPlan(places[node]));
-      svg.append(draw("line", { x1, y1, x2, y2, class: kind }));
+      svg.append(drawSvg("line", { x1, y1, x2, y2, class: kind }));
     };
     HEADER.links.filter(({ from, to }) => HEADER.parts[from] !== HEADER.parts[to]).forEach(({ from, to }) => line(from, to, "link"));
     HEADER.edges.filter(([from, to]) => from !== to).forEach(([from, to]) => line(from, to, "edge"));
-    this.camera = draw("path", { d: "M0 0L-9 -22L9 -22Z" });
+    this.camera = drawSvg("path", { d: "M0 0L-9 -22L9 -22Z" });
     svg.append(this.camera);
     this.buttons = HEADER.spots.map(({ name }, node) => {
       const button = document.createElement("button"), [left, top] = this.toPlan(places[node]);
       button.title = button.ariaLabel = `Go to ${name}`;
-      button.className = this.page.isSingle(node) ? "single" : "";
+      button.className = isSingle(node) ? "single" : "";
       button.style.transform = `translate(${left - 12}px, ${top - 12}px)`;
-      button.onclick = () => this.page.goTo(node);
+      button.onclick = () => goTo(node);
       return button;
     });
     this.heights = places.map(([, down]) => down);
@@ -57,7 +64,7 @@ class Plan {
 
   show() {
     if (!this.isOpen) return;
-    const { camera, here } = this.page, place = this.inLevel(camera.position), [x, y] = this.toPlan(place);
+    const place = this.inLevel(camera.position), [x, y] = this.toPlan(place);
     this.camera.setAttribute("transform", `translate(${x} ${y}) rotate(${camera.yaw / DEGREE})`);
     this.buttons.forEach((button, node) => {
       button.classList.toggle("faint", Math.abs(this.heights[node] - this.heights[here]) > STOREY);
@@ -66,3 +73,5 @@ class Plan {
     });
   }
 }
+
+export const plan = new Plan();

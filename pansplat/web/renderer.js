@@ -1,11 +1,12 @@
-"use strict";
 // Draws the Gaussians of HEADER's views with WebGL 2 (docs/rendering.md), as they arrive.
+
+import { scaled } from "./graph.js";
 
 const BATCH = HEADER.batch;         // quads of one instance
 const TEXTURE_WIDTH = 2048;         // WebGL 2 guarantees 2048 texels a side, which is 4,194,304 Gaussians
 
 // Draws to a WebGL 2 context: one layer for each view, and their mean by nearness (docs/rendering.md, section 7).
-class Renderer {
+export class Renderer {
   constructor(gl) {
     this.gl = gl;
     const float = gl.getExtension("EXT_color_buffer_float");

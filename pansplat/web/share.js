@@ -1,12 +1,15 @@
-"use strict";
 // Links to a pose, and pictures. A pose has `position` (three numbers in the page's unit), `yaw`, `pitch` and `fov` (degrees); it
 // stands in the hash of the address as #at=x,y,z,yaw,pitch,fov.
 
-const DEGREE = Math.PI / 180;
+import { camera } from "./camera.js";
+import { explain, say } from "./dom.js";
+import { takePicture } from "./loop.js";
+
+export const DEGREE = Math.PI / 180;
 
 const turnsOf = (radians) => Math.atan2(Math.sin(radians), Math.cos(radians)) / DEGREE;
 
-function poseOf({ position, yaw, pitch, fov }) {
+export function poseOf({ position, yaw, pitch, fov }) {
   return { position: [...position], yaw: turnsOf(yaw), pitch: pitch / DEGREE, fov };
 }
 
@@ -15,7 +18,7 @@ function formatPose(pose) {
 }
 
 // Returns null if the hash has no pose.
-function parsePose(hash) {
+export function parsePose(hash) {
   const found = /^#at=([-+.\de]+(?:,[-+.\de]+){5})$/i.exec(hash), values = found ? found[1].split(",").map(Number) : [];
   if (values.length !== 6 || !values.every(Number.isFinite)) return null;
   const [x, y, z, yaw, pitch, fov] = values;
@@ -23,13 +26,8 @@ function parsePose(hash) {
 }
 
 class Share {
-  // `page`: the functions of page.js that are used below.
-  constructor(page) {
-    this.page = page;
-  }
-
   get link() {
-    return location.href.split("#")[0] + formatPose(poseOf(this.page.camera));
+    return location.href.split("#")[0] + formatPose(poseOf(camera));
   }
 
   // Where the browser does not allow the clipboard, the link is shown.
@@ -37,20 +35,22 @@ class Share {
     const { link } = this;
     try {
       await navigator.clipboard.writeText(link);
-      this.page.say("Link to this view copied");
+      say("Link to this view copied");
     } catch {
-      this.page.explain(link);
+      explain(link);
     }
   }
 
   // Downloads the picture of the camera at the full resolution.
   async savePicture() {
-    const blob = await this.page.takePicture(), link = document.createElement("a");
+    const blob = await takePicture(), link = document.createElement("a");
     if (!blob) return;
     link.href = URL.createObjectURL(blob);
     link.download = `${document.title}.png`;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 60000);
-    this.page.say(window.parent === window ? "Picture saved" : "Picture saved, if the page around this frame allows downloads");
+    say(window.parent === window ? "Picture saved" : "Picture saved, if the page around this frame allows downloads");
   }
 }
+
+export const share = new Share();

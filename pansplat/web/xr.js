@@ -1,13 +1,20 @@
-"use strict";
 // The page in a headset (WebXR): both eyes, controllers and hands. docs/web.md describes it.
 //
 // The reference space of a session has x right, y up and z backwards, and its origin on the floor if the device knows it. A
 // heading turns it into the scene, and the point between the eyes is the page's camera. So the page's functions work as
 // without a headset: they move the camera, and the movement of the head is added to it.
 
+import { blendWeights, camera, findSpot, floorPoint, walk } from "./camera.js";
+import { doll } from "./doll.js";
+import { byId, calm, explain } from "./dom.js";
+import { coverage, goHome, goTo, isFlying, jumpTo, setTouring } from "./flight.js";
+import { clamp, column, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
+import { advance, changed, renderer, requestSort, sorted } from "./loop.js";
+import { findRings } from "./rings.js";
+
 const XR_FEATURES = ["local-floor", "hand-tracking"];
 const XR_AXES = [[1, 0, 0], [0, -1, 0], [0, 0, -1]];  // of WebXR to OpenCV, and back
-const SORT_DISTANCE = 0.01;         // metres from the point for which the Gaussians are sorted
+export const SORT_DISTANCE = 0.01;         // metres from the point for which the Gaussians are sorted
 const SNAP_TURN = Math.PI / 6;      // radians
 const DEAD_ZONE = 0.2;              // of a stick
 const MIN_POINTING = 0.06;          // radians between a ray and the centre of a ring that it selects
@@ -16,7 +23,7 @@ const FLOOR_SPEED = 5;              // of the way to the height of a new floor, 
 const HEIGHT_RATIO = 1.5;           // of the head to the panorama's camera, both over their floors
 const MIN_RATE = 72, LOWEST_RATE = 60;  // frames a second: if the device has a choice, and of any device
 const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30;  // of the resolution, after so many frames
-const BUTTONS = { 4: "goHome", 5: "leave" };  // A and X, B and Y
+const BUTTONS = { 4: () => goHome(), 5: () => headset.leave() };  // A and X, B and Y
 
 const rowsOf = (matrix) => [0, 1, 2].map((row) => [0, 1, 2].map((k) => matrix[4 * k + row]));
 const pointOf = ({ x, y, z }) => [x, y, z];
@@ -24,29 +31,23 @@ const unit = (vector) => scaled(vector, 1 / Math.max(Math.hypot(...vector), 1e-9
 const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
 
 class Headset {
-  // `page`: the functions and values of page.js that are used below.
-  constructor(page) {
-    Object.assign(this, { page, gl: null, session: null, works: false, isEntering: false });
+  constructor() {
+    Object.assign(this, { gl: null, session: null, works: false, isEntering: false });
   }
 
   // Shows the button where there is a headset, and otherwise what to do.
   async offer() {
-    const button = document.getElementById("vr"), system = navigator.xr;
+    const button = byId("vr"), system = navigator.xr;
     this.works = Boolean(system) && await system.isSessionSupported("immersive-vr").catch(() => false);
     button.hidden = !this.works && isSecureContext;
     button.onclick = () => this.toggle();
-    document.getElementById("no-vr").hidden = this.works || (isSecureContext && location.protocol !== "file:");
+    byId("no-vr").hidden = this.works || (isSecureContext && location.protocol !== "file:");
   }
 
   toggle() {
     if (this.session) this.leave();
     else if (this.works) this.enter();
-    else this.say(document.getElementById("no-vr").textContent);
-  }
-
-  say(text) {
-    document.getElementById("notice-text").textContent = text;
-    document.getElementById("notice").showModal();
+    else explain(byId("no-vr").textContent);
   }
 
   async enter() {
@@ -65,14 +66,14 @@ class Headset {
     } catch (error) {
       const isDenied = error.name === "NotAllowedError" || error.name === "SecurityError";
       const advice = "Allow it in the settings of this site, then try again.";
-      this.say(isDenied ? `The browser does not allow VR on this page. ${advice}` : `VR could not start: ${error.message}`);
+      explain(isDenied ? `The browser does not allow VR on this page. ${advice}` : `VR could not start: ${error.message}`);
       if (session) session.end().catch(() => {});
     }
     this.isEntering = false;
   }
 
   start(session) {
-    this.page.leaveDollHouse();
+    if (doll.isOn) jumpTo(doll.node);
     this.heading = this.headYaw = 0;
     this.head = this.origin = this.left = this.floor = this.hovered = null;
     this.last = performance.now();
@@ -84,11 +85,11 @@ class Headset {
     const rate = (session.supportedFrameRates || []).find((each) => each >= MIN_RATE);
     if (rate && rate !== session.frameRate) session.updateTargetFrameRate(rate).catch(() => {});
     session.addEventListener("end", () => this.end());
-    session.addEventListener("select", (event) => this.select(event, matchMedia("(prefers-reduced-motion: reduce)").matches));
+    session.addEventListener("select", (event) => this.select(event, calm.matches));
     session.addEventListener("squeeze", (event) => this.select(event, true));
     this.space.addEventListener("reset", () => { this.head = null; });
     this.session = session;
-    document.getElementById("vr").setAttribute("aria-pressed", true);
+    byId("vr").setAttribute("aria-pressed", true);
     session.requestAnimationFrame((now, frame) => this.onFrame(now, frame));
   }
 
@@ -107,39 +108,39 @@ class Headset {
   lose() {
     if (!this.session) return;
     this.leave();
-    this.say("The graphics of the headset were lost. Please enter VR again.");
+    explain("The graphics of the headset were lost. Please enter VR again.");
   }
 
   // The session has ended, whoever ended it. The page goes on from the camera of before.
   end() {
     this.session = null;
-    document.getElementById("vr").setAttribute("aria-pressed", false);
-    this.page.changed();
+    byId("vr").setAttribute("aria-pressed", false);
+    changed();
   }
 
   onFrame(now, frame) {
-    const { session, page } = this;
+    const { session } = this;
     if (!session) return;
     session.requestAnimationFrame((...next) => this.onFrame(...next));
     const elapsed = now - this.last, seconds = clamp(elapsed, 0, 100) / 1000;
     this.last = now;
-    const pose = frame.getViewerPose(this.space), { renderer } = page;
-    if (!pose || !renderer) return;  // not tracked; the graphics are lost
-    page.advance(now, seconds);
+    const pose = frame.getViewerPose(this.space);
+    if (!pose || !renderer || !sorted) return;  // not tracked; the graphics are lost
+    advance(now, seconds);
     this.followHead(pose.transform, seconds);
     const isWalking = this.readControllers(seconds);
     if (!this.session) return;  // a button has ended it
-    this.left = [...page.camera.position];
-    page.requestSort(SORT_DISTANCE);
+    this.left = [...camera.position];
+    requestSort(SORT_DISTANCE);
     this.adaptScale(1000 * seconds);
-    this.motion += ((isWalking || page.isFlying) - this.motion) * Math.min(8 * seconds, 1);
+    this.motion += ((isWalking || isFlying()) - this.motion) * Math.min(8 * seconds, 1);
     const marks = this.findMarks(frame), layer = session.renderState.baseLayer;
     for (const view of pose.views) {
       if (view.requestViewportScale) view.requestViewportScale(this.scale);
       const { x, y, width, height } = layer.getViewport(view);
       if (!width || !height) continue;
       const eye = this.makeEye(view);
-      renderer.draw(eye, page.blendWeights(eye.position), layer.framebuffer, [x, y, width, height]);
+      renderer.draw(eye, blendWeights(eye.position), layer.framebuffer, [x, y, width, height]);
       this.drawMarks(eye, [...marks, ...this.findVeils(eye)]);
     }
   }
@@ -157,7 +158,7 @@ class Headset {
   }
 
   pointInScene(point) {
-    return plus(this.page.camera.position, this.rotate(minus(point, this.head)));
+    return plus(camera.position, this.rotate(minus(point, this.head)));
   }
 
   // The page has turned the camera.
@@ -168,7 +169,7 @@ class Headset {
   // Moves the camera as the head has moved. A flight and a jump place the camera anew: then the movement since they began is
   // added.
   followHead({ position, matrix }, seconds) {
-    const { page } = this, { camera } = page, head = pointOf(position);
+    const head = pointOf(position);
     const [right, , back] = [0, 1, 2].map((k) => column(multiply(XR_AXES, rowsOf(matrix)), k));
     const forward = scaled(back, -1), isSteep = Math.abs(forward[1]) > 0.95;
     this.headYaw = isSteep ? Math.atan2(-right[2], right[0]) : Math.atan2(forward[0], forward[2]);
@@ -184,7 +185,7 @@ class Headset {
   // The first pose, or that after the device has moved its reference space: the camera of before looks straight ahead. Heights
   // over the two floors that differ too much are not of one scale: then the head begins at the camera.
   begin(head) {
-    const { camera, findSpot } = this.page, spot = findSpot(camera.position), height = distanceOf(spot.position, spot.mark);
+    const spot = findSpot(camera.position), height = distanceOf(spot.position, spot.mark);
     this.turnTo(camera.yaw);
     this.head = this.origin = head;
     this.hasFloor = this.hasFloor && head[1] > height / HEIGHT_RATIO && head[1] < height * HEIGHT_RATIO;
@@ -193,8 +194,8 @@ class Headset {
 
   // The head is over the scene's floor as it is over the room's.
   standOnFloor(seconds) {
-    const { page } = this, { camera } = page, down = column(HEADER.level, 1), floor = dot(down, page.floorPoint(camera.position));
-    const isNew = this.floor === null || page.black === 1;
+    const down = column(HEADER.level, 1), floor = dot(down, floorPoint(camera.position));
+    const isNew = this.floor === null || coverage() === 1;
     this.floor = isNew ? floor : this.floor + (floor - this.floor) * Math.min(FLOOR_SPEED * seconds, 1);
     camera.position = plus(camera.position, scaled(down, this.floor - this.head[1] - dot(down, camera.position)));
   }
@@ -213,7 +214,6 @@ class Headset {
 
   // Sticks: the left one walks, the right one turns in steps and walks straight on. Returns whether it walks.
   readControllers(seconds) {
-    const { page } = this;
     let [right, forward, turn] = [0, 0, 0];
     for (const source of this.session.inputSources) {
       const { gamepad, handedness } = source;
@@ -224,18 +224,18 @@ class Headset {
       if (handedness === "left" || Math.abs(y) > Math.abs(x)) forward -= y;
       const before = this.pressed.get(source) || [], pressed = gamepad.buttons.map((button) => button.pressed);
       this.pressed.set(source, pressed);
-      for (const [button, call] of Object.entries(BUTTONS)) {
-        if (pressed[button] && before[button] === false) call === "leave" ? this.leave() : page[call]();
+      for (const [button, act] of Object.entries(BUTTONS)) {
+        if (pressed[button] && before[button] === false) act();
       }
     }
     if (Math.abs(turn) > 0.6 && !this.isTurned) {
       this.heading += Math.sign(turn) * SNAP_TURN;
-      page.camera.yaw += Math.sign(turn) * SNAP_TURN;
+      camera.yaw += Math.sign(turn) * SNAP_TURN;
     }
     this.isTurned = Math.abs(turn) > (this.isTurned ? 0.3 : 0.6);
     if (Math.hypot(right, forward) < DEAD_ZONE) return false;
-    if (page.isFlying) page.setTouring(false);
-    page.walk(...scaled([right, 0, forward], seconds * HEADER.speed));
+    if (isFlying()) setTouring(false);
+    walk(...scaled([right, 0, forward], seconds * HEADER.speed));
     return true;
   }
 
@@ -248,7 +248,7 @@ class Headset {
 
   // The ring that a ray points at.
   findRing(ray) {
-    const found = this.page.findRings().map((ring) => {
+    const found = findRings().map((ring) => {
       const offset = minus(ring.mark, ray.origin), distance = Math.hypot(...offset);
       const angle = Math.acos(clamp(dot(ray.direction, offset) / Math.max(distance, 1e-6), -1, 1));
       return { ring, distance, angle, limit: Math.max(1.2 * ring.radius / Math.max(distance, 1e-6), MIN_POINTING) };
@@ -259,8 +259,8 @@ class Headset {
   select({ inputSource, frame }, isJump) {
     const ray = this.rayOf(inputSource, frame), found = ray && this.findRing(ray);
     if (!found) return;
-    if (isJump) this.page.jumpTo(found.ring.node);
-    else this.page.goTo(found.ring.node);
+    if (isJump) jumpTo(found.ring.node);
+    else goTo(found.ring.node);
   }
 
   // ---- resolution ----
@@ -297,24 +297,24 @@ class Headset {
 
   // Rings, rays of controllers and hands, and the name of the ring that one of them points at.
   findMarks(frame) {
-    const { page } = this, marks = [], pointed = new Map(), down = column(HEADER.level, 1);
+    const marks = [], pointed = new Map(), down = column(HEADER.level, 1);
     const [right, ahead] = [0, 2].map((k) => column(HEADER.level, k));
     for (const source of this.session.inputSources) {
       const ray = source.targetRayMode === "tracked-pointer" ? this.rayOf(source, frame) : null;
       if (!ray) continue;
       const found = this.findRing(ray), along = scaled(ray.direction, 0.5 * (found ? found.distance : RAY_LENGTH));
-      const center = plus(ray.origin, along), across = unit(cross(along, minus(center, page.camera.position)));
+      const center = plus(ray.origin, along), across = unit(cross(along, minus(center, camera.position)));
       marks.push({ center, axes: [along, scaled(across, 0.003)], shape: 0, color: [0.6, 0.6, 0.6, 0.6] });
       if (found) pointed.set(found.ring, found.distance);
     }
-    for (const ring of page.findRings()) {
+    for (const ring of findRings()) {
       const color = ring.link ? [1, 0.8, 0.4, 1] : [1, 1, 1, 1], strength = pointed.has(ring) ? 1 : 0.6;
       const axes = [right, ahead].map((axis) => scaled(axis, ring.radius));
       marks.push({ center: ring.mark, axes, shape: 1, color: scaled(color, strength) });
     }
     const [ring] = pointed.keys();
     if (ring) {
-      const size = 0.05 * pointed.get(ring), across = unit(cross(down, minus(ring.mark, page.camera.position)));
+      const size = 0.05 * pointed.get(ring), across = unit(cross(down, minus(ring.mark, camera.position)));
       const axes = [scaled(across, 8 * size), scaled(down, size)];
       marks.push({ center: minus(ring.mark, scaled(down, 2 * ring.radius)), axes, shape: 3, color: [1, 1, 1, 1], ring });
     }
@@ -329,13 +329,13 @@ class Headset {
     };
     const veils = [];
     if (this.motion > 0.01) veils.push(cover(2, [0, 0, 0, 1], 0.125 + 0.3 * (1 - this.motion)));
-    if (this.page.black) veils.push(cover(0, [0, 0, 0, this.page.black], 0));
+    if (coverage()) veils.push(cover(0, [0, 0, 0, coverage()], 0));
     return veils;
   }
 
   // Over what has been drawn in the viewport.
   drawMarks(eye, marks) {
-    const { gl, page: { renderer } } = this;
+    const { gl } = this;
     if (this.renderer !== renderer) {
       this.renderer = renderer;
       this.program = renderer.link(SHADERS.mark);
@@ -381,3 +381,5 @@ class Headset {
     this.hovered = ring;
   }
 }
+
+export const headset = new Headset();

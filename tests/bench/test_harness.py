@@ -1,26 +1,29 @@
-"""Memory, time and errors of calls, and errors of child processes."""
+"""Memory, time and errors of calls; rows that a run prints and writes, though it is interrupted."""
 
+import json
 import math
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from pansplat.bench import harness
 from pansplat.bench.harness import (
-    CaseFailedError,
-    OverLimitError,
-    _make_error,
+    Suite,
+    announce,
     compare_images,
     describe_machine,
     measure_peak_memory,
     quartile_range,
-    relative_deviation,
     time_call,
     time_workload,
 )
+from pansplat.evaluation.results import Column, Row
+from pansplat.files import is_written
 
 CPU = torch.device("cpu")
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark is Linux's")
@@ -36,7 +39,7 @@ def test_peak_memory_is_the_memory_that_the_call_holds_at_once(count):
 
     peak, total = measure_peak_memory(hold, CPU)
     assert total == count * 10_000_000
-    assert peak is not None and 10 * count - 2 <= peak <= 10 * count + 20  # other threads may allocate a little
+    assert 10 * count - 2 <= peak["peak_mb"] <= 10 * count + 20  # other threads may allocate a little
     del before  # held during the call
 
 
@@ -77,15 +80,6 @@ def test_one_wrong_pixel_sets_the_largest_error_and_the_psnr():
         compare_images(wrong[:, :-1], reference)
 
 
-def test_deviation_of_tensors_is_relative_to_the_reference():
-    reference = {"a": torch.tensor([3.0, 0.0]), "b": torch.tensor([4.0])}
-    result = {"a": torch.tensor([3.0, 0.3]), "b": torch.tensor([4.0])}
-    assert relative_deviation(result, reference, together=True) == pytest.approx(0.06)
-    assert relative_deviation(result, reference, together=False) == pytest.approx(0.1)
-    with pytest.raises(ValueError, match="must hold"):
-        relative_deviation({"a": result["a"]}, reference, together=True)
-
-
 def test_the_workload_is_the_median_of_51_calls_after_half_a_second(monkeypatch):
     clock, durations = Clock(monkeypatch), [0.3, 0.3, *range(51)]
     monkeypatch.setattr(torch.nn.functional, "conv2d", lambda *_, **__: clock.work(durations.pop(0)))
@@ -98,17 +92,40 @@ def test_the_machine_is_described():
     assert machine["versions"]["torch"] == torch.__version__
 
 
-@pytest.mark.parametrize(
-    ("status", "log", "kind", "message"),
-    [
-        (1, "RuntimeError: [enforce fail] can't allocate memory", OverLimitError, "no memory left"),
-        (1, "torch.OutOfMemoryError: CUDA out of memory. Tried", OverLimitError, "no memory left"),
-        (1, "MemoryError", OverLimitError, "no memory left"),
-        (-9, "", CaseFailedError, "ended by SIGKILL"),
-        (1, "", CaseFailedError, "no message"),
-        (1, "Traceback\nValueError: nonsense", CaseFailedError, "ValueError: nonsense"),
-    ],
+SPEED = Suite(
+    "speed",
+    (Column("height", "height", "d"), Column("seconds", "seconds", ".1f")),
+    lambda row: f"room: {row.get('height')}",
+    lambda rows, header: Figure(),
+    lambda rows: [f"{len(rows)} rows."],
 )
-def test_errors_of_children_name_their_cause(status, log, kind, message):
-    error = _make_error(status, log)
-    assert type(error) is kind and str(error).startswith(message)
+
+
+def test_an_interrupted_run_is_printed_and_written(tmp_path, capsys):
+    def measure():
+        announce("the first row")
+        row = Row({"height": 16}, {"seconds": 2.0})
+        yield row
+        row.values["seconds"] = math.inf  # measured again
+        yield row
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        harness.run(SPEED, measure(), {"setting": "small"}, out=tmp_path)
+    content = json.loads((tmp_path / "speed.json").read_text())
+    assert content["rows"] == [{"height": 16, "seconds": None}] and content["setting"] == "small"
+    assert (tmp_path / "speed.md").read_text().splitlines()[1:] == [
+        *("* 1 rows.", "", "### Room: 16", ""),
+        *("| height | seconds |", "| ---: | ---: |", "| 16 | exact |"),
+    ]
+    names = ["speed.json", "speed.md", "speed.png"]
+    assert all(is_written(tmp_path / name) for name in names)
+    printed, steps = capsys.readouterr()
+    assert "GPU: none" in printed and "room: 16" in printed and "1 rows." in printed
+    assert printed.split()[-3:] == [str(tmp_path / name) for name in names] and steps == "the first row\n"
+
+
+def test_a_run_without_rows_writes_nothing_and_one_without_a_plot_no_picture(tmp_path):
+    assert harness.run(SPEED, [], {}, out=tmp_path) == [] and not list(tmp_path.iterdir())
+    harness.run(replace(SPEED, plot=lambda rows, header: None), [Row({"height": 16})], {}, out=tmp_path)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["speed.json", "speed.md"]

@@ -1,4 +1,4 @@
-"""`pansplat bench model`: errors against the float32 row, one process per row, files and tables."""
+"""`pansplat bench model`: errors against the float32 row, files and tables."""
 
 import dataclasses
 import json
@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 
 import pytest
-import safetensors.torch
 import torch
 
 from pansplat.bench import model as bench_model
@@ -15,11 +14,9 @@ from pansplat.bench.model import (
     ModelCase,
     compare_predictions,
     list_model_cases,
-    measure_case,
     save_random_weights,
 )
 from pansplat.cli import run
-from pansplat.errors import InputError
 from pansplat.model.network import build_network, has_bfloat16
 from pansplat.model.weights import load_weights
 from pansplat.training.network import network_config
@@ -35,23 +32,15 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture
-def children(monkeypatch: pytest.MonkeyPatch) -> list[tuple[dict, dict[str, torch.Tensor]]]:
-    """Views and tensors of the measured cases. The jobs of child processes run in this one."""
-    results = []
+def test_the_command_measures_predictions_of_the_network(weights, monkeypatch, tmp_path, capsys):
+    measured, measure_case = [], bench_model.measure_case
 
-    def run_child(module: str, job: dict, *, threads: int) -> tuple:
-        assert module == "pansplat.bench.model" and threads == 1
-        numbers, tensors = bench_model._measure_job(json.loads(json.dumps(job)))
-        views = safetensors.torch.load_file(job["views"]) | {"near": job["near"], "far": job["far"]}
-        results.append((views, tensors))
-        return numbers, tensors
+    def measure(case, file, views):
+        values, prediction = measure_case(case, file, views)
+        measured.append((views, prediction))
+        return values, prediction
 
-    monkeypatch.setattr(bench_model, "run_child", run_child)
-    return results
-
-
-def test_the_command_measures_predictions_of_the_network(children, weights, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(bench_model, "measure_case", measure)
     cases = [PLAIN, dataclasses.replace(PLAIN, tiles=2)]
     cases += [dataclasses.replace(PLAIN, precision="bfloat16")] * has_bfloat16()
     monkeypatch.setattr(bench_model, "list_model_cases", lambda threads, bfloat16, quick: cases)
@@ -62,21 +51,21 @@ def test_the_command_measures_predictions_of_the_network(children, weights, monk
     assert content["weights"] == "tiny.safetensors"
     plain, tiled, *rounded = content["rows"]
     assert plain["is_reference"] and "psnr_db" not in plain and plain["height"] == 64
-    assert list(plain["stages_s"]) == list(STAGES) and plain["peak_gib"] > 0.05
+    assert list(plain["stages_s"]) == list(STAGES) and plain["taken_gib"] > 0
     assert plain["stages_s"]["mono"] == 0 and {"processor_s", "total_ratio"} <= plain.keys()
     assert plain["total_s"] == pytest.approx(sum(plain["stages_s"].values()), rel=1e-4)
     assert tiled["depth_max_error"] == 0 and tiled["psnr_db"] > 60  # only the heads are tiled
     for row in rounded:
         assert 0 < row["depth_median_error"] < 0.02 and row["depth_max_error"] < 0.5 and row["psnr_db"] > 25
     printed = capsys.readouterr().out
-    for word in ("cost volume s", "reference", "peak GiB", "0.0e+00"):
+    for word in ("cost volume s", "reference", "taken GiB", "0.0e+00"):
         assert word in printed
     # The measured prediction is that of the network.
-    views, tensors = children[0]
-    bounds = (torch.full((1, 2), views[name]) for name in ("near", "far"))
+    views, tensors = measured[0]
+    bounds = (torch.full((1, 2), bound) for bound in (views.near, views.far))
     with torch.no_grad():
         network = build_network(load_weights(weights), "fixed", weights)
-        expected = network(views["images"][None], views["cam2world"][None].float(), *bounds)
+        expected = network(views.images[None], views.cam2world[None].float(), *bounds)
     assert plain["num_gaussians"] == len(expected.gaussians[0])
     depth = {"depth": expected.depths.depth[-1][0], "image": tensors["image"]}
     assert compare_predictions(tensors, depth)["depth_max_error"] < 1e-4
@@ -102,12 +91,6 @@ def test_depth_errors_are_relative_to_the_reference():
     reference = {"depth": torch.tensor([1.0, 2.0, 4.0]), "image": image}
     found = compare_predictions({"depth": torch.tensor([1.0, 2.2, 3.0]), "image": image}, reference)
     assert found == pytest.approx({"depth_median_error": 0.1, "depth_max_error": 0.25, "psnr_db": math.inf})
-
-
-@pytest.mark.slow
-def test_the_error_of_a_child_is_passed_on(weights, tmp_path):
-    with pytest.raises(InputError, match=r"a row of the bench failed \(.*FileNotFoundError.*try a smaller --height"):
-        measure_case(PLAIN, weights, tmp_path / "none.safetensors", near=0.5, far=10.0)
 
 
 def test_random_weights_depend_on_the_seed_only(tmp_path, weights):

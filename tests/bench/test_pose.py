@@ -9,11 +9,11 @@ import torch
 from PIL import Image
 
 from pansplat.bench import pose as bench
-from pansplat.bench.report import Row
 from pansplat.cli import run
 from pansplat.data.folders import load_pairs
 from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
+from pansplat.evaluation.results import Row
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.solvers import rotation_exp
 from pansplat.poses.two_view import RelativePose
@@ -50,7 +50,7 @@ def test_errors_do_not_depend_on_the_world(monkeypatch: pytest.MonkeyPatch, turn
     assert row.get("scale_percent") == pytest.approx(100)
     assert row.get("position_cm") == pytest.approx(0, abs=1e-6)
     assert row.get("rotation_degrees") == pytest.approx(np.degrees(turn), abs=1e-6)
-    summary, tours = bench.summarise([Row("pair", "room", row.case, row.result), row])
+    summary, tours = bench.summarise([Row({**row.case, "suite": "pair"}, row.values), row])
     assert f"1 {outcome}" in summary and ("rotation median 0.000" in summary) == (outcome == "solved")
     assert tours.startswith("1 tours: 3 of 3 panoramas (100%)") and f"{int(turn > 0)} tours with a wrong pose" in tours
 

@@ -2,16 +2,16 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
 from pansplat.bench import raster
+from pansplat.bench.harness import run
 from pansplat.bench.raster import (
     RASTER,
     Group,
-    RasterBench,
     RasterCase,
     choice_height,
     default_face_size,
@@ -20,9 +20,10 @@ from pansplat.bench.raster import (
     list_raster_groups,
     make_room_scene,
     make_sample_group,
+    measure_raster,
     plot_choices,
 )
-from pansplat.bench.report import Report, Row
+from pansplat.evaluation.results import Row
 
 HEIGHT = 16
 HEADER = {"machine": {"cpu": "some", "threads": 2, "gpu": None}}
@@ -35,16 +36,14 @@ def group(*cases: RasterCase, backward: bool = False, height: int = HEIGHT) -> G
 
 
 def measure(*groups: Group, budget: float = 0, **files) -> list[Row]:
-    report = Report(RASTER, HEADER, **files)
-    RasterBench(report, budget=budget).run(groups)
-    return report.rows
+    return run(RASTER, measure_raster(groups, budget=budget), {}, **files)
 
 
 def test_rows_hold_times_memory_and_errors():
     reference, row = measure(group(DIRECT, backward=True), budget=0.1)
-    assert (reference.case.precision, reference.get("max_error"), reference.get("repeats")) == ("float64", 0, 1)
-    assert reference.is_reference and reference.get("backward_ms") is None
-    result = row.result
+    assert (reference.get("precision"), reference.get("max_error"), reference.get("repeats")) == ("float64", 0, 1)
+    assert reference.get("is_reference") and reference.get("backward_ms") is None
+    result = row.values
     assert result["forward_min_ms"] <= result["forward_ms"] and result["num_gaussians"] == 862
     assert {"backward_ms", "forward_cpu_ms", "backward_cpu_ms", "peak_mb"} <= result.keys()
     assert 0 < result["max_error"] < 1e-5 and result["psnr_db"] > 120
@@ -54,19 +53,19 @@ def test_errors_are_against_the_exact_image_of_the_layout():
     pinhole, official = replace(DIRECT, layout="pinhole"), list_main_choices("torch", HEIGHT, 1)[-1]
     cases = (FACES, replace(FACES, kernel="ewa"), official, pinhole, replace(pinhole, kernel="ewa"))
     rows = measure(group(*cases))
-    assert [row.case.layout for row in rows if row.case.precision == "float64"] == ["equirect", "pinhole"]
-    exact, ewa, official, pinhole, pinhole_ewa = (row for row in rows if row.case.precision == "float32")
+    assert [row.get("layout") for row in rows if row.get("precision") == "float64"] == ["equirect", "pinhole"]
+    exact, ewa, official, pinhole, pinhole_ewa = (row for row in rows if row.get("precision") == "float32")
     assert exact.get("psnr_db") > ewa.get("psnr_db") > official.get("psnr_db")
     assert pinhole.get("max_error") < 1e-5 and pinhole_ewa.get("max_error") > 1e-3
 
 
 def test_the_exact_image_is_rendered_once_for_each_scene_and_not_of_huge_ones(monkeypatch):
     rows = measure(group(DIRECT), group(DIRECT, height=8), group(DIRECT))
-    assert [row.scene for row in rows if row.case.precision == "float64"] == [f"room {HEIGHT}", "room 8"]
+    assert [row.get("scene") for row in rows if row.get("precision") == "float64"] == [f"room {HEIGHT}", "room 8"]
     assert rows[-1].get("max_error") < 1e-5
     monkeypatch.setattr(raster, "_MAX_TORCH_GAUSSIANS", 100)
     (row,) = measure(group(DIRECT))
-    assert "forward_ms" in row.result and "max_error" not in row.result
+    assert "forward_ms" in row.values and "max_error" not in row.values
 
 
 @pytest.fixture
@@ -137,14 +136,19 @@ def test_all_choices_are_all_combinations():
 def row() -> Row:
     names = ("forward_ms", "forward_min_ms", "backward_ms", "forward_cpu_ms", "max_error", "psnr_db", "num_gaussians")
     result = dict(zip(names, (100.0, 100.0, 200.0, 90.0, 1e-6, 130.0, 886_580), strict=True))
-    return Row("headline", "room 512", RasterCase("numba", 512), result)
+    return make_row("headline", RasterCase("numba", 512), result)
+
+
+def make_row(suite: str, case: RasterCase, values: dict[str, float]) -> Row:
+    entries = {"suite": suite, "scene": "room 512", **asdict(case), "layout_name": case.layout_name}
+    return Row({**entries, "is_reference": case.precision == "float64"}, values)
 
 
 def change(row: Row, suite: str | None = None, **values) -> Row:
     """The row with other values of its case or its result."""
-    in_case = {name: value for name, value in values.items() if hasattr(row.case, name)}
-    in_result = {name: value for name, value in values.items() if name not in in_case}
-    return Row(suite or row.suite, row.scene, replace(row.case, **in_case), row.result | in_result)
+    fields = RasterCase.__dataclass_fields__
+    case = RasterCase(**{name: values.pop(name, row.get(name)) for name in fields})
+    return make_row(suite or row.get("suite"), case, row.values | values)
 
 
 def test_cells_of_unmeasured_values_are_empty(row):

@@ -8,8 +8,7 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.bench import refine as bench
-from pansplat.bench.refine import CROSS_FADE, MEAN, RefineCase, average_rows, list_refine_cases
-from pansplat.bench.report import Row
+from pansplat.bench.refine import CROSS_FADE, MEAN, RefineCase, list_refine_cases
 from pansplat.cli import run
 
 HEIGHT = 16
@@ -62,13 +61,6 @@ def test_the_bench_writes_rows_means_table_and_plot(folder: Path, tmp_path: Path
     assert rows[11]["ws_psnr_db"] == pytest.approx((rows[1]["ws_psnr_db"] + rows[6]["ws_psnr_db"]) / 2, rel=1e-4)
     assert "| default | 16 | all | 2 s | 40 |" in (out / "refine.md").read_text()
     assert (out / "refine.png").stat().st_size > 1000 and "cross-fade" in capsys.readouterr().out
-
-
-def test_means_skip_values_that_were_not_measured() -> None:
-    results = {"a": {"ws_psnr_db": 20, "lpips": 0.2}, "b": {"ws_psnr_db": 24}}
-    rows = [Row("refine", name, RefineCase("sweep", 64), result) for name, result in results.items()]
-    (mean,) = average_rows(rows)
-    assert (mean.result, mean.scene) == ({"ws_psnr_db": 22}, MEAN)
 
 
 def test_quick_is_a_small_part() -> None:

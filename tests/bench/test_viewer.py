@@ -1,8 +1,8 @@
-"""The viewer's benchmark: cases, errors against float64, rows that continue a run, and its files."""
+"""The viewer's benchmark: cases, errors against float64, and its files."""
 
 import json
 import os
-from dataclasses import replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from pansplat.bench import viewer
-from pansplat.bench.report import Report, Row
-from pansplat.bench.viewer import VIEWER, ViewerBench, ViewerCase, list_viewer_cases
+from pansplat.bench.viewer import VIEWER, ViewerCase, list_viewer_cases, measure_viewer
 from pansplat.cli import run
 from pansplat.errors import InputError
+from pansplat.evaluation.results import Row
 from pansplat.gaussians.ply import load_ply
 from pansplat.rendering import rasterize
 
@@ -25,10 +25,10 @@ def jobs(monkeypatch) -> list[dict]:
     """Jobs given to the viewer, which is replaced by numba for joint images and by black for others."""
     jobs = []
 
-    def read_viewer_output(file: Path, threads: int):
+    def run_viewer(file: Path, threads: int) -> list[str]:
         job = json.loads(file.read_text())
         jobs.append(job)
-        gaussians = load_ply(job["scene"]).gaussians
+        gaussians, lines = load_ply(job["scene"]).gaussians, []
         for index, settings in enumerate(job["settings"]):
             width, height = settings["size"]
             image = np.zeros((height, width, 4), np.float32)
@@ -41,12 +41,14 @@ def jobs(monkeypatch) -> list[dict]:
             path = file.parent / f"{index}.npy"
             np.save(path, image)
             times = [3.0, 1.0, 2.0]
-            yield {
+            line = {
                 "settings": index, "tier": job["tiers"][0], "frame_ms": times, "sort_ms": 0.5,
                 "stages": {"sort": 0.5, "draw": 1.5}, "image": str(path), "renderer": "fake",
             }  # fmt: skip
+            lines.append(json.dumps(line))
+        return lines
 
-    monkeypatch.setattr(viewer, "read_viewer_output", read_viewer_output)
+    monkeypatch.setattr(viewer, "run_viewer", run_viewer)
     monkeypatch.setattr(viewer, "_PANORAMA_SIZE", (16, 8))  # a float64 image of the usual size takes seconds
     return jobs
 
@@ -61,7 +63,7 @@ def test_each_renderer_moves_and_turns_in_both_modes():
     assert {(case.renderer, case.width, case.height) for case in coarse} == {("cpu", 64, 32)}
 
 
-def test_the_command_writes_rows_page_and_plot_and_continues(jobs, tmp_path, capsys):
+def test_the_command_writes_rows_page_and_plot(jobs, tmp_path):
     command = ["bench", "viewer", "--heights", "16", "--size", "64", "64", "--out", str(tmp_path), "--threads", "1"]
     assert run(command) == 0
     rows = json.loads((tmp_path / "viewer.json").read_text())["rows"]
@@ -74,17 +76,11 @@ def test_the_command_writes_rows_page_and_plot_and_continues(jobs, tmp_path, cap
     assert "deferred blending takes 1.00 times" in page and "sort 0.5, draw 1.5" in page
     assert (tmp_path / "viewer.png").stat().st_size > 5000
     assert len(jobs) == 3
-    assert run(command) == 0
-    assert len(jobs) == 3, "nothing is measured again"
-    capsys.readouterr()
-    (tmp_path / "viewer.json").write_text('{"software": "pansplat"}')
-    assert run(command) == 2
-    assert "needed rows of `pansplat bench viewer`" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["--heights", "20"], "multiple of 8"), (["--size", "8", "8"], "64 to 8192 pixels")],
+    [(["--heights", "20"], "multiple of 8"), (["--size", "8", "8"], "--size, [0]: needed a whole number >= 64")],
 )
 def test_invalid_arguments_are_refused(arguments, message, capsys):
     assert run(["bench", "viewer", *arguments]) == 2
@@ -94,15 +90,15 @@ def test_invalid_arguments_are_refused(arguments, message, capsys):
 def test_without_the_viewer_the_error_says_so(monkeypatch):
     monkeypatch.setattr(viewer, "_VIEWER_PACKAGE", "no_such_package")
     with pytest.raises(InputError, match="viewer is not installed"):
-        ViewerBench(Report(VIEWER, HEADER), repeats=1, threads=1).run(16, list_viewer_cases((64, 64)))
+        list(measure_viewer(16, list_viewer_cases((64, 64)), repeats=1, threads=1))
 
 
 def test_findings_and_plot_need_no_complete_rows():
-    case, times = ViewerCase("cpu", "perspective", "joint", 64, 64), ("frame_ms", "best_ms", "num_gaussians")
-    rows = [Row("viewer", "room 16", case, dict(zip(times, (11.0, 10.0, 500), strict=True)))]
+    case, times = asdict(ViewerCase("cpu", "perspective", "joint", 64, 64)), ("frame_ms", "best_ms", "num_gaussians")
+    rows = [Row({"scene": "room 16", **case}, dict(zip(times, (11.0, 10.0, 500), strict=True)))]
     assert VIEWER.findings(rows) == []
     slow = dict(zip(times, (45.0, 40.0, 500), strict=True))
-    rows.append(Row("viewer", "room 16", replace(case, renderer="gl33"), slow))
+    rows.append(Row({"scene": "room 16", **case, "renderer": "gl33"}, slow))
     assert VIEWER.findings(rows) == ["500 Gaussians: cpu draws a frame in 10 ms, OpenGL in 40 ms."]
     assert len(viewer.plot_viewer(rows, HEADER).axes) == 1
 
@@ -110,17 +106,16 @@ def test_findings_and_plot_need_no_complete_rows():
 @pytest.mark.slow
 @pytest.mark.gl
 def test_the_viewer_renders_the_exact_images(tmp_path):
-    report = Report(VIEWER, HEADER)
     cases = [case for case in list_viewer_cases((64, 48), ("cpu", "gl33")) if case.view == "perspective"]
     try:
-        ViewerBench(report, repeats=2, threads=2).run(16, cases)
+        rows = list(measure_viewer(16, cases, repeats=2, threads=2))
     except InputError as error:
         if os.environ.get("CI"):
             raise
         pytest.skip(str(error))
-    assert [row.case for row in report.rows] == cases
-    for row in report.rows:
+    assert [(row.get("renderer"), row.get("mode")) for row in rows] == [(case.renderer, case.mode) for case in cases]
+    for row in rows:
         assert row.get("psnr_db") > 60 and row.get("best_ms") <= row.get("frame_ms") and row.get("device")
     (tmp_path / "job.json").write_text("{}")
     with pytest.raises(InputError, match="the viewer rendered nothing: error: 'scene'"):
-        list(viewer.read_viewer_output(tmp_path / "job.json", 1))
+        viewer.run_viewer(tmp_path / "job.json", 1)

@@ -54,10 +54,6 @@ def test_the_quick_run_writes_rows_and_a_plot_and_prints_the_tables(file, tmp_pa
         ("model --json no/rows.json", "create it first"),
         ("model --pair nowhere", "nowhere is not a folder"),
         ("model --height 64 --model none.safetensors", "none.safetensors"),
-        ("memory --heights 80", "multiple of 32"),
-        ("memory --heights 32", "needed a whole number >= 64"),
-        ("memory --threads 0", "--threads: needed a whole number >= 1"),
-        ("memory --limit-gb 0", "--limit-gb: needed a number > 0"),
     ],
 )
 def test_invalid_arguments_are_refused_before_the_work(arguments, message, refusal, tmp_path, monkeypatch):

@@ -29,7 +29,7 @@ def test_help_does_not_import_torch() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    for command in ("predict", "render", "evaluate", "check", "info", "convert", "bench memory", "bench pose"):
+    for command in ("predict", "render", "evaluate", "check", "info", "convert", "bench raster", "bench pose"):
         assert f"usage: pansplat {command} " in done.stdout
 
 

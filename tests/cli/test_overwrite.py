@@ -13,7 +13,7 @@ from pansplat.cli import run
 from pansplat.data.images import write_depth, write_image
 from pansplat.data.video import write_video
 from pansplat.errors import InputError
-from pansplat.evaluation.report import write_json
+from pansplat.evaluation.results import write_json
 from pansplat.files import is_written, require_replaceable
 
 OWN = b"of the user"

@@ -404,7 +404,7 @@ FILES = [
     Fault("an output of 250 bytes works", PREDICT.replace("out.ply", f"{'a' * 250}.ply"), status=0),
     Fault("an output in /proc", PREDICT.replace("out.ply", "/proc/out.ply"), says="/proc/out.ply"),
     *(Fault(f"{command[:12]}: an output folder that is a file", command.format("scene.ply"), says="scene.ply") for command in (
-        "evaluate pair --model sphere --out {}", "bench model --out {}", "bench memory --out {}",
+        "evaluate pair --model sphere --out {}", "bench model --out {}",
         "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
     *(Fault(f"{command[:12]}: an output folder of 300 bytes", command.format(_LONG), says="too long") for command in (
         "evaluate pair --model sphere --out {}", "bench refine --out {}",

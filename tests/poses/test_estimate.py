@@ -30,6 +30,7 @@ from pansplat.poses.estimate import (
 from pansplat.poses.features import Features, detect_features
 from pansplat.poses.files import write_poses
 from pansplat.poses.learned import LearnedFeatures, LearnedMatches, MatcherMissingError
+from pansplat.poses.pose_cache import PoseCache
 from pansplat.poses.solvers import angle_between, rotation_angle
 from pansplat.poses.two_view import RelativePose
 from pansplat.poses.ways import NO_WAYS, Ways
@@ -218,7 +219,10 @@ def test_a_linked_pair_is_compared_among_many(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("pansplat.poses.estimate._quick_overlap", lambda first, second: 0.0)
     views = [_view(_no_features(1), np.zeros((4, 8), np.float32)) for _ in range(8)]
     ways = {(i, j): NO_WAYS for i in range(8) for j in range(i + 1, 8)}
-    found = [_relate_views(views, ways | linked, 0, lambda *_: None) for linked in ({}, {(4, 6): Ways(back=0.5)})]
+    found = [
+        _relate_views(views, ways | linked, 0, PoseCache(None, (), ""), lambda *_: None)
+        for linked in ({}, {(4, 6): Ways(back=0.5)})
+    ]
     assert set(found[1]) - set(found[0]) == {(4, 6)}
 
 

@@ -89,7 +89,7 @@ def test_panoramas_are_predicted_with_their_part_or_with_a_piece_of_a_large_one(
 
 
 def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
-    assert list(home.overlaps.items()) == [((0, 1), 0), ((1, 2), 0), ((4, 5), 0), ((3, 3), 1), ((6, 6), 1)]
+    assert list(home.overlaps.items()) == [((0, 1), 1), ((1, 2), 1), ((4, 5), 1), ((3, 3), 1), ((6, 6), 1)]
     assert home.parts == (0, 0, 0, 1, 2, 2, 3) and home.name == "home tour"
     scenes = home.choose_scene_views()
     assert scenes[3, 3] == (3,) and scenes[4, 5] == (4, 5) and set(home.choose_sources()) == set(scenes.values())
@@ -300,3 +300,15 @@ def test_a_pair_of_a_scene_has_its_panoramas(comb):
     pair = comb.make_pair((1, 4))
     assert pair.name == "p1-p4" and pair.context == (comb.panoramas[1], comb.panoramas[4])
     assert (pair.near, pair.far, pair.targets) == (0.45, 10.0, ())
+
+
+def test_no_flight_leads_through_a_wall_and_places_stay_known(comb):
+    tour = comb.with_walls([(1, 2)])
+    assert (1, 2) not in tour.overlaps and tour.parts == (0, 0, 1, 1, 0, 1) and set(tour.worlds) == {0}
+    assert tour.is_fade(1, 2) and tour.find_walk(0, 3) == [0, 1, 2, 3] and not comb.is_fade(1, 2)
+    tour = tour.with_walls([(2, 5)])
+    assert tour.overlaps[5, 5] == 1 and tour.is_placed(5), "a panorama behind walls is in the world of the others"
+    assert tour.leave_out(5).context and set(tour.plan_walk()) == set(range(6))
+    again = comb.with_overlaps(tour.list_overlaps())
+    assert again.overlaps == tour.overlaps and again.walls == tour.walls
+    assert not comb.with_overlaps(((0, 1, 0.5), *((node, node, 1.0) for node in range(2, 6)))).is_placed(5)

@@ -29,10 +29,12 @@ def test_panoramas_of_one_room_overlap_and_those_of_two_rooms_do_not(tmp_path, m
         write_image(tour.panoramas[index].image, image.numpy())
     tasks = []
     given = dataclasses.replace(tour, overlaps={(0, 3): 0.0, (2, 2): 1.0})
-    overlaps = connect(given, lambda task, done: tasks.append(done)).overlaps
-    assert set(overlaps) == {(0, 1), (0, 2), (1, 2), (0, 3)}, "given edges are kept, self-edges where there is no other"
-    assert min(overlaps[0, 1], overlaps[0, 2], overlaps[1, 2]) > 0.25 > 0.1 > overlaps[0, 3]
+    connected = connect(given, lambda task, done: tasks.append(done))
+    overlaps = connected.overlaps
+    assert set(overlaps) == {(0, 1), (0, 2), (1, 2), (3, 3)}, "self-edges where there is no other"
+    assert min(overlaps[0, 1], overlaps[0, 2], overlaps[1, 2]) > 0.25
+    assert connected.walls == ((0, 3),) and connected.is_placed(3), "a given edge without anything in common is a wall"
     assert tasks == sorted(tasks) and tasks[-1] < 1
     other_world = dataclasses.replace(tour.panoramas[2], world=1)
     parts = dataclasses.replace(given, panoramas=(*tour.panoramas[:2], other_world, tour.panoramas[3]))
-    assert set(connect(parts).overlaps) == {(0, 1), (0, 3), (2, 2)}, "only panoramas of one world are compared"
+    assert set(connect(parts).overlaps) == {(0, 1), (3, 3), (2, 2)}, "only panoramas of one world are compared"

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from pansplat.data.images import write_image
-from pansplat.data.pairs import Link, Panorama
+from pansplat.data.pairs import Link, Pair, Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
@@ -318,3 +318,14 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     centers = {view: tour.positions[view][[0, 2]] for view in entry.views}
     outlines = {view: FloorOutline(center, center + corners, 1.0) for view, center in centers.items()}
     return LoadedScene(entry, scene, outlines=outlines)
+
+
+@pytest.fixture(scope="session")
+def pair(axis_photos, small_scene, tmp_path_factory) -> Pair:
+    """The two photographs at the cameras of the small scene."""
+    folder = tmp_path_factory.mktemp("pair")
+    panoramas = []
+    for name, image, pose in zip(small_scene.names, axis_photos, small_scene.cam2world, strict=True):
+        write_image(folder / name, image)
+        panoramas.append(Panorama(name, folder / name, pose))
+    return Pair("pair", folder, tuple(panoramas), (), 0.45, 10.0)

@@ -1,1911 +1,933 @@
-"""Synthetic clicks and keys, on a context without a window, change the rendered image."""
+"""State and input of the whole viewer, without OpenGL and without a window: nothing is drawn."""
 
-import json
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any
+from unittest.mock import MagicMock, Mock
 
 import moderngl
 import numpy as np
-import OpenEXR
 import pytest
 import torch
 from imgui_bundle import imgui
 from PIL import Image
 
 from pansplat.cleanup import find_floaters
-from pansplat.data.folders import load_pairs
 from pansplat.data.images import read_blur_mask, write_image
 from pansplat.data.pairs import Pair, Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.formats import load_scene
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
-from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat.poses.dense import Surroundings
-from pansplat.poses.depth import DepthMap
-from pansplat.poses.placing import Piece
-from pansplat.rendering.cpu.display import DisplayScene
-from pansplat.tours import find_tours
-from pansplat_viewer.draw.color_maps import map_values
-from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.layers import SplatRasterizer
-from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
-from pansplat_viewer.scene.loader import (
-    LoadedScene,
-    LoadOptions,
-    Progress,
-    SceneEntry,
-    SceneLoader,
-    load_entry,
-)
-from pansplat_viewer.scene.settings import Comparison, Display, Preset
-from pansplat_viewer.scene.state import ViewerState
-from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
-from pansplat_viewer.ui.photographs import Photographs
-from pansplat_viewer.ui.presenter import ERROR_MAP
+from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, load_entry
+from pansplat_viewer.scene.settings import FrameStats
 from pansplat_viewer.viewer import Viewer
-from pansplat_viewer.window.input import Commands
-from pansplat_viewer.window.preferences import Preferences
-
-pytestmark = pytest.mark.gl
+from pansplat_viewer.window.input import Input
 
 SIZE = (560, 900)
-IMAGE = (slice(20, 560), slice(310, 560))  # rows and columns without panels
-NAMES = ["first", "second"]
-SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_while_moving=True)
-
-# Widgets that must change the image, and the settings that give some of them something to change.
-IMAGE_WIDGETS = (
-    "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
-    "min. opacity", "exact", "3dgs", "black", "grey", "white", "field of view",
-    "off##stereo", "pair##stereo", "red/cyan##stereo",
-    "2##panorama", "##flight",
-)  # fmt: skip
-PRESETS = get_args(Preset)  # which the processor's renderer does not offer
-INITIAL_SETTINGS = {
-    **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
-    "joint": {"mode": "deferred"},
-    "exact": {"preset": "3dgs"},
-    "off##stereo": {"stereo": "anaglyph"},
-    "black": {"background": (1.0, 1.0, 1.0)},
-}
-# Widgets whose effect has its own test.
-OTHER_WIDGETS = {
-    "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
-    *get_args(Display), *get_args(Comparison),
-    "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
-    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
-}  # fmt: skip
+CENTER = (0.5, 0.5)
 
 
-class User:
-    """Sends events to a viewer and reads its frames."""
+class NoRenderer:
+    """A renderer that keeps its scene and draws nothing.
 
-    def __init__(self, viewer: Viewer, target: moderngl.Framebuffer, clock: list[float]) -> None:
-        self.viewer, self.target, self.clock = viewer, target, clock
-        self.state, self.data, self.panels = viewer.state, viewer.panel_data, viewer.panels
+    Attributes:
+        refuse: the error of an upload of a scene; None to accept it.
+        problem: the error of the next images.
+        scales: of the images.
+    """
 
-    def draw_frames(self, count: int, seconds: float = 1 / 30) -> None:
+    pacing = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_while_moving=True)
+    pending = None
+    refuse: Callable[[Scene], Exception | None] = staticmethod(lambda scene: None)
+    problem: Exception | None = None
+
+    def __init__(self) -> None:
+        self.stats, self.scales = FrameStats(tier="gl33"), []
+
+    @staticmethod
+    def prepare(scene: Scene, report: Callable[[float], None] = lambda done: None) -> Scene:
+        return scene
+
+    def upload(self, scene: Scene, prepared: object = None) -> None:
+        if (error := NoRenderer.refuse(scene)) is not None:
+            raise error
+        self.stats = FrameStats(total=len(scene.gaussians), tier="gl33")
+
+    def render(self, cam2world: np.ndarray, size: tuple[int, int], settings: Any, *, wait: bool = True) -> Mock:
+        if NoRenderer.problem is not None:
+            raise NoRenderer.problem
+        before = settings if not self.scales else self.last
+        self.scales.append(settings.scale)
+        self.last = settings  # as a GPU, the time that is known is that of the image before
+        self.stats = replace(self.stats, size=size, frame_ms=1.0, timed=before)
+        return Mock()
+
+    def read_color(self) -> np.ndarray:
+        return np.zeros((2, 2, 4), np.float32)
+
+    def read_depth(self) -> np.ndarray:
+        return np.full(SIZE[::-1], 3.0, np.float32)
+
+    has_faces = draw_faces = release = lambda self, *_: None
+
+
+class App:
+    """A viewer to which a test gives input.
+
+    Attributes:
+        load, find: what the viewer's loader calls; a test may replace them.
+    """
+
+    def __init__(self, load: Callable[..., LoadedScene], folder: Path, **options: Any) -> None:
+        self.load, self.now, self.events = load, 0.0, Input()
+        self.find: Callable[..., list[SceneEntry]] = lambda path, progress: [SceneEntry("opened")]
+        loader = SceneLoader(lambda *arguments: self.load(*arguments))
+        self.viewer = Viewer(
+            MagicMock(), loader, find=lambda *arguments: self.find(*arguments), folder=folder, clock=lambda: self.now,
+            **options,
+        )  # fmt: skip
+        self.state, self.library, self.target = self.viewer.state, self.viewer.library, Mock(viewport=(0, 0, *SIZE))
+
+    def frame(self, seconds: float = 1 / 30, **events: Any) -> None:
+        self.now += seconds
+        self.events = Input(**events)
+        self.viewer.frame(self.target, seconds)
+        self.events = Input()
+
+    def frames(self, count: int, seconds: float = 1 / 30) -> None:
         for _ in range(count):
-            self.clock[0] += seconds
-            self.viewer.frame(self.target, seconds)
+            self.frame(seconds)
 
-    def draw_until(self, condition: Callable[[], object], expected: str, seconds: float = 1 / 30) -> None:
-        """Draw frames until a condition is true; their number does not matter, for threads can be slow."""
+    def press(self, *keys: str, held: str = "") -> None:
+        self.frame(pressed=frozenset(keys), held=frozenset((*keys, *held.split())))
+
+    def until(self, condition: Callable[[], object], expected: str, seconds: float = 1 / 30) -> None:
         deadline = time.monotonic() + 300
         while not condition():
             assert time.monotonic() < deadline, f"no {expected}"
-            self.draw_frames(1, seconds)
-            time.sleep(0.002)
+            self.frame(seconds)
+            time.sleep(0.001)
 
-    def wait_for_progress(self, *expected: object) -> None:
-        """Draw frames until the panel shows this progress: name, description, fraction."""
-        self.draw_until(lambda: self.data.loading == expected, f"progress {expected}", 0.01)
-
-    def settle(self, *, refining: bool = False) -> None:
-        """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
-        self.draw_frames(3, SETTLE_AFTER)
-        self.draw_until(lambda: not (self.viewer.moving if refining else self.viewer.busy), "settled viewer")
-        self.draw_frames(1)
-
-    def read_screen(self) -> np.ndarray:
-        """RGB of the last frame, outside the panels."""
-        pixels = np.frombuffer(self.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
-        return pixels[::-1][IMAGE].astype(int)
-
-    def read_image(self) -> np.ndarray:
-        """RGB of a settled frame, outside the panels."""
-        self.settle()
-        return self.read_screen()
+    def settle(self) -> None:
+        self.frames(3, 0.2)
+        self.until(lambda: not self.viewer.busy, "settled viewer")
+        self.frame()
 
     def show(self, *entries: SceneEntry) -> None:
         self.viewer.show(list(entries), 0)
         self.settle()
 
-    def click(self, label: str) -> None:
-        self.draw_frames(1)
-        left, top, right, bottom = self.panels.items[label]
-        x = (left + right) / 2
-        if "opacity" in label or label == "field of view":  # the label is right of the slider
-            x = left + 0.4 * (right - left)
-        elif right - left > 60 and label not in ("path", "pair", "##flight"):
-            x = left + 10
-        self.click_at(x, (top + bottom) / 2)
+    def fly(self, seconds: float = 0.2) -> None:
+        """Draw frames until the flight has begun and ended."""
+        self.frames(2, seconds)
+        self.until(lambda: not (self.state.playing or self.viewer.moving), "end of the flight", seconds)
 
-    def click_at(self, x: float, y: float) -> None:
-        self.drag((x, y), (x, y))
-        imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
-        self.draw_frames(1)
+    @property
+    def node(self) -> int:
+        """The panorama of the tour that is nearest to the camera."""
+        return int(np.linalg.norm(self.viewer.tour.tour.positions - self.state.camera.position, axis=1).argmin())
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        io = imgui.get_io()
-        io.add_mouse_pos_event(*start)
-        self.draw_frames(2)
-        io.add_mouse_button_event(0, True)
-        self.draw_frames(1)
-        io.add_mouse_pos_event(*end)
-        self.draw_frames(1)
-        io.add_mouse_button_event(0, False)
-        self.draw_frames(2)
-
-    def slide(self, label: str, fraction: float, start: float = 0.2) -> None:
-        """Drag a slider to a fraction of its width, which its label is a part of."""
-        left, top, right, bottom = self.panels.items[label]
-        middle = (top + bottom) / 2
-        self.drag((left + start * (right - left), middle), (left + fraction * (right - left), middle))
-
-    def press(self, *keys: imgui.Key, frames: int = 1) -> None:
-        for down in (True, False):
-            for key in keys:
-                imgui.get_io().add_key_event(key, down)
-            self.draw_frames(frames if down else 1)
+    @property
+    def content(self) -> object:
+        """The scene or the number of the photograph that is shown."""
+        return self.viewer.stage.fade.contents[self.viewer.stage.fade.front]
 
 
-def make_sphere_scene(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
-    """A photograph, and the same photograph as Gaussians around its camera, in a world with z up."""
-    pose = torch.eye(4, dtype=torch.float64)
-    yaw = 0.7
-    right, forward = (np.cos(yaw), -np.sin(yaw), 0.0), (np.sin(yaw), np.cos(yaw), 0.0)
-    pose[:3, :3] = torch.tensor((right, (0.0, 0.0, -1.0), forward)).T
-    pose[:3, 3] = torch.tensor((1.0, -2.0, 0.5))
-    count = 3000
-    directions = fibonacci_directions(count)
-    image = torch.from_numpy(photos[0]).permute(2, 0, 1)
-    color = sample_equirect(image, uv_from_directions(directions).float()).T
-    gaussians = Gaussians(
-        means=(pose[:3, 3] + 3 * directions @ pose[:3, :3].T).float(),
-        scales=torch.full((count, 3), 0.2),
-        quats=torch.tensor((1.0, 0, 0, 0)).expand(count, 4),
-        opacities=torch.full((count,), 0.99),
-        harmonics=((color - 0.5) / 0.28209479177387814)[:, None],
-        levels=torch.zeros(count, dtype=torch.int64),
-        views=torch.zeros(count, dtype=torch.int64),
-    )
-    scene = Scene(gaussians, pose[None], 0.45, 10.0, ("a.png",), "synthetic", 128)
-    (panorama, *_) = entry.pair.context
-    entry = replace(entry, pair=replace(entry.pair, context=(replace(panorama, cam2world=pose),)))
-    return LoadedScene(entry, scene)
+@pytest.fixture
+def make_app(small_scene, load_house, tmp_path, monkeypatch) -> Iterator[Callable[..., App]]:
+    """Makes a viewer whose window has `SIZE`; everything of OpenGL and of imgui's panels is replaced."""
+    apps: list[App] = []
 
-
-@pytest.fixture(scope="module")
-def pair(axis_photos, small_scene, tmp_path_factory) -> Pair:
-    """The two photographs at the cameras of the small scene."""
-    folder = tmp_path_factory.mktemp("pair")
-    panoramas = []
-    for name, image, pose in zip(small_scene.names, axis_photos, small_scene.cam2world, strict=True):
-        write_image(folder / name, image)
-        panoramas.append(Panorama(name, folder / name, pose))
-    return Pair("pair", folder, tuple(panoramas), (), 0.45, 10.0)
-
-
-def both(test: Callable[..., None]) -> Callable[..., None]:
-    """Run a test with both renderers; the other tests do not depend on the renderer."""
-    test.renderers = ("gl", "cpu")  # type: ignore[attr-defined]
-    return test
-
-
-def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    if "label" in metafunc.fixturenames:
-        cases = [("gl" if label in PRESETS else "cpu", label) for label in IMAGE_WIDGETS]
-        metafunc.parametrize(("session", "label"), cases, indirect=["session"], scope="module")
-    elif "session" in metafunc.fixturenames:
-        renderers = getattr(metafunc.function, "renderers", ("cpu",))
-        metafunc.parametrize("session", renderers, indirect=True, scope="module")
-
-
-@pytest.fixture(scope="module")
-def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp_path_factory) -> Iterator[User]:
-    def load(entry, progress, show):
-        if entry.tour is not None:
-            return load_house(entry)
-        if entry.name == "sphere":
-            return make_sphere_scene(entry, axis_photos)
+    def load(entry: SceneEntry, progress: object, show: object) -> LoadedScene:
         if entry.name == "damaged":
             raise InputError("damaged.ply: 100% unreadable; export it again")
-        return LoadedScene(entry, small_scene)
+        return load_house(entry) if entry.tour is not None else LoadedScene(entry, small_scene)
 
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
-        if path.name == "nothing":
-            raise InputError(f"{path}: no such file or folder")
-        return [SceneEntry("opened")]
+    def make(**options: Any) -> App:
+        apps.append(App(load, tmp_path / "renders", **options))
+        return apps[-1]
 
-    clock = [0.0]
-    folder = tmp_path_factory.mktemp("screenshots")
-    with gl_context:
-        target = gl_context.simple_framebuffer(SIZE, components=3)
-        viewer = Viewer(
-            gl_context, SceneLoader(load), find=find, folder=folder, renderer=request.param, clock=lambda: clock[0]
-        )
-        imgui.get_io().display_size = SIZE
-        user = User(viewer, target, clock)
-        user.entries = [SceneEntry(name, pair=pair) for name in NAMES]
-        user.show(*user.entries)
-        user.click("Drawing")
-    yield user
-    with gl_context:
-        viewer.close()
+    context = imgui.create_context()
+    imgui.set_current_context(context)
+    imgui.get_io().display_size = SIZE
+    for name in ("viewer.Gui", "viewer.Panels", "ui.stage.Presenter", "ui.stage.PhotographLayer"):
+        monkeypatch.setattr(f"pansplat_viewer.{name}", MagicMock())
+    monkeypatch.setattr("pansplat_viewer.ui.stage.create_window_renderer", lambda ctx, choice: NoRenderer())
+    monkeypatch.setattr("pansplat_viewer.viewer.read_input", lambda seconds: replace(apps[-1].events, seconds=seconds))
+    yield make
+    for app in apps:
+        app.viewer.close()
+    monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: None))
+    imgui.destroy_context(context)
 
 
 @pytest.fixture
-def user(session, ctx) -> User:
-    """The session with scene, state and camera as at the start."""
-    if session.data.entries != NAMES or session.data.current != 0:
-        session.show(*session.entries)
-    state, start = session.state, ViewerState()
-    kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "adaptive", "message", "message_until")
-    for name in (field.name for field in fields(ViewerState) if field.name not in kept):
-        setattr(state, name, getattr(start, name))
-    state.camera, state.adaptive, state.message = state.home, True, ""
-    session.data.error, session.viewer._resolution.budget_ms = None, BUDGET_MS
-    imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
-    session.draw_frames(2, SETTLE_AFTER)
-    return session
-
-
-def changed_fraction(before: np.ndarray, after: np.ndarray) -> float:
-    """Fraction of the pixels that differ visibly."""
-    return float((np.abs(before - after).max(-1) > 2).mean())
-
-
-def test_every_widget_has_a_test_and_fits_without_scrolling(user):
-    assert set(user.panels.items) == set(IMAGE_WIDGETS) | OTHER_WIDGETS
-    assert max(rectangle[3] for rectangle in user.panels.items.values()) < SIZE[1]
-
-
-@pytest.mark.slow
-def test_clicking_the_widget_changes_the_image(user, label):
-    user.state.settings = replace(user.state.settings, **INITIAL_SETTINGS.get(label, {}))
-    before = user.read_image()
-    user.click(label)
-    assert changed_fraction(before, user.read_image()) > 3e-4  # 0 without an effect; the filter changes few pixels
-
-
-def test_levels_are_hidden_and_shown_again(user):
-    before = user.read_image()
-    for shown in (False, True):
-        for level in range(4):
-            user.click(f"{level}##level")
-        assert (user.read_image().max() > 0) == shown
-    assert changed_fraction(before, user.read_image()) == 0
-
-
-def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
-    user.click("view 1")
-    single = user.read_image()
-    user.click("deferred")
-    user.state.camera = replace(user.state.camera, position=(0.0, 0.0, 0.2))
-    both = user.read_image()
-    user.slide("weight 0", 0.0, start=0.4)
-    assert user.state.settings.view_weights == (0.0, 1.0)
-    assert changed_fraction(both, user.read_image()) > 0.1
-    user.state.camera = user.state.home
-    assert changed_fraction(single, user.read_image()) == 0
-    user.slide("weight 1", 0.4)
-    assert 0 < user.state.settings.view_weights[1] < 1
-
-
-@both
-def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 64)
-    user.click("pair##stereo")
-    user.settle()
-    left, right = np.split(user.viewer.renderer.read_color(), 2, axis=1)
-    assert np.abs(left - right).max() > 0.1
-    user.click("red/cyan##stereo")
-    near = user.read_image()
-    user.slide("eye distance", 0.9)
-    assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
-    user.click("360 PNG")
-    with Image.open(user.viewer.screenshots[-1]) as file:
-        assert file.size == (128, 64)
-    user.click("off##stereo")
-    assert "eye distance" not in user.panels.items
-
-
-@pytest.fixture
-def cleaning(user: User) -> Iterator[User]:
-    """The user with the section "Clean up" open, and the sections above it closed."""
-    headers = ("Clean up", "Display", "Compare", "Camera", "Gaussians")
-    for header in headers:
-        user.click(header)
-    yield user
-    user.viewer._stop_painting()
-    for header in headers[::-1]:
-        user.click(header)
-
-
-def test_a_box_hides_what_is_outside_and_a_saved_scene_lacks_it(cleaning, small_scene, tmp_path):
-    user = cleaning
-    whole = user.read_image()
-    user.click("crop to a box")
-    user.draw_frames(1)
-    assert user.state.settings.box == pytest.approx(user.data.bounds)
-    assert changed_fraction(whole, user.read_image()) == 0
-    user.slide("x from", 0.4, start=0.01)
-    box = user.state.settings.box
-    assert box is not None and box[0] > user.data.bounds[0] + 0.5
-    cropped = user.read_image()
-    assert changed_fraction(whole, cropped) > 0.05
-    user.panels.cleaning.file = str(tmp_path / "small.ply")
-    user.state.settings = replace(user.state.settings, opacity_threshold=0.5)
-    user.click("Save##clean")
-    user.draw_until(lambda: (tmp_path / "small.ply").exists() and not user.data.cleaning, "saved scene")
-    saved = load_scene(tmp_path / "small.ply")
-    means, opacities = small_scene.gaussians.means, small_scene.gaussians.opacities
-    inside = (means[:, 0] >= box[0]) & (opacities >= 0.5)
-    assert len(saved.gaussians) == int(inside.sum())
-    assert "Gaussians left out" in user.state.message and "small.ply" in user.state.message
-    (tmp_path / "own.ply").write_bytes(b"of the user")
-    for name, message in (("small.stl", "small.stl"), (str(tmp_path / "own.ply"), "own.ply, which pansplat did not")):
-        user.panels.cleaning.file = name
-        user.click("Save##clean")
-        user.draw_frames(2)
-        assert message in user.data.error
-        user.data.error = None
-    assert (tmp_path / "own.ply").read_bytes() == b"of the user"
-    user.click("crop to a box")
-    assert user.state.settings.box is None
-
-
-def test_floaters_are_removed_and_the_box_stays(cleaning, small_scene):
-    user = cleaning
-    user.click("crop to a box")
-    user.click("Remove floaters")
-    user.draw_until(lambda: "floaters:" in user.state.message, "message")
-    expected = len(small_scene.gaussians) - int(find_floaters(small_scene).sum())
-    assert f"{len(small_scene.gaussians) - expected:,} of {len(small_scene.gaussians):,}" in user.state.message
-    user.draw_until(lambda: len(user.viewer._slot.scene.gaussians) == expected, "cleaned scene")
-    assert user.state.settings.box is not None
-    user.show(*user.entries)
-
-
-def test_a_mask_is_painted_on_the_photograph_and_saved(cleaning, pair):
-    user = cleaning
-    mask = pair.folder / "a_blur.png"
-    user.click("paint what to hide")
-    user.draw_frames(2)
-    assert user.state.comparison == "photograph" and user.state.split == 0 and "Save mask" in user.panels.items
-    user.slide("brush", 0.5)
-    before = user.state.camera
-    user.drag((400, 300), (480, 320))
-    assert user.state.camera == before, "the left button paints"
-    painter = user.viewer._painter
-    assert painter is not None and painter.is_changed and 0 < painter.hidden.mean() < 0.2
-    painted = painter.hidden.copy()
-    assert changed_fraction(user.read_screen(), painted_without(user)) > 0, "outlines are drawn"
-    user.click("Save mask")
-    user.draw_frames(2)
-    try:
-        assert np.array_equal(read_blur_mask(mask, 512), painted) and "Reload" in user.state.message
-        user.press(imgui.Key.left_shift)
-        user.click("Clear")
-        assert not painter.hidden.any() and painter.is_changed
-        user.press(imgui.Key.escape)
-        user.draw_frames(1)
-        user.click("Drop it")
-        assert user.viewer._painter is None and user.state.comparison == "off" and not user.state.quit
-        user.click("paint what to hide")
-        user.draw_frames(1)
-        assert np.array_equal(user.viewer._painter.hidden, painted), "that of the file"
-        user.click("paint what to hide")
-        assert user.viewer._painter is None
-    finally:
-        mask.unlink()
-
-
-@pytest.fixture
-def painted(cleaning: User, pair) -> Iterator[User]:
-    """The user with a mask that is not saved."""
-    user = cleaning
-    user.show(SceneEntry(pair.name, pair=pair), SceneEntry("other", file=pair.folder / "other.ply"))
-    user.click("paint what to hide")
-    user.draw_frames(2)
-    user.drag((400, 300), (480, 320))
-    user.draw_frames(1)
-    assert user.viewer._painter.is_changed
-    yield user
-    user.viewer._stop_painting()
-    user.show(*user.entries)
-
-
-def press_escape(user: User) -> None:
-    user.press(imgui.Key.escape)
-
-
-def press_quit(user: User) -> None:
-    user.press(imgui.Key.mod_ctrl, imgui.Key.q)
-
-
-LEAVING = {
-    "Esc": press_escape,
-    "untick": lambda user: user.click("paint what to hide"),
-    "Reload": lambda user: user.click("Reload"),
-    "another scene": lambda user: user.viewer._execute(Commands(choose=1), SIZE, user.clock[0]),
-    "another path": lambda user: user.viewer._execute(Commands(open="nowhere"), SIZE, user.clock[0]),
-    "export": lambda user: user.click("Save##clean"),
-    "quit": press_quit,
-    "close the window": lambda user: user.viewer.request_quit(),
-}
-
-
-@pytest.mark.parametrize("leave", LEAVING.values(), ids=LEAVING)
-def test_an_unsaved_mask_is_dropped_only_after_a_question(painted, leave, pair, tmp_path):
-    user, painter, mask = painted, painted.viewer._painter, pair.folder / "a_blur.png"
-    user.panels.cleaning.file = str(tmp_path / "clean.ply")
-    hidden = painter.hidden.copy()
-
-    def ask() -> None:
-        leave(user)
-        user.draw_until(lambda: "Go on painting" in user.panels.items, "question")
-        user.draw_frames(2)
-        assert user.viewer._painter is painter and np.array_equal(painter.hidden, hidden) and painter.is_changed
-        assert not user.state.quit and not mask.exists() and not (tmp_path / "clean.ply").exists()
-        assert user.viewer.loader.entry is None and not user.viewer.loader.is_searching
-
-    ask()
-    user.click("Go on painting")
-    user.draw_frames(2)
-    assert "Go on painting" not in user.panels.items and user.viewer._painter is painter and painter.is_changed
-    ask()
-    user.click("Drop it")
-    assert user.viewer._painter is None and not mask.exists()
-    user.state.quit = False
-    user.data.error = None
-
-
-def test_an_unsaved_mask_is_saved_by_the_answer(painted, pair):
-    user, mask = painted, pair.folder / "a_blur.png"
-    hidden = user.viewer._painter.hidden.copy()
-    try:
-        user.panels.cleaning.file = str(pair.folder / "clean.ply")
-        user.click("Save##clean")
-        user.draw_frames(2)
-        user.click("Save mask##answer")
-        user.draw_frames(2)
-        assert np.array_equal(read_blur_mask(mask, 512), hidden) and "Reload" in user.state.message
-        assert not (pair.folder / "clean.ply").exists(), "the scene shows what the new mask hides"
-        press_quit(user)
-        assert user.state.quit, "there is nothing to lose"
-    finally:
-        user.state.quit = False
-        mask.unlink(missing_ok=True)
-
-
-def test_a_mask_that_is_painted_stays_when_its_photograph_is_loaded_again(painted, pair):
-    user, painter = painted, painted.viewer._painter
-    hidden, entry = painter.hidden.copy(), user.viewer._loaded.entry
-    again = replace(pair, context=tuple(replace(view) for view in pair.context))
-    user.viewer._show_loaded(replace(user.viewer._loaded, entry=replace(entry, pair=again)), user.clock[0])
-    user.draw_frames(2)
-    assert user.viewer._painter is painter and painter.is_changed and np.array_equal(painter.hidden, hidden)
-    assert painter.panorama is again.context[0] and user.state.photograph == 0
-
-
-def test_a_scene_that_was_loading_while_a_mask_was_painted_waits_for_the_answer(painted):
-    user, painter = painted, painted.viewer._painter
-    shown = user.viewer._loaded
-    user.viewer.show(user.viewer.entries, 1)
-    user.draw_until(lambda: "Go on painting" in user.panels.items, "question")
-    assert user.viewer._loaded is shown and user.viewer._painter is painter
-    user.click("Go on painting")
-    user.draw_frames(2)
-    assert user.viewer._loaded is shown and user.viewer._painter is painter and user.data.current == 0
-    user.viewer.show(user.viewer.entries, 1)
-    user.draw_until(lambda: "Drop it" in user.panels.items, "question")
-    user.click("Drop it")
-    user.draw_until(lambda: user.viewer._loaded is not shown, "the other scene")
-    assert user.viewer._painter is None and user.data.current == 1
-
-
-def painted_without(user: User) -> np.ndarray:
-    """The screen without the mask that is painted."""
-    painter, user.viewer._painter = user.viewer._painter, None
-    user.draw_frames(2)
-    screen = user.read_screen()
-    user.viewer._painter = painter
-    user.draw_frames(2)
-    return screen
-
-
-def test_camera_widgets_fly_orbit_and_restore_the_start(user):
-    user.slide("speed", 0.5)
-    assert user.state.speed > 1 and user.state.camera == user.state.home
-    user.click("Fly")
-    assert user.state.playing
-    user.click("Stop")
-    assert not user.state.playing and 0 < user.state.flight < 1
-    user.click("orbit")
-    assert user.state.orbiting
-    user.drag((500, 400), (560, 400))
-    assert user.state.camera.position != user.state.home.position
-    user.click("fly")
-    assert not user.state.orbiting
-    user.click("Reset")
-    assert user.state.camera == user.state.home
-    user.click("2##panorama")
-    user.click("1##panorama")
-    assert user.state.camera.position == (0, 0, 0)
-
-
-def test_the_scene_follows_a_drag_on_the_image(user):
-    before = user.read_image()
-    user.drag((500, 400), (470, 400))
-    after = user.read_image()
-    assert user.state.camera.yaw_radians > 0 and user.state.camera.position == user.state.home.position
-    errors = {s: np.abs(before[100:380, 60:200] - after[100:380, 60 + s : 200 + s]).mean() for s in (-30, 0, 30)}
-    assert min(errors, key=errors.get) == -30, "the image is shifted by the 30 pixels of the drag"
-
-
-def test_a_click_shows_the_point_and_a_second_one_the_distance(user):
-    before = user.read_image()
-    user.click_at(430, 300)
-    (point,) = user.state.points
-    assert 0.5 < point.depth < 8 and point.count > 0
-    assert changed_fraction(before, user.read_image()) > 0.0002, "a marker"
-    user.click_at(500, 500)
-    assert len(user.state.points) == 2 and user.state.points[0] == point
-    user.drag((500, 400), (460, 400))
-    user.press(imgui.Key.r)
-    assert user.state.points == []
-    assert changed_fraction(before, user.read_image()) == 0
-
-
-def test_keys_and_wheel_move_the_camera_and_r_restores_it(user):
-    before = user.read_image()
-    user.press(imgui.Key.w, frames=5)
-    assert user.state.camera.position[2] > 0.1
-    user.press(imgui.Key.r)
-    assert user.state.camera == user.state.home
-    imgui.get_io().add_mouse_wheel_event(0, 1)
-    user.draw_frames(2)
-    assert user.state.camera.vertical_fov_degrees < user.state.home.vertical_fov_degrees
-    assert changed_fraction(before, user.read_image()) > 0.1
-
-
-def test_tab_hides_the_panels_and_h_shows_the_keys(user):
-    user.press(imgui.Key.tab)
-    assert not user.panels.items
-    plain = user.read_image()
-    user.press(imgui.Key.h)
-    assert changed_fraction(plain, user.read_image()) > 0.1
-    user.press(imgui.Key.escape)
-    assert changed_fraction(plain, user.read_image()) == 0 and not user.state.quit
-
-
-def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
-    user.click("path")
-    io = imgui.get_io()
-    for character in "wasd":
-        io.add_key_event(getattr(imgui.Key, character), True)
-        io.add_input_character(ord(character))
-        assert user.viewer.gui.has_input
-        user.draw_frames(3)
-        assert not user.viewer.gui.has_input
-        io.add_key_event(getattr(imgui.Key, character), False)
-        user.draw_frames(1)
-    assert user.panels.path == "wasd"
-    assert user.state.camera == user.state.home
-    user.press(imgui.Key.enter)
-    user.settle()
-    assert user.data.entries == ["opened"]
-
-
-def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
-    opened = []
-
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
-        opened.append(path.name)
-        return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
-
-    monkeypatch.setattr(user.viewer, "_find", find)
-    monkeypatch.setattr(user.data, "preferences", Preferences())
-    user.panels.path = "kitchen"
-    user.click("Open")
-    user.settle()
-    user.panels.path = ""
-    assert user.data.entries == ["kitchen 1"] and user.data.preferences.recent == (str(Path("kitchen").absolute()),)
-    user.draw_frames(2)
-    user.click("recent")
-    left, _, _, bottom = user.panels.items["recent"]
-    user.click_at(left + 30, bottom + 12)
-    user.settle()
-    assert user.data.entries == ["kitchen 2"]
-
-
-def test_the_background_is_chosen_in_a_picker(user):
-    user.state.settings = replace(user.state.settings, levels=frozenset())
-    assert user.read_image().max() == 0
-    left, top, _, bottom = user.panels.items["background"]
-    user.click_at(left + 5, (top + bottom) / 2)
-    user.draw_frames(2)
-    user.click_at(left + 60, bottom + 60)
-    user.click_at(500, 880)
-    assert max(user.state.settings.background) > 0 and user.read_image().max() > 0
-
-
-def test_the_list_of_scenes_loads_the_other_pair(user):
-    user.click("pair")
-    left, _, _, bottom = user.panels.items["pair"]
-    user.click_at(left + 30, bottom + 36)
-    user.settle()
-    assert user.data.current == 1
-
-
-def test_errors_are_shown_and_keep_the_scene(user):
-    before = user.read_image()
-    user.viewer.open(Path("nothing"))
-    user.settle()
-    assert "no such file" in user.data.error
-    assert changed_fraction(before, user.read_image()) > 0.02, "the message is on the screen"
-    user.click("OK")
-    assert user.data.error is None
-    assert changed_fraction(before, user.read_image()) == 0
-    user.show(SceneEntry("damaged"))
-    assert user.data.error.startswith("damaged.ply: 100% unreadable")
-    assert user.data.entries == NAMES and user.data.current == 0
-    user.click("OK")
-    assert changed_fraction(before, user.read_image()) == 0
-
-
-def test_the_photograph_is_shown_in_the_viewing_direction(user):
-    state = user.state
-    state.comparison, state.split = "photograph", 0.0
-    state.settings = replace(state.settings, levels=frozenset())  # saves time: the photograph covers the rendering
-    state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=40)
-    image = user.read_image()
-    red, green, blue = image[180:200].mean((0, 1)) / 255
-    assert red > 0.95 and 0.4 < green < 0.6 and 0.4 < blue < 0.6, "right is red"
-    rows = image[..., 1].mean(1)
-    assert rows[0] > rows[-1] + 20, "up is green: upright"
-    state.camera = replace(state.camera, yaw_radians=0.0)
-    columns = user.read_image()[..., 0].mean(0)
-    assert columns[-1] > columns[0] + 20, "right is red: not mirrored"
-    state.camera = replace(state.camera, position=(0.0, 0.0, 0.4))
-    assert user.read_image().max() < 90, "the nearest photograph is the second, dim one"
-
-
-@both
-@pytest.mark.slow
-def test_rendering_at_an_input_camera_looks_like_its_photograph(user, pair):
-    user.show(SceneEntry("sphere", pair=pair))
-    state = user.state
-    for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
-        state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
-        state.comparison = "off"
-        rendered = user.read_image()
-        state.comparison, state.split = "photograph", 0.0
-        photograph = user.read_image()
-        assert np.abs(rendered - photograph).mean() < 4
-        assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "not mirrored"
-        assert np.abs(rendered - photograph[::-1]).mean() > 8, "not upside down"
-
-
-def assert_split(rendered: np.ndarray, compared: np.ndarray, split: float, right: float = 0.5) -> None:
-    """Asserts that both are equal left of the divider, and differ in a fraction `right` of the pixels right of it."""
-    column = round(split * SIZE[0]) - IMAGE[1].start
-    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) == 0
-    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) > right
-
-
-@both
-def test_a_drag_moves_the_divider_between_rendering_and_photograph(user):
-    rendered, camera = user.read_image(), user.state.camera
-    user.click("photograph")
-    user.state.split = 0.75
-    assert_split(rendered, user.read_image(), 0.75, right=0.9)
-    user.drag((0.75 * SIZE[0], 300), (0.75 * SIZE[0] + 60, 300))
-    assert user.state.split == pytest.approx(0.75 + 60 / SIZE[0]) and user.state.camera == camera
-    assert_split(rendered, user.read_image(), user.state.split, right=0.9)
-    user.press(imgui.Key.c)
-    assert user.state.comparison == "off" and changed_fraction(rendered, user.read_image()) == 0
-
-
-def test_the_error_is_the_mapped_difference_from_the_photograph(user):
-    state = user.state
-    state.split, state.comparison = 0.0, "off"
-    rendered = user.read_image()
-    state.comparison = "photograph"
-    photograph = user.read_image()
-    user.click("error")
-    state.max_error = 0.4
-    expected = map_values(np.abs(rendered - photograph).mean(axis=2) / 255, 0.4, ERROR_MAP)
-    assert (np.abs(user.read_image() - expected).max(axis=2) <= 12).mean() > 0.98, "up to the steps of 8 bits"
-    user.slide("error up to", 0.05)
-    assert state.max_error < 0.2 and user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
-
-
-def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
-    rendered = user.read_image()
-    user.press(imgui.Key.x)
-    assert user.state.comparison == "pinned" and user.data.right_name == "first, joint, color"
-    user.state.split, user.state.message = 0.8, ""
-    user.click("view 0")
-    compared = user.read_image()
-    column = round(0.8 * SIZE[0]) - IMAGE[1].start
-    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) > 0.2
-    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) == 0
-    user.show(SceneEntry("sphere", pair=user.entries[0].pair), SceneEntry("other"))
-    assert user.data.right_name == "first, joint, color"
-    user.click("Pin this image")
-    assert user.data.right_name == "sphere, view, color"
-
-
-def test_a_chosen_photograph_is_compared_from_its_own_camera(user):
-    user.state.comparison, user.state.photograph = "photograph", 1
-    user.draw_frames(2)
-    assert user.data.right_name == "photograph b.png" and user.data.photograph_distance == pytest.approx(0.5)
-    user.click("Go")
-    assert user.state.camera.position == pytest.approx((0, 0, 0.5)) and user.state.camera.yaw_radians == 0
-    assert user.data.photograph_distance == pytest.approx(0)
-    user.click("photographs")
-    left, _, _, bottom = user.panels.items["photographs"]
-    user.click_at(left + 20, bottom + 12)
-    assert user.state.photograph is None, "the nearest one"
-
-
-def test_a_photograph_that_cannot_be_read_is_an_error_and_keeps_the_image(user, pair, tmp_path):
-    broken = replace(pair.context[0], image=tmp_path / "gone.png")
-    user.show(SceneEntry("broken", pair=replace(pair, context=(broken, pair.context[1]))))
-    before = user.read_image()
-    user.click("photograph")
-    user.settle()
-    assert "gone.png" in user.data.error
-    user.click("OK")
-    assert changed_fraction(before, user.read_image()) == 0
-
-
-def test_each_display_is_another_image(user):
-    images = [user.read_image()]
-    for display in get_args(Display)[1:]:
-        user.click(display)
-        images.append(user.read_image())
-        differences = [changed_fraction(other, images[-1]) for other in images[:-1]]
-        assert min(differences) > 0.1, display
-    user.click("color")
-    assert changed_fraction(images[0], user.read_image()) == 0
-
-
-def test_the_range_of_a_display_is_shown_and_can_be_changed(user):
-    user.click("depth")
-    assert 2 < user.state.settings.display_max < 6, "most Gaussians are nearer"
-    near = user.read_image()
-    user.slide("range", 0.5, start=0.3)
-    assert user.state.settings.display_max > 6
-    assert changed_fraction(near, user.read_image()) > 0.5
-
-
-def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, small_scene, monkeypatch):
-    viewer, go = user.viewer, threading.Event()
-
-    def predict(entry, progress, show):
-        progress("matching", 0.5)
+def app(make_app, pair) -> App:
+    """A viewer that shows a pair."""
+    app = make_app()
+    app.entries = [SceneEntry(name, pair=pair) for name in ("first", "second")]
+    app.show(*app.entries)
+    return app
+
+
+class Gate:
+    """A load that waits for `open`, with a progress."""
+
+    def __init__(self, load: Callable[[SceneEntry], LoadedScene], *progress: object) -> None:
+        self.load, self.progress, self.event, self.entered = load, progress, threading.Event(), threading.Event()
+        self.ended = 0
+
+    def __call__(self, entry: SceneEntry, progress: Callable[..., None], show: object) -> LoadedScene:
+        try:
+            self.entered.set()
+            while not self.event.wait(0.003):
+                progress(*self.progress)
+            return self.load(entry)
+        finally:
+            self.ended += 1
+
+    def open(self) -> None:
+        self.event.set()
+
+
+# --- scenes ---
+
+
+def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
+    def find(path: Path, progress: object) -> list[SceneEntry]:
+        raise InputError(f"{path}: no such file or folder")
+
+    app.find = find
+    app.viewer.open(Path("nothing"))
+    app.settle()
+    assert "no such file" in app.viewer.error
+    app.viewer.dismiss_error()
+    app.show(SceneEntry("damaged"))
+    assert app.viewer.error.startswith("damaged.ply: 100% unreadable")
+    assert app.library.names == ["first", "second"] and app.library.current == 0
+    assert app.viewer.stage.slot.scene is small_scene
+    app.viewer.dismiss_error()
+    assert app.viewer.error is None
+
+
+def test_a_path_is_remembered_and_an_entry_is_chosen_by_its_name(app, pair):
+    app.find = lambda path, progress: [SceneEntry(name, pair=pair) for name in ("a", "b")]
+    app.viewer.open(Path("kitchen"), "b")
+    app.settle()
+    assert app.library.current == 1 and app.library.path == Path("kitchen")
+    assert app.viewer.preferences.recent == (str(Path("kitchen").absolute()),)
+    app.viewer.choose(0)
+    app.settle()
+    assert app.viewer.loaded.entry.name == "a"
+
+
+def test_progress_is_shown_and_input_accepted_while_a_scene_is_loaded(app, small_scene):
+    app.load = gate = Gate(lambda entry: LoadedScene(entry, small_scene), "searching depth", 0.5)
+    app.viewer.show([SceneEntry("slow")], 0)
+    app.until(lambda: app.viewer.loading == ("slow", "searching depth", 0.5), "progress")
+    app.frame(held=frozenset("w"))
+    assert app.state.camera.position[2] > 0
+    gate.open()
+    app.settle()
+    assert app.viewer.loading is None and app.viewer.loaded.entry.name == "slow"
+
+
+def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
+    gate = Gate(lambda entry: LoadedScene(entry, small_scene), "estimating poses", 0.3)
+    app.find = lambda path, progress: gate(path, progress, None)
+    app.viewer.open(Path("unposed"))
+    app.until(lambda: app.viewer.loading == ("unposed", "estimating poses", 0.3), "search")
+    app.viewer.cancel_loading()
+    assert app.viewer.loading is None and app.library.current == 0, "the scene is still the current one"
+    app.load = gate
+    app.viewer.reload()
+    app.until(lambda: app.viewer.loading == ("first", "estimating poses", 0.3), "prediction")
+    app.viewer.cancel_loading()
+    app.settle()
+    assert app.viewer.loading is app.viewer.error is None
+    app.until(lambda: gate.ended == 2, "end of both threads")
+
+
+def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(app, small_scene):
+    go, refined = threading.Event(), replace(small_scene, near=0.5)
+
+    def load(entry: SceneEntry, progress: Callable[..., None], show: Callable[..., None]) -> LoadedScene:
+        show(LoadedScene(entry, small_scene, is_final=False))
+        progress("refining", 0.75)
         assert go.wait(300)
-        return LoadedScene(entry, small_scene)
+        return LoadedScene(entry, refined)
 
-    monkeypatch.setattr(viewer.loader, "_load", predict)
-    viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
-    viewer.show([SceneEntry("kitchen", pair=pair)], 0)
-    user.wait_for_progress("kitchen", "matching", 0.5)
-    user.draw_until(lambda: viewer._comparer.photographs._textures, "photograph")
-    user.draw_frames(1)
-    ahead = user.read_screen()
-    assert ahead.mean() > 60 and user.data.loading == ("kitchen", "matching", 0.5)
-    user.drag((500, 400), (380, 400))
-    turned, camera = user.read_screen(), user.state.camera
-    assert camera.yaw_radians > 0.1 and turned[..., 0].mean() > ahead[..., 0].mean() + 8, "more of the red right"
+    app.load = load
+    app.viewer.show([SceneEntry("kitchen")], 0)
+    app.until(lambda: app.viewer.refinement == 0.5, "refinement")
+    app.frame(held=frozenset("w"))
+    camera, stage = app.state.camera, app.viewer.stage
     go.set()
-    user.settle()
-    assert user.state.camera == replace(camera, distance=user.state.camera.distance), "the view is kept"
-    user.state.comparison, user.state.split = "photograph", 0.0
-    assert np.abs(user.read_image() - turned).mean() < 1, "it was the photograph"
+    app.until(lambda: app.library.loader.refinement is None, "refined scene")
+    app.settle()
+    assert app.viewer.refinement == 1 and stage.slot.scene is refined and app.state.camera == camera
+    for expected in (small_scene, refined):
+        app.press("b")
+        app.settle()
+        assert stage.slot.scene is expected
 
 
-def test_a_panorama_alone_is_entered_in_a_wide_view(user, tmp_path, monkeypatch):
+def test_a_cancelled_refinement_keeps_the_prediction(app, small_scene):
+    gate = Gate(lambda entry: pytest.fail("cancelled"), "refining", 0.6)
+
+    def load(entry: SceneEntry, progress: object, show: Callable[..., None]) -> LoadedScene:
+        show(LoadedScene(entry, small_scene, is_final=False))
+        return gate(entry, progress, show)
+
+    app.load = load
+    app.viewer.show([SceneEntry("kitchen")], 0)
+    app.until(lambda: app.viewer.refinement is not None, "refinement")
+    app.library.loader.cancel()
+    app.until(lambda: gate.ended, "end of the thread")
+    app.settle()
+    assert app.viewer.refinement is app.viewer.error is None and app.viewer.loaded.scene is small_scene
+
+
+def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(app, small_scene, monkeypatch):
+    twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
+    refuse = staticmethod(lambda scene: MemoryError("too many") if scene is twice else None)
+    monkeypatch.setattr(NoRenderer, "refuse", refuse)
+    app.load = lambda entry, *_: LoadedScene(entry, twice)
+    app.show(SceneEntry("large"))
+    assert "the memory is exhausted" in app.viewer.error and app.viewer.reduced == len(twice.gaussians) // 4
+    assert app.library.names == ["large"]
+    app.viewer.dismiss_error()
+    assert app.viewer.stage.slot.scene is small_scene and app.library.names == ["first", "second"]
+    app.show(SceneEntry("large again"))
+    app.viewer.show_reduced()
+    app.settle()
+    assert app.viewer.error is None and len(app.viewer.stage.slot.scene.gaussians) == 600
+    assert app.library.names == ["large again"]
+
+
+def test_an_error_of_opengl_is_not_called_exhausted_memory(app, monkeypatch):
+    error = moderngl.Error("GLSL Compiler failed")
+    monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: error))
+    app.show(SceneEntry("refused"))
+    assert app.viewer.error == "refused: OpenGL failed: GLSL Compiler failed" and app.viewer.reduced is None
+
+
+def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(app, monkeypatch):
+    monkeypatch.setattr(NoRenderer, "problem", MemoryError("no memory"))
+    app.state.camera = replace(app.state.camera, yaw_radians=0.5)
+    app.until(lambda: app.viewer.error and not app.viewer.moving, "error", 0.2)
+    assert "the memory is exhausted" in app.viewer.error and app.viewer.stage.has_failed
+    monkeypatch.setattr(NoRenderer, "problem", None)
+    app.viewer.dismiss_error()
+    app.frame()
+    assert app.viewer.error is None and not app.viewer.stage.has_failed
+
+
+def test_a_large_scene_is_converted_while_the_window_accepts_input(make_app, pair, small_scene, monkeypatch):
+    go, other = threading.Event(), replace(small_scene, near=0.5)
+
+    def prepare(scene: Scene, report: Callable[[float], None]) -> Scene:
+        report(0.25)
+        assert scene is small_scene or go.wait(300)
+        return scene
+
+    monkeypatch.setattr(NoRenderer, "prepare", staticmethod(prepare))
+    monkeypatch.setattr("pansplat_viewer.scene.slots._SMALL_SCENE", 0)
+    app = make_app()
+    app.show(SceneEntry("first", pair=pair))
+    app.load = lambda entry, *_: LoadedScene(entry, other)
+    app.viewer.show([SceneEntry("large")], 0)
+    app.until(lambda: app.viewer.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
+    assert app.viewer.busy and app.viewer.stage.slot.scene is small_scene
+    app.frame(drag=(30.0, 0.0))
+    assert app.state.camera.yaw_radians != 0
+    go.set()
+    app.settle()
+    assert app.viewer.stage.slot.scene is other and app.viewer.loading is None
+
+
+def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(app, monkeypatch):
+    resolution, recorded = app.viewer.stage.resolution, []
+    monkeypatch.setattr(resolution, "record", lambda plan, ms: recorded.append(plan.scale))
+    scales = app.viewer.stage.renderer.scales
+    scales.clear()
+    for step in (0, 1, 2, 1, 0):
+        resolution.step = step
+        app.state.camera = replace(app.state.camera, position=(0.0, 0.0, 0.01 + 0.01 * len(scales)))
+        app.frame()
+    assert scales == [1.0, 0.75, 0.5, 0.75, 1.0] and recorded[-4:] == scales[:-1]
+
+
+def test_a_changed_file_is_announced_and_read_again(app, room):
+    app.show(SceneEntry("room", file=room))
+    app.frame(3.0)
+    assert not app.library.watch.changed
+    room.write_bytes(room.read_bytes() + b"0")
+    app.frames(2, 3.0)
+    assert app.library.watch.changed
+    app.viewer.reload()
+    app.settle()
+    assert not app.library.watch.changed
+    room.unlink()
+    app.frames(2, 3.0)
+    assert app.library.watch.changed, "a missing file has changed, too"
+
+
+def test_a_folder_that_changes_is_announced_and_searched_again(app, pair, tmp_path):
+    folder, found = tmp_path / "folder", []
+    folder.mkdir()
+    image = folder / "a.png"
+    image.write_bytes(pair.context[0].image.read_bytes())
+    pair = replace(pair, folder=folder, context=(replace(pair.context[0], image=image), *pair.context[1:]))
+
+    def find(path: Path, progress: object) -> list[SceneEntry]:
+        found.append(path)
+        return [SceneEntry(name, pair=pair) for name in ("new", "pair 1", "pair 2")[len(found) == 1 :]]
+
+    app.find = find
+    app.viewer.open(folder)
+    app.settle()
+    assert app.library.names == ["pair 1", "pair 2"]
+    for name in ("poses.json", "b.png"):
+        (folder / ".pansplat").mkdir(exist_ok=True)
+        app.frames(2, 3.0)
+        assert not app.library.watch.changed
+        (folder / name).write_bytes(b"1")
+        app.frames(2, 3.0)
+        assert app.library.watch.changed, name
+        app.viewer.reload()
+        app.settle()
+        (folder / ".pansplat").rmdir()
+    assert found == [folder] * 3
+    assert app.library.names[app.library.current] == "pair 1" and app.library.current == 1
+
+
+# --- photographs and comparison ---
+
+
+def test_a_panorama_alone_is_entered_in_a_wide_view(make_app, tmp_path):
     image = np.full((64, 128, 3), 0.6, np.float32)
     image[20:44, 90:106:2] = 0.1  # 0.37 to 0.41 of a turn right of the left border, at 1.67 radians
     write_image(tmp_path / "alone.png", image)
     panorama = Panorama("alone", tmp_path / "alone.png", torch.eye(4, dtype=torch.float64))
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: pytest.fail("not shown"))
     for start, yaw in ((None, 2 * np.pi * (98 / 128 - 0.5)), ((0.5, 0.0), 0.5)):
-        user.viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
+        app = make_app()
         pair = Pair("alone", tmp_path, (replace(panorama, start=start),), (), 0.45, 10.0)
-        user.viewer._preview(SceneEntry("alone", pair=pair))
-        assert user.state.camera == user.state.home
-        assert user.state.camera.yaw_radians == pytest.approx(yaw, abs=0.1)
-
-
-def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_path, axis_photos):
-    photographs = Photographs(ctx)
-    (first, *_) = pair.context
-
-    def read(panorama: Panorama) -> np.ndarray:
-        photographs.open([panorama])
-        while (texture := photographs.get(0)) is None:
-            time.sleep(0.002)
-        return np.frombuffer(texture.read(), np.uint8)
-
-    write_image(tmp_path / "a.png", axis_photos[0])
-    before = read(panorama := replace(first, image=tmp_path / "a.png"))
-    write_image(tmp_path / "a.png", axis_photos[1])
-    assert (read(panorama) == before).all()
-    pose = first.cam2world.clone()
-    pose[0, 3] += 5
-    assert (read(replace(panorama, cam2world=pose)) != before).any()
-    assert photographs.pose(0)[0, 3] == pose[0, 3] and photographs.find_nearest(np.zeros(3)) == 0
-    photographs.release()
-
-
-def test_a_scene_without_photographs_has_no_comparison_with_one(user):
-    user.show(SceneEntry("no photographs"))
-    before = user.read_image()
-    user.click("photograph")
-    assert user.state.comparison == "off", "it is disabled"
-    before = user.read_image()
-    user.press(imgui.Key.c)
-    assert changed_fraction(before, user.read_image()) == 0
-
-
-@both
-def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 128)
-    image = user.read_image()
-    user.click("PNG")
-    user.click("360 PNG")
-    png, panorama = user.viewer.screenshots[-2:]
-    with Image.open(png) as file:
-        assert file.size == SIZE
-        pixels = np.asarray(file).astype(int)
-    assert np.abs(pixels[IMAGE] - image).max() <= 3
-    assert changed_fraction(pixels[20:560, 20:290], np.zeros_like(pixels[20:560, 20:290])) > 0.3
-    with Image.open(panorama) as file:
-        assert file.size == (256, 128)
-    user.state.message = ""
-    assert changed_fraction(image, user.read_image()) == 0, "the window shows the view again"
-
-
-def test_screenshot_without_memory_is_reported(user, monkeypatch):
-    def fail(*args, **options):
-        raise MemoryError("no memory")
-
-    written = len(user.viewer.screenshots)
-    monkeypatch.setattr("pansplat_viewer.viewer.write_screenshot", fail)
-    user.click("PNG")
-    assert user.data.error == "no screenshot written: the memory is exhausted (MemoryError: no memory)"
-    assert len(user.viewer.screenshots) == written
-    user.click("OK")
-    assert user.data.error is None
-
-
-@both
-def test_exr_screenshot_holds_color_and_radial_depth(user):
-    user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
-    user.click("EXR + depth")
-    by_key, path = user.viewer.screenshots[-2:]
-    assert by_key.suffix == path.suffix == ".exr"
-    with OpenEXR.File(str(path)) as file:
-        depth = file.channels()["Z"].pixels
-        assert depth.shape == SIZE[::-1] and file.channels()["RGB"].pixels.shape == (*SIZE[::-1], 3)
-    assert 1.5 < np.median(depth[depth > 0]) < 4.5
-
-
-@both
-def test_focus_orbits_the_point_in_the_centre(user):
-    user.settle()
-    user.press(imgui.Key.f)
-    assert user.state.orbiting
-    assert 1.5 < user.state.camera.distance < 4.5
-    assert user.state.camera.position == user.state.home.position
-
-
-@both
-def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
-    user.viewer._resolution.budget_ms = 1e-3
-    monkeypatch.setattr(user.viewer.renderer, "pacing", SMALL)
-    io = imgui.get_io()
-    io.add_key_event(imgui.Key.w, True)
-    user.draw_frames(8)
-    assert user.data.size[0] < SIZE[0]
-    io.add_key_event(imgui.Key.w, False)
-    user.settle()
-    assert user.data.size == SIZE
-    user.click("coarser while moving")
-    user.press(imgui.Key.w, frames=4)
-    assert user.data.size == SIZE
-
-
-def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_scene, monkeypatch):
-    reported, go = threading.Event(), threading.Event()
-
-    def slow(entry, progress, show):
-        progress("searching depth", 0.5)
-        reported.set()
-        assert go.wait(300)
-        return LoadedScene(entry, small_scene)
-
-    monkeypatch.setattr(user.viewer.loader, "_load", slow)
-    user.viewer.show([SceneEntry("slow")], 0)
-    assert reported.wait(300)
-    user.draw_frames(2)
-    assert user.data.loading == ("slow", "searching depth", 0.5)
-    left, top, right, bottom = user.panels.items["Cancel##loading"]
-    assert 0 < left < right < SIZE[0] and 0 < top < bottom < SIZE[1], "next to a progress bar at the bottom"
-    user.press(imgui.Key.w, frames=3)
-    assert user.state.camera.position[2] > 0
-    go.set()
-    user.settle()
-    assert user.data.loading is None
-
-
-def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(user, small_scene, monkeypatch):
-    go = threading.Event()
-    gaussians = replace(small_scene.gaussians, harmonics=small_scene.gaussians.harmonics + 1.0)
-
-    def load(entry, progress, show):
-        show(LoadedScene(entry, small_scene, is_final=False))
-        progress("refining", 0.75)
-        assert go.wait(300)
-        return LoadedScene(entry, replace(small_scene, gaussians=gaussians))
-
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
-    user.viewer.show([SceneEntry("kitchen")], 0)
-    user.draw_until(lambda: user.viewer.loader.refinement is not None, "refinement")
-    user.press(imgui.Key.w, frames=2)
-    user.settle(refining=True)
-    predicted, camera = user.read_screen(), user.state.camera
-    assert 0 < user.data.refinement < 1 and "Cancel" in user.panels.items
-    go.set()
-    user.draw_until(lambda: user.viewer.loader.refinement is None, "refined scene")
-    user.settle()
-    refined = user.read_image()
-    assert user.state.camera == camera and changed_fraction(predicted, refined) > 0.2
-    user.click("refined")
-    assert changed_fraction(predicted, user.read_image()) == 0
-    user.press(imgui.Key.b)
-    user.settle()
-    assert changed_fraction(refined, user.read_image()) == 0
-
-
-def test_a_cancelled_refinement_keeps_the_prediction(user, small_scene, monkeypatch):
-    cancelled = threading.Event()
-
-    def load(entry, progress, show):
-        show(LoadedScene(entry, small_scene, is_final=False))
-        try:
-            while True:
-                progress("refining", 0.6)
-                time.sleep(0.005)
-        finally:
-            cancelled.set()
-
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
-    user.viewer.show([SceneEntry("kitchen")], 0)
-    user.draw_until(lambda: user.viewer.loader.refinement is not None, "refinement")
-    user.draw_frames(2)
-    user.click("Cancel")
-    assert cancelled.wait(300)
-    user.settle()
-    assert user.data.refinement is None and user.data.error is None
-
-
-# --- window, memory and files ---
-
-
-def test_a_search_and_a_prediction_can_be_cancelled(user, monkeypatch):
-    before, ended = user.read_image(), []
-
-    def wait(progress) -> None:
-        try:
-            while True:
-                progress("estimating poses", 0.3)
-                time.sleep(0.002)
-        finally:
-            ended.append(1)
-
-    monkeypatch.setattr(user.viewer, "_find", lambda path, progress: wait(progress))
-    user.viewer.open(Path("unposed"))
-    user.wait_for_progress("unposed", "estimating poses", 0.3)
-    user.click("Cancel##loading")
-    assert user.data.loading is None and user.data.current == 0, "the scene is still the current one"
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: wait(progress))
-    user.click("Reload")
-    user.wait_for_progress(user.data.entries[0], "estimating poses", 0.3)
-    user.click("Cancel##loading")
-    user.settle()
-    assert user.data.loading is None and user.data.error is None
-    user.draw_until(lambda: len(ended) == 2, "end of both threads")
-    user.state.message = ""
-    assert changed_fraction(before, user.read_image()) == 0
-
-
-@both
-def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, small_scene, monkeypatch):
-    before, allocate = user.read_image(), SplatRasterizer._allocate
-    twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
-
-    def refuse(self, splats):
-        if len(splats) == len(twice.gaussians):
-            raise MemoryError("too many")
-        allocate(self, splats)
-
-    def refuse_rows(means, *arguments):
-        if len(means) == len(twice.gaussians):
-            raise MemoryError("too many")
-        return DisplayScene(means, *arguments)
-
-    monkeypatch.setattr(SplatRasterizer, "_allocate", refuse)
-    monkeypatch.setattr("pansplat_viewer.draw.cpu_renderer.DisplayScene", refuse_rows)
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, twice))
-    user.show(SceneEntry("large"))
-    assert "the memory is exhausted" in user.data.error and user.data.reduced == len(small_scene.gaussians) // 2
-    assert user.data.entries == ["large"]
-    user.click("OK")
-    assert changed_fraction(before, user.read_image()) == 0 and user.data.entries == NAMES, "the scene before is kept"
-    user.show(SceneEntry("large again"))
-    user.click("Reduce")
-    after = user.read_image()
-    assert user.data.error is None and len(user.viewer._slot.scene.gaussians) == 600
-    assert user.data.entries == ["large again"]
-    assert changed_fraction(before, after) > 0.02
-    assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"
-
-
-def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(user, monkeypatch):
-    viewer, renderer, drawn, recorded = user.viewer, user.viewer.renderer._eyes[0], [], []
-    render = renderer.render
-
-    def log(cam2world, size, settings, *, wait=True):
-        drawn.append(settings.scale)
-        return render(cam2world, size, settings, wait=wait)
-
-    monkeypatch.setattr(renderer, "render", log)
-    monkeypatch.setattr(viewer._resolution, "record", lambda plan, ms: recorded.append((plan.scale, ms > 0)))
-    for step in (0, 1, 2, 1, 0):
-        viewer._resolution.step = step
-        user.state.camera = replace(user.state.camera, position=(0.0, 0.0, 0.01 + 0.01 * len(drawn)))
-        user.draw_frames(1)
-    assert drawn == [1.0, 0.75, 0.5, 0.75, 1.0]
-    assert recorded[-4:] == [(scale, True) for scale in drawn[:-1]]
-
-
-test_the_time_of_a_frame_is_recorded_for_its_own_resolution.renderers = ("gl",)  # type: ignore[attr-defined]
-
-
-def test_an_error_of_opengl_is_not_called_exhausted_memory(user, small_scene, monkeypatch):
-    def refuse(*_: object) -> None:
-        raise moderngl.Error("GLSL Compiler failed")
-
-    monkeypatch.setattr(user.viewer._slots[0], "upload", refuse)
-    user.show(SceneEntry("refused"))
-    assert user.data.error == "refused: OpenGL failed: GLSL Compiler failed" and user.data.reduced is None
-    user.click("OK")
-
-
-@both
-def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_scene, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.scene.slots._SMALL_SCENE", 0)
-    go, prepare = threading.Event(), user.viewer.renderer.prepare
-
-    def slow(scene, report):
-        report(0.25)
-        assert go.wait(300)
-        return prepare(scene, report)
-
-    monkeypatch.setattr(user.viewer._preparer, "_prepare", slow)
-    before, shown = user.read_image(), user.viewer._slot.scene
-    other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
-    user.viewer.show([SceneEntry("large")], 0)
-    user.wait_for_progress("large", "preparing 600 Gaussians", 0.25)
-    assert user.viewer.busy and user.viewer._slot.scene is shown
-    yaw = user.state.camera.yaw_radians
-    user.drag((450, 300), (480, 300))
-    assert user.state.camera.yaw_radians != yaw, "the window accepts input"
-    go.set()
-    user.settle()
-    assert user.viewer._slot.scene is other and user.data.loading is None
-    assert changed_fraction(before, user.read_image()) > 0.1
-
-
-def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair, small_scene, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.scene.slots._LARGE_SCENE", 0)
-    before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
-    monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(300) and draw(*arguments))
-    other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
-    user.viewer.show([SceneEntry("large", pair=pair)], 0)
-    user.draw_until(
-        lambda: user.viewer._slot.scene is other and user.viewer._comparer.photographs._textures, "photograph"
-    )
-    user.draw_frames(1)
-    assert user.viewer.pending is not None and user.viewer.busy and user.data.error is None
-    photograph = user.read_screen()
-    assert changed_fraction(before, photograph) > 0.3 and photograph.mean() > 60
-    go.set()
-    image = user.read_image()
-    assert changed_fraction(photograph, image) > 0.3 and changed_fraction(before, image) > 0.1
-
-
-def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(user, monkeypatch):
-    before = user.read_image()
-
-    def fail(*_: object) -> None:
-        raise MemoryError("no memory")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(CpuRenderer, "_draw", fail)
-        user.state.camera = replace(user.state.camera, yaw_radians=0.5)
-        user.draw_until(lambda: user.data.error and not user.viewer.moving, "error", SETTLE_AFTER)
-        assert "the memory is exhausted" in user.data.error
-    user.state.camera = user.state.home
-    user.click("OK")
-    assert changed_fraction(before, user.read_image()) == 0
-
-
-def test_a_changed_file_is_announced_and_read_again(user, room):
-    user.show(SceneEntry("room", file=room))
-    user.draw_frames(1, 3.0)
-    assert not user.data.changed
-    room.write_bytes(room.read_bytes() + b"0")
-    user.draw_frames(2, 3.0)
-    assert user.data.changed
-    user.click("Reload")
-    user.settle()
-    assert not user.data.changed
-    room.unlink()
-    user.draw_frames(2, 3.0)
-    assert user.data.changed, "a missing file has changed, too"
-
-
-def test_a_folder_that_changes_is_announced_and_searched_again(user, pair, tmp_path, monkeypatch):
-    image, found = tmp_path / "a.png", []
-    image.write_bytes(pair.context[0].image.read_bytes())
-    pair = replace(pair, folder=tmp_path, context=(replace(pair.context[0], image=image), *pair.context[1:]))
-
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
-        found.append(path)
-        return [SceneEntry(name, pair=pair) for name in ("new", "pair 1", "pair 2")[len(found) == 1 :]]
-
-    monkeypatch.setattr(user.viewer, "_find", find)
-    user.viewer.open(tmp_path)
-    user.settle()
-    assert user.data.entries == ["pair 1", "pair 2"]
-    for name in ("poses.json", "b.png"):
-        (tmp_path / ".pansplat").mkdir(exist_ok=True)
-        user.draw_frames(2, 3.0)
-        assert not user.data.changed
-        (tmp_path / name).write_bytes(b"1")
-        user.draw_frames(2, 3.0)
-        assert user.data.changed, name
-        user.click("Reload")
-        user.settle()
-        (tmp_path / ".pansplat").rmdir()
-    assert found == [tmp_path] * 3
-    assert user.data.entries[user.data.current] == "pair 1" and user.data.current == 1
-
-
-def test_theme_scale_and_layout_change_the_panels(user):
-    user.click("Drawing")
-    user.click("Window")
-    user.draw_frames(2)
-    panel = (slice(0, None), slice(0, 280))
-
-    def read_panel() -> np.ndarray:
-        user.draw_frames(3)
-        pixels = np.frombuffer(user.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
-        return pixels[::-1][panel].astype(int)
-
-    dark, height = read_panel(), user.panels.items["joint"][3] - user.panels.items["joint"][1]
-    user.click("light")
-    assert read_panel().mean() > dark.mean() + 80
-    user.click("dark")
-    assert np.abs(read_panel() - dark).mean() < 2
-    user.click_at(4, 4)  # shows the title
-    user.drag((30, 8), (60, 60))
-    assert np.abs(read_panel() - dark).mean() > 20, "the panel is no longer docked"
-    user.click("Default layout")
-    assert np.abs(read_panel() - dark).mean() < 2
-    user.viewer.gui.set_scale(1.5)
-    user.draw_frames(3)
-    _, top, _, bottom = user.panels.items["joint"]
-    assert bottom - top == pytest.approx(1.5 * height, abs=2)
-    user.viewer.gui.set_scale(1.0)
-    user.draw_frames(3)
-    user.click("Window")
-    user.click("Drawing")
-
-
-def test_a_gamepad_flies_and_looks(user):
-    io = imgui.get_io()
-    for key, field in (("gamepad_l_stick_up", "position"), ("gamepad_r_stick_right", "yaw_radians")):
-        before = getattr(user.state.camera, field)
-        io.add_key_analog_event(getattr(imgui.Key, key), True, 0.8)
-        user.draw_frames(3)
-        io.add_key_analog_event(getattr(imgui.Key, key), False, 0.0)
-        user.draw_frames(1)
-        moved = getattr(user.state.camera, field)
-        assert moved != before
-        user.draw_frames(2)
-        assert getattr(user.state.camera, field) == moved
-    assert user.state.camera.position[2] > 0 and user.state.camera.yaw_radians > 0
-    user.press(imgui.Key.gamepad_face_right)
-    assert user.state.camera == user.state.home
-
-
-# --- tours ---
+        app.viewer.show([SceneEntry("alone", pair=pair)], 0)
+        assert app.state.camera == app.state.home
+        assert app.state.camera.yaw_radians == pytest.approx(yaw, abs=0.1)
+
+
+def test_the_view_of_a_photograph_is_kept_when_its_scene_is_there(make_app, pair, small_scene):
+    app = make_app()
+    app.load = gate = Gate(lambda entry: LoadedScene(entry, small_scene), "matching", 0.5)
+    app.viewer.show([SceneEntry("kitchen", pair=pair)], 0)
+    app.until(lambda: app.content == 0, "photograph")
+    app.frame(drag=(-120.0, 0.0))
+    camera = app.state.camera
+    gate.open()
+    app.until(lambda: app.content is small_scene, "scene")
+    assert camera.yaw_radians > 0.1 and app.state.camera == replace(camera, distance=app.state.camera.distance)
+
+
+def test_a_chosen_photograph_is_compared_from_its_own_camera(app):
+    comparer = app.viewer.stage.comparer
+    app.state.comparison, app.state.photograph = "photograph", 1
+    assert app.viewer.right_name == "photograph b.png" and comparer.measure_distance(app.state) == pytest.approx(0.5)
+    comparer.go_to_photograph(app.state)
+    assert app.state.camera.position == pytest.approx((0, 0, 0.5)) and app.state.camera.yaw_radians == 0
+    assert comparer.measure_distance(app.state) == pytest.approx(0)
+
+
+def test_a_photograph_that_cannot_be_read_is_an_error(app, pair, tmp_path):
+    broken = replace(pair.context[0], image=tmp_path / "gone.png")
+    app.show(SceneEntry("broken", pair=replace(pair, context=(broken, pair.context[1]))))
+    app.press("c")
+    app.settle()
+    assert "gone.png" in app.viewer.error
+
+
+def test_a_scene_without_photographs_has_no_comparison_with_one(app):
+    app.show(SceneEntry("no photographs"))
+    app.press("c")
+    assert app.viewer.right_name is None
+
+
+def test_a_pinned_image_keeps_its_settings_beside_other_scenes(app):
+    app.press("x")
+    assert app.state.comparison == "pinned" and app.viewer.right_name == "first, joint, color"
+    app.state.settings = replace(app.state.settings, mode="view")
+    app.show(SceneEntry("other"))
+    assert app.viewer.right_name == "first, joint, color"
+    app.press("x")
+    assert app.viewer.right_name == "other, view, color"
+
+
+# --- screenshots, paths and films ---
+
+
+def test_a_screenshot_without_memory_is_reported(app, monkeypatch):
+    monkeypatch.setattr("pansplat_viewer.recorder.write_screenshot", Mock(side_effect=MemoryError("no memory")))
+    app.press("p")
+    assert app.viewer.error == "no screenshot written: the memory is exhausted (MemoryError: no memory)"
+    assert app.viewer.recorder.files == []
 
 
 @pytest.fixture
-def tour_user(user, house, monkeypatch) -> User:
-    """The session in the tour, at its first panorama, with all that is next in memory."""
-    user.show(SceneEntry(house.name, tour=house))
-    user.settle()
-    for slot in user.viewer._slots:
-        monkeypatch.setattr(slot.renderer, "pacing", SMALL)
-    return user
+def path_app(app) -> App:
+    """The viewer with a path of two key frames, 1 s apart, at the second."""
+    app.press("k")
+    app.state.camera = replace(app.state.camera, position=(0.2, 0.0, 0.3), yaw_radians=0.5)
+    app.state.path_seconds = 1.0
+    app.press("k")
+    assert [frame.seconds for frame in app.state.path.key_frames] == [0.0, 1.0]
+    return app
 
 
-def fly(user: User, seconds: float = 1 / 5) -> list[float]:
-    """Draw frames until the flight ends; returns the mean change from each frame to the next."""
-    user.viewer._resolution.budget_ms = 1e-3  # coarse images save time
-    steps, shown = [], [user.read_screen()]
-
-    def has_ended() -> bool:
-        shown.append(user.read_screen())
-        steps.append(float(np.abs(shown[1] - shown.pop(0)).mean()))
-        return len(steps) > 1 and not (user.state.playing or user.viewer.moving)
-
-    user.draw_until(has_ended, "end of the flight", seconds)
-    return steps
-
-
-def enter_doll_house(user: User) -> None:
-    user.press(imgui.Key.o)
-    user.draw_until(lambda: user.state.doll_house and user.state.glide is None, "doll's house", 1 / 5)
-
-
-def test_o_flies_out_to_the_dolls_house_and_a_click_on_a_mark_flies_in(user):
-    inside, image = user.state.camera, user.read_image()
-    enter_doll_house(user)
-    assert np.degrees(user.state.camera.pitch_radians) == pytest.approx(-45)
-    outside = user.read_image()
-    assert changed_fraction(image, outside) > 0.3 and (outside[0] < 20).all()
-    user.drag((430, 500), (470, 480))
-    turned = user.state.camera
-    assert turned.yaw_radians != 0 and np.linalg.norm(turned.orbit_center - inside.position) < 3
-    user.drag((430, 300), (430, 880))  # the camera stays above the floor
-    assert user.state.camera.pitch_radians < 0
-    beside = np.asarray(turned.position) - 1.2 * turned.rotation[:, 0]  # the mark is right of the panel
-    user.state.camera = replace(turned, position=tuple(beside.tolist()))
-    user.draw_frames(2)
-    (mark,) = [mark for mark in user.data.hotspots if mark.node == 1]
-    user.click_at(*mark.center)
-    user.draw_until(lambda: not user.state.doll_house, "end of the flight", 1 / 5)
-    assert user.state.camera.position == (0, 0, 0.5)
-    assert user.state.camera.vertical_fov_degrees == inside.vertical_fov_degrees and user.viewer._doll_house is None
-
-
-def test_the_dolls_house_has_a_widget_and_the_start_leaves_it(user):
-    user.click("doll's house")
-    user.draw_until(lambda: user.state.doll_house and user.state.glide is None, "doll's house", 1 / 5)
-    user.press(imgui.Key.r)
-    assert not user.state.doll_house and user.state.camera == user.state.home and user.viewer._doll_house is None
-
-
-def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titles(tour_user):
-    user = tour_user
-    user.draw_until(lambda: len(user.viewer._tour.loaded) == 3, "all scenes")
-    enter_doll_house(user)
-    house = user.viewer._doll_house[0]
-    assert house.nodes == (0, 1, 2, 3) and set(house.scene.gaussians.views.tolist()) == {0, 1, 2, 3}
-    assert {mark.label for mark in user.data.hotspots} <= {"room0", "room1", "room2", "room3"}
-    user.press(imgui.Key._4)
-    user.draw_until(lambda: not user.state.doll_house, "end of the flight", 1 / 5)
-    assert find_node(user) == 3
-
-
-def find_node(user: User) -> int:
-    return int(np.linalg.norm(user.viewer._tour.tour.positions - user.state.camera.position, axis=1).argmin())
-
-
-def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
-    user = tour_user
-    assert user.viewer._tour.tour.name == "house tour" and user.data.hotspots
-    images = [user.read_image()]
-    for label in ("hotspots", "floor plan"):
-        user.click(label)
-        images.append(user.read_image())
-        assert changed_fraction(images[-2], images[-1]) > 0.002, label
-    user.press(imgui.Key.m)
-    user.press(imgui.Key.m)
-    assert user.state.minimap == user.state.hotspots
-    user.press(imgui.Key.m)
-    assert user.state.minimap and user.state.hotspots
-    assert changed_fraction(images[0], user.read_image()) == 0
-    imgui.set_window_pos("Tour", (SIZE[0] - 20, 200))  # as remembered from a larger window
-    user.draw_frames(3)
-    assert user.panels.items["hotspots"][2] < SIZE[0]
+def test_a_path_is_saved_and_loaded_and_other_files_are_kept(path_app, tmp_path):
+    app, path, viewer = path_app, path_app.state.path, path_app.viewer
+    walk, own = str(tmp_path / "walk.json"), tmp_path / "own.json"
+    viewer.save_path(walk)
+    app.state.path = CameraPath()
+    viewer.open_path(walk)
+    assert app.state.path == path
+    viewer.save_path(walk)
+    assert viewer.error is None, "pansplat wrote the file"
+    own.write_text("{}")
+    for act, name in ((viewer.open_path, "missing.json"), (viewer.save_path, "own.json")):
+        act(str(tmp_path / name))
+        assert name in viewer.error
+    assert own.read_text() == "{}"
 
 
 @pytest.mark.slow
-def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
-    user = tour_user
-    user.state.camera = replace(user.state.camera, yaw_radians=-0.25)  # the hotspot is right of the panel
-    user.draw_frames(2)
-    (hotspot,) = [spot for spot in user.data.hotspots if spot.node == 2]
-    first, color = user.viewer._slot.scene, user.read_image().mean((0, 1))
-    user.click_at(*hotspot.center)
-    assert user.state.playing and not user.state.points
-    fly(user)
-    assert np.linalg.norm(user.state.camera.position - user.viewer._tour.tour.positions[2]) < 1e-6
-    user.click_at(*user.panels.minimap.nodes[3])
-    steps = fly(user)
-    assert find_node(user) == 3 and user.viewer._slot.scene is not first
-    exchanged = np.abs(user.read_image().mean((0, 1)) - color).mean()
-    assert exchanged > 30, "the scenes have different colours"
-    assert max(steps) < 0.5 * exchanged, "no jump: a fade changes 30 % in 0.2 s at most"
+def test_the_last_frame_of_a_film_is_the_last_key_frame(path_app):
+    app = path_app
+    app.state.film_fps, app.state.film_suffix = 2.0, ".png"
+    app.viewer.start_film()
+    app.settle()
+    files = app.viewer.recorder.files
+    assert [file.name[-9:] for file in files] == [f"_{i:04d}.png" for i in range(3)]
+    with Image.open(files[-1]) as file:
+        assert file.size == SIZE and np.asarray(file).std() > 10
 
 
-def test_hotspots_are_where_they_are_clicked_on_a_screen_with_two_pixels_a_point(tour_user, ctx, monkeypatch):
-    user = tour_user
-    user.state.camera = replace(user.state.camera, yaw_radians=-0.25)  # the hotspot is right of the panel
-    user.draw_frames(2)
-    expected = [(spot.node, spot.center) for spot in user.data.hotspots]
-    target = ctx.simple_framebuffer((2 * SIZE[0], 2 * SIZE[1]), components=3)
-    monkeypatch.setattr(user, "target", target)
-    user.draw_frames(2)
-    assert [(spot.node, spot.center) for spot in user.data.hotspots] == expected
-    user.click_at(*dict(expected)[2])
-    assert user.state.playing and not user.state.points
-    user.state.playing = False
-    monkeypatch.undo()
-    user.draw_frames(1)
-    target.release()
+def test_a_film_can_be_cancelled(path_app):
+    app = path_app
+    app.state.path = app.state.path.add(replace(app.state.path.key_frames[0], seconds=600.0))
+    app.viewer.start_film()
+    app.frame()
+    assert 0 <= app.viewer.jobs.progress("film")[1] < 1
+    app.viewer.jobs.cancel("film", join=True)
+    app.settle()
+    assert app.viewer.jobs.progress("film") is app.viewer.error is None and app.viewer.recorder.files == []
 
 
-def match_photograph(user: User, node: int) -> float:
-    """The mean difference of the screen from a photograph in the direction of the camera."""
-    user.draw_frames(3, SETTLE_AFTER)
-    shown = user.read_screen()
-    user.state.comparison, user.state.split, user.state.photograph = "photograph", 0.0, node
-    user.draw_frames(3)
-    difference = np.abs(user.read_screen() - shown).mean()
-    user.state.comparison, user.state.photograph = "off", None
-    return float(difference)
+def test_a_film_of_a_tour_is_cancelled_during_a_prediction(tour_app, load_house):
+    app, gate = tour_app, Gate(load_house, "searching depth", 0.5)
+    app.viewer.tour._loaded.clear()
+    app.viewer.state.path = CameraPath((KeyFrame.of_camera(app.state.camera, 0.0),))
+    app.load = gate
+    app.viewer.start_film()
+    assert gate.entered.wait(300)
+    app.viewer.jobs.cancel("film", join=True)
+    assert not gate.event.is_set(), "it waited for the prediction"
 
 
-def test_a_flight_fades_between_photographs_where_no_scene_is_ready(user, house, load_house, monkeypatch):
-    go, viewer = threading.Event(), user.viewer
-
-    def load(entry, progress, show):
-        if entry.views and entry.views != (0, 1):
-            while not go.wait(0.005):
-                progress("predicting", 0.5)
-        return load_house(entry)
-
-    monkeypatch.setattr(viewer.loader, "_load", load)
-    viewer.show([SceneEntry(house.name, tour=house)], 0)
-    user.draw_until(lambda: viewer._tour is not None and not viewer.loader.is_searching, "tour")
-    first = viewer._slot.scene
-    user.press(imgui.Key._4)
-    shown = [user.read_screen()]
-    viewer._resolution.budget_ms = 1e-3
-    contents = []
-
-    def has_ended() -> bool:
-        shown.append(user.read_screen())
-        contents.append(viewer._fade.contents[viewer._fade.front])
-        return not (user.state.playing or viewer._is_animated)
-
-    user.draw_until(has_ended, "end of the flight", 1 / 10)
-    assert find_node(user) == 3, "it does not wait"
-    order = [content for content, before in zip(contents, [None, *contents], strict=False) if content is not before]
-    assert order[:2] == [first, 1] and order[-1] == 3, "the scene ends near its last panorama"
-    assert min(frame.max(-1).mean() for frame in shown) > 40, "no black"
-    steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3))
-    assert steps.max() < 20, "no jump: a fade changes 15 % in 0.1 s at most"
-    assert match_photograph(user, 3) < 1
-    user.press(imgui.Key.p)
-    assert "no scene" in user.state.message
-    go.set()
-    user.draw_until(lambda: not viewer._shows_photograph, "scene")
-    user.settle()
-    assert viewer._slot.scene is viewer._tour.get((2, 3)).scene
+# --- clean up ---
 
 
-def test_a_tour_shows_its_photographs_before_the_first_scene(user, house, load_house, monkeypatch):
-    go, viewer = threading.Event(), user.viewer
-
-    def load(entry, progress, show):
-        if not entry.views:
-            while not go.wait(0.005):
-                progress("predicting", 0.5)
-        return load_house(entry)
-
-    monkeypatch.setattr(viewer.loader, "_load", load)
-    viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
-    viewer.show([SceneEntry(house.name, tour=house)], 0)
-    user.draw_frames(1)
-    assert (user.read_screen().max(-1) > 8).all(), "the first frame is a photograph"
-    assert user.state.camera.yaw_radians == 0 and house.plan_walk()[:2] == [0, 1], "towards its neighbour"
-    assert "visit" in user.panels.items and match_photograph(user, 0) < 1
-    user.press(imgui.Key._3)
-    user.draw_until(lambda: not (user.state.playing or viewer._is_animated), "end of the flight", 1 / 10)
-    assert find_node(user) == 2 and match_photograph(user, 2) < 1
-    user.press(imgui.Key.space)
-    user.draw_frames(5, 1 / 10)
-    assert user.state.playing
-    go.set()
-    user.draw_until(lambda: viewer._loaded is not None, "first scene", 1e-3)
-    assert user.state.playing, "the flight goes on"
-    assert viewer._fade.contents[viewer._fade.front] == 2, "the scene of panoramas 0 and 1 is not shown from here"
-    user.draw_until(lambda: not viewer._shows_photograph, "scene", 1 / 10)
-    assert 2 in viewer._scene_views
+def test_a_saved_scene_lacks_what_is_hidden_and_other_files_are_kept(app, small_scene, tmp_path):
+    bounds = app.viewer.bounds
+    app.state.settings = replace(app.state.settings, box=(0.2, *bounds[1:]), opacity_threshold=0.5)
+    app.viewer.save_scene(str(tmp_path / "small.ply"))
+    app.settle()
+    means, opacities = small_scene.gaussians.means, small_scene.gaussians.opacities
+    inside = (means[:, 0] >= 0.2) & (opacities >= 0.5)
+    assert len(load_scene(tmp_path / "small.ply").gaussians) == int(inside.sum())
+    assert "Gaussians left out" in app.state.message and "small.ply" in app.state.message
+    (tmp_path / "own.ply").write_bytes(b"of the user")
+    for name, message in (("small.stl", "small.stl"), (str(tmp_path / "own.ply"), "own.ply, which pansplat did not")):
+        app.viewer.save_scene(name)
+        assert message in app.viewer.error
+    assert (tmp_path / "own.ply").read_bytes() == b"of the user"
 
 
-def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user):
-    user = tour_user
-    user.viewer._tour._budget, user.viewer._resolution.budget_ms = 0, 1e-3
-    user.press(imgui.Key.space)
-    visited = set()
-
-    def has_ended() -> bool:
-        visited.add(find_node(user))
-        assert len(user.viewer._tour.loaded) <= 3, "a scene, that of the camera and the one before"
-        return not user.state.playing
-
-    user.draw_until(has_ended, "end of the tour", 1 / 4)
-    assert visited == {0, 1, 2, 3}
-    before = user.state.camera
-    user.press(imgui.Key.w, frames=4)
-    user.press(imgui.Key.space)
-    moved = np.linalg.norm(np.subtract(user.state.camera.position, before.position))
-    assert moved < 1.0, "the flight starts where the camera is"
-    user.press(imgui.Key.space)
-
-
-def test_a_file_of_a_tour_is_flown_along_its_edges(user, house_file, monkeypatch):
-    options = LoadOptions()
-    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, *rest: load_entry(entry, options, *rest))
-    user.show(SceneEntry("home", file=house_file))
-    user.settle()
-    user.state.camera = replace(user.state.camera, pitch_radians=-1.1)
-    first, before = user.viewer._slot.scene, user.read_image()
-    assert 2 in [hotspot.node for hotspot in user.data.hotspots] and "floor plan" in user.panels.items
-    assert first.gaussians.views.unique().tolist() == [0, 1], "only the views of the edge are blended"
-    user.click_at(*user.panels.minimap.nodes[3])
-    for slot in user.viewer._slots:
-        monkeypatch.setattr(slot.renderer, "pacing", SMALL)
-    fly(user, seconds=0.5)
-    assert find_node(user) == 3 and np.allclose(user.viewer._slot.scene.cam2world, user.state.context[2:])
-    assert changed_fraction(before, user.read_image()) > 0.5
-    user.press(imgui.Key.c)
-    assert user.data.right_name is None, "there are no photographs"
-
-
-def test_a_click_on_a_link_fades_to_a_panorama_without_a_place_and_the_list_leads_back(user, parted_house, monkeypatch):
-    notes = ("room3.png: no pose was found; it is a part of its own",)
-    user.show(SceneEntry(parted_house.name, tour=parted_house, notes=notes))
-    user.settle()
-    assert user.data.notes == notes and "Notes" in user.panels.items
-    for slot in user.viewer._slots:
-        monkeypatch.setattr(slot.renderer, "pacing", SMALL)
-    user.state.target = 2
-    fly(user, 1.0)
-    user.state.camera = replace(user.state.camera, pitch_radians=-0.25, yaw_radians=-0.1)
-    user.draw_frames(2)
-    (spot,) = user.data.hotspots
-    assert (spot.node, spot.label, spot.is_fade) == (3, "to the hall", True)
-    left = user.viewer._slot.scene
-    user.click_at(*spot.center)
-    shown: list[np.ndarray] = []
-
-    def has_begun() -> bool:
-        shown.append(user.read_screen())
-        return user.viewer._tour.part == 1
-
-    user.draw_until(has_begun, "fade", 0.2)
-    assert np.abs(shown[-1] - shown[-2]).mean() < 5, "without a jump"
-    poses, front = user.viewer._fade.poses, user.viewer._fade.front
-    assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 0.71, "the scene before stays"
-    assert np.allclose(poses[front], user.state.camera.cam2world) and user.viewer._slots[1 - front].scene is left
-    fly(user, 0.5)
-    assert find_node(user) == 3 and user.viewer._slot.scene is not left
-    assert changed_fraction(shown[-1], user.read_image()) > 0.5
-    user.click("visit")
-    user.click("visit 1")
-    fly(user, 0.5)
-    assert find_node(user) == 1
-    user.press(imgui.Key.r)
-    user.settle()
-    assert find_node(user) == 0 and user.state.camera == user.state.home
-
-
-# --- poses by hand ---
+def test_floaters_are_removed_and_the_box_stays(app, small_scene):
+    app.state.settings = replace(app.state.settings, box=app.viewer.bounds)
+    app.viewer.remove_floaters()
+    app.until(lambda: "floaters:" in app.state.message, "message")
+    expected = len(small_scene.gaussians) - int(find_floaters(small_scene).sum())
+    assert f"{len(small_scene.gaussians) - expected:,} of {len(small_scene.gaussians):,}" in app.state.message
+    app.settle()
+    assert len(app.viewer.stage.slot.scene.gaussians) == expected and app.state.settings.box is not None
 
 
 @pytest.fixture
-def placing_user(user, tmp_path, monkeypatch) -> User:
-    """The session in a tour of a, b, c and d: c is probably placed, d is not; a suggestion is 1 m to the right of a."""
-    for name in "abcd":
-        pixels = np.random.default_rng(ord(name)).integers(0, 255, (32, 64, 3), np.uint8)
-        Image.fromarray(pixels).resize((256, 128)).save(tmp_path / f"{name}.png")
-    poses = {f"{name}.png": np.eye(4).tolist() for name in "abc"}
-    for step, pose in enumerate(poses.values()):
-        pose[2][3] = 0.8 * step
-    estimate = {
-        "unplaced": {"d.png": "no door in d"},
-        "pairs": [
-            {"between": ["a.png", "b.png"], "check": "certain"},
-            {"between": ["b.png", "c.png"], "check": "probable"},
-        ],
-        "suggestions": [{"between": ["a.png", "d.png"], "places": [[1.0, 0.0, 0.5, -1.0]]}],
-    }
-    content = {"convention": "cam2world opencv", "worlds": [{"unit": 1.0}], "poses": poses, "estimate": estimate}
-    (tmp_path / "poses.json").write_text(json.dumps(content))
-
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_pairs(path))]
-
-    def read(image: Path) -> Piece:
-        depth = DepthMap(np.zeros((32, 64)), np.full((8, 16), 0.05), np.eye(3))
-        rays = pixel_directions(32, 64).numpy()
-        np.log(1 / np.abs(rays).max(axis=-1), out=depth.log_depth)  # a cube
-        return Piece(Surroundings(np.full((32, 64, 3), 0.5), depth), 0.0)
-
-    monkeypatch.setattr(user.viewer, "_find", find)
-    monkeypatch.setattr("pansplat_viewer.scene.placing.read_piece", read)
-    user.viewer.open(tmp_path)
-    user.draw_until(lambda: user.viewer._tour is not None and not user.viewer.loader.is_searching, "tour")
-    user.settle()
-    yield user
-    user.viewer._placing.stop()
+def painted(app, pair) -> App:
+    """The viewer with a mask that is not saved."""
+    app.show(SceneEntry(pair.name, pair=pair), SceneEntry("other", file=pair.folder / "other.ply"))
+    app.viewer.start_painting()
+    app.frame(pointer=CENTER, drag=(5.0, 0.0))
+    app.frame(pointer=(0.55, 0.52))
+    assert app.viewer.painting.painter.is_changed
+    return app
 
 
-def test_states_of_photographs_are_listed_and_drawn_on_the_floor_plan(placing_user):
-    user = placing_user
-    assert user.data.placing.panoramas[3].placement.reason == "no door in d"
-    tour = user.viewer._tour.tour
-    assert describe_panoramas(tour) == "2 placed, 1 probably, 1 not placed"
-    assert [describe_panorama(tour, node) for node in range(4)] == ["a", "b", "c (probably placed)", "d (not placed)"]
-    labels = {label for label in user.panels.items if "##" in label}
-    assert {"Place##0", "Place##1", "Place##2", "Place##3", "Reject##2"} <= labels
-    assert not {"Reject##0", "Reject##1", "Reject##3", "Restore##2"} & labels
-    pixels = np.frombuffer(user.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)[::-1].astype(int)
-    centres = [pixels[round(y), round(x)].sum() for x, y in user.panels.minimap.nodes]
-    assert centres[1] > centres[2] + 100, "the mark of the one that is probably placed is hollow"
+def test_a_mask_is_painted_on_the_photograph_and_saved(app, pair):
+    mask, painting, before = pair.folder / "a_blur.png", app.viewer.painting, app.state.camera
+    app.viewer.start_painting()
+    assert app.state.comparison == "photograph" and app.state.split == 0
+    app.frame(pointer=CENTER, drag=(9.0, 3.0))
+    app.frame(pointer=(0.6, 0.52))
+    assert app.state.camera == before, "the left button paints"
+    app.frame(pan=(9.0, 3.0))
+    assert app.state.camera != before, "the right one looks around"
+    painted = painting.painter.hidden.copy()
+    assert 0 < painted.mean() < 0.2
+    app.frame(pointer=CENTER, held=frozenset({"shift"}))
+    assert painting.painter.hidden.sum() < painted.sum(), "with shift it shows again"
+    painted = painting.painter.hidden.copy()
+    try:
+        assert painting.save() and "Reload" in app.state.message
+        assert np.array_equal(read_blur_mask(mask, 512), painted)
+        painting.painter.clear()
+        assert not painting.painter.hidden.any() and painting.painter.is_changed
+        painting.stop()
+        assert app.state.comparison == "off"
+        app.viewer.start_painting()
+        assert np.array_equal(painting.painter.hidden, painted), "that of the file"
+        painting.leave(painting.stop)
+        assert painting.painter is None
+    finally:
+        mask.unlink()
 
 
-@pytest.mark.filterwarnings("ignore:.*has no pose of")
-def test_a_probable_photograph_is_rejected_restored_and_the_rejection_undone(placing_user, tmp_path):
-    user = placing_user
-    before = (tmp_path / "poses.json").read_bytes()
-    user.click("Reject##2")
-    assert "c.png" not in json.loads((tmp_path / "poses.json").read_text())["poses"]
-    user.draw_frames(2)
-    assert "Restore##2" in user.panels.items and "Reject##2" not in user.panels.items
-    user.draw_until(lambda: user.data.changed, "note of the changed file")  # it moves the button
-    user.click("Load the changed poses")
-    user.draw_until(lambda: not user.data.placing.is_changed, "loaded poses")
-    user.settle()
-    assert describe_panoramas(user.viewer._tour.tour) == "2 placed, 2 not placed"
-    assert "Restore##2" in user.panels.items
-    user.click("Undo##poses")  # also after loading
-    assert (tmp_path / "poses.json").read_bytes() == before
-    assert user.data.placing.panoramas[2].placement.state == "probable"
+LEAVING = {
+    "Esc": lambda app: app.press("escape"),
+    "untick": lambda app: app.viewer.painting.leave(app.viewer.painting.stop),
+    "Reload": lambda app: app.viewer.reload(),
+    "another scene": lambda app: app.viewer.choose(1),
+    "another path": lambda app: app.viewer.open_text("nowhere"),
+    "export": lambda app: app.viewer.save_scene(str(app.viewer.loaded.entry.pair.folder / "clean.ply")),
+    "quit": lambda app: app.press("q", held="ctrl"),
+    "close the window": lambda app: app.viewer.request_quit(),
+}
 
 
-def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(placing_user, tmp_path):
-    user = placing_user
-    user.click("Place##3")
-    placing, window, io = user.data.placing, user.panels.placing, imgui.get_io()
-    user.draw_until(lambda: not placing.missing and placing.places, "pieces")
-    user.draw_frames(2)
-    assert placing.shown.suggestion == 0
+@pytest.mark.parametrize("leave", LEAVING.values(), ids=LEAVING)
+def test_an_unsaved_mask_is_dropped_only_after_a_question(painted, leave, pair):
+    app, painting, painter = painted, painted.viewer.painting, painted.viewer.painting.painter
+    mask, exported, hidden = pair.folder / "a_blur.png", pair.folder / "clean.ply", painter.hidden.copy()
 
-    def find_pixel() -> tuple[float, float]:
-        x, y = window.view.to_pixels(np.array(placing.shown.place[:2]))
-        return x + window.corner[0], y + window.corner[1]
+    def ask() -> None:
+        leave(app)
+        app.frames(2)
+        assert painting.question == "a.png" and painting.painter is painter and painter.is_changed
+        assert np.array_equal(painter.hidden, hidden)
+        assert not app.state.quit and not mask.exists() and not exported.exists()
+        assert app.library.loader.entry is None and not app.library.loader.is_searching and not app.viewer.jobs.is_busy
 
-    start, (x, y) = placing.shown.place, find_pixel()
-    scale = window.view.pixels_per_metre
-    user.drag((x, y), (x + 0.6 * scale, y - 0.5 * scale))
-    assert placing.shown.place.right == pytest.approx(start.right + 0.6, abs=0.02)
-    assert placing.shown.place.forward == pytest.approx(start.forward + 0.5, abs=0.02)
-    assert placing.shown.suggestion is None and placing.fit is not None
-
-    camera, flight, yaw = user.state.camera, user.state.flight, placing.shown.place.yaw
-    user.press(imgui.Key.period)
-    assert placing.shown.place.yaw == pytest.approx(yaw + np.radians(5), abs=0.03)
-    io.add_key_event(imgui.Key.mod_shift, True)
-    yaw = placing.shown.place.yaw
-    user.press(imgui.Key.comma)
-    io.add_key_event(imgui.Key.mod_shift, False)
-    user.draw_frames(1)
-    assert placing.shown.place.yaw == pytest.approx(yaw - np.radians(0.5), abs=1e-6)
-    io.add_mouse_pos_event(*find_pixel())
-    user.draw_frames(2)
-    yaw = placing.shown.place.yaw
-    io.add_mouse_wheel_event(0.0, 2.0)
-    user.draw_frames(2)
-    assert abs(placing.shown.place.yaw - yaw - np.radians(10)) < 0.05
-    assert (user.state.camera, user.state.flight) == (camera, flight), "keys and wheel turn the piece only"
-
-    user.click("Adjust##pose")
-    user.draw_until(lambda: not placing.is_adjusting, "end of the adjustment")
-    ghost = placing.ghosts[0].place
-    at = window.view.to_pixels(np.array(ghost[:2])) + window.corner
-    user.click_at(*at)  # on the ghost
-    assert placing.shown.suggestion == 0
-    user.click("Save##pose")
-    entry = json.loads((tmp_path / "poses.json").read_text())["poses"]["d.png"]
-    assert entry["placed"] == "by hand" and entry["cam2world"][0][3] == pytest.approx(1.0)
-    user.draw_frames(2)
-    user.click("Load the changed poses##pose")
-    user.draw_until(lambda: not placing.is_changed, "loaded poses")
-    user.settle()
-    tour = user.viewer._tour.tour
-    assert describe_panorama(tour, 3) == "d (placed by hand)" and (3, 3) not in tour.overlaps
-    user.press(imgui.Key.escape)
-    assert placing.node is None and not user.state.quit
+    ask()
+    painting.answer("keep")
+    app.frames(2)
+    assert painting.question is None and painting.painter is painter and painter.is_changed
+    ask()
+    painting.answer("drop")
+    assert painting.painter is None and not mask.exists()
+    app.settle()
+    assert app.state.quit == (leave in (LEAVING["quit"], LEAVING["close the window"]))
+    assert exported.exists() == (leave is LEAVING["export"])
+    exported.unlink(missing_ok=True)
 
 
-def test_alt_disables_snapping_and_the_knob_turns_the_piece(placing_user):
-    user = placing_user
-    user.click("Place##3")
-    placing, window, io = user.data.placing, user.panels.placing, imgui.get_io()
-    user.draw_until(lambda: not placing.missing and placing.places, "pieces")
-    user.draw_frames(2)
-    scale, start = window.view.pixels_per_metre, placing.shown.place
-    io.add_key_event(imgui.Key.mod_alt, True)
-    x, y = window.view.to_pixels(np.array(start[:2])) + window.corner
-    user.drag((x, y), (x + 0.1 * scale, y))
-    assert placing.shown.suggestion is None and placing.shown.place.right == pytest.approx(start.right + 0.1, abs=0.02)
-    io.add_key_event(imgui.Key.mod_alt, False)
-    user.draw_frames(1)
-    knob = window._find_knob(placing, 1.0)
-    x, y = window.view.to_pixels(np.array(placing.shown.place[:2])) + window.corner
-    user.drag(knob, (x + 60, y + 2))  # to the right of the camera
-    assert placing.shown.has_walls and placing.shown.place.yaw == pytest.approx(np.pi / 2)
+def test_an_unsaved_mask_is_saved_by_the_answer(painted, pair):
+    app, painting, mask = painted, painted.viewer.painting, pair.folder / "a_blur.png"
+    hidden = painting.painter.hidden.copy()
+    try:
+        app.viewer.save_scene(str(pair.folder / "clean.ply"))
+        painting.answer("save")
+        app.settle()
+        assert np.array_equal(read_blur_mask(mask, 512), hidden) and "Reload" in app.state.message
+        assert not (pair.folder / "clean.ply").exists(), "the scene shows what the new mask hides"
+        app.press("q", held="ctrl")
+        assert app.state.quit, "there is nothing to lose"
+    finally:
+        mask.unlink(missing_ok=True)
 
 
-def test_a_pose_that_cannot_be_written_is_an_error_in_the_window(placing_user, tmp_path):
-    user = placing_user
-    (tmp_path / "poses.json").write_text("{")
-    user.click("Reject##2")
-    user.draw_frames(1)
-    assert "poses.json: needed JSON" in user.data.error
-    user.click("OK")
-    assert user.data.error is None
+def test_a_mask_that_is_painted_stays_when_its_photograph_is_loaded_again(painted, pair):
+    app, painter = painted, painted.viewer.painting.painter
+    hidden, again = painter.hidden.copy(), replace(pair, context=tuple(replace(view) for view in pair.context))
+    app.show(SceneEntry(pair.name, pair=again))
+    assert app.viewer.painting.painter is painter and painter.is_changed and np.array_equal(painter.hidden, hidden)
+    assert painter.panorama is again.context[0] and app.state.photograph == 0
+
+
+def test_a_scene_that_was_loading_while_a_mask_was_painted_waits_for_the_answer(painted):
+    app, painting, shown = painted, painted.viewer.painting, painted.viewer.loaded
+    painter = painting.painter
+    for answer in ("keep", "drop"):
+        app.viewer.show(app.library.entries, 1)
+        app.until(lambda: painting.question, "question")
+        assert app.viewer.loaded is shown and painting.painter is painter
+        painting.answer(answer)
+        app.frames(2)
+        assert app.library.current == (answer == "drop")
+    assert app.viewer.loaded is not shown and painting.painter is None
+
+
+# --- the doll's house ---
+
+
+def enter_doll_house(app: App) -> None:
+    app.press("o")
+    app.until(lambda: app.state.doll_house and app.state.glide is None, "doll's house", 1 / 5)
+
+
+def click_on(app: App, node: int) -> None:
+    """Click on the mark or hotspot of a panorama."""
+    (spot,) = [spot for spot in app.viewer.hotspots if spot.node == node]
+    app.frame(click=(spot.center[0] / SIZE[0], spot.center[1] / SIZE[1]))
+
+
+def test_o_flies_out_to_the_dolls_house_and_a_click_on_a_mark_flies_in(app):
+    inside = app.state.camera
+    enter_doll_house(app)
+    assert np.degrees(app.state.camera.pitch_radians) == pytest.approx(-45)
+    app.frame(drag=(40.0, -20.0))
+    turned = app.state.camera
+    assert turned.yaw_radians != 0 and np.linalg.norm(turned.orbit_center - inside.position) < 3
+    for down in (580.0, -1160.0):
+        app.frame(drag=(0.0, down))
+        assert np.degrees(app.state.camera.pitch_radians) < -7, "the camera stays above the floor"
+    app.state.camera = turned
+    app.frame()
+    click_on(app, 1)
+    app.until(lambda: not app.state.doll_house, "end of the flight", 1 / 5)
+    assert app.state.camera.position == (0, 0, 0.5) and app.viewer.doll_house.house is None
+    assert app.state.camera.vertical_fov_degrees == inside.vertical_fov_degrees
+
+
+def test_the_start_and_another_scene_leave_the_dolls_house(app):
+    enter_doll_house(app)
+    app.press("r")
+    assert not app.state.doll_house and app.state.camera == app.state.home and app.viewer.doll_house.house is None
+    enter_doll_house(app)
+    app.show(app.entries[1])
+    assert not app.state.doll_house and not app.viewer.doll_house.is_on and app.viewer.stage.outside is None
+
+
+def test_a_scene_without_rooms_has_a_message(app, small_scene):
+    hidden = replace(small_scene.gaussians, opacities=torch.zeros(1200))
+    app.load = lambda entry, *_: LoadedScene(entry, replace(small_scene, gaussians=hidden))
+    app.show(SceneEntry("empty"))
+    app.viewer.toggle_doll_house()
+    app.settle()
+    assert not app.state.doll_house and (app.state.message == "no room is known here" or app.viewer.error)
+
+
+def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titles(tour_app):
+    app = tour_app
+    app.until(lambda: len(app.viewer.tour.loaded) == 3, "all scenes")
+    enter_doll_house(app)
+    house = app.viewer.doll_house.house
+    assert house.nodes == (0, 1, 2, 3) and set(house.scene.gaussians.views.tolist()) == {0, 1, 2, 3}
+    assert {mark.label for mark in app.viewer.hotspots} <= {"room0", "room1", "room2", "room3"}
+    app.press("4")
+    app.until(lambda: not app.state.doll_house, "end of the flight", 1 / 5)
+    assert app.node == 3
 
 
 # --- tours ---
 
 
-def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(user, house, load_house, small_scene, monkeypatch):
-    requested = []
+@pytest.fixture
+def tour_app(make_app, house) -> App:
+    """The viewer in a tour, at its first panorama."""
+    app = make_app()
+    app.show(SceneEntry(house.name, tour=house))
+    return app
 
-    def load(entry, progress, show):
+
+def test_a_click_on_a_hotspot_flies_there_and_shows_its_scene(tour_app):
+    app, first = tour_app, tour_app.viewer.stage.slot.scene
+    click_on(app, 2)
+    assert app.state.target == 2 and not app.state.points
+    app.fly()
+    assert np.linalg.norm(app.state.camera.position - app.viewer.tour.tour.positions[2]) < 1e-6
+    app.state.target = 3
+    app.fly()
+    assert app.node == 3 and app.viewer.stage.slot.scene is not first
+    app.press("r")
+    app.settle()
+    assert app.node == 0 and app.state.camera == app.state.home
+
+
+def test_hotspots_are_in_points_of_a_screen_with_two_pixels_a_point(tour_app):
+    app = tour_app
+    expected = [(spot.node, spot.center) for spot in app.viewer.hotspots]
+    app.target.viewport = (0, 0, 2 * SIZE[0], 2 * SIZE[1])
+    app.frames(2)
+    assert expected and [(spot.node, spot.center) for spot in app.viewer.hotspots] == expected
+
+
+def test_a_flight_shows_photographs_where_no_scene_is_ready(make_app, house, load_house):
+    app, gate = make_app(), Gate(load_house, "predicting", 0.5)
+    app.load = lambda entry, *rest: gate(entry, *rest) if entry.views not in ((), (0, 1)) else load_house(entry)
+    app.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    app.until(lambda: app.viewer.loaded is not None, "tour")
+    first, contents = app.viewer.stage.slot.scene, []
+    app.press("4")
+
+    def has_ended() -> bool:
+        contents.append(app.content)
+        return not (app.state.playing or app.viewer.stage.is_animated(app.now)) and len(contents) > 3
+
+    app.until(has_ended, "end of the flight", 1 / 10)
+    assert app.node == 3, "it does not wait"
+    order = [content for content, before in zip(contents, [None, *contents], strict=False) if content is not before]
+    assert order[0] is first and order[-1] == 3 and set(order[1:]) <= {1, 2, 3}, "the scene ends near its last panorama"
+    app.press("p")
+    assert "no scene" in app.state.message
+    gate.open()
+    app.until(lambda: app.viewer.stage.photograph is None, "scene")
+    app.settle()
+    assert app.viewer.stage.slot.scene is app.viewer.tour.get((2, 3)).scene
+
+
+def test_a_tour_shows_its_photographs_before_the_first_scene(make_app, house, load_house):
+    app, gate = make_app(), Gate(load_house, "predicting", 0.5)
+    app.load = lambda entry, *rest: load_house(entry) if entry.views else gate(entry, *rest)
+    app.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    app.frame()
+    assert app.content == 0 and app.state.camera.yaw_radians == 0, "towards its neighbour"
+    app.press("3")
+    app.fly()
+    app.until(lambda: app.content == 2, "photograph")
+    assert app.node == 2
+    app.press("space")
+    app.frames(5, 1 / 10)
+    gate.open()
+    app.until(lambda: app.viewer.loaded is not None, "first scene", 1e-3)
+    assert app.state.playing, "the flight goes on"
+    assert app.content == 2, "the scene of panoramas 0 and 1 is not shown from here"
+    app.until(lambda: app.viewer.stage.photograph is None, "scene", 1 / 10)
+    assert 2 in app.viewer.stage.scene_views
+
+
+def test_space_plays_the_tour_through_all_panoramas_within_the_memory(make_app, house):
+    app = make_app(memory=0.0)
+    app.show(SceneEntry(house.name, tour=house))
+    app.press("space")
+    visited = set()
+
+    def has_ended() -> bool:
+        visited.add(app.node)
+        assert len(app.viewer.tour.loaded) <= 3, "a scene, that of the camera and the one before"
+        return not app.state.playing
+
+    app.until(has_ended, "end of the tour", 1 / 4)
+    assert visited == {0, 1, 2, 3}
+    before = app.state.camera
+    app.frame(0.1, held=frozenset("w"))
+    app.press("space")
+    moved = np.linalg.norm(np.subtract(app.state.camera.position, before.position))
+    assert app.state.playing and moved < 1.0, "the flight starts where the camera is"
+
+
+def test_a_file_of_a_tour_is_flown_along_its_edges(make_app, house_file):
+    app = make_app()
+    app.load = lambda entry, *rest: load_entry(entry, LoadOptions(), *rest)
+    app.show(SceneEntry("home", file=house_file))
+    first = app.viewer.stage.slot.scene
+    assert first.gaussians.views.unique().tolist() == [0, 1], "only the views of the edge are blended"
+    app.state.target = 3
+    app.fly(0.5)
+    assert app.node == 3 and np.allclose(app.viewer.stage.slot.scene.cam2world, app.state.context[2:])
+    app.press("c")
+    assert app.viewer.right_name is None, "there are no photographs"
+
+
+def test_a_link_leads_to_a_panorama_without_a_place_and_the_scene_before_stays(make_app, parted_house):
+    notes = ("room3.png: no pose was found; it is a part of its own",)
+    app = make_app()
+    app.show(SceneEntry(parted_house.name, tour=parted_house, notes=notes))
+    assert app.library.notes == notes
+    app.state.target = 2
+    app.fly(1.0)
+    app.state.camera = replace(app.state.camera, pitch_radians=-0.25, yaw_radians=-0.1)
+    app.frames(2)
+    (spot,) = app.viewer.hotspots
+    assert (spot.node, spot.label, spot.is_fade) == (3, "to the hall", True)
+    left, stage = app.viewer.stage.slot.scene, app.viewer.stage
+    click_on(app, 3)
+    app.until(lambda: app.viewer.tour.part == 1, "fade", 0.2)
+    poses, front = stage.fade.poses, stage.fade.front
+    assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 0.71, "the scene before stays"
+    assert np.allclose(poses[front], app.state.camera.cam2world) and stage.slots[1 - front].scene is left
+    app.fly(0.5)
+    assert app.node == 3 and stage.slot.scene is not left
+    app.state.target = 1
+    app.fly(0.5)
+    assert app.node == 1
+
+
+def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(tour_app, load_house, small_scene, monkeypatch):
+    app, ready, requested = tour_app, threading.Event(), []
+
+    def load(entry: SceneEntry, *_: object) -> LoadedScene:
         requested.append(entry.name)
         return LoadedScene(entry, small_scene) if entry.tour is None else load_house(entry)
 
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
-    user.show(SceneEntry(house.name, tour=house))
-    user.viewer._tour._loaded.popitem()  # a scene of the tour is still missing
-    ready = threading.Event()
-    is_ready = user.viewer._preparer.is_ready
+    app.viewer.tour._loaded.popitem()  # a scene of the tour is still missing
+    is_ready = app.viewer.stage.preparer.is_ready
     monkeypatch.setattr(
-        user.viewer._preparer,
+        app.viewer.stage.preparer,
         "is_ready",
         lambda scene: is_ready(scene) and (scene is not small_scene or ready.is_set()),
     )
-    user.viewer.loader.cancel()
-    requested.clear()
-    user.viewer.show([SceneEntry("large")], 0)
-    user.draw_until(lambda: user.viewer._incoming is not None, "scene that is prepared")
-    user.draw_frames(3)
+    app.library.loader.cancel()
+    app.load = load
+    app.viewer.show([SceneEntry("large")], 0)
+    app.until(lambda: requested, "request")
+    app.frames(5)
     ready.set()
-    user.settle()
+    app.settle()
     assert requested == ["large"], "the tour requests nothing"
-    assert user.viewer._loaded.entry.name == "large" and user.viewer._tour is None
+    assert app.viewer.loaded.entry.name == "large" and app.viewer.tour is None
 
 
-def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, monkeypatch):
-    failed = []
+def test_a_scene_of_a_tour_that_fails_is_reported_once(make_app, house, load_house):
+    app, failed = make_app(), []
 
-    def load(entry, progress, show):
+    def load(entry: SceneEntry, *_: object) -> LoadedScene:
         if entry.views == (1, 2):
             failed.append(entry.name)
             raise InputError("room2.png: no such file")
         return load_house(entry)
 
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
-    user.viewer.show([SceneEntry(house.name, tour=house)], 0)
-    user.draw_until(lambda: user.data.error, "error")
-    user.data.error = None
-    user.draw_frames(5)
-    user.settle()
-    assert failed == ["room1-room2"] and user.data.error is None
-    user.press(imgui.Key._3)
-    fly(user, 0.25)
-    assert find_node(user) == 2 and match_photograph(user, 2) < 1, "there is no scene of the edge"
+    app.load = load
+    app.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    app.until(lambda: app.viewer.error, "error")
+    app.viewer.error = None
+    app.settle()
+    assert failed == ["room1-room2"] and app.viewer.error is None
+    app.press("3")
+    app.fly(0.25)
+    app.until(lambda: app.content == 2, "photograph: there is no scene of the edge")
+    assert app.node == 2
 
 
-def test_a_scene_after_a_tour_does_not_fade_from_it(tour_user, pair):
-    user = tour_user
-    user.click_at(*user.panels.minimap.nodes[3])
-    fly(user, 1.0)
-    while user.viewer._fade.front == 0:
-        user.click_at(*user.panels.minimap.nodes[2 if find_node(user) == 0 else 0])
-        fly(user, 1.0)
-    user.viewer.show(user.entries, 0)
-    user.draw_until(lambda: user.viewer._tour is None, "pair")
-    assert user.viewer._fade.compute_weight(user.clock[0]) == 1
-
-
-def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
-    user = tour_user
-    before = user.read_image()
-    user.click("photograph")
-    assert changed_fraction(before, user.read_image()) > 0.3
-    assert user.data.right_name == "photograph room0"
-
-
-# --- camera paths ---
-
-
-@pytest.fixture
-def path_user(user) -> User:
-    """The session with the opened editor of a path of two key frames, 1 s apart, at the second."""
-    sections = ("Gaussians", "Drawing", "Camera path")  # the first two are closed for space
-    for label in sections:
-        user.click(label)
-    user.click("Add key frame")
-    user.state.camera = replace(user.state.camera, position=(0.2, 0.0, 0.3), yaw_radians=0.5)
-    user.state.path_seconds = 1.0
-    user.press(imgui.Key.k)
-    assert [frame.seconds for frame in user.state.path.key_frames] == [0.0, 1.0]
-    yield user
-    for label in sections:
-        user.click(label)
-
-
-def test_the_buttons_of_key_frames_show_replace_and_delete_them(path_user):
-    user = path_user
-    last = user.read_image()
-    user.click("0.00 s##0")
-    first = user.read_image()
-    assert user.state.camera.position == (0, 0, 0) and changed_fraction(first, last) > 0.1
-    user.click("1.00 s##1")
-    assert changed_fraction(last, user.read_image()) == 0
-    user.click("Replace##0")
-    assert user.state.path.key_frames[0].position == (0.2, 0.0, 0.3)
-    user.click("Delete##0")
-    assert [frame.seconds for frame in user.state.path.key_frames] == [1.0]
-    user.click("Delete##0")
-    assert len(user.state.path) == 0 and "Play path" not in user.panels.items
-
-
-def test_the_path_is_played_and_its_time_is_dragged(path_user):
-    user = path_user
-    user.click("Play path")
-    assert user.state.path_playing
-    user.click("Pause")
-    assert not user.state.path_playing and 0 < user.state.path_seconds < 1
-    user.click("Play path")
-    user.draw_frames(5, 0.25)
-    assert not user.state.path_playing
-    assert user.state.camera.position == pytest.approx((0.2, 0.0, 0.3))
-    before = user.read_image()
-    user.slide("time", 0.15, start=0.02)
-    assert 0 < user.state.path_seconds < 1 and 0 < user.state.camera.position[2] < 0.3
-    assert changed_fraction(before, user.read_image()) > 0.1
-
-
-@pytest.mark.slow
-def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
-    user = path_user
-    path = user.state.path
-    user.panels.path_file = str(tmp_path / "walk.json")
-    user.click("Save")
-    user.click("Delete##0")
-    user.click("Load")
-    assert user.state.path == path
-    user.click("Save")
-    assert user.data.error is None, "pansplat wrote the file"
-    (tmp_path / "own.json").write_text("{}")
-    for name, button in (("missing.json", "Load"), ("own.json", "Save")):
-        user.panels.path_file = str(tmp_path / name)
-        user.click(button)
-        assert name in user.data.error
-        user.click("OK")
-    assert (tmp_path / "own.json").read_text() == "{}"
-    user.state.film_fps = 2.0
-    user.click(".png")
-    user.click("Write film")
-    user.settle()
-    files = user.viewer.screenshots[-3:]
-    assert [file.name[-9:] for file in files] == [f"_{i:04d}.png" for i in range(3)]
-    user.state.message = ""
-    shown = user.read_image()
-    with Image.open(files[-1]) as file:
-        assert np.abs(np.asarray(file).astype(int)[IMAGE] - shown).max() <= 3, "the last frame is the last key frame"
-
-
-def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
-    user, films = path_user, []
-    monkeypatch.setattr(
-        "pansplat_viewer.viewer.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
-    )
-    user.slide("frames per second", 0.6)
-    for suffix, projection in ((".webm", "equirect"), (".exr", "cubemap"), (".mp4", "perspective")):
-        user.click(suffix)
-        user.click(projection)
-        user.click("Write film")
-        user.settle()
-        frames, path, _, file, fps, _ = films.pop()
-        assert (frames.image_format.projection, file.suffix) == (projection, suffix)
-        assert path == user.state.path and fps == user.state.film_fps != 24
-
-
-def test_a_film_can_be_cancelled(path_user):
-    user = path_user
-    user.state.path = user.state.path.add(replace(user.state.path.key_frames[0], seconds=600.0))
-    written = len(user.viewer.screenshots)
-    user.click("Write film")
-    user.draw_frames(2)
-    assert 0 <= user.data.film < 1
-    user.click("Cancel##film")
-    user.settle()
-    assert user.data.film is None and user.data.error is None and len(user.viewer.screenshots) == written
-
-
-def test_a_film_of_a_tour_is_cancelled_during_a_prediction(user, house, load_house, monkeypatch):
-    predicting, go = threading.Event(), threading.Event()
-
-    def load(entry, progress, show):
-        if threading.current_thread().name.startswith("film-writer"):
-            predicting.set()
-            while not go.wait(0.005):
-                progress("searching depth", 0.5)
-        return load_house(entry)
-
-    user.show(SceneEntry(house.name, tour=house))
-    monkeypatch.setattr(user.viewer.loader, "_load", load)
-    user.viewer._tour._loaded.clear()
-    user.state.path = CameraPath((KeyFrame.of_camera(user.state.camera, 0.0),))
-    user.viewer._start_film(SIZE)
-    assert predicting.wait(300)
-    timer = threading.Timer(300, go.set)  # the end of a prediction that is not cancelled
-    timer.start()
-    user.viewer._films.cancel(join=True)
-    assert not go.is_set(), "it waited for the prediction"
-    timer.cancel()
+def test_a_scene_after_a_tour_does_not_fade_from_it(tour_app, pair):
+    app = tour_app
+    app.state.target = 3
+    app.fly(1.0)
+    app.viewer.show([SceneEntry("first", pair=pair)], 0)
+    app.until(lambda: app.viewer.tour is None, "pair")
+    assert app.viewer.stage.fade.compute_weight(app.now) == 1

@@ -6,6 +6,7 @@ import math
 import os
 import re
 import warnings
+from importlib import resources
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes, urljoin, urlsplit
@@ -348,3 +349,18 @@ def test_the_page_of_a_fused_tour_draws_all_gaussians_everywhere(house: Scene, t
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         write_page(dataclasses.replace(fused, overlaps=()), tmp_path / "pair.html")
+
+
+def test_modules_of_the_page_import_what_others_export_and_share_one_scope() -> None:
+    folder = resources.files("pansplat.web")
+    modules = {file.name: file.read_text("utf-8") for file in folder.iterdir() if file.name.endswith(".js")}
+    names = r"^(?:export )?(?:async )?(?:function|class|const|let) (\w+)"
+    own = {name: re.findall(names, text, re.MULTILINE) for name, text in modules.items() if "import {" in text}
+    every = [each for found in own.values() for each in found]
+    assert len(set(every)) == len(every) > 100, "names of two modules"
+    for text in modules.values():
+        for imported, other in re.findall(r'^import \{([^}]*)\} from "\./([\w.]+)";$', text, re.MULTILINE):
+            exports = " ".join(re.findall(r"^export .*", modules[other], re.MULTILINE))
+            for each in filter(None, map(str.strip, imported.split(","))):
+                assert re.search(rf"\b{each}\b", exports), (other, each)
+                assert len(re.findall(rf"\b{each}\b", text)) > 1, f"{each} is imported and not used"

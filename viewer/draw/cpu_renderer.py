@@ -33,7 +33,6 @@ from pansplat.rendering.cpu.display import (
     blend_to_pixels,
     enlarge,
 )
-from pansplat.rendering.cpu.footprints import Footprint
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
 from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
@@ -136,21 +135,9 @@ class CpuRenderer:
         self._texture: moderngl.Texture | None = None
 
     @property
-    def pixels(self) -> UInt32[np.ndarray, "height width"] | None:
-        """The last image as bytes, bottom row first; None before the first one."""
-        return None if self._picture is None else self._picture.pixels
-
-    @property
     def pending(self) -> Future[_Picture | None] | None:
         """The image that the worker draws; None if `render` has returned it, or waits for it."""
         return None if self._pending is None else self._worker.future
-
-    def create_sibling(self) -> CpuRenderer:
-        """A renderer that has this scene, without a copy."""
-        sibling = CpuRenderer(self._ctx)
-        sibling._min_transmittance = self._min_transmittance
-        sibling._splats, sibling._scene, sibling.stats = self._splats, self._scene, self.stats
-        return sibling
 
     @staticmethod
     def prepare(scene: Scene, report: Callable[[float], None] = lambda done: None) -> PreparedScene:
@@ -190,6 +177,8 @@ class CpuRenderer:
             raise InputError("there is no scene to draw; call `upload` first")
         if not settings.is_exact:
             raise InputError(f"the processor draws preset exact, got {settings.preset}; use renderer gl")
+        if settings.stereo != "mono":
+            raise InputError(f"the processor draws one eye of a window, got {settings.stereo}; use renderer gl")
         frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
         largest = max(*frame.size, frame.face_size if settings.layout == "equirect" else 0)
         if largest > LARGEST_SIDE:
@@ -217,44 +206,34 @@ class CpuRenderer:
 
     def has_faces(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings) -> bool:
         """Whether the cube faces that the camera reads are finished."""
-        assert self._splats is not None
-        frame = Frame.create(
-            self._splats, np.asarray(cam2world, dtype=np.float64), size, replace(settings, cached=True)
-        )
+        frame = self._create_cached_frame(cam2world, size, settings)
         if frame.storage != LayerStorage.PADDED_FACES:
             return False
         stored = self._faces.get(_face_key(frame))
         return stored is not None and not stored.find_missing(frame)
 
-    def prefetch_faces(
-        self,
-        cam2world: Float[np.ndarray, "4 4"],
-        size: tuple[int, int],
-        settings: list[DrawSettings],
-        *,
-        everywhere: bool = False,
-    ) -> None:
-        """Let the worker draw the faces that a camera reads, unless it works; those of the first settings first.
-
-        With `everywhere`, it draws the faces of all directions.
-        """
+    def draw_faces(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings) -> None:
+        """Draw the cube faces of a position for the next turn in the worker, unless it works; those in view first."""
         if self._worker.future is not None and not self._worker.future.done():
             return
+        frame = self._create_cached_frame(cam2world, size, settings)
+        if frame.storage != LayerStorage.PADDED_FACES:
+            return
+        stored, groups = self._find_face_set(frame), self._choose_groups(frame)
+        faces = [face for face in dict.fromkeys([*stored.find_missing(frame), *range(6)]) if face not in stored.done]
+
+        def draw() -> None:
+            for face in faces:
+                self._draw_face(frame, groups, stored, face)
+
+        if faces:
+            self._start(draw)
+
+    def _create_cached_frame(
+        self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
+    ) -> Frame:
         assert self._splats is not None
-        pose, work = np.asarray(cam2world, dtype=np.float64), []
-        for each in settings:
-            frame = Frame.create(self._splats, pose, size, replace(each, cached=True))
-            if frame.storage == LayerStorage.PADDED_FACES:
-                stored, groups = self._find_face_set(frame), self._choose_groups(frame)
-                faces = dict.fromkeys([*stored.find_missing(frame), *(range(6) if everywhere else ())])
-                work += [(frame, groups, stored, face) for face in faces if face not in stored.done]
-
-        def draw_faces() -> None:
-            for each in work:
-                self._draw_face(*each)
-
-        if work:
-            self._start(draw_faces)
+        return Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, replace(settings, cached=True))
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""
@@ -365,7 +344,6 @@ class CpuRenderer:
             selection=selection,
             cache=cache,
             min_transmittance=self._min_transmittance,
-            footprint=_find_footprint(frame.settings),
         )
 
     def _find_scene(self, settings: DrawSettings) -> DisplayScene:
@@ -395,7 +373,6 @@ class CpuRenderer:
                 len(groups.weights),
                 RasterOptions(near=settings.near),
                 min_transmittance=self._min_transmittance,
-                footprint=_find_footprint(settings),
             )
             _add_stages(stages, layers)
             return layers.sums, layers.statistics.visible
@@ -530,17 +507,13 @@ def _face_key(frame: Frame) -> Hashable:
     return frame.world_position.tobytes(), frame.focal, settings
 
 
-def _find_footprint(settings: DrawSettings) -> Footprint | None:
-    return None if settings.footprint == "gaussian" else settings.footprint
-
-
 def _blend(
     settings: DrawSettings, groups: _Groups, sums: Float[np.ndarray, "layer 5 height width"]
 ) -> tuple[Float[np.ndarray, "height width 4"], Float[np.ndarray, "height width"]]:
     """Colour over the background and coverage, and depth."""
     color, depth = blend_layers(sums, groups.weights, settings.background)
     if settings.display in SCALAR_MAPS:
-        values = {"depth": depth, "opacity": color[..., 3], "count": sums[0, 4]}[settings.display]
+        values = depth if settings.display == "depth" else color[..., 3]
         mapped = map_values(values, settings.display_max, SCALAR_MAPS[settings.display]) / np.float32(255)
         color[..., :3] = np.where(color[..., 3:] > 0, mapped, np.array(settings.background, np.float32))
     return color, depth

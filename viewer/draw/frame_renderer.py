@@ -25,7 +25,7 @@ class Pacing:
 
 
 class FrameRenderer(Protocol):
-    """Draws images of one scene: `SplatRenderer` (OpenGL), `CpuRenderer`, and `StereoRenderer` over one of them."""
+    """Draws images of one scene: `SplatRenderer` (OpenGL), `CpuRenderer`, and `StereoRenderer` over the first."""
 
     pacing: Pacing
 

@@ -125,7 +125,7 @@ class Frame:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
         key = (splats, self.position, s.preset, *s.selection, s.near)
-        key += (s.footprint, s.splat_colors, s.outside)
+        key += (s.splat_colors, s.outside)
         if self.storage == LayerStorage.IMAGE:
             return (*key, self.rotation.tobytes(), self.focal)
         return (*key, self.faces_to_world.tobytes())
@@ -408,8 +408,7 @@ class SplatRasterizer:
         self._set_uniforms(camera, settings)
         self._place_parts([place for _, place in parts], viewport)
         self._ctx.enable_only(moderngl.BLEND)
-        add = settings.footprint == "count"
-        self._ctx.blend_func = moderngl.ONE, moderngl.ONE if add else moderngl.ONE_MINUS_SRC_ALPHA
+        self._ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
         variance = compute_filter_variance(settings, camera.focal)
         drawn = 0
         if self._gpu is not None:
@@ -459,12 +458,7 @@ class SplatRasterizer:
             cameras=_CAMERAS_UNIT,
         )
         self._cameras.use(_CAMERAS_UNIT)
-        set_uniforms(
-            self._programs.splat(),
-            half_size=camera.half_size,
-            focal=camera.focal,
-            footprint=("gaussian", "count", "ellipsoids").index(settings.footprint),
-        )
+        set_uniforms(self._programs.splat(), half_size=camera.half_size, focal=camera.focal)
 
     def _place_parts(self, places: Sequence[Viewport], viewport: Viewport) -> None:
         """Set where the parts of a layer are in the viewport."""

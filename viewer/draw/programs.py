@@ -21,7 +21,6 @@ DIGITS = 64  # of the radix sort, and its threads in a work group
 TILE_SIZE = 1024  # keys or splats of a work group
 _UNIFORM = re.compile(r"^uniform \w+ (\w+)", re.MULTILINE)
 _MAX_ERRORS = 8  # that OpenGL can report at once
-COUNT_STEP = 1 / 256  # that one Gaussian adds to an image of counts, so that half floats hold its square
 
 
 def choose_tier(ctx: moderngl.Context, tier: str, count: int = 0) -> str:
@@ -47,7 +46,7 @@ def choose_tier(ctx: moderngl.Context, tier: str, count: int = 0) -> str:
 
 def read_source(name: str, version: int, **defines: float | str) -> str:
     """Return the text of a shader for OpenGL `version` (330 or 430), with the displays that web pages do not have."""
-    return load_shader(name, f"{version} core", INSPECT=1, COUNT_STEP=COUNT_STEP, **defines)
+    return load_shader(name, f"{version} core", INSPECT=1, **defines)
 
 
 @contextlib.contextmanager

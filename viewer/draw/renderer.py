@@ -23,7 +23,7 @@ from pansplat.geometry.pose import blend_weights
 from pansplat_viewer.draw.color_maps import create_table_texture
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
-from pansplat_viewer.draw.programs import COUNT_STEP, Programs, choose_tier, set_uniforms
+from pansplat_viewer.draw.programs import Programs, choose_tier, set_uniforms
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.draw.splats import SortedSplats, Splats, SplatSorter, color_splats, sort_splats
 from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats
@@ -285,7 +285,7 @@ def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dic
         InputError: the scene lacks the view, or the cameras that mode `deferred` needs.
     """
     settings, num_views = frame.settings, splats.num_views
-    mode = settings.drawn_mode
+    mode = settings.mode
     if mode == "joint":
         return {None: 1.0}
     if mode == "view" and not 0 <= settings.view < max(num_views, 1):
@@ -348,8 +348,7 @@ class Compositor:
         """Set the number that the display shows, and its colours."""
         name = SCALAR_MAPS.get(settings.display)
         scalar = 0 if name is None else 1 if settings.display == "depth" else 2
-        step = COUNT_STEP if settings.display == "count" else 1.0
-        set_uniforms(program, scalar=scalar, scalar_max=settings.display_max * step, color_map=_COLOR_MAP_UNIT)
+        set_uniforms(program, scalar=scalar, scalar_max=settings.display_max, color_map=_COLOR_MAP_UNIT)
         if name is None:
             return
         if name not in self._tables:

@@ -40,11 +40,6 @@ class AdaptiveResolution:
         slow = self.full_ms > min(self.turn_ms, self.budget_ms)
         return ResolutionPlan(SCALES[self.step], cached=slow and not self.translated, moving=True)
 
-    @property
-    def coarsest(self) -> float:
-        """The smallest scale that may be used."""
-        return SCALES[self.num_scales - 1]
-
     def limit(self, size: tuple[int, int], min_size: tuple[int, int]) -> None:
         """Use no scale that makes an image of `size` smaller than `min_size`, pixels."""
         fits = [scale for scale in SCALES if all(a * scale >= b for a, b in zip(size, min_size, strict=True))]

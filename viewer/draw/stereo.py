@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import moderngl
 import numpy as np
 import torch
-from jaxtyping import Float, UInt32
+from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -22,22 +21,19 @@ from pansplat.geometry.cubemap import FACES
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.options import EYE_DISTANCE
 from pansplat.rendering.image_planes import image_planes
-from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer, create_renderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.programs import Programs, set_uniforms
 from pansplat_viewer.draw.renderer import SplatRenderer, bind
-from pansplat_viewer.scene.settings import DrawSettings, FrameStats, Preset, Projection, Stereo
+from pansplat_viewer.scene.settings import DrawSettings, FrameStats, Preset, Projection, RendererChoice, Stereo
 
 # Places of the faces in an image of three columns and two rows: layout 0 of the spherical metadata, version 2.
 _GRID = ("right", "left", "up"), ("down", "front", "back")
 _DEFAULT_SIZES = {"perspective": (1920, 1080), "equirect": (2880, 1440), "cubemap": (2160, 1440)}
 MAX_TURN = math.radians(20)  # of the camera before the eyes follow, while cached faces are read
-_PREFETCH_TURN = math.radians(5)  # of the camera before the faces at the next places of the eyes are drawn
-_SAME_AXIS = 1e-3
 _STEREO_FACE_OVERSAMPLING = 1.5  # of the panorama that the faces of stereo cubemaps are interpolated in
 
 _ARRANGEMENTS = ("side-by-side", "top-bottom", "anaglyph")  # as in shaders/arrange.frag
-_RED_AND_ALPHA = np.uint32(0xFF0000FF)
 _MAX_TARGETS = 4
 
 
@@ -202,51 +198,31 @@ def get_eye_size(size: tuple[int, int], stereo: Stereo) -> tuple[int, int]:
     return max(size[0] // columns, 1), max(size[1] // rows, 1)
 
 
-def _turn(
-    cam2world: Float[np.ndarray, "4 4"], first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """The pose turned in place by the smallest rotation from one direction to another."""
-    x, y, z = np.cross(first, second)
-    across, turned = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0))), cam2world.copy()
-    turned[:3, :3] = (np.eye(3) + across + across @ across / (1 + first @ second)) @ cam2world[:3, :3]
-    return turned
-
-
 def _join_sizes(eye_size: tuple[int, int], stereo: Stereo) -> tuple[int, int]:
     """(width, height) of an image of both eyes."""
     return eye_size[0] * (2 if stereo == "side-by-side" else 1), eye_size[1] * (2 if stereo == "top-bottom" else 1)
 
 
 class StereoRenderer:
-    """A `FrameRenderer` of images for one or two eyes over another one.
+    """A `FrameRenderer` of images for one or two eyes over that of OpenGL.
 
     The second eye has a renderer of its own, made at the first stereo image. While `settings.cached`, the eyes stay
     where they are in the faces, until the camera has turned by `MAX_TURN`; then they move to where they belong.
-    `prefetch` draws the faces of these places before.
     """
 
-    def __init__(self, renderer: SplatRenderer | CpuRenderer, ctx: moderngl.Context | None) -> None:
+    pending: Future[Any] | None = None  # nothing is drawn in the background
+    pacing = SplatRenderer.pacing
+    prepare = staticmethod(SplatRenderer.prepare)
+
+    def __init__(self, renderer: SplatRenderer, ctx: moderngl.Context) -> None:
         """Take over a renderer; `ctx` is its context."""
         self._eyes = [renderer]
-        self.pacing = renderer.pacing
         self._ctx = ctx
         self._programs: Programs | None = None
         self._triangle: moderngl.VertexArray | None = None
         self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
         self._axis: Float[np.ndarray, "3"] | None = None
-        self._following: Float[np.ndarray, "3"] | None = None  # the axis after this one
         self._stereo: Stereo = "mono"
-        self._last: moderngl.Texture | None = None
-
-    @property
-    def prepare(self) -> Callable[[Scene, Callable[[float], None]], Any]:
-        """That of the renderer."""
-        return self._eyes[0].prepare
-
-    @property
-    def _cpu_eyes(self) -> list[CpuRenderer]:
-        """The renderers, if they draw on the processor and so in the background."""
-        return [eye for eye in self._eyes if isinstance(eye, CpuRenderer)]
 
     @property
     def stats(self) -> FrameStats:
@@ -265,19 +241,13 @@ class StereoRenderer:
             size=_join_sizes(stats.size, self._stereo),
         )
 
-    @property
-    def pending(self) -> Future[Any] | None:
-        """The image of an eye that is being drawn in the background; None if there is none."""
-        eyes = self._cpu_eyes[: 1 if self._stereo == "mono" else 2]
-        return next((eye.pending for eye in eyes if eye.pending is not None), None)
-
     def upload(self, scene: Scene, prepared: Any = None) -> None:
         """Replace the scene; `prepared` is the result of `prepare`."""
         self._eyes[0].upload(scene, prepared)
         for other in self._eyes[1:]:
             other.release()
         del self._eyes[1:]
-        self._stereo, self._last = "mono", None
+        self._stereo = "mono"
 
     def render(
         self,
@@ -286,147 +256,58 @@ class StereoRenderer:
         settings: DrawSettings,
         *,
         wait: bool = True,
-    ) -> moderngl.Texture | None:
+    ) -> moderngl.Texture:
         """As the renderer's `render`; `size` is that of the whole image, `cam2world` is between the eyes."""
-        if self._stereo != settings.stereo:
-            self._stereo, self._last = settings.stereo, None
+        self._stereo = settings.stereo
         if settings.stereo == "mono":
             return self._eyes[0].render(cam2world, size, settings, wait=wait)
         if settings.layout != "pinhole":
             raise InputError(f"stereo of a window is perspective, got layout {settings.layout}; use `render_image`")
         if len(self._eyes) == 1:
             self._eyes.append(self._eyes[0].create_sibling())
-        axis = self._choose_axis(cam2world, size, settings)
-        if axis is not self._axis:
-            self._axis, self._following = axis, None
+        right, axis = cam2world[:3, 0], self._axis
+        if axis is None or not settings.cached or float(right @ axis) <= math.cos(MAX_TURN):
+            axis = self._axis = right.copy()
         eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
-        textures = [
-            eye.render(pose, eye_size, eye_settings, wait=wait or self._last is None)
-            for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings, self._axis), strict=True)
-        ]
-        if self._last is None or self.stats.settled or not self.pacing.waits_while_moving:
-            self._last = self._arrange(textures, settings.stereo)
-        return self._last  # the images of the processor's renderers that are not finished are those of another frame
+        textures = []
+        for eye, sign in zip(self._eyes, (-0.5, 0.5), strict=True):
+            pose = cam2world.copy()
+            pose[:3, 3] += sign * settings.eye_distance * axis
+            textures.append(eye.render(pose, eye_size, eye_settings, wait=wait))
+        return self._arrange(*textures, settings.stereo)
 
-    def has_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> bool:
-        """Whether the cube faces that the eyes read are finished on the processor."""
-        if settings.stereo == "mono":
-            return any(eye.has_faces(cam2world, size, settings) for eye in self._cpu_eyes[:1])
-        if len(self._cpu_eyes) < 2 or self._axis is None:
-            return False
-        return self._has_faces(self._choose_axis(cam2world, size, settings), cam2world, size, settings)
+    def has_faces(self, *_: object) -> bool:
+        """Whether cube faces are finished that were drawn in the background: never."""
+        return False
 
-    def draw_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
-        """Draw the cube faces of all directions in the background, for the next turn."""
-        if settings.stereo == "mono":
-            for eye in self._cpu_eyes[:1]:
-                eye.prefetch_faces(cam2world, size, [settings], everywhere=True)
-        elif self._axis is not None and len(self._cpu_eyes) == 2:
-            eye_size, eye_settings = get_eye_size(size, settings.stereo), [replace(settings, stereo="mono")]
-            for eye, pose in zip(self._cpu_eyes, self._place_eyes(cam2world, settings, self._axis), strict=True):
-                eye.prefetch_faces(pose, eye_size, eye_settings, everywhere=True)
-
-    def prefetch(
-        self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings, scale: float
-    ) -> None:
-        """Draw the faces at the next places of the eyes in the background, while the camera turns towards them.
-
-        Args:
-            cam2world, size, settings: as for `render`.
-            scale: of the faces that are drawn first, which serve a fast turn.
-        """
-        if settings.stereo == "mono" or not settings.cached or self._axis is None:
-            return
-        if len(self._cpu_eyes) < 2:
-            return
-        right = cam2world[:3, 0]
-        across = right - (right @ self._axis) * self._axis
-        length = float(np.linalg.norm(across))
-        if length < math.sin(_PREFETCH_TURN):
-            return
-        following = math.cos(MAX_TURN) * self._axis + math.sin(MAX_TURN) * across / length
-        if self._following is None or np.abs(following - self._following).max() > _SAME_AXIS:
-            self._following = following
-        eye_size, settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono", scale=1.0)
-        turned = _turn(cam2world, right, self._following)
-        for eye, pose in zip(self._cpu_eyes, self._place_eyes(turned, settings, self._following), strict=True):
-            eye.prefetch_faces(pose, eye_size, [replace(settings, scale=scale), settings])
+    def draw_faces(self, *_: object) -> None:
+        """Draw nothing: OpenGL draws a face when it is read."""
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
-        """Return the last image, float32, top row first: RGB over the background, and coverage."""
-        if self._stereo == "mono":
-            return self._eyes[0].read_color()
-        colors = [eye.read_color() for eye in self._eyes]
-        color = arrange_eyes([color[..., :3] for color in colors], self._stereo)
-        if self._stereo == "anaglyph":
-            return np.concatenate((color, np.maximum(colors[0][..., 3:], colors[1][..., 3:])), axis=-1)
-        return np.concatenate((color, arrange_eyes([color[..., 3:] for color in colors], self._stereo)), axis=-1)
+        """As the renderer's, of the left eye; `render_image` reads both."""
+        return self._eyes[0].read_color()
 
     def read_depth(self) -> Float[np.ndarray, "height width"]:
-        """Return the radial depth of the last image in metres; that of an anaglyph is the left eye's."""
-        if self._stereo in ("mono", "anaglyph"):
-            return self._eyes[0].read_depth()
-        return arrange_eyes([eye.read_depth()[..., None] for eye in self._eyes], self._stereo)[..., 0]
-
-    def read_eye_depth(self) -> Float[np.ndarray, "height width"]:
-        """Return the radial depth of the left eye's image in metres."""
+        """As the renderer's, of the left eye."""
         return self._eyes[0].read_depth()
 
     def release(self) -> None:
         """Release the renderers, and free the textures."""
-        for target in self._targets.values():
-            target.color_attachments[0].release()
-            target.release()
-        self._targets.clear()
+        self._release_targets()
         if self._triangle is not None and self._programs is not None:
             self._triangle.release()
             self._programs.release()
         for eye in self._eyes:
             eye.release()
 
-    def _choose_axis(
-        self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
-    ) -> Float[np.ndarray, "3"]:
-        """The direction from the left to the right eye.
+    def _release_targets(self) -> None:
+        for target in self._targets.values():
+            target.color_attachments[0].release()
+            target.release()
+        self._targets.clear()
 
-        It is kept up to `MAX_TURN`, and up to twice that while the faces at the next places of the eyes are drawn.
-        """
-        right = cam2world[:3, 0]
-        if self._axis is None or not settings.cached:
-            return right.copy()
-        if float(right @ self._axis) > math.cos(MAX_TURN):
-            return self._axis
-        following = self._following
-        if following is None or float(right @ following) < math.cos(2 * MAX_TURN):
-            return right.copy()
-        if self._has_faces(following, cam2world, size, settings):
-            return following
-        return self._axis if float(right @ self._axis) > math.cos(2 * MAX_TURN) else following
-
-    def _has_faces(
-        self, axis: Float[np.ndarray, "3"], cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
-    ) -> bool:
-        """Whether the faces that the eyes on an axis read are finished."""
-        eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
-        poses = self._place_eyes(cam2world, settings, axis)
-        return all(eye.has_faces(pose, eye_size, eye_settings) for eye, pose in zip(self._cpu_eyes, poses, strict=True))
-
-    def _place_eyes(
-        self, cam2world: np.ndarray, settings: DrawSettings, axis: Float[np.ndarray, "3"]
-    ) -> list[Float[np.ndarray, "4 4"]]:
-        poses = [cam2world.copy(), cam2world.copy()]
-        for pose, sign in zip(poses, (-0.5, 0.5), strict=True):
-            pose[:3, 3] += sign * settings.eye_distance * axis
-        return poses
-
-    def _arrange(self, textures: list[moderngl.Texture | None], stereo: Stereo) -> moderngl.Texture | None:
+    def _arrange(self, left: moderngl.Texture, right: moderngl.Texture, stereo: Stereo) -> moderngl.Texture:
         """One texture of both images."""
-        left, right = textures
-        if self._ctx is None or left is None or right is None:
-            return None
-        if self._cpu_eyes:
-            first, second = self._cpu_eyes
-            return self._arrange_pixels(first.pixels, second.pixels, stereo)
         bound = self._ctx.fbo
         target = self._get_target(left.size, stereo, left.dtype)
         if self._programs is None or self._triangle is None:
@@ -439,36 +320,25 @@ class StereoRenderer:
         self._ctx.enable_only(moderngl.NOTHING)
         self._triangle.render(moderngl.TRIANGLES, vertices=3)
         bind(bound)
-        return target.color_attachments[0]
-
-    def _arrange_pixels(
-        self,
-        left: UInt32[np.ndarray, "height width"] | None,
-        right: UInt32[np.ndarray, "height width"] | None,
-        stereo: Stereo,
-    ) -> moderngl.Texture:
-        """One texture of the pixels of both images, whose bottom row is the first."""
-        assert left is not None and right is not None
-        if stereo == "anaglyph":
-            pixels = (left & _RED_AND_ALPHA) | (right & ~_RED_AND_ALPHA)
-        else:
-            pixels = np.hstack((left, right)) if stereo == "side-by-side" else np.vstack((right, left))
-        texture = self._get_target(left.shape[::-1], stereo, "f1").color_attachments[0]
-        texture.write(pixels)
+        texture = target.color_attachments[0]
+        assert isinstance(texture, moderngl.Texture)
         return texture
 
     def _get_target(self, eye_size: tuple[int, int], stereo: Stereo, dtype: str) -> moderngl.Framebuffer:
-        assert self._ctx is not None
         size = _join_sizes(eye_size, stereo)
         if size not in self._targets:
             if len(self._targets) >= _MAX_TARGETS:
-                for target in self._targets.values():
-                    target.color_attachments[0].release()
-                    target.release()
-                self._targets.clear()
-            bound = self._ctx.fbo
+                self._release_targets()
             texture = self._ctx.texture(size, 4, dtype=dtype)
             texture.repeat_x = texture.repeat_y = False
             self._targets[size] = self._ctx.framebuffer([texture])
-            bind(bound)
         return self._targets[size]
+
+
+WindowRenderer = StereoRenderer | CpuRenderer
+
+
+def create_window_renderer(ctx: moderngl.Context, choice: RendererChoice) -> WindowRenderer:
+    """The renderer of a window; without a GPU it draws one eye."""
+    renderer = create_renderer(ctx, choice)
+    return renderer if isinstance(renderer, CpuRenderer) else StereoRenderer(renderer, ctx)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -16,76 +19,40 @@ from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import directions_from_uv, pixel_directions
-from pansplat_viewer.scene.background import BackgroundWorker, Report
+from pansplat_viewer.scene.background import Report
+from pansplat_viewer.scene.picking import compute_pixel_ray
 from pansplat_viewer.scene.settings import DrawSettings
+from pansplat_viewer.scene.state import ViewerState
+
+if TYPE_CHECKING:
+    from pansplat_viewer.window.input import Input
+
+MaskAnswer = Literal["save", "drop", "keep"]
+
+CLEANING_JOB = "cleaning"
 
 _ROWS = 512  # of a mask
 _STEP = 0.5  # between the circles of a stroke, in brush radii
 _STRAIGHT = 1.0  # pixels, of an outline
 
 
-@dataclass(frozen=True, eq=False)
-class Cleaned:
-    """A result.
+def remove_floaters(scene: Scene, report: Report) -> tuple[Scene | None, str]:
+    """The scene without floaters, None if there are none; and what was done."""
+    from pansplat.cleanup import Cleaning, clean_up
 
-    Attributes:
-        message: what was done.
-        given: the scene before.
-        scene: to show in its place; None if nothing has changed.
-    """
-
-    message: str
-    given: Scene
-    scene: Scene | None = None
+    cleaned, (change,) = clean_up(scene, Cleaning(floaters=False), progress=report)
+    return cleaned if change.after < change.before else None, str(change)
 
 
-class Cleaner:
-    """Removes floaters and writes scenes in a worker thread."""
+def save_cleaned(scene: Scene, settings: DrawSettings, path: Path, report: Report) -> str:
+    """Write a scene without what the box and the least opacity of the settings hide; returns what was done."""
+    from pansplat.cleanup import Cleaning, clean_up
+    from pansplat.gaussians.formats import save_scene
 
-    def __init__(self) -> None:
-        """The thread starts with the first work."""
-        self._worker: BackgroundWorker[Cleaned] = BackgroundWorker("scene-cleaner")
-
-    @property
-    def progress(self) -> tuple[str, float] | None:
-        """Description of the work and the fraction done; None if there is none."""
-        return self._worker.progress
-
-    def remove_floaters(self, scene: Scene) -> None:
-        """Start to remove the floaters of a scene."""
-        from pansplat.cleanup import Cleaning, clean_up
-
-        def work(report: Report) -> Cleaned:
-            cleaned, (change,) = clean_up(scene, Cleaning(floaters=False), progress=report)
-            return Cleaned(str(change), scene, cleaned if change.after < change.before else None)
-
-        self._worker.start(work, "looking for floaters")
-
-    def save(self, scene: Scene, settings: DrawSettings, path: Path) -> None:
-        """Start to write a scene without what the box and the least opacity of the settings hide."""
-        from pansplat.cleanup import Cleaning, clean_up
-        from pansplat.gaussians.formats import save_scene
-
-        def work(report: Report) -> Cleaned:
-            cleaning = Cleaning(box=settings.box, min_opacity=settings.opacity_threshold)
-            cleaned, changes = clean_up(scene, cleaning, progress=report)
-            save_scene(cleaned, path)
-            lines = [str(change) for change in changes]
-            return Cleaned("\n".join([*lines, f"wrote {path}: {len(cleaned.gaussians):,} Gaussians"]), scene)
-
-        self._worker.start(work, f"writing {path.name}")
-
-    def poll(self) -> Cleaned | BaseException | None:
-        """The result or the exception of work that is finished, once; None before."""
-        return self._worker.poll()
-
-    def cancel(self) -> None:
-        """End the work."""
-        self._worker.cancel()
-
-    def close(self) -> None:
-        """End the work and wait for the thread."""
-        self._worker.close()
+    cleaning = Cleaning(box=settings.box, min_opacity=settings.opacity_threshold)
+    cleaned, changes = clean_up(scene, cleaning, progress=report)
+    save_scene(cleaned, path)
+    return "\n".join([*map(str, changes), f"wrote {path}: {len(cleaned.gaussians):,} Gaussians"])
 
 
 def measure_bounds(scene: Scene) -> tuple[float, ...]:
@@ -168,3 +135,96 @@ class MaskPainter:
         write_image(path, white, panorama=False)
         self.is_changed = False
         return path
+
+
+class Painting:
+    """The mask that is painted on a photograph, and the question before one that is not saved is dropped.
+
+    Attributes:
+        painter: the mask; None if none is painted.
+    """
+
+    def __init__(self, state: ViewerState, show_error: Callable[[str], None]) -> None:
+        """No mask is painted; `show_error` shows a message."""
+        self._state, self._show_error = state, show_error
+        self.painter: MaskPainter | None = None
+        self._held: tuple[Callable[[], None], bool, Callable[[], None]] | None = None  # arguments of `leave`
+
+    @property
+    def question(self) -> str | None:
+        """The photograph of a mask whose end waits for an answer; None without a question."""
+        return None if self._held is None or self.painter is None else self.painter.panorama.label
+
+    def start(self, panoramas: Sequence[Panorama], index: int) -> None:
+        """Paint on a photograph, which fills the window."""
+        try:
+            self.painter = MaskPainter(panoramas[index])
+        except InputError as error:
+            self._show_error(str(error))
+            return
+        state = self._state
+        state.playing = state.path_playing = False
+        state.photograph, state.comparison, state.split = index, "photograph", 0.0
+        state.settings = replace(state.settings, stereo="mono")
+
+    def stop(self) -> None:
+        """Paint no longer; what is not saved is lost."""
+        self._held = None
+        if self.painter is not None:
+            self.painter, state = None, self._state
+            state.photograph, state.comparison, state.split = None, "off", ViewerState().split
+
+    def follow(self, panoramas: Sequence[Panorama]) -> int | None:
+        """Go on with the photograph if it is among these, which may have been loaded again; returns its place."""
+        image = None if self.painter is None else self.painter.panorama.image
+        found = next((index for index, view in enumerate(panoramas) if view.image == image), None)
+        if found is not None and self.painter is not None:
+            self.painter.move(panoramas[found])
+        return found
+
+    def apply(self, events: Input, size: tuple[int, int]) -> Input:
+        """Paint with the left button, and return the other input: the right button looks around."""
+        if self.painter is None:
+            return events
+        if events.pointer is None:
+            self.painter.lift()
+        else:
+            pixel = events.pointer[0] * size[0], events.pointer[1] * size[1]
+            direction = compute_pixel_ray(self._state.camera, pixel, size)[1]
+            radius = math.radians(self._state.brush_degrees)
+            self.painter.paint(direction, radius, erase="shift" in events.held)
+        if "escape" in events.pressed:
+            self.leave(self.stop)
+        pressed = events.pressed - {"escape"}
+        return replace(events, pressed=pressed, drag=events.pan, pan=(0.0, 0.0), click=None, pointer=None)
+
+    def leave(
+        self, action: Callable[[], None], *, after_saving: bool = True, otherwise: Callable[[], None] = lambda: None
+    ) -> None:
+        """Do what drops the mask, or writes a scene without it; if the mask is not saved, ask first.
+
+        The action is done after the answer to drop the mask, or with `after_saving` to save it; else `otherwise` is.
+        """
+        if self.painter is not None and self.painter.is_changed:
+            self._held = action, after_saving, otherwise
+        else:
+            action()
+
+    def answer(self, answer: MaskAnswer) -> None:
+        """Answer the question."""
+        if self._held is None:
+            return
+        (action, after_saving, otherwise), self._held = self._held, None
+        if answer == "drop":
+            self.stop()
+        is_saved = answer == "save" and self.save()
+        (action if answer == "drop" or (is_saved and after_saving) else otherwise)()
+
+    def save(self) -> bool:
+        """Write the mask; returns whether that was possible."""
+        assert self.painter is not None
+        try:
+            self._state.show_message(f"wrote {self.painter.save()}; Reload predicts the scene again")
+        except (InputError, OSError) as error:
+            self._show_error(str(error))
+        return not self.painter.is_changed

@@ -1,4 +1,4 @@
-"""The doll's house view of the viewer: its scene, its camera, and the marks of its panoramas.
+"""The doll's house view of the viewer: its scene, its camera, the marks of its panoramas, and the ways in and out.
 
 Imports no OpenGL. `pansplat.tours.doll_house` decides what is drawn.
 """
@@ -8,14 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from pansplat.gaussians.scene import Scene
 from pansplat.tours import Rooms, find_rooms, fit_box, measure_box
+from pansplat_viewer.scene.background import Jobs, Report
 from pansplat_viewer.scene.camera import Camera
-from pansplat_viewer.scene.tour import Hotspot, make_hotspot
+from pansplat_viewer.scene.state import GLIDE_SECONDS, Glide, ViewerState, leave_doll_house
+from pansplat_viewer.scene.tour import Hotspot, TourScenes, make_hotspot
+
+if TYPE_CHECKING:
+    from pansplat_viewer.ui.stage import Stage
+
+_JOB = "doll's house"
 
 _PITCH_RADIANS = math.radians(-45)  # of the first view
 _FOV_DEGREES = 45.0  # vertical
@@ -90,3 +98,108 @@ class DollHouse:
             if mark is not None:
                 found.append((float(np.linalg.norm(foot - position)), mark))
         return [mark for _, mark in sorted(found, key=lambda item: -item[0])]
+
+
+class DollHouseView:
+    """The doll's house beside the scene: it is made in the background, flown out to, and left.
+
+    Attributes:
+        house: what is shown; None inside of the rooms.
+    """
+
+    def __init__(self, state: ViewerState, jobs: Jobs, stage: Stage) -> None:
+        """The camera is inside."""
+        self._state, self._jobs, self._stage = state, jobs, stage
+        self.house: DollHouse | None = None
+        self._first = self._inside = state.camera  # the first one outside, and the last one inside
+
+    @property
+    def is_on(self) -> bool:
+        """Whether it is shown or made."""
+        return self.house is not None or self._jobs.progress(_JOB) is not None
+
+    def toggle(self, tour: TourScenes | None, labels: Sequence[str]) -> None:
+        """Make the doll's house of the part and the storey of the camera, or fly back into it.
+
+        Args:
+            tour: that is shown.
+            labels: of the panoramas of a scene that is no tour.
+        """
+        state = self._state
+        if self._jobs.cancel(_JOB) or state.glide is not None:
+            return
+        node = self._find_nearest(tour, state.camera if self.house is None else self._inside)
+        if self.house is not None:
+            state.target = node
+        elif node is None:
+            state.show_message("there are no panoramas")
+        else:
+            if tour is not None:
+                labels = [panorama.label for panorama in tour.tour.panoramas]
+            scene, gather = self._stage.slot.scene, None if tour is None else tour.gather_part()
+
+            def make(report: Report) -> DollHouse | None:
+                gathered = scene if gather is None else gather()
+                assert gathered is not None
+                report()
+                return DollHouse.make(gathered, labels, node)
+
+            self._jobs.start(_JOB, make, self._enter, failure="no doll's house: ")
+
+    def _find_nearest(self, tour: TourScenes | None, camera: Camera) -> int | None:
+        """The panorama nearest to a camera, in a tour one of the edge at the camera; None if there is none."""
+        if tour is not None:
+            return tour.find_nearest(np.asarray(camera.position))
+        distances = np.linalg.norm(self._state.context[:, :3, 3] - camera.position, axis=1)
+        return int(distances.argmin()) if len(distances) else None
+
+    def _enter(self, house: DollHouse | None) -> None:
+        """Show what was made, and fly out of the rooms."""
+        state = self._state
+        if house is None:
+            state.show_message("no room is known here")
+        elif self._stage.show_outside(house.scene):
+            self.house, self._inside = house, state.camera
+            self._first = house.frame(state.camera, self._stage.eye_size)
+            state.playing = state.path_playing = False
+            state.doll_house, state.glide, state.points = True, Glide(state.camera, self._first, is_entry=False), []
+
+    def update(self, seconds: float) -> None:
+        """Move the camera outside of the rooms, and back into the panorama that is chosen."""
+        state, house = self._state, self.house
+        if house is None:
+            return
+        if state.doll_house and state.target is not None:
+            if state.target in house.nodes:
+                end = house.enter(state.camera, state.target, self._inside)
+                state.glide, state.target = Glide(state.camera, end, is_entry=True), None
+            else:  # of another part or storey
+                self.leave()
+        if state.glide is not None:
+            state.glide = replace(state.glide, seconds=state.glide.seconds + seconds)
+            state.camera = state.glide.camera
+            if state.glide.seconds >= GLIDE_SECONDS:
+                if state.glide.is_entry:
+                    leave_doll_house(state)
+                state.glide = None
+        elif state.doll_house:
+            state.camera = house.limit(state.camera, self._first)
+        if not state.doll_house:
+            self._close()
+
+    def leave(self) -> None:
+        """Put the camera back where it was inside."""
+        if self.house is not None:
+            self._state.camera = self._inside
+            leave_doll_house(self._state)
+
+    def reset(self) -> None:
+        """Show the scene from inside again, and make no doll's house."""
+        self._jobs.cancel(_JOB)
+        self.leave()
+        self._close()
+
+    def _close(self) -> None:
+        if self.house is not None:
+            self.house = None
+            self._stage.hide_outside()

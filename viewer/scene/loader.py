@@ -17,7 +17,7 @@ from pansplat_viewer.scene.background import BackgroundWorker
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair, Panorama
     from pansplat.gaussians.scene import Scene
-    from pansplat.tours import FloorOutline, TourGraph
+    from pansplat.tours import Edge, FloorOutline, TourGraph
 
 
 Progress = Callable[[str, float], None]  # task, fraction done
@@ -87,12 +87,14 @@ class LoadedScene:
     Attributes:
         is_final: False for a prediction whose refinement will follow.
         outlines: of a scene of a tour: floor outlines by panorama.
+        walls: of a scene of a tour: edges that it shows to be none.
     """
 
     entry: SceneEntry
     scene: "Scene"
     is_final: bool = True
     outlines: "dict[int, FloorOutline]" = field(default_factory=dict)
+    walls: "Sequence[Edge]" = ()
 
 
 @dataclass(frozen=True)
@@ -225,7 +227,7 @@ def _load_tour_scene(
     The first scene of a window is not refined if it is predicted again with the rest of its part.
     """
     from pansplat import pipeline
-    from pansplat.tours import connect, find_floor_outlines, select_views
+    from pansplat.tours import connect, find_floor_outlines, find_walls, select_views
 
     tour, views, merged, seconds = entry.tour, entry.views, entry.merged, options.refine_seconds
     assert tour is not None
@@ -249,7 +251,8 @@ def _load_tour_scene(
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
         scene = tour.place(scene, views)
-        return LoadedScene(entry, scene, is_final=is_final, outlines=find_floor_outlines(tour, scene, views))
+        outlines, walls = find_floor_outlines(tour, scene, views), find_walls(scene, views, tour.overlaps)
+        return LoadedScene(entry, scene, is_final=is_final, outlines=outlines, walls=walls)
 
     scene = pipeline.predict(
         pair,

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -31,6 +32,10 @@ from pansplat.poses.placing import (
     snap,
 )
 from pansplat_viewer.scene.background import BackgroundWorker, CancelledError, Report
+from pansplat_viewer.scene.loader import SceneEntry, list_panoramas
+
+if TYPE_CHECKING:
+    from pansplat_viewer.window.input import Input
 
 TURN_STEP = math.radians(5)
 _ADJUST_STEP, _LEAST_STEP = 0.16, 0.01  # metres: first and last step of an adjustment
@@ -118,6 +123,24 @@ class Placing:
         self._step = 0.0  # metres, of the adjustment in progress
         self.is_changed = False
         self.error: str | None = None
+
+    @staticmethod
+    def open(before: Placing | None, entry: SceneEntry, entries: Sequence[SceneEntry]) -> Placing | None:
+        """The photographs of the folder of an entry, those of `before` if they are the same; None without any.
+
+        Args:
+            before: what was opened before; closed if it is not returned.
+            entry: the scene that is shown.
+            entries: all that were found at its path.
+        """
+        source = entry.tour or entry.pair
+        panoramas = [] if source is None or entry.merged is not None else list_panoramas(entries, source.folder)
+        if before is not None:
+            if source is not None and before.is_of(source.folder, panoramas):
+                before.reopen(panoramas)
+                return before
+            before.close()
+        return Placing(source.folder, panoramas) if source is not None and panoramas else None
 
     def is_of(self, folder: Path, panoramas: Sequence[Panorama]) -> bool:
         """Whether these are its photographs."""
@@ -250,6 +273,14 @@ class Placing:
         self._step = 0.0
         self._start_reading()
         self.update()
+
+    def apply(self, events: Input) -> Input:
+        """The input without the keys of the window in which a photograph is placed; Escape closes it."""
+        if self.node is None:
+            return events
+        if "escape" in events.pressed:
+            self.stop()
+        return replace(events, pressed=events.pressed - {",", ".", "escape"})
 
     def stop(self) -> None:
         """Place no photograph."""

@@ -17,7 +17,7 @@ Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Projection = Literal["perspective", "equirect", "cubemap"]
 Stereo = Literal["mono", "side-by-side", "top-bottom", "anaglyph"]
-Display = Literal["color", "depth", "opacity", "normals", "levels", "views", "count", "ellipsoids"]
+Display = Literal["color", "depth", "opacity", "normals", "levels", "views"]
 Comparison = Literal["off", "photograph", "error", "pinned"]
 
 GaussianChoice = tuple[frozenset[int] | None, float, tuple[float, ...] | None]
@@ -30,7 +30,7 @@ _CHOICES = {
     "display": Display,
     "stereo": Stereo,
 }
-SCALAR_MAPS: dict[Display, str] = {"depth": "turbo", "opacity": "viridis", "count": "inferno"}
+SCALAR_MAPS: dict[Display, str] = {"depth": "turbo", "opacity": "viridis"}
 """Displays of one number a pixel, and their colour maps."""
 
 
@@ -48,10 +48,8 @@ class DrawSettings:
             Views of factor 0 are not drawn, unless all are 0, which is the same as all 1.
         display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `normals`, the shortest
             axes of the Gaussians, towards their camera, with 0.5 + 0.5 (x, y, z) of the world as RGB; `levels` and
-            `views`, a colour for each label; `count`, the Gaussians that reach the alpha cut at the pixel;
-            `ellipsoids`, the nearest Gaussian within one standard deviation, opaque and shaded. The last two draw all
-            views together in mode `deferred`.
-        display_max: of `depth`, `opacity` and `count`, the number with the last colour of the map; the first is 0.
+            `views`, a colour for each label.
+        display_max: of `depth` and `opacity`, the number with the last colour of the map; the first is 0.
         eye_offset: of layout `equirect`: radius of the viewing circle of omni-directional stereo, metres; negative for
             the left eye. `CpuRenderer` only.
         stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, the left above the right,
@@ -109,8 +107,6 @@ class DrawSettings:
                 "omni-directional stereo needs layout equirect, preset exact and no face_size, got "
                 f"{self.layout}, {self.preset} and {self.face_size}"
             )
-        if self.eye_offset and self.footprint != "gaussian":
-            raise InputError(f"display {self.display} has no omni-directional stereo; use another display")
         if not 0 < self.scale <= 1:
             raise InputError(f"`scale` must be in (0, 1], got {self.scale}")
         if not abs(self.eye_offset) < math.inf:
@@ -129,19 +125,9 @@ class DrawSettings:
         return self.preset == "exact"
 
     @property
-    def footprint(self) -> Literal["gaussian", "count", "ellipsoids"]:
-        """What a Gaussian adds to the pixels that it covers."""
-        return self.display if self.display in ("count", "ellipsoids") else "gaussian"
-
-    @property
     def splat_colors(self) -> Literal["color", "normals", "levels", "views"]:
         """The colours of the Gaussians."""
         return self.display if self.display in ("normals", "levels", "views") else "color"
-
-    @property
-    def drawn_mode(self) -> Mode:
-        """The mode of the layers: counts and ellipsoids are not blended."""
-        return "joint" if self.footprint != "gaussian" and self.mode == "deferred" else self.mode
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Pr
 
 FLIGHT_SECONDS = 6.0
 GLIDE_SECONDS = 1.6
-COUNT_MAX = 300.0  # Gaussians per pixel with the last colour, by default
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
@@ -107,7 +106,8 @@ class ViewerState:
     levels: tuple[int, ...] = ()  # pyramid levels of the scene, ascending
     brush_degrees: float = 4.0  # radius of the brush that paints what to hide
     points: list[PickedPoint] = field(default_factory=list)  # the last picked points, two at most
-    message: str = ""  # a text to show until `message_until` (seconds of the viewer's clock)
+    now: float = 0.0  # time of the frame, seconds of the viewer's clock
+    message: str = ""  # a text to show until `message_until`
     message_until: float = 0.0
     quit: bool = False  # whether to close the viewer
 
@@ -117,9 +117,9 @@ class ViewerState:
         settings = replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
         return replace(settings, mode="joint", outside=True) if self.doll_house else settings
 
-    def show_message(self, message: str, now: float) -> None:
+    def show_message(self, message: str) -> None:
         """Show a message for four seconds."""
-        self.message, self.message_until = message, now + 4
+        self.message, self.message_until = message, self.now + 4
 
 
 def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
@@ -179,7 +179,7 @@ def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True
 
 def choose_display(state: ViewerState, display: Display) -> None:
     """Show a property, in the range of the scene."""
-    largest = {"depth": state.depth_max, "count": COUNT_MAX}.get(display, 1.0)
+    largest = state.depth_max if display == "depth" else 1.0
     state.settings = replace(state.settings, display=display, display_max=largest)
 
 

@@ -128,7 +128,7 @@ class TourScenes:
                 gaussians=Gaussians.cat(parts),
                 cam2world=tour.cam2world,
                 names=tuple(panorama.label for panorama in tour.panoramas),
-                overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
+                overlaps=tour.list_overlaps(),
                 gains=(),
                 links=(),
                 starts=(),
@@ -140,6 +140,8 @@ class TourScenes:
         """The same scenes in memory, for a film in another thread."""
         memory = self._budget / 2**30
         scenes = TourScenes(self.tour, memory=memory, merged=self._merged, max_views=self._max_views)
+        scenes._views, scenes._providers = self._views, self._providers
+        scenes._sources, scenes._predictions = self._sources, self._predictions
         scenes._loaded = self._loaded.copy()
         return scenes
 
@@ -184,6 +186,7 @@ class TourScenes:
         """
         views = loaded.entry.views
         self.outlines |= loaded.outlines
+        self._block(loaded.walls)
         if views not in self._predictions:
             self._selected[views] = loaded
             return
@@ -194,6 +197,18 @@ class TourScenes:
         for scene in [scene for scene in self._selected if views in self._sources[scene] and self._has_sources(scene)]:
             del self._selected[scene]
         self._drop(views)
+
+    def _block(self, walls: Sequence[Edge]) -> None:
+        """Put walls in place of edges. A panorama without another edge keeps the scene of its first one."""
+        blocked = [edge for edge in walls if edge in self.tour.overlaps]
+        if not blocked:
+            return
+        self.tour = self.tour.with_walls(blocked)
+        of_node = {node: views for edge, views in self._views.items() for node in edge}
+        self._views = {edge: self._views.get(edge, of_node[edge[0]]) for edge in self.tour.overlaps}
+        if self.edge in blocked:
+            self.edge = self.tour.find_edge(self.edge[0])
+        self._following = None
 
     def _drop(self, newest: Views) -> None:
         """Drop what was not used for the longest time, until the memory is not exceeded."""

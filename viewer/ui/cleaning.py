@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from imgui_bundle import imgui
 
 from pansplat_viewer.scene.camera import Camera
-from pansplat_viewer.scene.cleaning import MaskPainter
+from pansplat_viewer.scene.cleaning import CLEANING_JOB, MaskPainter
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.state import ViewerState
-from pansplat_viewer.window.input import Commands
+from pansplat_viewer.ui.widgets import Widgets
+
+if TYPE_CHECKING:
+    from pansplat_viewer.viewer import Viewer
 
 _OUTLINE, _BRUSH = (1.0, 0.25, 0.2, 1.0), (1.0, 1.0, 1.0, 0.8)
 _LONGEST = 0.1  # of a line of an outline that is drawn, radians; longer ones are divided
-
-Slider = Callable[[str, float, float, float, str], float]
-Check = Callable[[str, bool], bool]
-Button = Callable[[str], bool]
 
 
 class CleaningSection:
@@ -31,66 +30,50 @@ class CleaningSection:
         file: text of the field of the cleaned scene.
     """
 
-    def __init__(self, slider: Slider, check: Check, button: Button, record: Callable[[str], None]) -> None:
-        """Widgets that record their rectangles."""
-        self._slider, self._check, self._button, self._record = slider, check, button, record
-        self.file = "clean.ply"
+    def __init__(self, widgets: Widgets) -> None:
+        self._widgets, self.file = widgets, "clean.ply"
 
-    def draw(
-        self,
-        state: ViewerState,
-        commands: Commands,
-        bounds: tuple[float, ...] | None,
-        painter: MaskPainter | None,
-        progress: tuple[str, float] | None,
-        *,
-        refining: bool,
-        can_paint: bool,
-    ) -> None:
-        """Draw the widgets.
-
-        Args:
-            state: of the viewer.
-            commands: of this frame.
-            bounds: of the scene; None for scenes that cannot be cropped here.
-            painter: the mask that is painted; None if none is.
-            progress: of the work on the scene.
-            refining: whether another scene will follow.
-            can_paint: whether there are photographs.
-        """
+    def draw(self, viewer: Viewer) -> None:
+        """Draw the widgets."""
+        state, painting, widgets = viewer.state, viewer.painting, self._widgets
+        bounds, progress = viewer.bounds, viewer.jobs.progress(CLEANING_JOB)
         if bounds is None:
             imgui.text_disabled("crop a tour with pansplat export --crop")
         else:
             self._draw_box(state, bounds)
-            imgui.begin_disabled(progress is not None or refining)
-            commands.remove_floaters = self._button("Remove floaters")
-            _, self.file = imgui.input_text("##clean file", self.file)
-            self._record("clean file")
+            is_refining = viewer.refinement is not None and viewer.refinement < 1  # another scene will follow
+            imgui.begin_disabled(progress is not None or is_refining)
+            if widgets.button("Remove floaters"):
+                viewer.queue(viewer.remove_floaters)
+            self.file = widgets.text_field("clean file", self.file)
             imgui.same_line()
-            if self._button("Save##clean") and self.file.strip():
-                commands.save_scene = self.file.strip()
+            if widgets.button("Save##clean") and self.file.strip():
+                viewer.queue(viewer.save_scene, self.file.strip())
             imgui.end_disabled()
             if progress is not None:
                 imgui.progress_bar(progress[1], (-1, 0), progress[0])
-        imgui.begin_disabled(not can_paint)
-        is_painted = self._check("paint what to hide", painter is not None)
-        commands.paint = None if is_painted == (painter is not None) else is_painted
+        painter, was_painted = painting.painter, painting.painter is not None
+        imgui.begin_disabled(not len(viewer.stage.comparer.photographs))
+        if widgets.check("paint what to hide", was_painted) != was_painted:
+            viewer.queue(*((painting.leave, painting.stop) if was_painted else (viewer.start_painting,)))
         imgui.end_disabled()
         if painter is None:
             return
-        state.brush_degrees = self._slider("brush", state.brush_degrees, 0.5, 20.0, "%.1f deg")
+        state.brush_degrees = widgets.slider("brush", state.brush_degrees, 0.5, 20.0, "%.1f deg")
         imgui.text_disabled("drag: hide    Shift: show    right drag: look")
-        commands.clear_mask = self._button("Clear")
+        if widgets.button("Clear"):
+            viewer.queue(painter.clear)
         imgui.same_line()
         imgui.begin_disabled(not painter.is_changed)
-        commands.save_mask = self._button("Save mask")
+        if widgets.button("Save mask"):
+            viewer.queue(painting.save)
         imgui.end_disabled()
         imgui.same_line()
         imgui.text_unformatted(painter.panorama.label)
 
     def _draw_box(self, state: ViewerState, bounds: tuple[float, ...]) -> None:
         box = state.settings.box
-        is_cropped = self._check("crop to a box", box is not None)
+        is_cropped = self._widgets.check("crop to a box", box is not None)
         if not is_cropped or box is None:
             state.settings = replace(state.settings, box=bounds if is_cropped else None)
             return
@@ -98,7 +81,7 @@ class CleaningSection:
         for axis, name in enumerate("xyz"):
             low, high = bounds[axis], max(bounds[axis + 3], bounds[axis] + 1e-6)
             for end, label in ((0, "from"), (3, "to")):
-                values[axis + end] = self._slider(f"{name} {label}", values[axis + end], low, high, "%.2f m")
+                values[axis + end] = self._widgets.slider(f"{name} {label}", values[axis + end], low, high, "%.2f m")
         state.settings = replace(state.settings, box=tuple(values))
 
 

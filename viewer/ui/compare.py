@@ -10,7 +10,7 @@ import numpy as np
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.draw.stereo import StereoRenderer
+from pansplat_viewer.draw.stereo import WindowRenderer
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.slots import SceneSlot
 from pansplat_viewer.scene.state import ViewerState, fit_settings
@@ -33,15 +33,21 @@ class Comparer:
     Attributes:
         photographs: of the scene.
         pinned: the pinned image; None if there is none.
-        error: message of a photograph that cannot be read.
     """
 
-    def __init__(self, ctx: moderngl.Context, create_renderer: Callable[[], StereoRenderer]) -> None:
-        """`create_renderer` makes the renderer of the pinned image, at the first one."""
+    def __init__(
+        self, ctx: moderngl.Context, create_renderer: Callable[[], WindowRenderer], show_error: Callable[[str], None]
+    ) -> None:
+        """Start without photographs.
+
+        Args:
+            ctx: the context.
+            create_renderer: makes the renderer of the pinned image, at the first one.
+            show_error: shows that a photograph cannot be read.
+        """
         self.photographs = Photographs(ctx)
         self.pinned: PinnedImage | None = None
-        self.error: str | None = None
-        self._create_renderer = create_renderer
+        self._create_renderer, self._show_error = create_renderer, show_error
 
     def choose_photograph(self, state: ViewerState) -> int | None:
         """The photograph that the user has chosen, else the nearest one; None if there is none."""
@@ -59,7 +65,7 @@ class Comparer:
         try:
             texture = self.photographs.get(index)
         except InputError as problem:
-            self.error = str(problem)
+            self._show_error(str(problem))
             return None
         if texture is None:
             return None

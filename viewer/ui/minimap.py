@@ -36,7 +36,7 @@ _COLORS = (
 def describe_panorama(tour: TourGraph, node: int) -> str:
     """The label of a panorama, and how sure its place is."""
     label, placement = tour.panoramas[node].label, tour.panoramas[node].placement
-    if (node, node) in tour.overlaps:
+    if not tour.is_placed(node):
         return f"{label} (not placed)"
     notes = {"probable": " (probably placed)", "by hand": " (placed by hand)"}
     return label + notes.get(placement.state, "")
@@ -44,7 +44,7 @@ def describe_panorama(tour: TourGraph, node: int) -> str:
 
 def describe_panoramas(tour: TourGraph) -> str:
     """The number of panoramas with a known, a probable and no known place."""
-    alone = sum(a == b for a, b in tour.overlaps)
+    alone = sum(not tour.is_placed(node) for node in range(len(tour)))
     probable = sum(is_probable(tour, node) for node in range(len(tour)))
     if not alone and not probable:
         return f"{len(tour)} panoramas"
@@ -54,7 +54,7 @@ def describe_panoramas(tour: TourGraph) -> str:
 
 def is_probable(tour: TourGraph, node: int) -> bool:
     """Whether a panorama is only probably placed."""
-    return tour.panoramas[node].placement.state == "probable" and (node, node) not in tour.overlaps
+    return tour.panoramas[node].placement.state == "probable" and tour.is_placed(node)
 
 
 class Minimap:
@@ -136,7 +136,7 @@ class Minimap:
         loaded, half = {node for views in scenes.loaded for node in views}, 3.5 * scale
         for node, (x, y) in enumerate(self.nodes):
             color = colors[5 if node in others else node in loaded]
-            if (node, node) in tour.overlaps:
+            if not tour.is_placed(node):
                 canvas.add_rect_filled((x - half, y - half), (x + half, y + half), color)
             elif is_probable(tour, node):
                 canvas.add_circle((x, y), 4.0 * scale, color, 0, 1.8 * scale)

@@ -31,7 +31,7 @@ _LABEL = (
 )
 _LEGEND_WIDTH = 180.0
 FADE_COLOR = (1.0, 0.75, 0.3)  # of panoramas of other parts of a tour
-UNITS = {"depth": " m", "count": ""}  # of displays whose range can be changed
+UNITS = {"depth": " m"}  # of displays whose range can be changed
 
 
 def draw_stats(

@@ -6,7 +6,7 @@ All that they change is in `pansplat_viewer.scene.placing`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import moderngl
 import numpy as np
@@ -16,6 +16,10 @@ from jaxtyping import Float
 from pansplat.data.placements import State
 from pansplat.poses.placing import Piece
 from pansplat_viewer.scene.placing import Nodes, Place, Placing, PlanView
+from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
+
+if TYPE_CHECKING:
+    from pansplat_viewer.viewer import Viewer
 
 STATE_COLORS: dict[State, tuple[float, float, float, float]] = {
     "placed": (0.45, 0.8, 0.5, 1.0),
@@ -43,9 +47,6 @@ _SIZE = 520.0  # of the window, pixels at a DPI scale of 1
 
 _FLAGS = imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_scroll_with_mouse.value
 
-Button = Callable[[str], bool]
-Record = Callable[[str], None]
-
 
 def count_states(placing: Placing) -> str:
     """The numbers of photographs by state."""
@@ -54,8 +55,8 @@ def count_states(placing: Placing) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items() if count)
 
 
-def draw_photographs(placing: Placing, button: Button) -> bool:
-    """Draw the list; returns whether the scenes are to be loaded again."""
+def draw_photographs(viewer: Viewer, placing: Placing, widgets: Widgets) -> None:
+    """Draw the list."""
     imgui.text_unformatted(count_states(placing))
     gap, column = imgui.get_style().item_spacing.x, _BUTTONS * imgui.get_style().font_scale_dpi
     for node, panorama in enumerate(placing.panoramas):
@@ -72,24 +73,20 @@ def draw_photographs(placing: Placing, button: Button) -> bool:
         ):
             if shown:
                 imgui.same_line(max(imgui.get_item_rect_max().x - imgui.get_window_pos().x + gap, column))
-                if button(f"{label}##{node}"):
+                if widgets.button(f"{label}##{node}"):
                     act(node)
         if placement.reason:
-            imgui.push_text_wrap_pos(0.0)
-            imgui.text_disabled(placement.reason)
-            imgui.pop_text_wrap_pos()
+            draw_wrapped(placement.reason, is_disabled=True)
         imgui.pop_id()
     if placing.problem is not None:
-        imgui.push_text_wrap_pos(0.0)
-        imgui.text_disabled(placing.problem)
-        imgui.pop_text_wrap_pos()
-    if placing.can_undo and button("Undo##poses"):
+        draw_wrapped(placing.problem, is_disabled=True)
+    if placing.can_undo and widgets.button("Undo##poses"):
         placing.undo()
-    if not placing.is_changed:
-        return False
-    if placing.can_undo:
-        imgui.same_line()
-    return button("Load the changed poses")
+    if placing.is_changed:
+        if placing.can_undo:
+            imgui.same_line()
+        if widgets.button("Load the changed poses"):
+            viewer.queue(viewer.reload)
 
 
 class PlacingWindow:
@@ -99,9 +96,9 @@ class PlacingWindow:
         corner, view: of the plan in the last frame, pixels; for tests that drag.
     """
 
-    def __init__(self, ctx: moderngl.Context) -> None:
+    def __init__(self, ctx: moderngl.Context, widgets: Widgets) -> None:
         """No texture is made before the first frame."""
-        self._ctx = ctx
+        self._ctx, self._widgets = ctx, widgets
         self._texture: moderngl.Texture | None = None
         self._shown: Piece | None = None  # in the texture
         self.corner = (0.0, 0.0)
@@ -109,7 +106,7 @@ class PlacingWindow:
         self._key: tuple[object, ...] = ()
         self._held: str | None = None  # what the pointer drags
 
-    def draw(self, placing: Placing, button: Button, record: Record) -> bool:
+    def draw(self, placing: Placing) -> bool:
         """Draw the window; returns whether the scenes are to be loaded again."""
         assert placing.node is not None
         scale, display = imgui.get_style().font_scale_dpi, imgui.get_io().display_size
@@ -120,16 +117,16 @@ class PlacingWindow:
         shown, is_open = imgui.begin("Place by hand", True, _FLAGS)
         reload = False
         if shown:
-            self._draw_choices(placing, button)
+            self._draw_choices(placing)
             self._draw_photograph(placing)
-            self._draw_plan(placing, scale, record)
-            reload = self._draw_state(placing, button)
+            self._draw_plan(placing, scale)
+            reload = self._draw_state(placing)
         imgui.end()
         if not is_open:
             placing.stop()
         return reload
 
-    def _draw_choices(self, placing: Placing, button: Button) -> None:
+    def _draw_choices(self, placing: Placing) -> None:
         node = placing.node
         assert node is not None
         names = [panorama.label for panorama in placing.panoramas]
@@ -150,7 +147,7 @@ class PlacingWindow:
         if len(group) > 1 and any(not set(option) & set(group) for option in options):
             imgui.same_line()
             label = "only it##group" if placing.with_group else "with its group##group"
-            if button(label):
+            if self._widgets.button(label):
                 placing.start(node, with_group=not placing.with_group)
 
     def release(self) -> None:
@@ -179,14 +176,14 @@ class PlacingWindow:
         middle = at.x + width / 2
         imgui.get_window_draw_list().add_line((middle, at.y), (middle, at.y + height), _color((*_PIECE[:3], 0.7)), 1.0)
 
-    def _draw_plan(self, placing: Placing, scale: float, record: Record) -> None:
+    def _draw_plan(self, placing: Placing, scale: float) -> None:
         """Draw the plan, and apply the pointer, the wheel and the keys to the piece."""
         available = imgui.get_content_region_avail()
         size = (max(available.x, 50.0), max(available.y - 92 * scale, 50.0))
         at = imgui.get_cursor_screen_pos()
         self.corner = (at.x, at.y)
         imgui.invisible_button("plan", size)
-        record("plan")
+        self._widgets.record("plan")
         self._handle(placing, scale)
         self._choose_view(placing, size)
         canvas = imgui.get_window_draw_list()
@@ -309,7 +306,7 @@ class PlacingWindow:
         if steps:
             placing.turn(steps, fine=fine, free=free)
 
-    def _draw_state(self, placing: Placing, button: Button) -> bool:
+    def _draw_state(self, placing: Placing) -> bool:
         """Draw the fit and the buttons; returns whether the scenes are to be loaded again."""
         if placing.missing:
             progress = "" if not placing.is_reading else f"estimating depth: {placing.missing} photographs to go"
@@ -322,6 +319,7 @@ class PlacingWindow:
             text = f"likeness {fit.likeness:.2f}   conflict {100 * fit.conflict:.1f} %"
             imgui.text_colored((*color, 1.0), text)
             imgui.progress_bar(share, (-1, 5 * imgui.get_style().font_scale_dpi), "")
+        button = self._widgets.button
         imgui.text_disabled(HINT)
         imgui.begin_disabled(placing.fit is None)
         if button("Adjust##pose"):

@@ -1,54 +1,27 @@
-"""Keys and mouse: the input of one frame, and its effect on the viewer's state.
+"""Keys and mouse: the input of one frame, and its effect on the viewer.
 
-`read_input` reads imgui, so a window and synthetic events in tests use the same path. `apply_input` is pure.
+`read_input` reads imgui, so a window and synthetic events in tests use the same path. `apply_input` needs no window.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, step_flight, toggle_play
-from pansplat_viewer.window.preferences import Theme
 
-MaskAnswer = Literal["save", "drop", "keep"]
+if TYPE_CHECKING:
+    from pansplat_viewer.viewer import Viewer
 
 FLY_SPEED = 1.0  # metres per second
 FAST, SLOW = 4.0, 0.2
 TURN_SPEED = 2.0  # of a gamepad's stick, radians per second
 _CLICK_PIXELS = 3.0  # a longer way of the pointer with the button down is a drag
 ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
-
-# Rows of the key help in the window; docs/viewer.md has the same keys.
-HELP = (
-    ("W A S D", "fly forward, left, back, right"),
-    ("Q E", "fly down, up"),
-    ("Shift, Alt", "faster, slower"),
-    ("drag", "look around (orbit: turn)"),
-    ("click", "depth and Gaussian of a point; twice: their distance"),
-    ("right drag", "pan"),
-    ("scroll", "field of view (orbit: distance)"),
-    ("V", "orbit or fly"),
-    ("F", "focus the point in the centre"),
-    ("1 2 ... 9", "jump to a panorama (tour: fly there)"),
-    ("PgDn, PgUp", "the next or previous panorama"),
-    ("Space", "play the flight between them"),
-    ("M", "floor plan and hotspots of a tour"),
-    ("O", "doll's house: all rooms from outside"),
-    (", .", "step along the flight (placing: turn)"),
-    ("C", "compare with the nearest photograph"),
-    ("X", "pin the image, to compare others with it"),
-    ("B", "before or after the refinement"),
-    ("K", "key frame of the camera path"),
-    ("P, Shift P", "screenshot PNG, EXR with depth"),
-    ("R", "back to the start"),
-    ("Tab", "panels on or off"),
-    ("H", "this help"),
-    ("Esc, Ctrl Q", "quit"),
-)
 
 
 @dataclass(frozen=True)
@@ -74,60 +47,108 @@ class Input:
     sticks: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@dataclass
-class Commands:
-    """Actions by keys or panels that do not change the state.
+Action = Callable[["Viewer", Input], None]
+
+
+class KeyRow(NamedTuple):
+    """A row of the key help.
 
     Attributes:
-        png, exr, panorama: write a screenshot.
-        save_path, open_path: write or read the key frames, to or from this file.
+        label: the keys as the help names them.
+        help: what they do.
+        actions: by key, what happens when it goes down; None for keys that are held to move.
     """
 
-    png: bool = False
-    exr: bool = False
-    panorama: bool = False
-    pin: bool = False  # pin the image
-    go_to_photograph: bool = False  # move to the camera of the photograph of the comparison
-    focus: bool = False  # orbit the point in the image centre
-    pick: tuple[float, float] | None = None  # show the point at this place, as fractions of width and height
-    choose: int | None = None  # show the entry of this index
-    open: str | None = None  # show the scenes at this path
-    reload: bool = False  # load the entry again
-    reduce: int | None = None  # show the scene that did not fit, with this number of Gaussians
-    theme: Theme | None = None  # choose these colours
-    reset_layout: bool = False  # restore the default layout of the panels
-    visit: int | None = None  # fly to this panorama of the tour
-    remove_floaters: bool = False
-    save_scene: str | None = None  # write the scene without what is hidden to this file
-    paint: bool | None = None  # start or end to paint a mask
-    clear_mask: bool = False
-    save_mask: bool = False
-    answer: MaskAnswer | None = None  # what to do with a mask that is not saved
-    doll_house: bool = False  # go out of the rooms, or back into the last panorama
-    save_path: str | None = None
-    open_path: str | None = None
-    film: bool = False  # write the film of the path
-    cancel_film: bool = False  # end the film that is being written
-    dismiss_error: bool = False  # close the error message
-    cancel_loading: bool = False  # end the search for scenes, or the prediction
-    cancel_refinement: bool = False  # keep the prediction
+    label: str
+    help: str
+    actions: Mapping[str, Action | None] = {}
 
 
-_KEYS = {
-    **{letter: letter for letter in "wasdqevfhprcbmkxo"},
-    **{digit: f"_{digit}" for digit in "123456789"},
-    "space": "space",
-    ",": "comma",
-    ".": "period",
-    "tab": "tab",
-    "escape": "escape",
-    "page down": "page_down",
-    "page up": "page_up",
-    "up": "up_arrow",
-    "down": "down_arrow",
-    "left": "left_arrow",
-    "right": "right_arrow",
-}
+def _change(function: Callable[..., None], *arguments: object) -> Action:
+    """Call a function of the state."""
+    return lambda viewer, _: function(viewer.state, *arguments)
+
+
+def _toggle(name: str) -> Action:
+    """Change a value of the state between True and False."""
+    return lambda viewer, _: setattr(viewer.state, name, not getattr(viewer.state, name))
+
+
+def _queue(name: str) -> Action:
+    """Call a method of the viewer at the end of the frame."""
+    return lambda viewer, _: viewer.queue(getattr(viewer, name))
+
+
+def _write_screenshot(viewer: Viewer, events: Input) -> None:
+    viewer.queue(viewer.write_screenshot, "exr" if "shift" in events.held else "png")
+
+
+def _compare(state: ViewerState) -> None:
+    state.comparison = "off" if state.comparison == "photograph" else "photograph"
+
+
+def _toggle_plan(state: ViewerState) -> None:
+    state.minimap = state.hotspots = not state.minimap
+
+
+def _restart(state: ViewerState) -> None:
+    state.points = []
+    go_home(state)
+
+
+def _jump_by(state: ViewerState, steps: int) -> None:
+    """Go from the nearest panorama to another one, in the order of the list."""
+    if len(state.context):
+        distances = np.linalg.norm(state.context[:, :3, 3] - state.camera.position, axis=1)
+        jump_to_view(state, (int(distances.argmin()) + steps) % len(state.context))
+
+
+def _escape(viewer: Viewer, _: Input) -> None:
+    if viewer.state.help:
+        viewer.state.help = False
+    else:
+        viewer.queue(viewer.request_quit)
+
+
+KEYS = (
+    KeyRow("W A S D", "fly forward, left, back, right", dict.fromkeys((*"wasd", "up", "left", "down", "right"))),
+    KeyRow("Q E", "fly down, up", dict.fromkeys("qe")),
+    KeyRow("Shift, Alt", "faster, slower"),
+    KeyRow("drag", "look around (orbit: turn)"),
+    KeyRow("click", "depth and Gaussian of a point; twice: their distance"),
+    KeyRow("right drag", "pan"),
+    KeyRow("scroll", "field of view (orbit: distance)"),
+    KeyRow("V", "orbit or fly", {"v": _toggle("orbiting")}),
+    KeyRow("F", "focus the point in the centre", {"f": _queue("focus_center")}),
+    KeyRow(
+        "1 2 ... 9", "jump to a panorama (tour: fly there)", {str(n + 1): _change(jump_to_view, n) for n in range(9)}
+    ),
+    KeyRow(
+        "PgDn, PgUp",
+        "the next or previous panorama",
+        {"page down": _change(_jump_by, 1), "page up": _change(_jump_by, -1)},
+    ),
+    KeyRow("Space", "play the flight between them", {"space": _change(toggle_play)}),
+    KeyRow("M", "floor plan and hotspots of a tour", {"m": _change(_toggle_plan)}),
+    KeyRow("O", "doll's house: all rooms from outside", {"o": _queue("toggle_doll_house")}),
+    KeyRow(
+        ", .", "step along the flight (placing: turn)", {",": _change(step_flight, -1), ".": _change(step_flight, 1)}
+    ),
+    KeyRow("C", "compare with the nearest photograph", {"c": _change(_compare)}),
+    KeyRow("X", "pin the image, to compare others with it", {"x": _queue("pin")}),
+    KeyRow("B", "before or after the refinement", {"b": _toggle("refined")}),
+    KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
+    KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),
+    KeyRow("R", "back to the start", {"r": _change(_restart)}),
+    KeyRow("Tab", "panels on or off", {"tab": _toggle("overlay")}),
+    KeyRow("H", "this help", {"h": _toggle("help")}),
+    KeyRow("Esc, Ctrl Q", "quit", {"escape": _escape}),
+)
+"""The help in the window and the actions; docs/viewer.md has the same keys."""
+
+_ACTIONS = {key: action for row in KEYS for key, action in row.actions.items()}
+_IMGUI_NAMES = {",": "comma", ".": "period"} | {name: f"{name}_arrow" for name in ("up", "down", "left", "right")}
+_IMGUI_NAMES |= {digit: f"_{digit}" for digit in "123456789"}
 
 _BUTTONS = {
     "gamepad_face_down": "space",
@@ -164,10 +185,10 @@ def read_input(seconds: float) -> Input:
     io = imgui.get_io()
     held: set[str] = set()
     pressed: set[str] = set()
-    keys = [] if io.want_text_input else list(_KEYS.items())
+    keys = [] if io.want_text_input else [(name, _IMGUI_NAMES.get(name, name)) for name in _ACTIONS]
     keys += [(name, button) for button, name in _BUTTONS.items()]
     for name, key in keys:
-        value = getattr(imgui.Key, key)
+        value = getattr(imgui.Key, key.replace(" ", "_"))
         if imgui.is_key_down(value):
             held.add(name)
         if imgui.is_key_pressed(value, repeat=name in ",."):
@@ -194,55 +215,20 @@ def read_input(seconds: float) -> Input:
     )
 
 
-def apply_input(state: ViewerState, events: Input) -> Commands:
-    """Apply the input to the state, and return its commands."""
+def apply_input(viewer: Viewer, events: Input) -> None:
+    """Apply the input to the viewer's state, and queue other actions."""
     if "ctrl" in events.held:
-        state.quit = state.quit or "q" in events.pressed
-        return Commands()
-    _apply_pressed(state, events.pressed)
-    if state.glide is None:
-        _move_camera(state, events)
-    shift, screenshot = "shift" in events.held, "p" in events.pressed
-    return Commands(
-        png=screenshot and not shift,
-        exr=screenshot and shift,
-        focus="f" in events.pressed,
-        pin="x" in events.pressed,
-        doll_house="o" in events.pressed,
-        pick=events.click,
-    )
-
-
-def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
-    if "escape" in pressed:
-        if state.help:
-            state.help = False
-        else:
-            state.quit = True
-    for key, name in (("tab", "overlay"), ("h", "help"), ("v", "orbiting"), ("b", "refined")):
-        if key in pressed:
-            setattr(state, name, not getattr(state, name))
-    if "c" in pressed:
-        state.comparison = "off" if state.comparison == "photograph" else "photograph"
-    if "m" in pressed:
-        state.minimap = state.hotspots = not state.minimap
-    if "k" in pressed:
-        add_key_frame(state)
-    if "space" in pressed:
-        toggle_play(state)
-    if "r" in pressed:
-        state.points = []
-        go_home(state)
-    for view in range(9):
-        if str(view + 1) in pressed:
-            jump_to_view(state, view)
-    for key, steps in (("page up", -1), ("page down", 1)):
-        if key in pressed and len(state.context):
-            distances = np.linalg.norm(state.context[:, :3, 3] - state.camera.position, axis=1)
-            jump_to_view(state, (int(distances.argmin()) + steps) % len(state.context))
-    for key, steps in ((",", -1), (".", 1)):
-        if key in pressed:
-            step_flight(state, steps)
+        if "q" in events.pressed:
+            viewer.queue(viewer.request_quit)
+        return
+    for key in events.pressed:
+        action = _ACTIONS.get(key)
+        if action is not None:
+            action(viewer, events)
+    if viewer.state.glide is None:
+        _move_camera(viewer.state, events)
+    if events.click is not None:
+        viewer.queue(viewer.click, events.click)
 
 
 def _move_camera(state: ViewerState, events: Input) -> None:

@@ -76,8 +76,8 @@ class _Loop:
         while self.viewer.busy or time.perf_counter() < end:
             self.draw()
             time.sleep(0.01)
-        if self.viewer.panel_data.error is not None:
-            raise InputError(self.viewer.panel_data.error)
+        if self.viewer.error is not None:
+            raise InputError(self.viewer.error)
 
     def fly(self, key: imgui.Key, frames: int) -> list[float]:
         """Hold a key; returns the times of the later half of the frames."""
@@ -90,7 +90,7 @@ class _Loop:
         """Draw, and wait as the window does, until the full image is shown; returns seconds."""
         start, viewer = time.perf_counter(), self.viewer
         self.draw()
-        while viewer.panel_data.size != self._target.size or viewer.moving:
+        while viewer.stage.image_size != self._target.size or viewer.moving:
             if viewer.pending is not None:
                 concurrent.futures.wait([viewer.pending], _WAIT_SECONDS)
             self.draw()
@@ -138,7 +138,7 @@ def measure_loop(
             moving, sharp, turning = [], [], []
             for index in range(repeats):
                 moving += loop.fly((imgui.Key.w, imgui.Key.s)[index % 2], frames)
-                moving_size = loop.viewer.panel_data.size
+                moving_size = loop.viewer.stage.image_size
                 sharp.append(loop.wait_until_sharp())
                 loop.rest(rest_seconds)
                 turning += loop.turn(frames)

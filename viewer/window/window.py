@@ -268,6 +268,6 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
         if not shown:
             window.show()
             shown, active_until = True, time.perf_counter() + 0.25
-        data = viewer.panel_data
-        if data.current >= 0 and title != (title := f"{data.entries[data.current]} - pansplat"):
+        library = viewer.library
+        if library.current >= 0 and title != (title := f"{library.names[library.current]} - pansplat"):
             window.set_title(title)

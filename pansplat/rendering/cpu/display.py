@@ -18,10 +18,8 @@ import torch
 from jaxtyping import Float, Int, UInt32
 
 from pansplat.geometry.cubemap import face_rotations
-from pansplat.rendering.cpu.backend import find_distances, rasterize_plane, require_exact_kernel
-from pansplat.rendering.cpu.footprints import Footprint, draw_footprints
+from pansplat.rendering.cpu.backend import rasterize_plane, require_exact_kernel
 from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
-from pansplat.rendering.cpu.records import tabulate_pixels
 from pansplat.rendering.cpu.runtime import (
     Workspace,
     announce_compilation,
@@ -33,7 +31,6 @@ from pansplat.rendering.cpu.runtime import (
     thread_count,
 )
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
-from pansplat.rendering.cpu.tiling import EMPTY_BOX, find_bounding_boxes
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions
@@ -194,7 +191,6 @@ class DisplayScene:
         selection: Selection | None = None,
         cache: SelectionCache | None = None,
         min_transmittance: float = MIN_TRANSMITTANCE,
-        footprint: Footprint | None = None,
     ) -> Layers:
         """Rasterise the layers of an image plane.
 
@@ -207,7 +203,6 @@ class DisplayScene:
             selection: leaves out Gaussians that are not in view.
             cache: has the Gaussians of earlier views; written if they do not serve this one.
             min_transmittance: a pixel is finished at this transmittance or below.
-            footprint: drawn in place of blended Gaussians.
         """
         require_exact_kernel(options)
         statistics, threads, workspace = Statistics(), thread_count(), Workspace()
@@ -235,10 +230,7 @@ class DisplayScene:
                 layer = ProjectedGaussians(*(array[part] for array in projected[:4]), 0, 0)
                 arrays = GaussianArrays(*(array[part] for array in gaussians))
                 view = CameraView(arrays, camera, layer, options, threads, min_transmittance)
-                if footprint is None:
-                    rasterize_plane(view, plane, layer_sums, statistics)
-                else:
-                    _draw_plane(footprint, view, plane, layer_sums, statistics)
+                rasterize_plane(view, plane, layer_sums, statistics)
                 start = end
         return Layers(sums, ends[-1] if ends else 0, statistics)
 
@@ -317,20 +309,6 @@ def mark_in_view(
     )  # fmt: skip
     parallel_for(mark, parts, threads)
     return edges, marks, counts
-
-
-def _draw_plane(
-    footprint: Footprint, view: CameraView, plane: ImagePlane, sums: np.ndarray, statistics: Statistics
-) -> None:
-    """Draw footprints that are not blended."""
-    workspace, projected = Workspace(), view.projected
-    with statistics.timed("bound"):
-        boxes = find_bounding_boxes(projected.records, plane, workspace, view.threads)
-        distances = find_distances(view, plane, workspace)
-    with statistics.timed("rasterize"):
-        tables = tabulate_pixels(plane)
-        draw_footprints(footprint, projected.records, projected.values, distances, boxes, tables, sums, view.threads)
-    statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != EMPTY_BOX))
 
 
 @kernel

@@ -104,7 +104,7 @@ def test_without_waiting_the_last_image_is_shown_until_the_new_one_is_finished(r
         return changed
 
     wait_until(render, "image of the new pose")
-    renderer.prefetch_faces(turned, SIZE, [SETTINGS], everywhere=True)
+    renderer.draw_faces(turned, SIZE, SETTINGS)
     wait_until(
         lambda: all(renderer.has_faces(each, SIZE, SETTINGS) for each in (pose, turned)), "faces in every direction"
     )
@@ -151,9 +151,10 @@ def test_software_opengl_is_replaced_by_the_processor_unless_chosen(ctx):
         create_renderer(None, "gl")
 
 
-def test_the_preset_3dgs_is_refused(renderer, pose):
-    with pytest.raises(InputError, match="draws preset exact, got 3dgs; use renderer gl"):
-        renderer.render(pose, SIZE, replace(SETTINGS, preset="3dgs"))
+def test_the_preset_3dgs_and_two_eyes_are_refused(renderer, pose):
+    for name, value, message in (("preset", "3dgs", "preset exact"), ("stereo", "anaglyph", "one eye of a window")):
+        with pytest.raises(InputError, match=f"draws {message}, got {value}; use renderer gl"):
+            renderer.render(pose, SIZE, replace(SETTINGS, **{name: value}))
 
 
 def test_errors_in_the_worker_are_raised_and_drawing_goes_on(renderer, pose, monkeypatch):

@@ -139,10 +139,9 @@ def test_films_of_stereo_panoramas_state_their_layout(room, tmp_path, monkeypatc
 # --- the window's images ---
 
 
-@pytest.fixture(params=["gl", "cpu"])
-def stereo_renderer(request, ctx, random_scene):
-    renderer = CpuRenderer(ctx, exact=True) if request.param == "cpu" else SplatRenderer(ctx, color_bits=32)
-    stereo = StereoRenderer(renderer, ctx)
+@pytest.fixture
+def stereo_renderer(ctx, random_scene):
+    stereo = StereoRenderer(SplatRenderer(ctx, color_bits=32), ctx)
     stereo.upload(random_scene())
     yield stereo
     stereo.release()
@@ -159,15 +158,12 @@ def test_the_window_shows_the_images_of_both_eyes(stereo_renderer, pose):
     for stereo in ("mono", "side-by-side", "top-bottom", "anaglyph"):
         settings = DrawSettings(stereo=stereo, eye_distance=0.2)
         texture = stereo_renderer.render(pose, (48, 32), settings)
-        shown, color, depth = read_texture(texture), stereo_renderer.read_color(), stereo_renderer.read_depth()
+        shown, left = read_texture(texture), stereo_renderer.read_color()
         image_format = ImageFormat("perspective", stereo, 0.2)
-        expected, expected_depth = render_image(
-            stereo_renderer, pose, get_eye_size((48, 32), stereo), settings, image_format, with_depth=True
-        )
+        size = get_eye_size((48, 32), stereo)
+        expected, _ = render_image(stereo_renderer, pose, size, settings, image_format)
         assert shown.shape == (32, 48, 4) and np.abs(shown[..., :3].clip(0, 1) - expected).max() < 0.003
-        assert np.abs(color[..., :3].clip(0, 1) - expected).max() < 1e-6
-        assert np.array_equal(depth, expected_depth) and color.shape == (32, 48, 4)
-        assert stereo_renderer.read_eye_depth().shape == get_eye_size((48, 32), stereo)[::-1]
+        assert stereo_renderer.read_depth().shape == left.shape[:2] == size[::-1]
 
 
 @pytest.mark.gl
@@ -184,27 +180,6 @@ def test_turning_reads_cached_faces_of_both_eyes_until_they_are_out_of_place(ste
     moved = stereo_renderer.read_color()
     stereo_renderer.render(turn(pose, 30), (48, 32), replace(settings, cached=False))
     assert np.abs(stereo_renderer.read_color() - moved).mean() < 0.02
-
-
-@pytest.mark.gl
-@pytest.mark.parametrize("stereo_renderer", ["cpu"], indirect=True)
-@pytest.mark.parametrize("direction", [-1, 1])
-def test_the_faces_at_the_next_places_of_the_eyes_are_drawn_during_a_turn(
-    stereo_renderer, pose, turn, direction, wait_until
-):
-    settings, size = DrawSettings(stereo="anaglyph", eye_distance=0.2, cached=True, vertical_fov_degrees=40), (48, 32)
-    for degrees in (0, 4, 8, 16):
-        turned = turn(pose, direction * degrees)
-        stereo_renderer.render(turned, size, settings)
-        stereo_renderer.prefetch(turned, size, settings, 0.5)
-    turned = turn(pose, direction * 21)
-    for each in (replace(settings, scale=0.5), settings):
-        wait_until(lambda each=each: stereo_renderer.has_faces(turned, size, each), "faces")
-    stereo_renderer.render(turned, size, settings)
-    assert stereo_renderer.stats.cached and stereo_renderer.stats.drawn == 0
-    found = stereo_renderer.read_color()
-    expected = render_image(stereo_renderer, turned, size, settings, ImageFormat("perspective", "anaglyph", 0.2))[0]
-    assert np.abs(found[..., :3] - expected).mean() < 0.02
 
 
 @pytest.mark.gl

@@ -88,6 +88,19 @@ def test_scenes_of_edges_are_selected_from_one_prediction_of_their_part(house, l
     assert scenes.copy().loaded == scenes.loaded
 
 
+def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(house, load_house):
+    first = load_house(
+        SceneEntry(house.name, tour=house, pair=house.make_pair((0, 1)), views=(0, 1), start=1, max_views=64)
+    )
+    scenes = TourScenes.start(first)
+    (part,) = scenes.list_next(None, 0.0)
+    scenes.add(replace(load_house(scenes.make_entry(part)), walls=[(0, 1), (2, 3)]))
+    assert scenes.tour.walls == ((0, 1), (2, 3)) and scenes.tour.parts == (0, 1, 1, 2)
+    assert scenes.edge == (0, 0) and scenes.get(scenes.views) is not None, "the camera stays where it is"
+    assert scenes.list_next(None, 0.0) == [part] and scenes.copy().list_next(None, 0.0) == [part]
+    assert scenes.plan_way(house.cam2world[0].numpy(), 2).fades == (0,)
+
+
 def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_house, monkeypatch):
     monkeypatch.setattr("pansplat.tours.graph._MAX_PREDICTED", 2)
     scenes = TourScenes(house, max_views=64)

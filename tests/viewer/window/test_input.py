@@ -1,13 +1,16 @@
 """Every key has the effect that the help states."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
 from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene
-from pansplat_viewer.window.input import FAST, FLY_SPEED, SLOW, Commands, Input, apply_input
+from pansplat_viewer.window.input import FAST, FLY_SPEED, KEYS, SLOW, Input, apply_input
+
+METHODS = "write_screenshot", "focus_center", "pin", "toggle_doll_house", "click", "request_quit"
 
 
 @pytest.fixture
@@ -17,8 +20,16 @@ def state(small_scene) -> ViewerState:
     return state
 
 
-def press(state: ViewerState, *keys: str, held: tuple[str, ...] = ()) -> Commands:
-    return apply_input(state, Input(pressed=frozenset(keys), held=frozenset((*keys, *held))))
+def send(state: ViewerState, **events: object) -> list[tuple[object, ...]]:
+    """Apply input; returns the queued calls, with the names of methods of the viewer."""
+    viewer = Mock(state=state)
+    apply_input(viewer, Input(**events))
+    names = {getattr(viewer, name): name for name in METHODS}
+    return [(names[call.args[0]], *call.args[1:]) for call in viewer.queue.call_args_list]
+
+
+def press(state: ViewerState, *keys: str, held: tuple[str, ...] = ()) -> list[tuple[object, ...]]:
+    return send(state, pressed=frozenset(keys), held=frozenset((*keys, *held)))
 
 
 @pytest.mark.parametrize(
@@ -29,7 +40,7 @@ def press(state: ViewerState, *keys: str, held: tuple[str, ...] = ()) -> Command
     ],
 )  # fmt: skip
 def test_fly_keys_move_at_the_flying_speed(state, key, step):
-    apply_input(state, Input(seconds=0.5, held=frozenset((key,))))
+    send(state, seconds=0.5, held=frozenset((key,)))
     assert np.allclose(state.camera.position, 0.5 * FLY_SPEED * np.array(step))
 
 
@@ -37,20 +48,20 @@ def test_shift_is_faster_alt_is_slower_and_opposite_keys_cancel(state):
     moved = []
     for held in (("w",), ("w", "shift"), ("w", "alt")):
         state.camera = state.home
-        apply_input(state, Input(seconds=0.1, held=frozenset(held)))
+        send(state, seconds=0.1, held=frozenset(held))
         moved.append(state.camera.position[2])
     assert moved == pytest.approx([0.1, 0.1 * FAST, 0.1 * SLOW])
     state.camera = state.home
-    apply_input(state, Input(held=frozenset("wsadqe")))
+    send(state, held=frozenset("wsadqe"))
     assert state.camera == state.home
 
 
 def test_scroll_changes_the_field_of_view_when_flying_and_the_distance_when_orbiting(state):
-    apply_input(state, Input(scroll=1.0))
+    send(state, scroll=1.0)
     assert state.camera.vertical_fov_degrees < state.home.vertical_fov_degrees
     press(state, "v")
     before = state.camera
-    apply_input(state, Input(scroll=1.0))
+    send(state, scroll=1.0)
     assert state.camera.distance < before.distance
     assert state.camera.vertical_fov_degrees == before.vertical_fov_degrees
 
@@ -59,19 +70,19 @@ def test_v_switches_to_orbiting_which_keeps_the_centre(state):
     press(state, "v")
     assert state.orbiting
     center = state.camera.orbit_center
-    apply_input(state, Input(drag=(80.0, 10.0)))
+    send(state, drag=(80.0, 10.0))
     assert np.allclose(state.camera.orbit_center, center)
     assert state.camera.position != state.home.position
     for key in "wasdqe":
         before = state.camera
-        apply_input(state, Input(held=frozenset(key)))
+        send(state, held=frozenset(key))
         assert np.allclose(state.camera.orbit_center, center) and state.camera != before
     press(state, "v")
     assert not state.orbiting
 
 
 def test_pan_moves_across_the_view(state):
-    apply_input(state, Input(pan=(30.0, 0.0)))
+    send(state, pan=(30.0, 0.0))
     assert state.camera.position[0] < 0 and state.camera.position[2] == pytest.approx(0)
 
 
@@ -117,9 +128,9 @@ def test_space_pauses_a_playing_flight(state):
 
 def test_moving_the_camera_stops_the_flight_and_zooming_does_not(state):
     press(state, "space")
-    apply_input(state, Input(scroll=1.0))
+    send(state, scroll=1.0)
     assert state.playing
-    apply_input(state, Input(held=frozenset("w")))
+    send(state, held=frozenset("w"))
     assert not state.playing
 
 
@@ -145,33 +156,37 @@ def test_key_toggles_what_is_shown(state, key, name):
 
 
 def test_r_restores_the_start(state):
-    apply_input(state, Input(held=frozenset("wd"), drag=(40.0, 10.0), scroll=2.0))
+    send(state, held=frozenset("wd"), drag=(40.0, 10.0), scroll=2.0)
     assert state.camera != state.home
     press(state, "r")
     assert state.camera == state.home
 
 
-def test_p_and_f_give_commands(state):
-    assert press(state, "p") == Commands(png=True)
-    assert press(state, "p", held=("shift",)) == Commands(exr=True)
-    assert press(state, "f") == Commands(focus=True)
-    assert press(state) == Commands()
+def test_keys_and_clicks_queue_actions_of_the_viewer(state):
+    assert press(state, "p") == [("write_screenshot", "png")]
+    assert press(state, "p", held=("shift",)) == [("write_screenshot", "exr")]
+    assert press(state, "f") == [("focus_center",)]
+    assert press(state, "x") == [("pin",)]
+    assert press(state, "o") == [("toggle_doll_house",)]
+    assert send(state, click=(0.5, 0.25)) == [("click", (0.5, 0.25))]
+    assert press(state) == []
+
+
+def test_each_key_has_one_action():
+    keys = [key for row in KEYS for key in row.actions]
+    assert len(set(keys)) == len(keys)
 
 
 def test_escape_closes_the_help_first_and_then_quits(state):
     state.help = True
-    press(state, "escape")
-    assert not state.help and not state.quit
-    press(state, "escape")
-    assert state.quit
+    assert press(state, "escape") == [] and not state.help
+    assert press(state, "escape") == [("request_quit",)]
 
 
 def test_q_quits_only_with_control(state):
-    press(state, "q")
-    assert not state.quit
+    assert press(state, "q") == []
     before = state.camera
-    press(state, "q", held=("ctrl",))
-    assert state.quit and state.camera == before
+    assert press(state, "q", held=("ctrl",)) == [("request_quit",)] and state.camera == before
 
 
 def test_entering_a_scene_of_one_view_resets_modes_that_need_two(small_scene):

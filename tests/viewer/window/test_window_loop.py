@@ -23,7 +23,7 @@ def make_window(**values: object) -> Mock:
 
 def make_viewer() -> Mock:
     """A viewer that quits in its first frame."""
-    viewer = Mock(moving=True, pending=None, state=Mock(quit=False), panel_data=Mock(current=-1))
+    viewer = Mock(moving=True, pending=None, state=Mock(quit=False), library=Mock(current=-1))
     viewer.frame.side_effect = viewer.request_quit.side_effect = lambda *_: setattr(viewer.state, "quit", True)
     return viewer
 
@@ -114,7 +114,7 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
 
     def make(ctx: object, loader: object, **options: object) -> Mock:
         entries, opened = [SceneEntry("a"), SceneEntry("b")], tmp_path / "opened"
-        viewers.append(Mock(entries=entries, panel_data=Mock(current=1), path=opened, options=options))
+        viewers.append(Mock(library=Mock(entries=entries, current=1, path=opened), options=options))
         return viewers[-1]
 
     def run(window: object, viewer: Mock) -> None:
@@ -129,7 +129,7 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
     assert app._run_window(app.Options(tmp_path), [SceneEntry("a")], 0, (64, 32), None) is None
     first, second = viewers
     assert second.options["state"] is first.options["state"], "camera and settings"
-    second.show.assert_called_once_with(first.entries, 1, tmp_path / "opened")
+    second.show.assert_called_once_with(first.library.entries, 1, tmp_path / "opened")
 
 
 def test_sticks_and_buttons_of_a_gamepad_reach_imgui():

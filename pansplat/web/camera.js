@@ -1,0 +1,161 @@
+// The camera, its projection, where it may go, the edge of the tour at it, and the weights of the views there. Convention:
+// OpenCV axes (x right, y down, z forward), as everywhere in pansplat. Positions are in the scene's world, moved by its
+// origin. Matrices are arrays of rows.
+
+import { doll } from "./doll.js";
+import {
+  clamp, closestOnEdge, distanceOf, dot, followEdge, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
+} from "./graph.js";
+import { changed, sorted } from "./loop.js";
+import { DEGREE } from "./share.js";
+
+export const MAX_PITCH = 89.9 * Math.PI / 180;
+export const MIN_FOV = 20, MAX_FOV = 110;  // degrees, vertical
+const SOFT = 0.3;                   // of the way to the limit of the camera, in which steps become shorter
+
+export const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
+export const camera = makeStart();
+
+// Camera to world; positive yaw turns right, positive pitch up (viewer/scene/camera.py). The device's motion adds a roll.
+export function rotationOf({ yaw, pitch, roll }) {
+  const [cy, sy, cp, sp, cr, sr] = [yaw, pitch, roll].flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
+  const turned = multiply([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], [[1, 0, 0], [0, cp, -sp], [0, sp, cp]]);
+  return multiply(HEADER.level, multiply(turned, [[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]]));
+}
+
+// Half the height of the image at distance 1. The field of view is that of a landscape image; a portrait one is taller.
+export const tallOf = (width, height) => clamp(Math.sqrt(height / width), 1, HEADER.tallest);
+export const tangentOf = (width, height, fov = camera.fov) => tallOf(width, height) * Math.tan(0.5 * fov * DEGREE);
+
+export function turn(yaw, pitch) {
+  camera.yaw += yaw;
+  camera.pitch = clamp(camera.pitch + pitch, -MAX_PITCH, MAX_PITCH);
+  changed();
+}
+
+// Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part, or
+// near the panoramas of a scene without edges; steps away from them become shorter near the limit.
+export function walk(right, up, forward) {
+  if (doll.isOn) return;
+  const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
+  const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
+  const target = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
+  const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : nearestSpot(target);
+  const limit = HEADER.limits[currentPart()], before = distanceOf(camera.position, from), after = distanceOf(target, from);
+  const outward = Math.max(after - before, 0), slower = clamp((1 - before / limit) / SOFT, 0, 1);
+  const allowed = Math.min(after - (1 - slower) * outward, limit);
+  camera.position = after > allowed ? plus(from, scaled(minus(target, from), allowed / after)) : target;
+  changed();
+}
+
+function nearestSpot(position) {
+  return GRAPH.positions[nearestNode(position)];
+}
+
+// The nearest panorama, in a tour of the camera's part.
+export function nearestNode(position) {
+  const distances = GRAPH.positions.map((place, node) => parts[node] === currentPart() ? distanceOf(place, position) : Infinity);
+  return distances.indexOf(Math.min(...distances));
+}
+
+// The panorama at the camera, or that from which it looked at the doll's house.
+export const nodeHere = () => doll.isOn ? doll.node : nearestNode(camera.position);
+
+// A camera for a pose of share.js, some of whose values may be missing; its position is within the limits.
+export function cameraFor({ position, yaw, pitch, fov }) {
+  const found = { ...camera, position: [...camera.position], roll: 0 };
+  const check = (name, values) => {
+    if (!values.every(Number.isFinite)) throw new Error(`The ${name} of a pose needs finite numbers, got ${JSON.stringify(values)}.`);
+  };
+  if (position !== undefined) {
+    check("position", [0, 1, 2].map((k) => position[k]));
+    const edge = edges.length ? nearestEdge(GRAPH, position) : null;
+    const distances = GRAPH.positions.map((each) => distanceOf(each, position));
+    const from = edge === null ? GRAPH.positions[distances.indexOf(Math.min(...distances))] : closestOnEdge(GRAPH, edge, position);
+    const limit = HEADER.limits[edge === null ? 0 : partOfEdge(GRAPH, edge)], away = distanceOf(position, from);
+    found.position = plus(from, scaled(minus(position, from), Math.min(limit / Math.max(away, 1e-9), 1)));
+  }
+  check("angles", [yaw, pitch, fov].filter((value) => value !== undefined));
+  if (yaw !== undefined) found.yaw = yaw * DEGREE;
+  if (pitch !== undefined) found.pitch = clamp(pitch * DEGREE, -MAX_PITCH, MAX_PITCH);
+  if (fov !== undefined) found.fov = clamp(fov, MIN_FOV, MAX_FOV);
+  return found;
+}
+
+export const findSpot = (position) => HEADER.spots[nearestNode(position)];
+
+// Of the floor below a position: along an edge, between those of its panoramas.
+export function floorPoint(position) {
+  if (!edges.length) return findSpot(position).mark;
+  const [from, to] = endsOfEdge(), [start, end] = [from, to].map((node) => GRAPH.positions[node]);
+  const part = distanceOf(closestOnEdge(GRAPH, edge, position), start) / Math.max(distanceOf(start, end), 1e-6);
+  return plus(HEADER.spots[from].mark, scaled(minus(HEADER.spots[to].mark, HEADER.spots[from].mark), part));
+}
+
+const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
+export const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
+
+export const { edges, parts, next, hysteresis, reach } = HEADER;
+export const GRAPH = { positions: HEADER.spots.map((spot) => spot.position), edges, parts, next, hysteresis, reach };
+export let edge = 0, group = edges.length ? edges[0][2] : 0, fade = null;
+
+// Weights of the views of a group at a position: normalised inverse distances (docs/rendering.md, section 7). Other
+// views have weight 0.
+function groupWeights(group, position) {
+  const views = HEADER.groups[group], weights = HEADER.views.map(() => 0);
+  const distances = views.map((view) => distanceOf(position, HEADER.views[view].position));
+  const nearest = Math.min(...distances);
+  const closeness = distances.map((distance) => distance > 0 ? nearest / distance : 1);
+  const sum = closeness.reduce((a, b) => a + b);
+  views.forEach((view, i) => { weights[view] = Math.max(closeness[i] / sum, MIN_WEIGHT); });
+  return weights;
+}
+
+// The views of the edge at the camera, and for a second after a change also those of the edge before. A view fades in
+// when it has arrived.
+export function blendWeights(position) {
+  if (doll.isOn) return null;
+  const weights = groupWeights(group, position), old = fade ? groupWeights(fade.group, position) : weights;
+  const done = fade ? fade.done : 1;
+  return weights.map((weight, view) => shown[view] * (done * weight + (1 - done) * old[view]));
+}
+
+// How far each view has faded in. The first ones are there at once.
+export const shown = HEADER.views.map(() => 0);
+export function showViews(step) {
+  if (!sorted || !sorted.views.some((view) => shown[view] < 1)) return;
+  const isFirst = !sorted.views.some((view) => shown[view] && HEADER.views[view].count);
+  sorted.views.forEach((view) => { shown[view] = isFirst ? 1 : Math.min(shown[view] + step, 1); });
+  changed();
+}
+
+// Chooses the edge at the camera; its views fade in.
+export function updateEdge(now) {
+  if (fade) {
+    const t = clamp((now - fade.began) / FADE_MS, 0, 1);
+    fade.done = t * t * (3 - 2 * t);
+    if (t === 1) fade = null;
+    changed();
+    return;
+  }
+  const chosen = followEdge(GRAPH, camera.position, edge);
+  if (chosen === edge) return;
+  const old = group, part = currentPart();
+  settle(chosen);
+  if (group !== old && part === currentPart()) fade = { group: old, began: now, done: 0 };
+  changed();
+}
+
+// Shows the views of an edge at once.
+function settle(number) {
+  edge = number;
+  group = edges[number][2];
+  fade = null;
+}
+
+export function settleAt(position) {
+  if (edges.length) settle(nearestEdge(GRAPH, position));
+}
+
+export const currentPart = () => edges.length ? partOfEdge(GRAPH, edge) : 0;
+export const endsOfEdge = () => edges.length ? edges[edge].slice(0, 2) : [];

@@ -1,0 +1,31 @@
+// The document: elements, short messages, and the motion that a visitor prefers.
+
+export const byId = (id) => document.getElementById(id);
+export const canvas = byId("view");
+export const calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+// A short message, that a screen reader reads too.
+let spoken = null;
+export function say(text) {
+  byId("status").textContent = text;
+  clearTimeout(spoken);
+  spoken = setTimeout(() => { byId("status").textContent = ""; }, 5000);
+}
+
+export function explain(text) {
+  byId("notice-text").textContent = text;
+  byId("notice").showModal();
+}
+
+export function showMore(isOpen) {
+  byId("menu").hidden = !isOpen;
+  byId("more").setAttribute("aria-expanded", isOpen);
+}
+
+// An element with children that are elements or text; text is never HTML.
+export function make(tag, className, ...children) {
+  const element = document.createElement(tag);
+  element.className = className;
+  element.append(...children);
+  return element;
+}

@@ -1,0 +1,250 @@
+// Ways of the camera that need no hand: flights along edges, the flight through all panoramas, and jumps, which fade: the
+// image of the camera before covers the new one until that is sorted, then it fades out.
+
+import {
+  camera, cameraFor, currentPart, edge, edges, FADE_MS, GRAPH, group, makeStart, nearestNode, nodeHere, parts,
+  settleAt, turn,
+} from "./camera.js";
+import { doll } from "./doll.js";
+import { byId, calm, canvas } from "./dom.js";
+import {
+  clamp, distanceOf, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
+} from "./graph.js";
+import { isComplete } from "./loading.js";
+import { changed, drawAt, fullSize, isSortedAs, renderer, sorted } from "./loop.js";
+import { headset } from "./xr.js";
+
+const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
+const REST_SECONDS = 4;             // at a panorama, on a tour without flights
+
+// The heading after a fade: away from the link back, or the start view, or that of before.
+function arriveAt(node, from) {
+  const back = findLink(node, from), { start } = HEADER.spots[node];
+  if (back && back.leave) return { yaw: back.yaw + Math.PI, pitch: 0 };
+  return start ? { yaw: start[0], pitch: start[1] } : { yaw: camera.yaw, pitch: 0 };
+}
+
+const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
+
+export function jump(position, { yaw, pitch }) {
+  freeze();
+  place({ position: [...position], yaw, pitch });
+}
+
+function place(pose) {
+  if (doll.isOn) doll.setOn(false);  // before the pose, which may have a field of view
+  Object.assign(camera, pose);
+  headset.turnTo(camera.yaw);
+  settleAt(camera.position);
+  changed();
+}
+
+export function setPose(pose) {
+  const next = cameraFor(pose);
+  setTouring(false);
+  goToPose(next);
+}
+
+// A smooth flight to a panorama along the edges; the direction of view stays the user's. To another part, the camera
+// turns to the link, goes a step along it, and the image fades; without a link it fades at once.
+export let flight = null, touring = false;
+export function flyTo(spot) {
+  if (doll.isOn) {
+    doll.visit(spot);
+    return;
+  }
+  if (calm.matches) {
+    flight = { spot, legs: [{ from: edges.length ? nearestNode(camera.position) : spot, to: spot }], began: null };
+    if (touring) flight.legs.push({ path: [GRAPH.positions[spot]], rest: REST_SECONDS });
+    changed();
+    return;
+  }
+  const way = edges.length ? findWay(GRAPH, camera.position, spot, partOfEdge(GRAPH, followEdge(GRAPH, camera.position, edge))) : [spot];
+  const legs = [];
+  let path = [[...camera.position]];
+  way.forEach((node, i) => {
+    if (i > 0 && isFade(GRAPH, way[i - 1], node)) {
+      const link = findLink(way[i - 1], node);
+      legs.push({ path });
+      if (link && link.leave) legs.push({ path: path.slice(-1), yaw: link.yaw }, { path: [path.at(-1), link.leave] });
+      legs.push({ path: [], from: way[i - 1], to: node });
+      path = [];
+    } else if (i + 1 < way.length && i === 0 && isFade(GRAPH, node, way[1])) return;  // it fades where the camera is
+    path.push(GRAPH.positions[node]);
+  });
+  legs.push({ path });
+  flight = { spot, legs, began: null };
+  changed();
+}
+
+export const ease = (t) => t * t * t * (t * (6 * t - 15) + 10);
+
+export function advanceFlight(now) {
+  if (!flight || isWaiting()) return;
+  const leg = flight.legs[0];
+  if (leg.to !== undefined) {
+    jump(GRAPH.positions[leg.to], isFade(GRAPH, leg.from, leg.to) ? arriveAt(leg.to, leg.from) : camera);
+    flight.legs.shift();
+    if (!flight.legs.length) flight = null;
+    return;
+  }
+  if (flight.began === null) beginLeg(leg, now);
+  const t = leg.seconds ? clamp((now - flight.began) / (1000 * leg.seconds), 0, 1) : 1;
+  if (leg.length) camera.position = t < 1 ? pointAlong(leg.path, ease(t) * leg.length) : [...leg.path.at(-1)];
+  turn(leg.turn[0] * (ease(t) - leg.done), leg.turn[1] * (ease(t) - leg.done));  // a drag adds to it
+  leg.done = ease(t);
+  changed();
+  if (t < 1) return;
+  flight.began = null;
+  flight.legs.shift();
+  if (flight.legs.length) return;
+  const { spot } = flight;
+  flight = null;
+  if (touring) flyTo((spot + 1) % HEADER.spots.length);
+}
+
+function beginLeg(leg, now) {
+  flight.began = now;
+  leg.length = lengthOf(leg.path);
+  leg.done = 0;
+  leg.turn = leg.yaw === undefined ? [0, 0] : [Math.atan2(Math.sin(leg.yaw - camera.yaw), Math.cos(leg.yaw - camera.yaw)), -camera.pitch];
+  const turning = headset.session ? 0 : Math.hypot(...leg.turn) / TURN_SPEED;  // the head turns itself
+  leg.seconds = leg.rest || leg.length ? leg.rest || clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : turning;
+}
+
+function pointAlong(path, distance) {
+  for (let i = 1; i < path.length; i++) {
+    const step = minus(path[i], path[i - 1]), length = Math.hypot(...step);
+    if (distance < length) return plus(path[i - 1], scaled(step, distance / length));
+    distance -= length;
+  }
+  return [...path.at(-1)];
+}
+
+// The flight through all panoramas of a tour. It begins at the point of the route that is nearest to the camera, and
+// the difference in pose disappears at first. The camera turns with the route; a drag adds to it until a fade.
+export let route = null;
+function startRoute() {
+  const distances = HEADER.route.map((sample) => distanceOf(sample.slice(0, 3), camera.position));
+  const least = Math.min(...distances) + 0.02 * HEADER.speed;
+  const first = distances.findIndex((distance) => distance <= least), sample = HEADER.route[first];
+  const offset = minus([...camera.position, camera.yaw, camera.pitch], sample);
+  offset[3] -= 2 * Math.PI * Math.round(offset[3] / (2 * Math.PI));
+  const time = first / HEADER.routeRate, seconds = Math.max(1, Math.abs(offset[3]) / TURN_SPEED);
+  route = { time, began: time, seconds, last: null, offset };
+}
+
+export function advanceRoute(seconds) {
+  if (!route || isWaiting()) return;
+  const end = HEADER.route.length - 1, before = Math.floor(route.time * HEADER.routeRate);
+  route.time += seconds;
+  const at = Math.min(route.time * HEADER.routeRate, end), index = Math.min(Math.floor(at), end - 1);
+  if (HEADER.jumps.some((jumped) => before <= jumped && jumped < index)) {
+    const [x, y, z, yaw, pitch] = HEADER.route[index];
+    jump([x, y, z], { yaw, pitch });
+    Object.assign(route, { time: index / HEADER.routeRate, offset: [0, 0, 0, 0, 0], last: { yaw, pitch } });
+    return;
+  }
+  const part = HEADER.jumps.includes(index) ? 0 : at - index;
+  const sample = plus(HEADER.route[index], scaled(minus(HEADER.route[index + 1], HEADER.route[index]), part));
+  const left = 1 - ease(clamp((route.time - route.began) / route.seconds, 0, 1));
+  const [x, y, z, yaw, pitch] = plus(sample, scaled(route.offset, left));
+  camera.position = [x, y, z];
+  turn(yaw - (route.last ? route.last.yaw : yaw), pitch - (route.last ? route.last.pitch : pitch));
+  route.last = { yaw, pitch };
+  if (at === end) setTouring(false);
+}
+
+export function setTouring(value) {
+  touring = value && HEADER.spots.length > 1;
+  if (touring && doll.isOn) jumpTo(doll.node);
+  byId("play").setAttribute("aria-pressed", touring);
+  byId("play").querySelector("path").setAttribute("d", touring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
+  if (!touring) flight = route = null;
+  else if (HEADER.route.length > 1 && !calm.matches) {
+    flight = null;
+    startRoute();
+  } else if (!flight) {
+    flyTo((nearestNode(camera.position) + 1) % GRAPH.positions.length);
+  }
+  changed();
+}
+
+export function goHome() {
+  setTouring(false);
+  flight = null;
+  goToPose(makeStart());
+}
+
+// Goes to another camera; the image fades, unless the order of the Gaussians is right there too.
+function goToPose(pose) {
+  const isFar = distanceOf(pose.position, camera.position) > HEADER.speed;
+  const isElsewhere = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
+  if (isFar || isElsewhere || headset.session) freeze();
+  place(pose);
+}
+
+export function goTo(node) {
+  setTouring(false);
+  flyTo(node);
+  canvas.focus({ preventScroll: true });
+}
+
+// Goes to a panorama without a flight.
+export function jumpTo(node) {
+  setTouring(false);
+  const isSame = parts[node] === currentPart(), from = edges.length ? nodeHere() : node;
+  jump(GRAPH.positions[node], isSame ? camera : arriveAt(node, from));
+}
+
+export const isFlying = () => flight !== null || route !== null;
+
+// The image of the last camera before a jump covers the new one until that is sorted, then it fades out.
+const still = byId("still");
+export let frozen = null;
+
+export function freeze() {
+  if (!renderer || !sorted) return;
+  if (headset.session) {  // it fades from black
+    frozen = { began: null, left: 1, position: null };
+    return;
+  }
+  drawAt(canvas.width, canvas.height);  // what a canvas shows can be copied in the task that drew it
+  const size = fullSize(), context = still.getContext("2d");
+  const isSame = still.width === size[0] && still.height === size[1];
+  context.globalAlpha = frozen && isSame ? 1 - frozen.left : 1;
+  if (!isSame) [still.width, still.height] = size;
+  context.drawImage(canvas, 0, 0, ...size);
+  frozen = { began: null, left: 1, position: null };
+  showStill();
+  changed();
+}
+
+export function updateStill(now) {
+  if (!frozen) return;
+  frozen.position = frozen.position || [...camera.position];
+  const isSorted = isSortedAs() && distanceOf(sorted.position, frozen.position) < HEADER.speed;
+  if (frozen.began === null && isSorted && isSeen()) frozen.began = now;
+  if (frozen.began !== null) {
+    const t = clamp((now - frozen.began) / FADE_MS, 0, 1);
+    frozen.left = 1 - t * t * (3 - 2 * t);
+    if (t === 1) frozen = null;
+  }
+  showStill();
+  changed();
+}
+
+function showStill() {
+  const left = coverage();
+  still.hidden = !frozen || headset.session !== null;
+  still.style.opacity = left;
+  byId("spots").style.opacity = 1 - left;
+}
+
+// Whether a view of the group at the camera is sorted, or all are empty.
+const isSeen = () => doll.isOn || HEADER.groups[group].some((view) => sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
+
+export const isWaiting = () => frozen !== null && frozen.began === null;
+
+// How much of the picture the image covers, or the black in a headset.
+export const coverage = () => frozen ? frozen.left : 0;

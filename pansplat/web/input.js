@@ -1,0 +1,196 @@
+// Keys, pointers, the wheel, the device's motion, and buttons.
+
+import { camera, MAX_FOV, MAX_PITCH, MIN_FOV, tangentOf, turn, walk } from "./camera.js";
+import { doll } from "./doll.js";
+import { byId, canvas, say, showMore } from "./dom.js";
+import { embed } from "./embed.js";
+import { flyTo, goHome, setPose, setTouring, touring } from "./flight.js";
+import { clamp, distanceOf, dot, multiply, scaled } from "./graph.js";
+import { changed } from "./loop.js";
+import { measure } from "./measure.js";
+import { plan } from "./plan.js";
+import { openList } from "./rings.js";
+import { parsePose, share } from "./share.js";
+
+const held = new Set(), fingers = new Map();
+let fast = false;
+const MOVES = {
+  KeyW: [0, 0, 1], ArrowUp: [0, 0, 1], KeyS: [0, 0, -1], ArrowDown: [0, 0, -1], KeyA: [-1, 0, 0], ArrowLeft: [-1, 0, 0],
+  KeyD: [1, 0, 0], ArrowRight: [1, 0, 0], KeyE: [0, 1, 0], KeyQ: [0, -1, 0],
+};
+const PRESSES = {
+  Space: () => setTouring(!touring),
+  KeyF: () => toggleFull(),
+  KeyR: () => goHome(),
+  KeyH: () => byId("keys").showModal(),
+  KeyL: () => openList(),
+  KeyM: () => { if (HEADER.spots.length > 1) plan.toggle(); },
+  KeyO: () => doll.toggle(),
+  KeyP: () => share.savePicture(),
+};
+const CLOSES = { KeyH: "keys", KeyL: "list" };  // the dialogs that a key opens and closes
+
+function onKey(event) {
+  const open = document.querySelector("dialog[open]");
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (open) {
+    if (open.id !== CLOSES[event.code] || event.repeat) return;
+    open.close();
+    event.preventDefault();
+    return;
+  }
+  if (event.code === "Escape") {
+    showMore(false);
+    if (measure.isOn) measure.toggle(false);
+  }
+  if (event.code === "Enter" && event.target === canvas && measure.isOn) measure.take(0.5 * innerWidth, 0.5 * innerHeight);
+  const onButton = event.target.tagName === "BUTTON" && (event.code === "Space" || event.code === "Enter");
+  if (onButton) return;
+  const digit = /^(Digit|Numpad)([1-9])$/.exec(event.code);
+  if (MOVES[event.code]) held.add(event.code);
+  else if (PRESSES[event.code] && !event.repeat) PRESSES[event.code]();
+  else if (digit && HEADER.spots[digit[2] - 1]) {
+    setTouring(false);
+    flyTo(digit[2] - 1);
+  }
+  else return;
+  event.preventDefault();
+  if (MOVES[event.code]) setTouring(false);
+}
+
+export function walkByKeys(seconds) {
+  const step = [0, 0, 0];
+  for (const code of held) MOVES[code].forEach((value, i) => { step[i] += value; });
+  if (doll.isOn) doll.move(step, seconds);
+  else if (step.some((value) => value)) walk(...scaled(step, seconds * HEADER.speed * (fast ? 3 : 1)));
+}
+
+// One finger or the mouse turns: the scene follows the pointer. Two fingers pull the scene: sideways, and forward by
+// moving down or apart.
+function onMove(event) {
+  const last = fingers.get(event.pointerId);
+  if (!last) return;
+  const moved = [event.clientX - last[0], event.clientY - last[1]];
+  const before = [...fingers.values()];
+  fingers.set(event.pointerId, [event.clientX, event.clientY]);
+  if (before.length === 1) {
+    const { clientWidth, clientHeight } = canvas;
+    const radians = 2 * tangentOf(clientWidth, clientHeight) / clientHeight;
+    if (doll.isOn) doll.orbit(2 * Math.PI * moved[0] / clientWidth, -Math.PI * moved[1] / clientHeight);
+    else turn(-moved[0] * radians, moved[1] * radians);
+  } else if (before.length === 2) {
+    const apart = ([a, b]) => distanceOf(a, b);
+    const metres = 2 * HEADER.speed / Math.min(canvas.clientWidth, canvas.clientHeight);
+    const pinch = apart([...fingers.values()]) - apart(before);
+    if (doll.isOn) doll.zoom(apart(before) / Math.max(apart([...fingers.values()]), 1));
+    setTouring(false);
+    walk(-0.5 * moved[0] * metres, 0, (0.5 * moved[1] + pinch) * metres);
+  }
+}
+
+// Look around by the device's motion: its axes in the earth's (east, north, up), turned by the screen's angle.
+let motion = null;
+function onOrientation({ alpha, beta, gamma }) {
+  if (alpha === null || beta === null || gamma === null || doll.isOn) return;
+  const [ca, sa, cb, sb, cg, sg] = [alpha, beta, gamma].map((degrees) => degrees * Math.PI / 180)
+    .flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
+  const toEarth = multiply([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]],
+    multiply([[1, 0, 0], [0, cb, -sb], [0, sb, cb]], [[cg, 0, sg], [0, 1, 0], [-sg, 0, cg]]));
+  const angle = (screen.orientation ? screen.orientation.angle : 0) * Math.PI / 180;
+  const inLevel = (axis) => {  // x east, y down, z north
+    const [east, north, up] = toEarth.map((row) => dot(row, axis));
+    return [east, -up, north];
+  };
+  const right = inLevel([Math.cos(angle), -Math.sin(angle), 0]), forward = inLevel([0, 0, -1]);
+  const yaw = Math.atan2(forward[0], forward[2]), pitch = Math.asin(clamp(-forward[1], -1, 1));
+  const across = [Math.cos(yaw), 0, -Math.sin(yaw)];
+  const down = [Math.sin(yaw) * Math.sin(pitch), Math.cos(pitch), Math.cos(yaw) * Math.sin(pitch)];
+  if (motion.last === null) motion.last = yaw;
+  camera.yaw += yaw - motion.last;  // so that a drag can turn the camera, too
+  motion.last = yaw;
+  camera.pitch = clamp(pitch, -MAX_PITCH, MAX_PITCH);
+  camera.roll = Math.atan2(dot(right, down), dot(right, across));
+  changed();
+}
+
+async function toggleMotion() {
+  if (motion) {
+    removeEventListener("deviceorientation", onOrientation);
+    motion = null;
+    camera.roll = 0;
+  } else {
+    const ask = DeviceOrientationEvent.requestPermission;  // iOS only
+    if (ask && await ask.call(DeviceOrientationEvent) !== "granted") return;
+    motion = { last: null };
+    addEventListener("deviceorientation", onOrientation);
+  }
+  byId("motion").setAttribute("aria-pressed", motion !== null);
+  changed();
+}
+
+function toggleFull() {
+  const root = document.documentElement;
+  if (document.fullscreenElement) document.exitFullscreen();
+  else if (root.requestFullscreen) root.requestFullscreen().catch(() => {});
+}
+
+export function listen() {
+  addEventListener("keydown", onKey);
+  addEventListener("keydown", (event) => { fast = event.shiftKey; });
+  addEventListener("keyup", (event) => { fast = event.shiftKey; held.delete(event.code); });
+  addEventListener("blur", () => held.clear());
+  addEventListener("resize", changed);
+  addEventListener("hashchange", () => {
+    const pose = parsePose(location.hash);
+    if (pose) setPose(pose);
+  });
+  addEventListener("pointerdown", (event) => { if (!byId("more").parentElement.contains(event.target)) showMore(false); });
+  let pressed = null;  // where the pointer went down, until it moves
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    pressed = event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;
+    fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    canvas.focus({ preventScroll: true });
+  });
+  canvas.addEventListener("pointermove", onMove);
+  canvas.addEventListener("click", ({ clientX, clientY }) => {
+    if (!pressed || distanceOf(pressed, [clientX, clientY]) >= 5) return;
+    if (measure.isOn) measure.take(clientX, clientY);
+    else if (doll.isOn) doll.take(clientX, clientY);
+  });
+  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  canvas.addEventListener("wheel", (event) => {
+    if (!embed.isEngaged) {
+      say("Click the picture to change its field of view by the wheel");
+      return;
+    }
+    event.preventDefault();
+    const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
+    const factor = Math.exp(0.001 * clamp(pixels, -200, 200));
+    if (doll.isOn) doll.zoom(factor);
+    else camera.fov = clamp(camera.fov * factor, MIN_FOV, MAX_FOV);
+    changed();
+  }, { passive: false });
+  byId("play").onclick = () => setTouring(!touring);
+  byId("home").onclick = goHome;
+  byId("place").onclick = openList;
+  byId("list").onclick = (event) => { if (event.target === byId("list")) byId("list").close(); };  // beside it
+  byId("map").onclick = () => plan.toggle();
+  byId("doll").onclick = () => doll.toggle();
+  byId("doll").hidden = !doll.isPossible;
+  byId("more").onclick = () => showMore(byId("menu").hidden);
+  for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", () => share.savePicture()], ["link", () => share.copyLink()]]) {
+    byId(id).onclick = () => {
+      showMore(false);
+      act();
+      canvas.focus({ preventScroll: true });
+    };
+  }
+  byId("help").onclick = () => byId("keys").showModal();
+  byId("motion").onclick = toggleMotion;
+  byId("motion").hidden = !("DeviceOrientationEvent" in window && matchMedia("(pointer: coarse)").matches);
+  byId("full").hidden = !document.documentElement.requestFullscreen;
+  byId("play").hidden = byId("place").hidden = byId("map").hidden = HEADER.spots.length < 2;
+  byId("buttons").hidden = false;
+}

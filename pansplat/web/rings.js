@@ -1,0 +1,118 @@
+// The panoramas that can be visited: rings on the floor, the list, and the name of the one at the camera.
+
+import { camera, currentPart, edge, edges, endsOfEdge, GRAPH, nodeHere, parts, tangentOf } from "./camera.js";
+import { doll } from "./doll.js";
+import { byId, canvas, make } from "./dom.js";
+import { goTo } from "./flight.js";
+import { clamp, column, distanceOf, dot, isReachable, minus } from "./graph.js";
+
+let rings = [], chosenFor = null;  // the edge for which they are chosen
+
+export function makeRings() {
+  const links = HEADER.links.filter((link) => link.mark);
+  const marks = [...HEADER.spots.map((_, node) => ({ node, link: null })), ...links.map((link) => ({ node: link.to, link }))];
+  rings = marks.map(({ node, link }) => {
+    const { name, position, mark } = HEADER.spots[node], text = make("small", "");
+    const label = make("span", "", make("b", "", name), text), button = make("button", link ? "fade" : "", label);
+    const place = link ? { mark: link.mark, camera: null, radius: HEADER.spots[link.from].radius } : { mark, camera: position, radius: HEADER.spots[node].radius };
+    button.hidden = true;
+    button.onclick = () => goTo(node);
+    byId("spots").append(button);
+    return { node, link, button, label, text, ...place, isNext: false, size: null };
+  });
+}
+
+// The rings of panoramas next to the edge, and of links from its ends. A link's text is a part of the label.
+function chooseRings() {
+  if (chosenFor === edge) return;
+  chosenFor = edge;
+  const ends = endsOfEdge();
+  for (const ring of rings) {
+    const { name } = HEADER.spots[ring.node];
+    const link = ring.link || HEADER.links.find(({ from, to }) => to === ring.node && ends.includes(from));
+    const isHere = parts[ring.node] === currentPart() && (link || !edges.length || isReachable(GRAPH, edge, ring.node));
+    ring.isNext = ring.link ? ends.includes(link.from) : isHere;
+    ring.text.textContent = link && link.text !== name ? link.text : "";
+    ring.button.title = ["Go to", name, ring.text.textContent].join(" ").trim();
+    ring.button.ariaLabel = ring.button.title;
+    ring.size = null;
+  }
+}
+
+// Those of chooseRings without that at the camera.
+export function findRings() {
+  chooseRings();
+  if (doll.isOn) return rings.filter(({ link, node }) => !link && doll.shows(node));
+  const isAtCamera = (ring) => ring.camera !== null && distanceOf(ring.camera, camera.position) < 2 * ring.radius;
+  return rings.filter((ring) => ring.isNext && !isAtCamera(ring));
+}
+
+// Rings in perspective. A label that would cover the label of a nearer ring is not shown.
+export function placeRings(rotation) {
+  const found = findRings();
+  const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
+  const taken = [], placed = [];
+  for (const ring of rings) {
+    const { radius } = ring, offset = minus(ring.mark, camera.position);
+    const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
+    ring.button.hidden = !found.includes(ring) || z < 0.1 * radius;
+    if (!ring.button.hidden) placed.push({ ring, x, y, z, distance: Math.hypot(x, y, z) });
+  }
+  for (const { ring, x, y, z, distance } of placed.sort((a, b) => a.distance - b.distance)) {
+    const { style } = ring.button, size = clamp(2 * ring.radius * focal / z, 16, 128), tall = size * clamp(y / distance, 0.25, 1);
+    const [left, top] = [0.5 * width + focal * x / z, 0.5 * height + focal * y / z];
+    style.width = `${size}px`;
+    style.height = `${tall}px`;
+    style.borderWidth = `${clamp(0.09 * size, 2, 6)}px`;
+    style.transform = `translate(${left - 0.5 * size}px, ${top - 0.5 * tall}px)`;
+    if (!ring.size) ring.size = [ring.label.offsetWidth, ring.label.offsetHeight];
+    const box = [left - 0.5 * ring.size[0], top + 0.5 * tall, left + 0.5 * ring.size[0], top + 0.5 * tall + ring.size[1]];
+    const isFree = taken.every((other) => box[0] > other[2] || box[2] < other[0] || box[1] > other[3] || box[3] < other[1]);
+    ring.label.style.visibility = isFree ? "" : "hidden";
+    if (isFree) taken.push(box);
+  }
+}
+
+const listed = [];  // a button for each panorama
+export let here = null;    // the panorama at the camera
+
+export const isSingle = (node) => parts.filter((part) => part === parts[node]).length === 1;
+
+// The panoramas with a common world by part, then those without others.
+export function makeList() {
+  const nodes = [...HEADER.spots.keys()], placed = [...new Set(nodes.filter((node) => !isSingle(node)).map((node) => parts[node]))];
+  const sections = placed.map((part, i) => {
+    const title = placed.length > 1 ? `Placed panoramas, part ${i + 1}` : "Placed panoramas";
+    return [title, nodes.filter((node) => parts[node] === part)];
+  });
+  sections.push(["Single photographs, not placed", nodes.filter(isSingle)]);
+  for (const [title, members] of sections.filter((section) => section[1].length)) {
+    byId("panoramas").append(make("h2", "", title));
+    for (const node of members) {
+      const button = make("button", "", `${node + 1}. ${HEADER.spots[node].name}`);
+      button.onclick = () => {
+        byId("list").close();
+        goTo(node);
+      };
+      listed[node] = button;
+      byId("panoramas").append(button);
+    }
+  }
+}
+
+export function openList() {
+  if (HEADER.spots.length < 2) return;
+  byId("list").showModal();
+  listed[here].focus();
+}
+
+// Names the panorama at the camera.
+export function showPlace() {
+  const node = nodeHere();
+  if (node === here) return;
+  if (listed[here]) listed[here].removeAttribute("aria-current");
+  here = node;
+  listed[here].setAttribute("aria-current", "location");
+  byId("name").textContent = HEADER.spots[here].name;
+  byId("kind").textContent = isSingle(here) ? "single photograph" : "";
+}

@@ -1,0 +1,53 @@
+"""Rows of results: means, tables and files."""
+
+import io
+import json
+import math
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pansplat.errors import InputError
+from pansplat.evaluation.results import Column, Row, average_rows, markdown_table, rich_table, write_json
+
+COLUMNS = (Column("method", "method"), Column("A\nPSNR", "psnr", ".2f", "-"), Column("A\nSSIM", "ssim", ".3f", "-"))
+ROWS = (Row({"method": "paper"}, {"psnr": 21.5}), Row({"method": "exact"}, {"psnr": math.inf, "ssim": 1.0}))
+OURS = Row({"method": "ours"}, {"psnr": 20.0, "ssim": 0.75})
+
+
+def test_a_mean_is_that_of_the_rows_with_the_value() -> None:
+    rows = [
+        Row({"set": "x", "method": "a"}, {"psnr": 20, "lpips": 0.2}),
+        Row({"set": "x", "method": "a"}, {"psnr": 24}),
+    ]
+    rows.append(Row({"set": "y", "method": "a"}, {"psnr": 1, "stages": {}}))
+    means = average_rows(rows, ("set", "method"))
+    assert means == [
+        Row({"set": "x", "method": "a"}, {"psnr": 22, "lpips": 0.2}),
+        Row({"set": "y", "method": "a"}, {"psnr": 1}),
+    ]
+
+
+def test_tables_have_formatted_cells_and_our_rows_below() -> None:
+    assert markdown_table("speed", COLUMNS, ROWS, [OURS]).splitlines() == [
+        *("### Speed", "", "| method | A PSNR | A SSIM |", "| --- | ---: | ---: |"),
+        *("| paper | 21.50 | - |", "| exact | exact | 1.000 |", "| **ours** | **20.00** | **0.750** |"),
+    ]
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(rich_table("speed", COLUMNS, ROWS, [OURS]))
+    lines = [line.replace("│", " ").split() for line in console.export_text().splitlines()]
+    assert lines.index(["ours", "20.00", "0.750"]) > lines.index(["exact", "exact", "1.000"])
+
+
+def test_numbers_that_json_has_not_are_null_and_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    file = tmp_path / "rows.json"
+    write_json([Row({"name": "a"}, {"psnr": math.inf, "stages": {"sort": math.nan}}).as_json()], file)
+    assert json.loads(file.read_text()) == [
+        {"software": "pansplat", "name": "a", "psnr": None, "stages": {"sort": None}}
+    ]
+    with pytest.raises(TypeError):
+        write_json({"value": object()}, file)
+    assert "sort" in file.read_text() and list(tmp_path.iterdir()) == [file]
+    with pytest.raises(InputError, match="create it first"):
+        write_json({}, tmp_path / "no" / "rows.json")

@@ -1,0 +1,1206 @@
+"""Synthetic clicks and keys, on a context without a window, change the rendered image."""
+
+import json
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import get_args
+
+import moderngl
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from imgui_bundle import imgui
+from PIL import Image
+
+from pansplat.data.folders import load_pairs
+from pansplat.data.images import write_image
+from pansplat.data.pairs import Panorama
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
+from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.poses.dense import Surroundings
+from pansplat.poses.depth import DepthMap
+from pansplat.poses.placing import Piece
+from pansplat.rendering.cpu.display import DisplayScene
+from pansplat.tours import find_tours
+from pansplat_viewer.draw.color_maps import map_values
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.frame_renderer import Pacing
+from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
+from pansplat_viewer.scene.loader import (
+    LoadedScene,
+    Progress,
+    SceneEntry,
+    SceneLoader,
+)
+from pansplat_viewer.scene.settings import Comparison, Display, Preset
+from pansplat_viewer.scene.state import ViewerState
+from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
+from pansplat_viewer.ui.photographs import Photographs
+from pansplat_viewer.ui.presenter import ERROR_MAP
+from pansplat_viewer.viewer import Viewer
+from pansplat_viewer.window.preferences import Preferences
+
+pytestmark = pytest.mark.gl
+
+SIZE = (560, 900)
+IMAGE = (slice(20, 560), slice(310, 560))  # rows and columns without panels
+NAMES = ["first", "second"]
+SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_while_moving=True)
+
+# Widgets that must change the image, and the settings that give some of them something to change.
+IMAGE_WIDGETS = (
+    "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
+    "min. opacity", "exact", "3dgs", "black", "grey", "white", "field of view",
+    "off##stereo", "pair##stereo", "red/cyan##stereo",
+    "2##panorama", "##flight",
+)  # fmt: skip
+OF_OPENGL = (*get_args(Preset), "off##stereo", "pair##stereo", "red/cyan##stereo")  # the processor does not offer them
+INITIAL_SETTINGS = {
+    **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
+    "joint": {"mode": "deferred"},
+    "exact": {"preset": "3dgs"},
+    "off##stereo": {"stereo": "anaglyph"},
+    "black": {"background": (1.0, 1.0, 1.0)},
+}
+# Widgets whose effect has its own test.
+OTHER_WIDGETS = {
+    "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
+    *get_args(Display), *get_args(Comparison),
+    "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
+    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
+}  # fmt: skip
+
+
+class User:
+    """Sends events to a viewer and reads its frames.
+
+    Attributes:
+        load, find: what the viewer's loader calls; a test may replace them.
+    """
+
+    def __init__(self, viewer: Viewer, target: moderngl.Framebuffer, clock: list[float], load: Callable) -> None:
+        self.viewer, self.target, self.clock = viewer, target, clock
+        self.load = self.first_load = load
+        self.find = lambda path, progress: [SceneEntry("opened")]
+        self.state, self.panels = viewer.state, viewer.panels
+
+    def draw_frames(self, count: int, seconds: float = 1 / 30) -> None:
+        for _ in range(count):
+            self.clock[0] += seconds
+            self.viewer.frame(self.target, seconds)
+
+    def draw_until(self, condition: Callable[[], object], expected: str, seconds: float = 1 / 30) -> None:
+        """Draw frames until a condition is true; their number does not matter, for threads can be slow."""
+        deadline = time.monotonic() + 300
+        while not condition():
+            assert time.monotonic() < deadline, f"no {expected}"
+            self.draw_frames(1, seconds)
+            time.sleep(0.002)
+
+    def wait_for_progress(self, *expected: object) -> None:
+        """Draw frames until the panel shows this progress: name, description, fraction."""
+        self.draw_until(lambda: self.viewer.loading == expected, f"progress {expected}", 0.01)
+
+    def settle(self, *, refining: bool = False) -> None:
+        """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
+        self.draw_frames(3, SETTLE_AFTER)
+        self.draw_until(lambda: not (self.viewer.moving if refining else self.viewer.busy), "settled viewer")
+        self.draw_frames(1)
+
+    def read_window(self) -> np.ndarray:
+        """RGB of the last frame."""
+        pixels = np.frombuffer(self.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
+        return pixels[::-1].astype(int)
+
+    def read_screen(self) -> np.ndarray:
+        """RGB of the last frame, outside the panels."""
+        return self.read_window()[IMAGE]
+
+    def read_image(self) -> np.ndarray:
+        """RGB of a settled frame, outside the panels."""
+        self.settle()
+        return self.read_screen()
+
+    def show(self, *entries: SceneEntry) -> None:
+        self.viewer.show(list(entries), 0)
+        self.settle()
+
+    def click(self, label: str) -> None:
+        self.draw_frames(1)
+        left, top, right, bottom = self.panels.widgets.items[label]
+        x = (left + right) / 2
+        if "opacity" in label or label == "field of view":  # the label is right of the slider
+            x = left + 0.4 * (right - left)
+        elif right - left > 60 and label not in ("path", "pair", "##flight"):
+            x = left + 10
+        self.click_at(x, (top + bottom) / 2)
+
+    def click_at(self, x: float, y: float) -> None:
+        self.drag((x, y), (x, y))
+        imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
+        self.draw_frames(1)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        io = imgui.get_io()
+        io.add_mouse_pos_event(*start)
+        self.draw_frames(2)
+        io.add_mouse_button_event(0, True)
+        self.draw_frames(1)
+        io.add_mouse_pos_event(*end)
+        self.draw_frames(1)
+        io.add_mouse_button_event(0, False)
+        self.draw_frames(2)
+
+    def slide(self, label: str, fraction: float, start: float = 0.2) -> None:
+        """Drag a slider to a fraction of its width, which its label is a part of."""
+        left, top, right, bottom = self.panels.widgets.items[label]
+        middle = (top + bottom) / 2
+        self.drag((left + start * (right - left), middle), (left + fraction * (right - left), middle))
+
+    def press(self, *keys: imgui.Key, frames: int = 1) -> None:
+        for down in (True, False):
+            for key in keys:
+                imgui.get_io().add_key_event(key, down)
+            self.draw_frames(frames if down else 1)
+
+
+def make_sphere_scene(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
+    """A photograph, and the same photograph as Gaussians around its camera, in a world with z up."""
+    pose = torch.eye(4, dtype=torch.float64)
+    yaw = 0.7
+    right, forward = (np.cos(yaw), -np.sin(yaw), 0.0), (np.sin(yaw), np.cos(yaw), 0.0)
+    pose[:3, :3] = torch.tensor((right, (0.0, 0.0, -1.0), forward)).T
+    pose[:3, 3] = torch.tensor((1.0, -2.0, 0.5))
+    count = 3000
+    directions = fibonacci_directions(count)
+    image = torch.from_numpy(photos[0]).permute(2, 0, 1)
+    color = sample_equirect(image, uv_from_directions(directions).float()).T
+    gaussians = Gaussians(
+        means=(pose[:3, 3] + 3 * directions @ pose[:3, :3].T).float(),
+        scales=torch.full((count, 3), 0.2),
+        quats=torch.tensor((1.0, 0, 0, 0)).expand(count, 4),
+        opacities=torch.full((count,), 0.99),
+        harmonics=((color - 0.5) / 0.28209479177387814)[:, None],
+        levels=torch.zeros(count, dtype=torch.int64),
+        views=torch.zeros(count, dtype=torch.int64),
+    )
+    scene = Scene(gaussians, pose[None], 0.45, 10.0, ("a.png",), "synthetic", 128)
+    (panorama, *_) = entry.pair.context
+    entry = replace(entry, pair=replace(entry.pair, context=(replace(panorama, cam2world=pose),)))
+    return LoadedScene(entry, scene)
+
+
+def both(test: Callable[..., None]) -> Callable[..., None]:
+    """Run a test with both renderers; the other tests do not depend on the renderer."""
+    test.renderers = ("gl", "cpu")  # type: ignore[attr-defined]
+    return test
+
+
+def opengl(test: Callable[..., None]) -> Callable[..., None]:
+    """Run a test with OpenGL."""
+    test.renderers = ("gl",)  # type: ignore[attr-defined]
+    return test
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "label" in metafunc.fixturenames:
+        cases = [("gl" if label in OF_OPENGL else "cpu", label) for label in IMAGE_WIDGETS]
+        metafunc.parametrize(("session", "label"), cases, indirect=["session"], scope="module")
+    elif "session" in metafunc.fixturenames:
+        renderers = getattr(metafunc.function, "renderers", ("cpu",))
+        metafunc.parametrize("session", renderers, indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
+def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp_path_factory) -> Iterator[User]:
+    def load(entry, progress, show):
+        if entry.tour is not None:
+            return load_house(entry)
+        if entry.name == "sphere":
+            return make_sphere_scene(entry, axis_photos)
+        if entry.name == "damaged":
+            raise InputError("damaged.ply: 100% unreadable; export it again")
+        return LoadedScene(entry, small_scene)
+
+    clock = [0.0]
+    folder = tmp_path_factory.mktemp("screenshots")
+    with gl_context:
+        target = gl_context.simple_framebuffer(SIZE, components=3)
+        loader = SceneLoader(lambda *arguments: user.load(*arguments))
+        find, options = lambda *arguments: user.find(*arguments), {"folder": folder, "renderer": request.param}
+        viewer = Viewer(gl_context, loader, find=find, clock=lambda: clock[0], **options)
+        imgui.get_io().display_size = SIZE
+        user = User(viewer, target, clock, load)
+        user.entries = [SceneEntry(name, pair=pair) for name in NAMES]
+        user.show(*user.entries)
+        user.click("Drawing")
+    yield user
+    with gl_context:
+        viewer.close()
+
+
+@pytest.fixture
+def user(session, ctx) -> User:
+    """The session with scene, state and camera as at the start."""
+    session.load, session.find = session.first_load, lambda path, progress: [SceneEntry("opened")]
+    if session.viewer.library.names != NAMES or session.viewer.library.current != 0:
+        session.show(*session.entries)
+    state, start = session.state, ViewerState()
+    kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "adaptive", "message", "message_until")
+    for name in (field.name for field in fields(ViewerState) if field.name not in kept):
+        setattr(state, name, getattr(start, name))
+    state.camera, state.adaptive, state.message = state.home, True, ""
+    session.viewer.error, session.viewer.stage.resolution.budget_ms = None, BUDGET_MS
+    imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
+    session.draw_frames(2, SETTLE_AFTER)
+    return session
+
+
+def changed_fraction(before: np.ndarray, after: np.ndarray) -> float:
+    """Fraction of the pixels that differ visibly."""
+    return float((np.abs(before - after).max(-1) > 2).mean())
+
+
+def test_every_widget_has_a_test_and_fits_without_scrolling(user):
+    assert set(user.panels.widgets.items) == set(IMAGE_WIDGETS) | OTHER_WIDGETS
+    assert max(rectangle[3] for rectangle in user.panels.widgets.items.values()) < SIZE[1]
+
+
+@pytest.mark.slow
+def test_clicking_the_widget_changes_the_image(user, label):
+    user.state.settings = replace(user.state.settings, **INITIAL_SETTINGS.get(label, {}))
+    before = user.read_image()
+    user.click(label)
+    assert changed_fraction(before, user.read_image()) > 3e-4  # 0 without an effect; the filter changes few pixels
+
+
+def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
+    user.click("view 1")
+    single = user.read_image()
+    user.click("deferred")
+    user.state.camera = replace(user.state.camera, position=(0.0, 0.0, 0.2))
+    both = user.read_image()
+    user.slide("weight 0", 0.0, start=0.4)
+    assert user.state.settings.view_weights == (0.0, 1.0)
+    assert changed_fraction(both, user.read_image()) > 0.1
+    user.state.camera = user.state.home
+    assert changed_fraction(single, user.read_image()) == 0
+    user.slide("weight 1", 0.4)
+    assert 0 < user.state.settings.view_weights[1] < 1
+
+
+@opengl
+def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
+    monkeypatch.setattr("pansplat_viewer.recorder.PANORAMA_HEIGHT", 64)
+    user.click("pair##stereo")
+    user.settle()
+    image = user.viewer.stage.slot.image
+    left, right = np.split(np.frombuffer(image.read(), np.float32).reshape(*SIZE[::-1], 4), 2, axis=1)
+    assert np.abs(left - right).max() > 0.1
+    user.click("red/cyan##stereo")
+    near = user.read_image()
+    user.slide("eye distance", 0.9)
+    assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
+    user.click("360 PNG")
+    with Image.open(user.viewer.recorder.files[-1]) as file:
+        assert file.size == (128, 64)
+    user.click("off##stereo")
+    assert "eye distance" not in user.panels.widgets.items
+
+
+@pytest.fixture
+def cleaning(user: User) -> Iterator[User]:
+    """The user with the section "Clean up" open, and the sections above it closed."""
+    headers = ("Clean up", "Display", "Compare", "Camera", "Gaussians")
+    for header in headers:
+        user.click(header)
+    yield user
+    user.viewer.painting.stop()
+    for header in headers[::-1]:
+        user.click(header)
+
+
+def test_a_box_hides_what_is_outside_and_buttons_write_the_scene_without_it(cleaning, tmp_path):
+    user = cleaning
+    whole = user.read_image()
+    user.click("crop to a box")
+    user.draw_frames(1)
+    assert user.state.settings.box == pytest.approx(user.viewer.bounds)
+    assert changed_fraction(whole, user.read_image()) == 0
+    user.slide("x from", 0.4, start=0.01)
+    assert user.state.settings.box[0] > user.viewer.bounds[0] + 0.5
+    assert changed_fraction(whole, user.read_image()) > 0.05
+    user.panels.cleaning.file = str(tmp_path / "small.ply")
+    user.click("Save##clean")
+    user.draw_until(lambda: (tmp_path / "small.ply").exists() and not user.viewer.jobs.is_busy, "saved scene")
+    user.click("Remove floaters")
+    user.draw_until(lambda: "floaters:" in user.state.message, "message")
+    user.settle()
+    user.click("crop to a box")
+    assert user.state.settings.box is None
+    user.show(*user.entries)
+
+
+def test_a_mask_is_painted_cleared_and_dropped_after_a_question(cleaning):
+    user, painting = cleaning, cleaning.viewer.painting
+    user.click("paint what to hide")
+    user.draw_frames(2)
+    assert user.state.comparison == "photograph" and "Save mask" in user.panels.widgets.items
+    user.slide("brush", 0.5)
+    plain = user.read_screen()
+    user.drag((400, 300), (480, 320))
+    assert painting.painter.is_changed and changed_fraction(user.read_screen(), plain) > 0, "outlines are drawn"
+    for answer in ("Go on painting", "Drop it"):
+        user.click("paint what to hide")
+        user.draw_frames(2)
+        user.click(answer)
+        assert (painting.painter is None) == (answer == "Drop it")
+    user.click("paint what to hide")
+    user.drag((400, 300), (480, 320))
+    user.click("Clear")
+    assert not painting.painter.hidden.any()
+    user.press(imgui.Key.escape)
+    user.click("Drop it")
+    assert painting.painter is None and not user.state.quit
+
+
+def test_camera_widgets_fly_orbit_and_restore_the_start(user):
+    user.slide("speed", 0.5)
+    assert user.state.speed > 1 and user.state.camera == user.state.home
+    user.click("Fly")
+    assert user.state.playing
+    user.click("Stop")
+    assert not user.state.playing and 0 < user.state.flight < 1
+    user.click("orbit")
+    assert user.state.orbiting
+    user.drag((500, 400), (560, 400))
+    assert user.state.camera.position != user.state.home.position
+    user.click("fly")
+    assert not user.state.orbiting
+    user.click("Reset")
+    assert user.state.camera == user.state.home
+    user.click("2##panorama")
+    user.click("1##panorama")
+    assert user.state.camera.position == (0, 0, 0)
+
+
+def test_the_scene_follows_a_drag_on_the_image(user):
+    before = user.read_image()
+    user.drag((500, 400), (470, 400))
+    after = user.read_image()
+    assert user.state.camera.yaw_radians > 0 and user.state.camera.position == user.state.home.position
+    errors = {s: np.abs(before[100:380, 60:200] - after[100:380, 60 + s : 200 + s]).mean() for s in (-30, 0, 30)}
+    assert min(errors, key=errors.get) == -30, "the image is shifted by the 30 pixels of the drag"
+
+
+def test_a_click_shows_the_point_and_a_second_one_the_distance(user):
+    before = user.read_image()
+    user.click_at(430, 300)
+    (point,) = user.state.points
+    assert 0.5 < point.depth < 8 and point.count > 0
+    assert changed_fraction(before, user.read_image()) > 0.0002, "a marker"
+    user.click_at(500, 500)
+    assert len(user.state.points) == 2 and user.state.points[0] == point
+    user.drag((500, 400), (460, 400))
+    user.press(imgui.Key.r)
+    assert user.state.points == []
+    assert changed_fraction(before, user.read_image()) == 0
+
+
+def test_keys_and_wheel_move_the_camera_and_r_restores_it(user):
+    before = user.read_image()
+    user.press(imgui.Key.w, frames=5)
+    assert user.state.camera.position[2] > 0.1
+    user.press(imgui.Key.r)
+    assert user.state.camera == user.state.home
+    imgui.get_io().add_mouse_wheel_event(0, 1)
+    user.draw_frames(2)
+    assert user.state.camera.vertical_fov_degrees < user.state.home.vertical_fov_degrees
+    assert changed_fraction(before, user.read_image()) > 0.1
+
+
+def test_tab_hides_the_panels_and_h_shows_the_keys(user):
+    user.press(imgui.Key.tab)
+    assert not user.panels.widgets.items
+    plain = user.read_image()
+    user.press(imgui.Key.h)
+    assert changed_fraction(plain, user.read_image()) > 0.1
+    user.press(imgui.Key.escape)
+    assert changed_fraction(plain, user.read_image()) == 0 and not user.state.quit
+
+
+def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
+    user.click("path")
+    io = imgui.get_io()
+    for character in "wasd":
+        io.add_key_event(getattr(imgui.Key, character), True)
+        io.add_input_character(ord(character))
+        assert user.viewer.gui.has_input
+        user.draw_frames(3)
+        assert not user.viewer.gui.has_input
+        io.add_key_event(getattr(imgui.Key, character), False)
+        user.draw_frames(1)
+    assert user.panels.path == "wasd"
+    assert user.state.camera == user.state.home
+    user.press(imgui.Key.enter)
+    user.settle()
+    assert user.viewer.library.names == ["opened"]
+
+
+def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
+    opened = []
+
+    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+        opened.append(path.name)
+        return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
+
+    user.find = find
+    monkeypatch.setattr(user.viewer, "preferences", Preferences())
+    user.panels.path = "kitchen"
+    user.click("Open")
+    user.settle()
+    user.panels.path = ""
+    assert user.viewer.library.names == ["kitchen 1"] and user.viewer.preferences.recent == (
+        str(Path("kitchen").absolute()),
+    )
+    user.draw_frames(2)
+    user.click("recent")
+    left, _, _, bottom = user.panels.widgets.items["recent"]
+    user.click_at(left + 30, bottom + 12)
+    user.settle()
+    assert user.viewer.library.names == ["kitchen 2"]
+
+
+def test_the_background_is_chosen_in_a_picker(user):
+    user.state.settings = replace(user.state.settings, levels=frozenset())
+    assert user.read_image().max() == 0
+    left, top, _, bottom = user.panels.widgets.items["background"]
+    user.click_at(left + 5, (top + bottom) / 2)
+    user.draw_frames(2)
+    user.click_at(left + 60, bottom + 60)
+    user.click_at(500, 880)
+    assert max(user.state.settings.background) > 0 and user.read_image().max() > 0
+
+
+def test_the_list_of_scenes_loads_the_other_pair(user):
+    user.click("pair")
+    left, _, _, bottom = user.panels.widgets.items["pair"]
+    user.click_at(left + 30, bottom + 36)
+    user.settle()
+    assert user.viewer.library.current == 1
+
+
+def test_an_error_is_shown_until_it_is_dismissed(user):
+    before = user.read_image()
+    user.show(SceneEntry("damaged"))
+    assert changed_fraction(before, user.read_image()) > 0.02, "the message is on the screen"
+    user.click("OK")
+    assert user.viewer.error is None and changed_fraction(before, user.read_image()) == 0
+
+
+def test_the_photograph_is_shown_in_the_viewing_direction(user):
+    state = user.state
+    state.comparison, state.split = "photograph", 0.0
+    state.settings = replace(state.settings, levels=frozenset())  # saves time: the photograph covers the rendering
+    state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=40)
+    image = user.read_image()
+    red, green, blue = image[180:200].mean((0, 1)) / 255
+    assert red > 0.95 and 0.4 < green < 0.6 and 0.4 < blue < 0.6, "right is red"
+    rows = image[..., 1].mean(1)
+    assert rows[0] > rows[-1] + 20, "up is green: upright"
+    state.camera = replace(state.camera, yaw_radians=0.0)
+    columns = user.read_image()[..., 0].mean(0)
+    assert columns[-1] > columns[0] + 20, "right is red: not mirrored"
+    state.camera = replace(state.camera, position=(0.0, 0.0, 0.4))
+    assert user.read_image().max() < 90, "the nearest photograph is the second, dim one"
+
+
+@both
+@pytest.mark.slow
+def test_rendering_at_an_input_camera_looks_like_its_photograph(user, pair):
+    user.show(SceneEntry("sphere", pair=pair))
+    state = user.state
+    for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
+        state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
+        state.comparison = "off"
+        rendered = user.read_image()
+        state.comparison, state.split = "photograph", 0.0
+        photograph = user.read_image()
+        assert np.abs(rendered - photograph).mean() < 4
+        assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "not mirrored"
+        assert np.abs(rendered - photograph[::-1]).mean() > 8, "not upside down"
+
+
+def assert_split(rendered: np.ndarray, compared: np.ndarray, split: float, right: float = 0.5) -> None:
+    """Asserts that both are equal left of the divider, and differ in a fraction `right` of the pixels right of it."""
+    column = round(split * SIZE[0]) - IMAGE[1].start
+    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) == 0
+    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) > right
+
+
+@both
+def test_a_drag_moves_the_divider_between_rendering_and_photograph(user):
+    rendered, camera = user.read_image(), user.state.camera
+    user.click("photograph")
+    user.state.split = 0.75
+    assert_split(rendered, user.read_image(), 0.75, right=0.9)
+    user.drag((0.75 * SIZE[0], 300), (0.75 * SIZE[0] + 60, 300))
+    assert user.state.split == pytest.approx(0.75 + 60 / SIZE[0]) and user.state.camera == camera
+    assert_split(rendered, user.read_image(), user.state.split, right=0.9)
+    user.press(imgui.Key.c)
+    assert user.state.comparison == "off" and changed_fraction(rendered, user.read_image()) == 0
+
+
+def test_the_error_is_the_mapped_difference_from_the_photograph(user):
+    state = user.state
+    state.split, state.comparison = 0.0, "off"
+    rendered = user.read_image()
+    state.comparison = "photograph"
+    photograph = user.read_image()
+    user.click("error")
+    state.max_error = 0.4
+    expected = map_values(np.abs(rendered - photograph).mean(axis=2) / 255, 0.4, ERROR_MAP)
+    assert (np.abs(user.read_image() - expected).max(axis=2) <= 12).mean() > 0.98, "up to the steps of 8 bits"
+    user.slide("error up to", 0.05)
+    assert state.max_error < 0.2 and user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
+
+
+def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
+    rendered = user.read_image()
+    user.press(imgui.Key.x)
+    assert user.state.comparison == "pinned" and user.viewer.right_name == "first, joint, color"
+    user.state.split, user.state.message = 0.8, ""
+    user.click("view 0")
+    compared = user.read_image()
+    column = round(0.8 * SIZE[0]) - IMAGE[1].start
+    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) > 0.2
+    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) == 0
+    user.show(SceneEntry("sphere", pair=user.entries[0].pair), SceneEntry("other"))
+    assert user.viewer.right_name == "first, joint, color"
+    user.click("Pin this image")
+    assert user.viewer.right_name == "sphere, view, color"
+
+
+def test_the_photograph_of_the_comparison_is_chosen_in_a_list(user):
+    user.state.comparison, user.state.photograph = "photograph", 1
+    user.draw_frames(2)
+    user.click("Go")
+    assert user.state.camera.position == pytest.approx((0, 0, 0.5))
+    user.click("photographs")
+    left, _, _, bottom = user.panels.widgets.items["photographs"]
+    user.click_at(left + 20, bottom + 12)
+    assert user.state.photograph is None, "the nearest one"
+
+
+def test_each_display_is_another_image(user):
+    images = [user.read_image()]
+    for display in get_args(Display)[1:]:
+        user.click(display)
+        images.append(user.read_image())
+        differences = [changed_fraction(other, images[-1]) for other in images[:-1]]
+        assert min(differences) > 0.1, display
+    user.click("color")
+    assert changed_fraction(images[0], user.read_image()) == 0
+
+
+def test_the_range_of_a_display_is_shown_and_can_be_changed(user):
+    user.click("depth")
+    assert 2 < user.state.settings.display_max < 6, "most Gaussians are nearer"
+    near = user.read_image()
+    user.slide("range", 0.5, start=0.3)
+    assert user.state.settings.display_max > 6
+    assert changed_fraction(near, user.read_image()) > 0.5
+
+
+def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_path, axis_photos):
+    photographs = Photographs(ctx)
+    (first, *_) = pair.context
+
+    def read(panorama: Panorama) -> np.ndarray:
+        photographs.open([panorama])
+        while (texture := photographs.get(0)) is None:
+            time.sleep(0.002)
+        return np.frombuffer(texture.read(), np.uint8)
+
+    write_image(tmp_path / "a.png", axis_photos[0])
+    before = read(panorama := replace(first, image=tmp_path / "a.png"))
+    write_image(tmp_path / "a.png", axis_photos[1])
+    assert (read(panorama) == before).all()
+    pose = first.cam2world.clone()
+    pose[0, 3] += 5
+    assert (read(replace(panorama, cam2world=pose)) != before).any()
+    assert photographs.pose(0)[0, 3] == pose[0, 3] and photographs.find_nearest(np.zeros(3)) == 0
+    photographs.release()
+
+
+@both
+def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
+    monkeypatch.setattr("pansplat_viewer.recorder.PANORAMA_HEIGHT", 128)
+    image = user.read_image()
+    user.click("PNG")
+    user.click("360 PNG")
+    png, panorama = user.viewer.recorder.files[-2:]
+    with Image.open(png) as file:
+        assert file.size == SIZE
+        pixels = np.asarray(file).astype(int)
+    assert np.abs(pixels[IMAGE] - image).max() <= 3
+    assert changed_fraction(pixels[20:560, 20:290], np.zeros_like(pixels[20:560, 20:290])) > 0.3
+    with Image.open(panorama) as file:
+        assert file.size == (256, 128)
+    user.state.message = ""
+    assert changed_fraction(image, user.read_image()) == 0, "the window shows the view again"
+
+
+@both
+def test_exr_screenshot_holds_color_and_radial_depth(user):
+    user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
+    user.click("EXR + depth")
+    by_key, path = user.viewer.recorder.files[-2:]
+    assert by_key.suffix == path.suffix == ".exr"
+    with OpenEXR.File(str(path)) as file:
+        depth = file.channels()["Z"].pixels
+        assert depth.shape == SIZE[::-1] and file.channels()["RGB"].pixels.shape == (*SIZE[::-1], 3)
+    assert 1.5 < np.median(depth[depth > 0]) < 4.5
+
+
+@both
+def test_focus_orbits_the_point_in_the_centre(user):
+    user.settle()
+    user.press(imgui.Key.f)
+    assert user.state.orbiting
+    assert 1.5 < user.state.camera.distance < 4.5
+    assert user.state.camera.position == user.state.home.position
+
+
+@both
+def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
+    user.viewer.stage.resolution.budget_ms = 1e-3
+    monkeypatch.setattr(user.viewer.stage.renderer, "pacing", SMALL)
+    io = imgui.get_io()
+    io.add_key_event(imgui.Key.w, True)
+    user.draw_frames(8)
+    assert user.viewer.stage.image_size[0] < SIZE[0]
+    io.add_key_event(imgui.Key.w, False)
+    user.settle()
+    assert user.viewer.stage.image_size == SIZE
+    user.click("coarser while moving")
+    user.press(imgui.Key.w, frames=4)
+    assert user.viewer.stage.image_size == SIZE
+
+
+def test_a_refinement_is_cancelled_or_compared_with_its_prediction(user, small_scene):
+    go = threading.Event()
+    gaussians = replace(small_scene.gaussians, harmonics=small_scene.gaussians.harmonics + 1.0)
+
+    def load(entry, progress, show):
+        show(LoadedScene(entry, small_scene, is_final=False))
+        while not go.wait(0.005):
+            progress("refining", 0.75)
+        return LoadedScene(entry, replace(small_scene, gaussians=gaussians))
+
+    user.load = load
+    for _ in range(2):
+        user.viewer.show([SceneEntry("kitchen")], 0)
+        user.draw_until(lambda: user.viewer.refinement is not None, "refinement")
+        user.draw_frames(2)
+        if not go.is_set():
+            user.click("Cancel")
+            user.settle()
+            assert user.viewer.refinement is None
+            predicted = user.read_image()
+            go.set()
+    user.settle()
+    refined = user.read_image()
+    assert changed_fraction(predicted, refined) > 0.2
+    user.click("refined")
+    assert changed_fraction(predicted, user.read_image()) == 0
+
+
+# --- window, memory and files ---
+
+
+def test_a_prediction_is_cancelled_by_a_button_below_the_image(user):
+    def load(entry, progress, show):
+        while True:
+            progress("estimating poses", 0.3)
+            time.sleep(0.002)
+
+    user.load = load
+    user.click("Reload")
+    user.draw_until(lambda: user.viewer.loading is not None, "progress")
+    user.draw_frames(2)
+    left, top, right, bottom = user.panels.widgets.items["Cancel##loading"]
+    assert 0 < left < right < SIZE[0] and 0 < top < bottom < SIZE[1], "next to a progress bar at the bottom"
+    user.click("Cancel##loading")
+    user.settle()
+    assert user.viewer.loading is user.viewer.error is None
+
+
+def test_the_largest_gaussians_of_a_scene_beyond_the_memory_make_the_picture(user, small_scene, monkeypatch):
+    before = user.read_image()
+    twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
+
+    def refuse_rows(means, *arguments):
+        if len(means) == len(twice.gaussians):
+            raise MemoryError("too many")
+        return DisplayScene(means, *arguments)
+
+    monkeypatch.setattr("pansplat_viewer.draw.cpu_renderer.DisplayScene", refuse_rows)
+    user.load = lambda entry, progress, show: LoadedScene(entry, twice)
+    user.show(SceneEntry("large"))
+    user.click("Reduce")
+    after = user.read_image()
+    assert changed_fraction(before, after) > 0.02 and np.abs(before - after).mean() < 20
+
+
+def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair, small_scene, monkeypatch):
+    monkeypatch.setattr("pansplat_viewer.scene.slots._LARGE_SCENE", 0)
+    before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
+    monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(300) and draw(*arguments))
+    other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
+    user.load = lambda entry, progress, show: LoadedScene(entry, other)
+    user.viewer.show([SceneEntry("large", pair=pair)], 0)
+    user.draw_until(
+        lambda: user.viewer.stage.slot.scene is other and user.viewer.stage.comparer.photographs._textures, "photograph"
+    )
+    user.draw_frames(1)
+    assert user.viewer.pending is not None and user.viewer.busy and user.viewer.error is None
+    photograph = user.read_screen()
+    assert changed_fraction(before, photograph) > 0.3 and photograph.mean() > 60
+    go.set()
+    image = user.read_image()
+    assert changed_fraction(photograph, image) > 0.3 and changed_fraction(before, image) > 0.1
+
+
+def test_theme_scale_and_layout_change_the_panels(user):
+    user.click("Drawing")
+    user.click("Window")
+    user.draw_frames(2)
+    panel = (slice(0, None), slice(0, 280))
+
+    def read_panel() -> np.ndarray:
+        user.draw_frames(3)
+        return user.read_window()[panel]
+
+    dark, height = read_panel(), user.panels.widgets.items["joint"][3] - user.panels.widgets.items["joint"][1]
+    user.click("light")
+    assert read_panel().mean() > dark.mean() + 80
+    user.click("dark")
+    assert np.abs(read_panel() - dark).mean() < 2
+    user.click_at(4, 4)  # shows the title
+    user.drag((30, 8), (60, 60))
+    assert np.abs(read_panel() - dark).mean() > 20, "the panel is no longer docked"
+    user.click("Default layout")
+    assert np.abs(read_panel() - dark).mean() < 2
+    user.viewer.gui.set_scale(1.5)
+    user.draw_frames(3)
+    _, top, _, bottom = user.panels.widgets.items["joint"]
+    assert bottom - top == pytest.approx(1.5 * height, abs=2)
+    user.viewer.gui.set_scale(1.0)
+    user.draw_frames(3)
+    user.click("Window")
+    user.click("Drawing")
+
+
+def test_a_gamepad_flies_and_looks(user):
+    io = imgui.get_io()
+    for key, field in (("gamepad_l_stick_up", "position"), ("gamepad_r_stick_right", "yaw_radians")):
+        before = getattr(user.state.camera, field)
+        io.add_key_analog_event(getattr(imgui.Key, key), True, 0.8)
+        user.draw_frames(3)
+        io.add_key_analog_event(getattr(imgui.Key, key), False, 0.0)
+        user.draw_frames(1)
+        moved = getattr(user.state.camera, field)
+        assert moved != before
+        user.draw_frames(2)
+        assert getattr(user.state.camera, field) == moved
+    assert user.state.camera.position[2] > 0 and user.state.camera.yaw_radians > 0
+    user.press(imgui.Key.gamepad_face_right)
+    assert user.state.camera == user.state.home
+
+
+# --- tours ---
+
+
+@pytest.fixture
+def small_pacing(monkeypatch) -> Callable[[User], None]:
+    """Lets the renderers of a viewer draw small images while the camera moves."""
+
+    def shrink(user: User) -> None:
+        for slot in user.viewer.stage.slots:
+            monkeypatch.setattr(slot.renderer, "pacing", SMALL)
+
+    return shrink
+
+
+@pytest.fixture
+def tour_user(user, house, small_pacing) -> User:
+    """The session in the tour, at its first panorama, with all that is next in memory."""
+    user.show(SceneEntry(house.name, tour=house))
+    user.settle()
+    small_pacing(user)
+    return user
+
+
+def fly(user: User, seconds: float = 1 / 5) -> list[float]:
+    """Draw frames until the flight ends; returns the mean change from each frame to the next."""
+    user.viewer.stage.resolution.budget_ms = 1e-3  # coarse images save time
+    steps, shown = [], [user.read_screen()]
+
+    def has_ended() -> bool:
+        shown.append(user.read_screen())
+        steps.append(float(np.abs(shown[1] - shown.pop(0)).mean()))
+        return len(steps) > 1 and not (user.state.playing or user.viewer.moving)
+
+    user.draw_until(has_ended, "end of the flight", seconds)
+    return steps
+
+
+def test_the_dolls_house_is_shown_and_a_click_on_a_mark_flies_in(user):
+    image = user.read_image()
+    user.click("doll's house")
+    user.draw_until(lambda: user.state.doll_house and user.state.glide is None, "doll's house", 1 / 5)
+    outside = user.read_image()
+    assert changed_fraction(image, outside) > 0.3 and (outside[0] < 20).all()
+    camera = user.state.camera
+    beside = np.asarray(camera.position) - 1.2 * camera.rotation[:, 0]  # the mark is right of the panel
+    user.state.camera = replace(camera, position=tuple(beside.tolist()))
+    user.draw_frames(2)
+    (mark,) = [mark for mark in user.viewer.hotspots if mark.node == 1]
+    user.click_at(*mark.center)
+    user.draw_until(lambda: not user.state.doll_house, "end of the flight", 1 / 5)
+    assert user.state.camera.position == (0, 0, 0.5)
+
+
+def find_node(user: User) -> int:
+    return int(np.linalg.norm(user.viewer.tour.tour.positions - user.state.camera.position, axis=1).argmin())
+
+
+def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
+    user = tour_user
+    assert user.viewer.tour.tour.name == "house tour" and user.viewer.hotspots
+    images = [user.read_image()]
+    for label in ("hotspots", "floor plan"):
+        user.click(label)
+        images.append(user.read_image())
+        assert changed_fraction(images[-2], images[-1]) > 0.002, label
+    user.press(imgui.Key.m)
+    user.press(imgui.Key.m)
+    assert user.state.minimap == user.state.hotspots
+    user.press(imgui.Key.m)
+    assert user.state.minimap and user.state.hotspots
+    assert changed_fraction(images[0], user.read_image()) == 0
+    imgui.set_window_pos("Tour", (SIZE[0] - 20, 200))  # as remembered from a larger window
+    user.draw_frames(3)
+    assert user.panels.widgets.items["hotspots"][2] < SIZE[0]
+
+
+@pytest.mark.slow
+def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
+    user = tour_user
+    user.state.camera = replace(user.state.camera, yaw_radians=-0.25)  # the hotspot is right of the panel
+    user.draw_frames(2)
+    (hotspot,) = [spot for spot in user.viewer.hotspots if spot.node == 2]
+    first, color = user.viewer.stage.slot.scene, user.read_image().mean((0, 1))
+    user.click_at(*hotspot.center)
+    assert user.state.playing and not user.state.points
+    fly(user)
+    assert np.linalg.norm(user.state.camera.position - user.viewer.tour.tour.positions[2]) < 1e-6
+    user.click_at(*user.panels.minimap.nodes[3])
+    steps = fly(user)
+    assert find_node(user) == 3 and user.viewer.stage.slot.scene is not first
+    exchanged = np.abs(user.read_image().mean((0, 1)) - color).mean()
+    assert exchanged > 30, "the scenes have different colours"
+    assert max(steps) < 0.5 * exchanged, "no jump: a fade changes 30 % in 0.2 s at most"
+    user.click("visit")
+    user.click("visit 0")
+    fly(user)
+    assert find_node(user) == 0
+
+
+def match_photograph(user: User, node: int) -> float:
+    """The mean difference of the screen from a photograph in the direction of the camera."""
+    user.draw_frames(3, SETTLE_AFTER)
+    shown = user.read_screen()
+    user.state.comparison, user.state.split, user.state.photograph = "photograph", 0.0, node
+    user.draw_frames(3)
+    difference = np.abs(user.read_screen() - shown).mean()
+    user.state.comparison, user.state.photograph = "off", None
+    return float(difference)
+
+
+def test_a_flight_fades_between_photographs_where_no_scene_is_ready(user, house, load_house):
+    go, viewer = threading.Event(), user.viewer
+
+    def load(entry, progress, show):
+        while entry.views not in ((), (0, 1)) and not go.wait(0.005):
+            progress("predicting", 0.5)
+        return load_house(entry)
+
+    user.load = load
+    viewer.show([SceneEntry(house.name, tour=house)], 0)
+    user.draw_until(lambda: viewer.tour is not None and not viewer.library.loader.is_searching, "tour")
+    user.press(imgui.Key._4)
+    viewer.stage.resolution.budget_ms, shown = 1e-3, [user.read_screen()]
+
+    def has_ended() -> bool:
+        shown.append(user.read_screen())
+        return not (user.state.playing or viewer.stage.is_animated(user.clock[0]))
+
+    user.draw_until(has_ended, "end of the flight", 1 / 10)
+    assert min(frame.max(-1).mean() for frame in shown) > 40, "no black"
+    steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3))
+    assert steps.max() < 20, "no jump: a fade changes 15 % in 0.1 s at most"
+    assert match_photograph(user, 3) < 1
+    go.set()
+
+
+# --- poses by hand ---
+
+
+@pytest.fixture
+def placing_user(user, tmp_path, monkeypatch) -> User:
+    """The session in a tour of a, b, c and d: c is probably placed, d is not; a suggestion is 1 m to the right of a."""
+    for name in "abcd":
+        pixels = np.random.default_rng(ord(name)).integers(0, 255, (32, 64, 3), np.uint8)
+        Image.fromarray(pixels).resize((256, 128)).save(tmp_path / f"{name}.png")
+    poses = {f"{name}.png": np.eye(4).tolist() for name in "abc"}
+    for step, pose in enumerate(poses.values()):
+        pose[2][3] = 0.8 * step
+    estimate = {
+        "unplaced": {"d.png": "no door in d"},
+        "pairs": [
+            {"between": ["a.png", "b.png"], "check": "certain"},
+            {"between": ["b.png", "c.png"], "check": "probable"},
+        ],
+        "suggestions": [{"between": ["a.png", "d.png"], "places": [[1.0, 0.0, 0.5, -1.0]]}],
+    }
+    content = {"convention": "cam2world opencv", "worlds": [{"unit": 1.0}], "poses": poses, "estimate": estimate}
+    (tmp_path / "poses.json").write_text(json.dumps(content))
+
+    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_pairs(path))]
+
+    def read(image: Path) -> Piece:
+        depth = DepthMap(np.zeros((32, 64)), np.full((8, 16), 0.05), np.eye(3))
+        rays = pixel_directions(32, 64).numpy()
+        np.log(1 / np.abs(rays).max(axis=-1), out=depth.log_depth)  # a cube
+        return Piece(Surroundings(np.full((32, 64, 3), 0.5), depth), 0.0)
+
+    user.find = find
+    monkeypatch.setattr("pansplat_viewer.scene.placing.read_piece", read)
+    user.viewer.open(tmp_path)
+    user.draw_until(lambda: user.viewer.tour is not None and not user.viewer.library.loader.is_searching, "tour")
+    user.settle()
+    yield user
+    user.viewer.placing.stop()
+
+
+def test_states_of_photographs_are_listed_and_drawn_on_the_floor_plan(placing_user):
+    user = placing_user
+    assert user.viewer.placing.panoramas[3].placement.reason == "no door in d"
+    tour = user.viewer.tour.tour
+    assert describe_panoramas(tour) == "2 placed, 1 probably, 1 not placed"
+    assert [describe_panorama(tour, node) for node in range(4)] == ["a", "b", "c (probably placed)", "d (not placed)"]
+    labels = {label for label in user.panels.widgets.items if "##" in label}
+    assert {"Place##0", "Place##1", "Place##2", "Place##3", "Reject##2"} <= labels
+    assert not {"Reject##0", "Reject##1", "Reject##3", "Restore##2"} & labels
+    pixels = user.read_window()
+    centres = [pixels[round(y), round(x)].sum() for x, y in user.panels.minimap.nodes]
+    assert centres[1] > centres[2] + 100, "the mark of the one that is probably placed is hollow"
+
+
+@pytest.mark.filterwarnings("ignore:.*has no pose of")
+def test_a_probable_photograph_is_rejected_restored_and_the_rejection_undone(placing_user, tmp_path):
+    user = placing_user
+    before = (tmp_path / "poses.json").read_bytes()
+    user.click("Reject##2")
+    assert "c.png" not in json.loads((tmp_path / "poses.json").read_text())["poses"]
+    user.draw_frames(2)
+    assert "Restore##2" in user.panels.widgets.items and "Reject##2" not in user.panels.widgets.items
+    user.draw_until(lambda: user.viewer.library.watch.changed, "note of the changed file")  # it moves the button
+    user.click("Load the changed poses")
+    user.draw_until(lambda: not user.viewer.placing.is_changed, "loaded poses")
+    user.settle()
+    assert describe_panoramas(user.viewer.tour.tour) == "2 placed, 2 not placed"
+    assert "Restore##2" in user.panels.widgets.items
+    user.click("Undo##poses")  # also after loading
+    assert (tmp_path / "poses.json").read_bytes() == before
+    assert user.viewer.placing.panoramas[2].placement.state == "probable"
+
+
+def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(placing_user, tmp_path):
+    user = placing_user
+    user.click("Place##3")
+    placing, window, io = user.viewer.placing, user.panels.placing, imgui.get_io()
+    user.draw_until(lambda: not placing.missing and placing.places, "pieces")
+    user.draw_frames(2)
+    assert placing.shown.suggestion == 0
+
+    def find_pixel() -> tuple[float, float]:
+        x, y = window.view.to_pixels(np.array(placing.shown.place[:2]))
+        return x + window.corner[0], y + window.corner[1]
+
+    start, (x, y) = placing.shown.place, find_pixel()
+    scale = window.view.pixels_per_metre
+    user.drag((x, y), (x + 0.6 * scale, y - 0.5 * scale))
+    assert placing.shown.place.right == pytest.approx(start.right + 0.6, abs=0.02)
+    assert placing.shown.place.forward == pytest.approx(start.forward + 0.5, abs=0.02)
+    assert placing.shown.suggestion is None and placing.fit is not None
+
+    camera, flight, yaw = user.state.camera, user.state.flight, placing.shown.place.yaw
+    user.press(imgui.Key.period)
+    assert placing.shown.place.yaw == pytest.approx(yaw + np.radians(5), abs=0.03)
+    io.add_key_event(imgui.Key.mod_shift, True)
+    yaw = placing.shown.place.yaw
+    user.press(imgui.Key.comma)
+    io.add_key_event(imgui.Key.mod_shift, False)
+    user.draw_frames(1)
+    assert placing.shown.place.yaw == pytest.approx(yaw - np.radians(0.5), abs=1e-6)
+    io.add_mouse_pos_event(*find_pixel())
+    user.draw_frames(2)
+    yaw = placing.shown.place.yaw
+    io.add_mouse_wheel_event(0.0, 2.0)
+    user.draw_frames(2)
+    assert abs(placing.shown.place.yaw - yaw - np.radians(10)) < 0.05
+    assert (user.state.camera, user.state.flight) == (camera, flight), "keys and wheel turn the piece only"
+
+    user.click("Adjust##pose")
+    user.draw_until(lambda: not placing.is_adjusting, "end of the adjustment")
+    ghost = placing.ghosts[0].place
+    at = window.view.to_pixels(np.array(ghost[:2])) + window.corner
+    user.click_at(*at)  # on the ghost
+    assert placing.shown.suggestion == 0
+    user.click("Save##pose")
+    entry = json.loads((tmp_path / "poses.json").read_text())["poses"]["d.png"]
+    assert entry["placed"] == "by hand" and entry["cam2world"][0][3] == pytest.approx(1.0)
+    user.draw_frames(2)
+    user.click("Load the changed poses##pose")
+    user.draw_until(lambda: not placing.is_changed, "loaded poses")
+    user.settle()
+    tour = user.viewer.tour.tour
+    assert describe_panorama(tour, 3) == "d (placed by hand)" and (3, 3) not in tour.overlaps
+    user.press(imgui.Key.escape)
+    assert placing.node is None and not user.state.quit
+
+
+def test_alt_disables_snapping_and_the_knob_turns_the_piece(placing_user):
+    user = placing_user
+    user.click("Place##3")
+    placing, window, io = user.viewer.placing, user.panels.placing, imgui.get_io()
+    user.draw_until(lambda: not placing.missing and placing.places, "pieces")
+    user.draw_frames(2)
+    scale, start = window.view.pixels_per_metre, placing.shown.place
+    io.add_key_event(imgui.Key.mod_alt, True)
+    x, y = window.view.to_pixels(np.array(start[:2])) + window.corner
+    user.drag((x, y), (x + 0.1 * scale, y))
+    assert placing.shown.suggestion is None and placing.shown.place.right == pytest.approx(start.right + 0.1, abs=0.02)
+    io.add_key_event(imgui.Key.mod_alt, False)
+    user.draw_frames(1)
+    knob = window._find_knob(placing, 1.0)
+    x, y = window.view.to_pixels(np.array(placing.shown.place[:2])) + window.corner
+    user.drag(knob, (x + 60, y + 2))  # to the right of the camera
+    assert placing.shown.has_walls and placing.shown.place.yaw == pytest.approx(np.pi / 2)
+
+
+# --- tours ---
+
+
+# --- camera paths ---
+
+
+@pytest.fixture
+def path_user(user) -> User:
+    """The session with the opened editor of a path of two key frames, 1 s apart, at the second."""
+    sections = ("Gaussians", "Drawing", "Camera path")  # the first two are closed for space
+    for label in sections:
+        user.click(label)
+    user.click("Add key frame")
+    user.state.camera = replace(user.state.camera, position=(0.2, 0.0, 0.3), yaw_radians=0.5)
+    user.state.path_seconds = 1.0
+    user.press(imgui.Key.k)
+    assert [frame.seconds for frame in user.state.path.key_frames] == [0.0, 1.0]
+    yield user
+    for label in sections:
+        user.click(label)
+
+
+def test_the_buttons_of_key_frames_show_replace_and_delete_them(path_user):
+    user = path_user
+    last = user.read_image()
+    user.click("0.00 s##0")
+    first = user.read_image()
+    assert user.state.camera.position == (0, 0, 0) and changed_fraction(first, last) > 0.1
+    user.click("1.00 s##1")
+    assert changed_fraction(last, user.read_image()) == 0
+    user.click("Replace##0")
+    assert user.state.path.key_frames[0].position == (0.2, 0.0, 0.3)
+    user.click("Delete##0")
+    assert [frame.seconds for frame in user.state.path.key_frames] == [1.0]
+    user.click("Delete##0")
+    assert len(user.state.path) == 0 and "Play path" not in user.panels.widgets.items
+
+
+def test_the_path_is_played_and_its_time_is_dragged(path_user):
+    user = path_user
+    user.click("Play path")
+    assert user.state.path_playing
+    user.click("Pause")
+    assert not user.state.path_playing and 0 < user.state.path_seconds < 1
+    user.click("Play path")
+    user.draw_frames(5, 0.25)
+    assert not user.state.path_playing
+    assert user.state.camera.position == pytest.approx((0.2, 0.0, 0.3))
+    before = user.read_image()
+    user.slide("time", 0.15, start=0.02)
+    assert 0 < user.state.path_seconds < 1 and 0 < user.state.camera.position[2] < 0.3
+    assert changed_fraction(before, user.read_image()) > 0.1
+
+
+@pytest.mark.slow
+def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
+    user, path = path_user, path_user.state.path
+    user.panels.path_file = str(tmp_path / "walk.json")
+    user.click("Save")
+    user.click("Delete##0")
+    user.click("Load")
+    assert user.state.path == path
+    user.state.film_fps = 2.0
+    user.click(".png")
+    user.click("Write film")
+    user.settle()
+    files = user.viewer.recorder.files[-3:]
+    user.state.message = ""
+    shown = user.read_image()
+    with Image.open(files[-1]) as file:
+        assert np.abs(np.asarray(file).astype(int)[IMAGE] - shown).max() <= 3, "the last frame is the last key frame"
+    user.state.path = path.add(replace(path.key_frames[0], seconds=600.0))
+    user.click("Write film")
+    user.click("Cancel##film")
+    user.settle()
+    assert user.viewer.error is None and user.viewer.recorder.files[-3:] == files
+
+
+def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
+    user, films = path_user, []
+    monkeypatch.setattr(
+        "pansplat_viewer.recorder.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
+    )
+    user.slide("frames per second", 0.6)
+    for suffix, projection in ((".webm", "equirect"), (".exr", "cubemap"), (".mp4", "perspective")):
+        user.click(suffix)
+        user.click(projection)
+        user.click("Write film")
+        user.settle()
+        frames, path, _, file, fps, _ = films.pop()
+        assert (frames.image_format.projection, file.suffix) == (projection, suffix)
+        assert path == user.state.path and fps == user.state.film_fps != 24

@@ -1,0 +1,66 @@
+"""The scenes that a user can choose from: where they were found, which one is listed as current, and file changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pansplat_viewer.scene.loader import Progress, SceneEntry, SceneLoader
+from pansplat_viewer.window.file_watch import FileWatch
+
+
+class Library:
+    """The listed entries and their loader.
+
+    Attributes:
+        loader: loads one entry at a time; closed with the viewer.
+        entries: to choose from.
+        current: number of the one that is shown or loaded; -1 if there is none.
+        path: where they were found; None if they are only loaded again.
+        watch: of the files of the current one.
+    """
+
+    def __init__(self, loader: SceneLoader, find: Callable[[Path, Progress], list[SceneEntry]]) -> None:
+        """`find` returns the entries of a path; it is called in a worker thread."""
+        self.loader, self._find = loader, find
+        self.entries: list[SceneEntry] = []
+        self.current = -1
+        self.path: Path | None = None
+        self.watch = FileWatch()
+        self._wanted: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
+        self._shown: tuple[list[SceneEntry], int, Path | None] | None = None  # arguments of `offer`
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the entries."""
+        return [entry.name for entry in self.entries]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was not used or not placed at the path, and why."""
+        return self.entries[self.current].notes if 0 <= self.current < len(self.entries) else ()
+
+    def search(self, path: Path, name: str | None = None) -> None:
+        """Look for the entries at a path, to show that of a name, else the first one."""
+        self._wanted = path, name
+        self.loader.search(path, self._find)
+
+    def choose_found(self, found: list[SceneEntry]) -> tuple[int, Path]:
+        """The number of the entry to show of those that a search has found, and its path."""
+        path, name = self._wanted
+        names = [entry.name for entry in found]
+        return names.index(name) if name in names else 0, path
+
+    def offer(self, entries: list[SceneEntry], index: int, path: Path | None) -> None:
+        """Offer these entries, of which one is loaded."""
+        self.entries, self.current, self.path = entries, index, path
+        self.watch.start(entries[index].files)
+
+    def keep(self) -> None:
+        """The current entry is shown."""
+        self._shown = self.entries, self.current, self.path
+
+    def restore(self) -> None:
+        """List the entry that is shown again, after another one was not loaded."""
+        if self._shown is not None:
+            self.offer(*self._shown)

@@ -1,0 +1,303 @@
+"""What the window shows: scenes and photographs that fade into each other, the doll's house, and a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
+from typing import Any
+
+import moderngl
+import numpy as np
+from jaxtyping import Float
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
+from pansplat_viewer.draw.stereo import WindowRenderer, create_window_renderer, get_eye_size
+from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.loader import LoadedScene
+from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
+from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot
+from pansplat_viewer.scene.state import ViewerState, adapt_settings, fit_settings
+from pansplat_viewer.scene.tour import CrossFade
+from pansplat_viewer.ui.compare import Comparer
+from pansplat_viewer.ui.presenter import PhotographLayer, Presenter
+
+DRAW_ERRORS = (InputError, MemoryError, moderngl.Error)
+_CENTER_REACHES = 4, 16, 64  # pixels around the image centre
+
+
+class Stage:
+    """Draws the image.
+
+    Attributes:
+        slots: renderers of a scene and of that which it fades to; the second one is for tours.
+        scene_views: the panoramas in its tour of the scene that was shown last.
+        outside: the doll's house; None inside of the rooms.
+        fade: what is shown, and what it fades from.
+        preparer: converts large scenes.
+        comparer: the photographs and the pinned image.
+        resolution: of the frames.
+        size: of the window, pixels.
+        image_size: of the rendered image, pixels; smaller than the window while the camera moves.
+        has_failed: whether drawing has failed; nothing is drawn until this is False.
+        last_camera: of the last frame; a change since then is a movement.
+    """
+
+    def __init__(
+        self, ctx: moderngl.Context, choice: RendererChoice, state: ViewerState, show_error: Callable[[str], None]
+    ) -> None:
+        """Create GL objects on the current context."""
+        self._ctx, self._state, self._show_error = ctx, state, show_error
+        self._choice: RendererChoice = choice
+        self.slots = [self._create_slot()]
+        self._scene_slot = 0  # that of the scene that was shown last
+        self.scene_views: tuple[int, ...] = ()
+        self.outside: SceneSlot | None = None
+        self.fade = CrossFade()
+        self.preparer = ScenePreparer(self.renderer.prepare)
+        self.presenter = Presenter(ctx)
+        self.comparer = Comparer(ctx, lambda: create_window_renderer(ctx, choice), show_error)
+        self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
+        self.resolution = self._create_resolution()
+        self.size: tuple[int, int] = (1, 1)
+        self.image_size: tuple[int, int] = (1, 1)
+        self.has_failed = False
+        self.last_camera = state.camera
+
+    def _create_slot(self) -> SceneSlot:
+        return SceneSlot(create_window_renderer(self._ctx, self._choice))
+
+    def _create_resolution(self) -> AdaptiveResolution:
+        pacing = self.renderer.pacing
+        return AdaptiveResolution(settle_after=pacing.settle_seconds, turn_ms=pacing.turn_ms)
+
+    @property
+    def slot(self) -> SceneSlot:
+        """The scene that is shown, or that was shown before a photograph."""
+        return self.slots[self._scene_slot] if self.outside is None else self.outside
+
+    @property
+    def renderer(self) -> WindowRenderer:
+        """The renderer of `slot`."""
+        return self.slot.renderer
+
+    @property
+    def eye_size(self) -> tuple[int, int]:
+        """(width, height) of the image of one eye, pixels."""
+        return get_eye_size(self.size, self._state.settings.stereo)
+
+    @property
+    def photograph(self) -> int | None:
+        """Number of the photograph that is shown, because there is no scene of the camera's place yet; else None."""
+        content = self.fade.contents[self.fade.front]
+        return content if self.outside is None and isinstance(content, int) else None
+
+    @property
+    def _shown_slots(self) -> list[SceneSlot]:
+        slots = [] if self.photograph is not None else [self.slot]
+        return slots if self.comparer.pinned is None else [*slots, self.comparer.pinned.slot]
+
+    def is_animated(self, now: float) -> bool:
+        """Whether the image changes with the time alone."""
+        state = self._state
+        fading = self.fade.compute_weight(now) < 1
+        return fading or state.path_playing or state.playing or state.glide is not None
+
+    def is_moving(self, now: float) -> bool:
+        """Whether the image is still changing, so that a window draws as often as it can."""
+        recently = now - self.resolution.last_motion < 2 * self.resolution.settle_after
+        unsettled = any(slot.scene is not None and not slot.renderer.stats.settled for slot in self._shown_slots)
+        return self.is_animated(now) or recently or (unsettled and not self.has_failed)
+
+    @property
+    def pending(self) -> Future[Any] | None:
+        """The image that is drawn in the background."""
+        return next((slot.renderer.pending for slot in self._shown_slots if slot.renderer.pending is not None), None)
+
+    # --- what is shown ---
+
+    def upload(self, slot: SceneSlot, scene: Scene, name: str) -> Exception | None:
+        """Upload a scene; if this fails, show the error and return it."""
+        try:
+            slot.upload(scene, self.preparer.take(scene))
+        except DRAW_ERRORS as error:
+            self._show_error(f"{name}: {describe_error(error)}")
+            return error
+        return None
+
+    def clear(self) -> None:
+        """Show nothing; the next scene is that of the first slot."""
+        self.fade.clear()
+        self._scene_slot, self.resolution = 0, self._create_resolution()
+
+    def add_slot(self) -> None:
+        """Make the slot that the scenes of a tour fade to."""
+        if len(self.slots) == 1:
+            self.slots.append(self._create_slot())
+
+    def fade_to_scene(self, loaded: LoadedScene, part: int, *, can_wait: bool) -> bool:
+        """Start to fade to a scene of a tour; returns False if it is not prepared.
+
+        Args:
+            loaded: the scene.
+            part: of the tour.
+            can_wait: whether a scene that is not prepared may be prepared.
+        """
+        slot = self.fade.choose_slot(loaded.scene)
+        if slot is None:  # it is shown, or a fade goes on
+            return True
+        if self.slots[slot].scene is not loaded.scene:
+            ready = can_wait and self.preparer.is_ready(loaded.scene)
+            if not ready or self.upload(self.slots[slot], loaded.scene, loaded.entry.name) is not None:
+                return False
+        self.fade.show(slot, loaded.scene, self._state.now, part)
+        self._scene_slot, self.scene_views = slot, loaded.entry.views
+        adapt_settings(self._state, loaded.scene)
+        self._state.points = []
+        return True
+
+    def fade_to_photograph(self, index: int | None, part: int = 0) -> None:
+        """Start to fade to a photograph; what is shown stays while it is read."""
+        self.fade.compute_weight(self._state.now)
+        slot = None if index is None else self.fade.choose_slot(index)
+        if index is not None and slot is not None and self.comparer.get_photograph(self._state, index) is not None:
+            self.fade.show(slot, index, self._state.now, part)
+
+    def show_outside(self, scene: Scene) -> bool:
+        """Show a doll's house; returns whether that was possible."""
+        slot = self._create_slot()
+        if self.upload(slot, scene, "doll's house") is not None:
+            slot.renderer.release()
+            return False
+        self.outside, self.resolution = slot, self._create_resolution()
+        return True
+
+    def hide_outside(self) -> None:
+        """Show the scene from inside."""
+        if self.outside is not None:
+            self.outside.renderer.release()
+            self.outside, self.resolution = None, self._create_resolution()
+
+    # --- frames ---
+
+    def draw(self, target: moderngl.Framebuffer) -> Exception | None:
+        """Draw the image. If this fails, show the error, return it, and draw the background while `has_failed`."""
+        problem = None
+        if not self.has_failed:
+            try:
+                self._draw_image(target)
+                return None
+            except DRAW_ERRORS as error:
+                self.has_failed, self.slot.image, problem = True, None, error
+                self._show_error(describe_error(error))
+        self._draw_background(target)
+        return problem
+
+    def _draw_background(self, target: moderngl.Framebuffer) -> None:
+        target.use()
+        self._ctx.clear(*self._state.settings.background)
+
+    def _draw_image(self, target: moderngl.Framebuffer) -> None:
+        state, plan, weight, fading = self._state, self._plan_resolution(), 1.0, None
+        if self.outside is not None:
+            milliseconds = self._render(self.outside, state.camera.cam2world, state.draw_settings, plan)
+            image = self.outside.image
+        else:
+            weight = self.fade.compute_weight(state.now)
+            image, milliseconds = self._draw_content(self.fade.front, plan)
+            if weight < 1:
+                fading, more = self._draw_content(1 - self.fade.front, plan)
+                milliseconds += more
+            if image is None:  # the first one of a large scene is not finished
+                image, fading = fading, None
+        self._record_time(plan, milliseconds)
+        if image is None:
+            photograph = self.comparer.get_photograph(state) if self.outside is None else None
+            if photograph is None:
+                self._draw_background(target)
+            else:
+                self.presenter.draw_photograph(photograph, target, state.camera)
+            return
+        self.image_size = self.size if self.photograph is not None else self.renderer.stats.size
+
+        def draw_pinned(slot: SceneSlot, settings: DrawSettings) -> moderngl.Texture | None:
+            self._render(slot, state.camera.cam2world, settings, plan)
+            return slot.image
+
+        can_compare = self.outside is None and state.settings.stereo == "mono"
+        right = self.comparer.get_right_side(state, draw_pinned) if can_compare else None
+        self.presenter.draw(image, target, state.camera, right=right, fading=fading, weight=weight)
+
+    def _plan_resolution(self) -> ResolutionPlan:
+        """The plan of the frame, from the movement since the last one."""
+        camera = self._state.camera
+        moved = camera.position != self.last_camera.position
+        turned = not moved and camera != self.last_camera
+        self.last_camera = camera
+        self.resolution.limit(self.size, self.renderer.pacing.min_size)
+        return self.resolution.plan(self._state.now, moved=moved, turned=turned, adaptive=self._state.adaptive)
+
+    def _record_time(self, plan: ResolutionPlan, milliseconds: float) -> None:
+        if milliseconds > 0:  # else the image is not new, or not finished
+            timed = self.renderer.stats.timed
+            timed_plan = plan if timed is None else ResolutionPlan(timed.scale, cached=timed.cached)
+            self.resolution.record(timed_plan, milliseconds)
+
+    def _draw_content(self, slot: int, plan: ResolutionPlan) -> tuple[moderngl.Texture | None, float]:
+        """The image of a slot of the fade, None if there is none yet, and the milliseconds of drawing a new one."""
+        state, content, pose = self._state, self.fade.contents[slot], self.fade.poses[slot]
+        pose = state.camera.cam2world if pose is None else pose
+        if isinstance(content, int):
+            photograph = self.comparer.get_photograph(state, content)
+            if photograph is None:
+                return None, 0.0
+            return self._layers[slot].draw(photograph, cameras.move_to_pose(state.camera, pose), self.size), 0.0
+        scene_slot = self.slots[slot]
+        if content is None or scene_slot.scene is None:
+            return None, 0.0
+        settings = fit_settings(state.draw_settings, scene_slot.scene)  # that which fades may have fewer views
+        milliseconds = self._render(scene_slot, pose, settings, plan)
+        return scene_slot.image, milliseconds
+
+    def _render(
+        self, slot: SceneSlot, cam2world: Float[np.ndarray, "4 4"], settings: DrawSettings, plan: ResolutionPlan
+    ) -> float:
+        """Draw the image of this plan; returns milliseconds, 0 if it is not new."""
+        settings = replace(settings, cached=plan.cached)
+        if not (plan.cached and slot.renderer.has_faces(cam2world, self.size, settings)):
+            settings = replace(settings, scale=plan.scale)
+        wait = plan.moving and slot.renderer.pacing.waits_while_moving
+        return slot.draw(cam2world, self.size, settings, wait=wait)
+
+    def measure_center_depth(self) -> float | None:
+        """Median depth around the centre of the last image, metres; None if nothing is drawn there."""
+        if self.slot.image is None or self.photograph is not None:
+            return None
+        depth = self.renderer.read_depth()
+        self.slot.image = None  # `read_depth` may have replaced the texture
+        row, column = depth.shape[0] // 2, depth.shape[1] // 2
+        for reach in _CENTER_REACHES:
+            near = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+            if (near > 0).any():
+                return float(np.median(near[near > 0]))
+        return None
+
+    def release(self) -> None:
+        """Stop the threads and free every GL object."""
+        self.preparer.close()
+        for layer in self._layers:
+            layer.release()
+        self.presenter.release()
+        self.comparer.release()
+        self.hide_outside()
+        for slot in self.slots:
+            slot.renderer.release()
+
+
+def describe_error(error: Exception) -> str:
+    """The text of an error of drawing."""
+    if isinstance(error, MemoryError):
+        return f"the memory is exhausted ({type(error).__name__}: {error})"
+    return f"OpenGL failed: {error}" if isinstance(error, moderngl.Error) else str(error)
