@@ -40,7 +40,8 @@ from pansplat.gaussians.scene import Scene
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
 from pansplat.strict_json import read_json
-from pansplat.tours import TourGraph, find_tours, merge_scenes, write_floor_plan
+from pansplat.tours import TourGraph, find_tours, merge_scenes
+from pansplat.tours.plan_files import write_picture
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
@@ -323,7 +324,7 @@ def _process_unit(
 
             write_page(scene, path, gaussians=int(_count_of_page(options)), title=name.replace("_", " "))
         elif options.suffix == ".png":
-            write_floor_plan(scene, path)
+            write_picture(scene, path)
         elif pipeline.can_stream(predictor):
             pipeline.save(scene, path)  # networks are trained for joint drawing
         elif tour is not None:

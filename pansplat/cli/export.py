@@ -43,7 +43,7 @@ _MIN_POINT_OPACITY, _MOST_POINTS = 0.1, 200_000  # of the points to train from
 @dataclass(frozen=True)
 class Export(Writer):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
-    web page (.html, docs/web.md), as a floor plan (.svg and .dxf with straight walls and areas; .png), as textured
+    web page (.html, docs/web.md), as a floor plan with straight walls and areas (.svg, .png, .dxf), as textured
     triangles (.obj, .glb with --mesh), or as a folder to train further from (a name without suffix): cube faces, poses
     and points for COLMAP, nerfstudio, gsplat and brush."""
 
@@ -91,7 +91,6 @@ class Export(Writer):
         """Write the file and print its size."""
         from pansplat.gaussians.formats import save_scene
         from pansplat.gaussians.ply import save_points
-        from pansplat.tours import write_floor_plan
         from pansplat.web import parse_origins
 
         is_dataset = not self.out.suffix
@@ -133,14 +132,12 @@ class Export(Writer):
                 from pansplat.web.serve import serve_page
 
                 serve_page(page)
-        elif is_drawing:
-            from pansplat.tours.plan_files import describe_plan, write_plan
+        elif is_drawing or is_picture:
+            from pansplat.tours.plan_files import describe_plan, write_picture, write_plan
 
-            plan = write_plan(scene, self.out)
-            print(f"{self.out}: {'; '.join(describe_plan(plan))}")
-        elif is_picture:
-            write_floor_plan(scene, self.out)
-            print(f"{self.out}: the floors of {len(scene.cam2world)} panoramas")
+            plan = write_plan(scene, self.out) if is_drawing else write_picture(scene, self.out)
+            floors = [f"the floors of {len(scene.cam2world)} panoramas"]
+            print(f"{self.out}: {'; '.join(floors if plan is None else describe_plan(plan))}")
         else:
             if self.points:
                 save_points(scene, self.out)

@@ -1,18 +1,21 @@
-"""Floor plans of straight walls as drawings: SVG for browsers and DXF for CAD programs.
+"""Floor plans of straight walls as drawings: SVG and PNG of one figure, and DXF for CAD programs.
 
-Storeys are next to each other, the lowest on the left. Both are to scale: an SVG is 1:50 on paper, a DXF is in metres.
+The longest wall is horizontal. Storeys are next to each other, the lowest on the left. All are to scale: figures are
+1:50 on paper, a DXF is in metres.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 import ezdxf
 import numpy as np
+import shapely
 from ezdxf import units
 from ezdxf.enums import TextEntityAlignment
 from jaxtyping import Float
@@ -22,34 +25,35 @@ from pansplat.atomic import replacing
 from pansplat.errors import InputError
 from pansplat.files import SOFTWARE
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.floor import assign_storeys
+from pansplat.tours.floor import assign_storeys, write_floor_plan
 from pansplat.tours.graph import make_graph
-from pansplat.tours.plan import Plan, make_plan
+from pansplat.tours.plan import Plan, Room, make_plan
 
-SUFFIXES = (".svg", ".dxf")
+SUFFIXES = (".svg", ".png", ".dxf")
 
-_PAPER = 20.0  # millimetres of paper for a metre: 1:50
-_MARGIN, _GAP = 0.8, 1.5  # around a storey and between two, metres
+_PAPER = 0.02  # metres of paper for a metre: 1:50
+_INCH = 0.0254
+_DOTS_PER_INCH = 150
+_MARGIN, _GAP, _LINE = 0.8, 1.5, 0.35  # around a storey, between two, and between lines of notes, metres
 _TEXT, _SMALL_TEXT = 0.22, 0.13  # heights, metres
-_LAYERS = {"WALLS": 7, "DOORS": 30, "ROOMS": 5, "PANORAMAS": 4, "EDGES": 8, "NOTES": 7}  # names and colours
-_STYLE = (
-    "polygon{fill:#f2f0ea;stroke:#222;stroke-width:.07;stroke-linejoin:miter}"
-    "polygon.loose{stroke-dasharray:.2 .1}"
-    ".door{stroke:#f2f0ea;stroke-width:.09}.leaf{stroke:#c26a1b;stroke-width:.035}"
-    ".edge{stroke:#7a93a8;stroke-width:.02;stroke-dasharray:.08 .08}"
-    "circle{fill:#2b7bb9}text{font-family:sans-serif;fill:#222}.camera{fill:#2b7bb9}"
-)
+_LETTER = 0.72  # width of a letter, of its height
+_MEASURED = 0.6  # metres, the shortest wall whose length is written
+_UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below
+_CAP_HEIGHT = 0.73  # of a letter, of the font's size
+_POINT = _INCH / 72
+_LAYERS = {"WALLS": 7, "DOORS": 30, "ROOMS": 5, "LENGTHS": 8, "PANORAMAS": 4, "NOTES": 7}  # names and colours
 
 
 @dataclass(frozen=True)
 class _Text:
-    """A text around a place or, if it starts there, on its right; sizes in metres."""
+    """A text around a place or, if it starts there, on its right; sizes in metres, the angle in degrees."""
 
     layer: str
     place: tuple[float, float]
     text: str
     size: float
     is_centred: bool = True
+    angle: float = 0.0
 
 
 def write_plan(scene: Scene, path: str | Path) -> Plan:
@@ -57,28 +61,56 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
 
     Args:
         scene: with input cameras, not fused.
-        path: a .svg or .dxf.
+        path: a .svg, .png or .dxf.
 
     Raises:
         InputError: no panorama shows walls around it, another suffix, or the file cannot be written.
     """
-    path, tour = Path(path), make_graph(scene)
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"cannot write {path}: needed a name ending in {' or '.join(SUFFIXES)}; rename it")
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"cannot write {path}: needed a name ending in {', '.join(SUFFIXES)}; rename it")
     if scene.joint:
         raise InputError(
             f"cannot write {path}: needed all that each panorama shows, got a scene with each surface once; give the "
             "folder of the panoramas, or a scene that was exported with --layers"
         )
-    plan = make_plan(scene, tour) if len(tour) else None
-    if plan is None or not plan.rooms:
+    plan = _find_rooms(scene)
+    if plan is None:
         raise InputError(
-            f"cannot write {path}: needed a floor, and walls around at least one of the {len(tour)} input cameras, "
-            "got none; export a folder of upright panoramas of rooms"
+            f"cannot write {path}: needed a floor, and walls around at least one of the {len(scene.cam2world)} input "
+            "cameras, got none; export a folder of upright panoramas of rooms"
         )
+    drawing = _Drawing(plan)
     with replacing(path) as partial:
-        partial.write_text((_draw_svg if path.suffix.lower() == ".svg" else _draw_dxf)(plan), encoding="utf-8")
+        partial.write_bytes(_draw_dxf(drawing) if suffix == ".dxf" else _draw_figure(drawing, suffix[1:]))
     return plan
+
+
+def write_picture(scene: Scene, path: str | Path) -> Plan | None:
+    """Write the floor plan as an image: the drawing of `write_plan`, or only the floors where no walls are known.
+
+    Args:
+        scene: with input cameras.
+        path: a .png.
+
+    Returns:
+        The plan; None if only the floors are shown, as in a scene with each surface once.
+
+    Raises:
+        InputError: no panorama shows a floor, or the file cannot be written.
+    """
+    if not scene.joint and _find_rooms(scene) is not None:
+        return write_plan(scene, path)
+    write_floor_plan(scene, path)
+    return None
+
+
+def _find_rooms(scene: Scene) -> Plan | None:
+    """The plan of a scene; None if it has no rooms."""
+    tour = make_graph(scene)
+    plan = make_plan(scene, tour) if len(tour) else None
+    return plan if plan is not None and plan.rooms else None
 
 
 def describe_plan(plan: Plan) -> list[str]:
@@ -106,136 +138,160 @@ def _describe_area(plan: Plan, number: int) -> str:
     return f"{room.area:.1f} m²" + (f" ± {error:.1f}" if known else "")
 
 
-def _arrange(plan: Plan) -> tuple[Float[np.ndarray, "storey 2"], tuple[float, float]]:
-    """What each storey is moved by, so that all are in one row from (0, 0) on, and the size of the row."""
-    storeys = np.array(assign_storeys(plan.tour))
-    centers = _centers(plan)
-    moves, right, height = [], 0.0, 0.0
-    for storey in range(int(storeys.max()) + 1):
-        outlines = [room.outline for room in plan.rooms if room.storey == storey]
-        places = np.concatenate([centers[storeys == storey], *outlines])
-        low, size = places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN
-        moves.append((right - low[0], -low[1]))
-        right, height = right + float(size[0]) + _GAP, max(height, float(size[1]))
-    return np.array(moves), (right - _GAP, height)
+@dataclass(frozen=True, eq=False)
+class _Drawing:
+    """A plan on a sheet: where its rooms, doors, panoramas and texts are, metres to the right and up."""
+
+    plan: Plan
+
+    @cached_property
+    def _turn(self) -> Float[np.ndarray, "2 2"]:
+        """The rotation, applied from the right, after which the longest wall is horizontal."""
+        walls = np.concatenate([np.roll(room.outline, -1, axis=0) - room.outline for room in self.plan.rooms])
+        x, y = walls[np.linalg.norm(walls, axis=1).argmax()]
+        angle = math.remainder(math.atan2(y, x), math.pi)
+        return np.array(((math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle))))
+
+    @cached_property
+    def storeys(self) -> list[int]:
+        """The storey of each panorama."""
+        return assign_storeys(self.plan.tour)
+
+    @cached_property
+    def _centers(self) -> Float[np.ndarray, "node 2"]:
+        return self.plan.tour.positions @ self.plan.tour.level_axes[:, (0, 2)] @ self._turn
+
+    @cached_property
+    def _layout(self) -> tuple[Float[np.ndarray, "storey 2"], tuple[float, float]]:
+        """What each storey is moved by, so that all are in one row from (0, 0) on, and the size of the row."""
+        moves, right, height = [], 0.0, 0.0
+        for storey in range(max(self.storeys) + 1):
+            outlines = [room.outline @ self._turn for room in self.plan.rooms if room.storey == storey]
+            places = np.concatenate([self._centers[np.array(self.storeys) == storey], *outlines])
+            low, size = places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN
+            moves.append((right - low[0], -low[1]))
+            right, height = right + float(size[0]) + _GAP, max(height, float(size[1]))
+        return np.array(moves), (right - _GAP, height)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of all storeys."""
+        return self._layout[1]
+
+    def outline(self, room: Room) -> Float[np.ndarray, "corner 2"]:
+        """The corners of a room."""
+        return room.outline @ self._turn + self._layout[0][room.storey]
+
+    @cached_property
+    def doors(self) -> list[Float[np.ndarray, "2 2"]]:
+        """The ends of all doors."""
+        moves = [self._layout[0][self.plan.rooms[door.rooms[0]].storey] for door in self.plan.doors]
+        return [door.ends @ self._turn + move for door, move in zip(self.plan.doors, moves, strict=True)]
+
+    @cached_property
+    def panoramas(self) -> Float[np.ndarray, "node 2"]:
+        """The places of all panoramas."""
+        return self._centers + self._layout[0][self.storeys]
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """Lines below the plan."""
+        return describe_plan(self.plan)
+
+    def list_texts(self) -> Iterator[_Text]:
+        """Names and areas of rooms, lengths of walls, and the names of panoramas outside of rooms."""
+        for number, room in enumerate(self.plan.rooms):
+            corners = self.outline(room)
+            circle = shapely.maximum_inscribed_circle(Polygon(corners))
+            (x, y), width = circle.coords[0], 2 * circle.length
+            name = room.name if room.is_placed else f"{room.name} (not placed)"
+            for row, text in ((0.7, name), (-0.7, _describe_area(self.plan, number))):
+                size = min(_TEXT, 0.9 * width / (_LETTER * max(len(text), 1)))
+                yield _Text("ROOMS", (x, y + row * size), text, size)
+            for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+                length = float(np.linalg.norm(end - start))
+                if length >= _MEASURED:
+                    x, y = (start + end) / 2 + 1.2 * _SMALL_TEXT * np.array((start - end)[::-1]) * (1, -1) / length
+                    angle = math.degrees(
+                        math.remainder(math.atan2(*(end - start)[::-1]) - _UPWARDS, math.pi) + _UPWARDS
+                    )
+                    yield _Text("LENGTHS", (x, y), f"{length:.2f}", _SMALL_TEXT, angle=angle)
+        inside = {node for room in self.plan.rooms for node in room.panoramas}
+        for node, (x, y) in enumerate(self.panoramas.tolist()):
+            if node not in inside:
+                name = self.plan.tour.panoramas[node].name
+                yield _Text("PANORAMAS", (x + 0.12, y), name, _SMALL_TEXT, is_centred=False)
 
 
-def _centers(plan: Plan) -> Float[np.ndarray, "node 2"]:
-    return plan.tour.positions @ plan.tour.level_axes[:, (0, 2)]
+def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
+    """The plan as a file of a figure, 1:50 on paper: "svg", whose texts are texts, or "png"."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    notes = [*drawing.notes, "1:50 on paper; the bar is 1 m"]
+    width, height = drawing.size
+    width = max(width, 0.15 * _LETTER * max(map(len, notes)) + _MARGIN)
+    below = _LINE * len(notes) + _MARGIN
+    figure = Figure(figsize=(width * _PAPER / _INCH, (height + below) * _PAPER / _INCH))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(-below, height))
+    axes.set_axis_off()
+
+    def points(metres: float) -> float:
+        return metres * _PAPER / _POINT
+
+    for room in drawing.plan.rooms:
+        dashes = "solid" if room.is_placed else "dashed"
+        style = {"facecolor": "#f2f0ea", "edgecolor": "#222", "linestyle": dashes, "linewidth": points(0.07)}
+        axes.fill(*drawing.outline(room).T, gid="room", joinstyle="miter", **style)
+    for ends in drawing.doors:
+        axes.plot(*ends.T, color="#f2f0ea", linewidth=points(0.09), solid_capstyle="butt")
+        axes.plot(*ends.T, color="#c26a1b", linewidth=points(0.035), solid_capstyle="butt")
+    axes.plot(*drawing.panoramas.T, "o", color="#2b7bb9", markersize=points(0.12), markeredgewidth=0)
+    rows = [_Text("NOTES", (_MARGIN / 2, -_LINE * (n + 1)), note, 0.15, False) for n, note in enumerate(notes)]
+    for text in [*drawing.list_texts(), *rows]:
+        axes.text(
+            *text.place,
+            text.text.encode(errors="backslashreplace").decode(),
+            fontsize=points(text.size) / _CAP_HEIGHT,
+            rotation=text.angle,
+            rotation_mode="anchor",
+            ha="center" if text.is_centred else "left",
+            va="center",
+            color={"LENGTHS": "#777", "PANORAMAS": "#2b7bb9"}.get(text.layer, "#222"),
+            parse_math=False,
+        )
+    bar = -_LINE * len(notes) - 0.4
+    axes.plot((_MARGIN / 2, _MARGIN / 2 + 1), (bar, bar), color="#222", linewidth=points(0.05))
+    file = io.BytesIO()
+    stated = {"Creator": SOFTWARE, "Date": None} if kind == "svg" else {"Software": SOFTWARE}
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "pansplat"}):
+        figure.savefig(file, format=kind, dpi=_DOTS_PER_INCH, metadata=stated)
+    return file.getvalue()
 
 
-def _list_edges(plan: Plan) -> Iterator[tuple[int, int]]:
-    """Ways between panoramas: edges and links; each once."""
-    ways = [*plan.tour.overlaps, *plan.tour.links]
-    yield from dict.fromkeys((min(way), max(way)) for way in ways if way[0] != way[1])
-
-
-def _list_texts(plan: Plan, moves: Float[np.ndarray, "storey 2"]) -> list[_Text]:
-    """The texts inside the rooms and beside the panoramas."""
-    texts, storeys, centers = [], assign_storeys(plan.tour), _centers(plan)
-    for number, room in enumerate(plan.rooms):
-        x, y = (_place_label(room.outline) + moves[room.storey]).tolist()
-        name = room.name if room.is_placed else f"{room.name} (not placed)"
-        texts.append(_Text("ROOMS", (x, y + 0.7 * _TEXT), name, _TEXT))
-        texts.append(_Text("ROOMS", (x, y - 0.7 * _TEXT), _describe_area(plan, number), _TEXT))
-    for node, panorama in enumerate(plan.tour.panoramas):
-        x, y = (centers[node] + moves[storeys[node]]).tolist()
-        texts.append(_Text("PANORAMAS", (x + 0.12, y), panorama.name, _SMALL_TEXT, is_centred=False))
-    return texts
-
-
-def _place_label(outline: Float[np.ndarray, "corner 2"]) -> Float[np.ndarray, "2"]:
-    """A place well inside a room."""
-    shape = Polygon(outline)
-    if shape.contains(shape.centroid):
-        return np.array(shape.centroid.coords[0])
-    return np.array(shape.representative_point().coords[0])
-
-
-def _draw_svg(plan: Plan) -> str:
-    """The plan as the text of an SVG."""
-    moves, (width, height) = _arrange(plan)
-    notes = [*describe_plan(plan), "1:50 on paper; the bar is 1 m"]
-    total = height + 0.35 * len(notes) + 0.8
-    storeys, centers = assign_storeys(plan.tour), _centers(plan)
-    width = max(width, 0.075 * max(map(len, notes)) + _MARGIN)
-
-    def number(values: Sequence[float]) -> str:
-        return " ".join(f"{value:.3f}" for value in values)
-
-    def point(place: np.ndarray, storey: int) -> str:
-        x, y = place + moves[storey]
-        return f"{x:.3f},{height - y:.3f}"
-
-    def line(kind: str, ends: np.ndarray, *at: int) -> str:
-        (x1, y1), (x2, y2) = (end + moves[storey] for end, storey in zip(ends, at, strict=True))
-        shape = f'x1="{x1:.3f}" y1="{height - y1:.3f}" x2="{x2:.3f}" y2="{height - y2:.3f}"'
-        return f'<line class="{kind}" {shape}/>'
-
-    def write(x: float, y: float, text: str, size: float, more: str = "") -> str:
-        text = escape(text.encode(errors="backslashreplace").decode())
-        return f'<text x="{x:.3f}" y="{y:.3f}" font-size="{size}"{more}>{text}</text>'
-
-    parts = [
-        f'<?xml version="1.0" encoding="UTF-8"?><!-- {SOFTWARE} -->',
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width * _PAPER:.1f}mm" height="{total * _PAPER:.1f}mm" '
-        f'viewBox="{number((0, 0, width, total))}">',
-        f'<style>{_STYLE}</style><rect width="100%" height="100%" fill="#fff"/>',
-    ]
-    for room in plan.rooms:
-        corners = " ".join(point(corner, room.storey) for corner in room.outline)
-        kind = "room" if room.is_placed else "loose"
-        parts.append(f'<polygon class="{kind}" points="{corners}"/>')
-    for door in plan.doors:
-        storey = plan.rooms[door.rooms[0]].storey
-        parts += [line(kind, door.ends, storey, storey) for kind in ("door", "leaf")]
-    for edge in _list_edges(plan):
-        if storeys[edge[0]] == storeys[edge[1]]:
-            parts.append(line("edge", centers[list(edge)], *(storeys[node] for node in edge)))
-    for node, center in enumerate(centers):
-        x, y = point(center, storeys[node]).split(",")
-        parts.append(f'<circle cx="{x}" cy="{y}" r="0.06"/>')
-    for text in _list_texts(plan, moves):
-        x, y = text.place
-        more = ' text-anchor="middle"' if text.is_centred else ' class="camera"'
-        parts.append(write(x, height - y + 0.35 * text.size, text.text, text.size, more))
-    for row, note in enumerate(notes):
-        parts.append(write(_MARGIN / 2, height + 0.35 * (row + 1), note, 0.15))
-    bar = height + 0.35 * len(notes) + 0.4
-    parts.append(f'<path d="M{_MARGIN / 2} {bar:.3f}h1" stroke="#222" stroke-width=".05"/></svg>')
-    return "\n".join(parts) + "\n"
-
-
-def _draw_dxf(plan: Plan) -> str:
-    """The plan as the text of a DXF of AutoCAD 2010, in metres."""
+def _draw_dxf(drawing: _Drawing) -> bytes:
+    """The plan as a DXF of AutoCAD 2010, in metres."""
     document = ezdxf.new("R2010", setup=True)
     document.units = units.M
     for name, color in _LAYERS.items():
-        document.layers.add(name, color=color, linetype="DASHED" if name == "EDGES" else "Continuous")
+        document.layers.add(name, color=color)
     space = document.modelspace()
-    moves, _ = _arrange(plan)
-    storeys, centers = assign_storeys(plan.tour), _centers(plan)
-    for room in plan.rooms:
-        space.add_lwpolyline((room.outline + moves[room.storey]).tolist(), close=True, dxfattribs={"layer": "WALLS"})
-    for door in plan.doors:
-        ends = (door.ends + moves[plan.rooms[door.rooms[0]].storey]).tolist()
-        space.add_line(*ends, dxfattribs={"layer": "DOORS"})
-    for a, b in _list_edges(plan):
-        if storeys[a] == storeys[b]:
-            ends = (centers[[a, b]] + moves[storeys[a]]).tolist()
-            space.add_line(*ends, dxfattribs={"layer": "EDGES"})
-    for node, center in enumerate(centers):
-        space.add_circle((center + moves[storeys[node]]).tolist(), 0.06, dxfattribs={"layer": "PANORAMAS"})
+    for room in drawing.plan.rooms:
+        space.add_lwpolyline(drawing.outline(room).tolist(), close=True, dxfattribs={"layer": "WALLS"})
+    for ends in drawing.doors:
+        space.add_line(*ends.tolist(), dxfattribs={"layer": "DOORS"})
+    for place in drawing.panoramas.tolist():
+        space.add_circle(place, 0.06, dxfattribs={"layer": "PANORAMAS"})
     notes = [
-        _Text("NOTES", (_MARGIN / 2, -0.35 * (row + 1)), note, 0.15, is_centred=False)
-        for row, note in enumerate(describe_plan(plan))
+        _Text("NOTES", (_MARGIN / 2, -_LINE * (row + 1)), note, 0.15, is_centred=False)
+        for row, note in enumerate(drawing.notes)
     ]
-    for text in [*_list_texts(plan, moves), *notes]:
+    for text in [*drawing.list_texts(), *notes]:
         content = text.text.encode(errors="backslashreplace").decode().replace("\n", " ")
         align = TextEntityAlignment.MIDDLE_CENTER if text.is_centred else TextEntityAlignment.MIDDLE_LEFT
-        entity = space.add_text(content, height=text.size, dxfattribs={"layer": text.layer})
+        entity = space.add_text(content, height=text.size, rotation=text.angle, dxfattribs={"layer": text.layer})
         entity.set_placement(text.place, align=align)
     stream = io.StringIO()
     stream.write(f"999\n{SOFTWARE}\n")
     document.write(stream)
-    return stream.getvalue()
+    return stream.getvalue().encode()

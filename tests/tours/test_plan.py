@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
+import cv2
 import ezdxf
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.tours import make_graph
 from pansplat.tours.plan import Plan, make_plan
-from pansplat.tours.plan_files import describe_plan, write_plan
+from pansplat.tours.plan_files import _Drawing, describe_plan, write_picture, write_plan
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
@@ -213,15 +214,10 @@ def _two_storeys() -> Scene:
 def _read_svg(path: Path) -> tuple[list[np.ndarray], str]:
     """Corners of the rooms in metres, and all texts."""
     root = ElementTree.parse(path).getroot()
-    assert root.get("width").endswith("mm")
-    scale = float(root.get("width")[:-2]) / float(root.get("viewBox").split()[2])
-    assert scale == pytest.approx(20, rel=1e-3), "1:50"
-    rooms = [
-        np.array(re.findall(r"-?[\d.]+", node.get("points")), float).reshape(-1, 2)
-        for node in root.iter()
-        if node.tag.endswith("polygon")
-    ]
-    return rooms, "\n".join(node.text for node in root.iter() if node.tag.endswith("text"))
+    paths = [node for group in root.iter() if group.get("id", "").startswith("room") for node in group]
+    rooms = [np.array(re.findall(r"-?[\d.]+", node.get("d")), float).reshape(-1, 2) for node in paths]
+    metre = 0.02 / 0.0254 * 72
+    return [room / metre for room in rooms], "\n".join(n.text for n in root.iter() if n.tag.endswith("text"))
 
 
 def _area(corners: np.ndarray | Sequence) -> float:
@@ -244,8 +240,30 @@ def test_storeys_are_next_to_each_other_in_metres_with_names_and_areas(tmp_path:
         assert len(space.query("CIRCLE[layer=='PANORAMAS']")) == 4
     assert [_area(room) for room in rooms] == pytest.approx([15.6, 15.6], rel=0.02)
     assert rooms[0][:, 0].max() < rooms[1][:, 0].min(), "the lower storey is on the left"
-    for expected in ("Hall", "Attic / x<y", "15.6 m²", "Hall (2)", *describe_plan(plan)):
+    for expected in ("Hall", "Attic / x<y", "15.6 m²", "4.00", "3.90", *describe_plan(plan)):
         assert any(line.startswith(expected) for line in text.split("\n")), expected
+
+
+def test_the_picture_is_the_drawing_and_without_walls_the_floors(tmp_path: Path) -> None:
+    scene = _make_house(WALLS, CAMERAS)
+    assert write_picture(scene, tmp_path / "plan.png") is not None and is_written(tmp_path / "plan.png")
+    image = cv2.imread(str(tmp_path / "plan.png"))
+    assert (image[:3] == 255).all() and np.abs(image[..., ::-1].astype(int) - (242, 240, 234)).sum(axis=2).min() == 0
+    assert write_picture(dataclasses.replace(scene, joint=True), tmp_path / "floors.png") is None
+    assert not (cv2.imread(str(tmp_path / "floors.png"))[:3] == 255).all()
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 90, 200])
+def test_the_longest_wall_is_horizontal_and_lengths_are_read_from_below_or_the_right(degrees: float) -> None:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    corners = [(c * x - s * z, s * x + c * z) for x, z in ((0, 0), (5, 0), (5, 3), (0, 3))]
+    plan = _plan(_make_house(_walls_around(corners), [(c * 2 - s * 1.5, s * 2 + c * 1.5)]))
+    drawing = _Drawing(plan)
+    sides = np.diff(drawing.outline(plan.rooms[0]), axis=0)
+    longest = sides[np.linalg.norm(sides, axis=1).argmax()]
+    assert abs(longest[1]) < 0.02 * abs(longest[0])
+    lengths = {text.text: text.angle for text in drawing.list_texts() if text.layer == "LENGTHS"}
+    assert all(min(abs(angle), abs(angle - 90)) < 2 for angle in lengths.values()), lengths
 
 
 def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:
@@ -257,7 +275,7 @@ def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:
             write_plan(bad, tmp_path / "plan.svg")
     with pytest.raises(InputError, match="exported with --layers"):
         write_plan(dataclasses.replace(scene, joint=True), tmp_path / "plan.dxf")
-    with pytest.raises(InputError, match=r"\.svg or \.dxf"):
+    with pytest.raises(InputError, match=r"\.svg, \.png, \.dxf"):
         write_plan(scene, tmp_path / "plan.pdf")
     assert not list(tmp_path.iterdir())
 
