@@ -23,7 +23,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from msgspec import Meta, Struct
 
 from pansplat import __version__, pipeline, tours
 from pansplat.atomic import replacing
@@ -37,7 +39,7 @@ from pansplat.files import SCENE_SUFFIXES, expand_home, is_portable_name, read_f
 from pansplat.gaussians.scene import Scene
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
-from pansplat.strict_json import list_field, number_field, read_json, require_object, text_field
+from pansplat.strict_json import read_json
 from pansplat.tours import TourGraph, find_tours, merge_scenes
 from pansplat.tours.plan_files import write_picture
 
@@ -139,7 +141,7 @@ def list_items(path: Path) -> list[Item]:
         if not folders:
             raise InputError(f"{path}: needed folders with panoramas, got none there or in its subfolders; check it.")
         return [Item(path.name if f == path else f.relative_to(path).as_posix(), f) for f in folders]
-    entries = list_field(require_object(read_json(path), path), "items", path)
+    entries = read_json(path, _Manifest).items
     if not entries:
         raise InputError(f'{path}: needed a list of folders as "items", got none; see docs/batch.md.')
     items = [_read_entry(entry, path, f"{path}, items[{index}]") for index, entry in enumerate(entries)]
@@ -151,32 +153,35 @@ def list_items(path: Path) -> list[Item]:
     return items
 
 
-def _read_entry(entry: Any, manifest: Path, source: str) -> Item:
+class _Entry(Struct, forbid_unknown_fields=True):
+    """An item as a manifest states it."""
+
+    path: Annotated[str, Meta(min_length=1)]
+    name: str | None = None
+    pair: str | None = None
+    convention: str | None = None
+    near: float | None = None
+    far: float | None = None
+
+
+class _Manifest(Struct):
+    """A manifest: items, or paths of folders."""
+
+    items: list[str | _Entry] = []
+
+
+def _read_entry(entry: str | _Entry, manifest: Path, source: str) -> Item:
     """An item of a manifest: the path of a folder, or an object."""
-    content = {"path": entry} if isinstance(entry, str) else require_object(entry, source)
-    unknown = sorted(set(content) - {"path", "name", "pair", "convention", "near", "far"})
-    if unknown:
-        raise InputError(f"{source}: needed path, name, pair, convention, near or far, got {unknown[0]!r}; correct it.")
-    given = text_field(content, "path", source)
-    if not given:
-        raise InputError(f'{source}: needed the path of a folder as "path", got none; add it.')
-    folder = Path(os.path.normpath(manifest.parent / expand_home(given)))
-    pair = text_field(content, "pair", source)
-    name = text_field(content, "name", source) or (f"{folder.name}-{pair}" if pair else folder.name)
+    entry = _Entry(entry) if isinstance(entry, str) else entry
+    folder = Path(os.path.normpath(manifest.parent / expand_home(entry.path)))
+    name = entry.name or (f"{folder.name}-{entry.pair}" if entry.pair else folder.name)
     parts = PurePosixPath(name).parts
     allowed = all(not part.startswith(".") and len(os.fsencode(part)) <= 200 for part in parts)
     if sys.platform == "win32":
         allowed = allowed and all(map(is_portable_name, parts))
     if not parts or name.startswith("/") or not allowed:
         raise InputError(f'{source}: needed a name that can be a folder, got {name[:60]!r}; add another "name".')
-    return Item(
-        name,
-        folder,
-        pair,
-        text_field(content, "convention", source),
-        number_field(content, "near", source),
-        number_field(content, "far", source),
-    )
+    return Item(name, folder, entry.pair, entry.convention, entry.near, entry.far)
 
 
 # The work of a task
@@ -274,8 +279,7 @@ def _connect(tour: TourGraph, outputs: _Outputs) -> TourGraph:
             temporary.write_text(json.dumps({"overlaps": overlaps}), "utf-8")
 
     path = outputs.make("graph", key, tour.name, ".json", write)
-    rows = list_field(require_object(read_json(path), path), "overlaps", path)
-    return tour.with_overlaps(tuple(map(tuple, rows)))
+    return tour.with_overlaps(tuple(read_json(path, dict[str, list[tuple[int, int, float]]])["overlaps"]))
 
 
 def load_predictor(options: BatchOptions) -> Predictor:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import difflib
-import errno
 import functools
 import io
 import math
 import os
 import re
-import shutil
 import signal
 import sys
 import tempfile
@@ -20,8 +16,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TextIO, TypeVar
 
 from pansplat.errors import InputError, InputWarning
 
@@ -38,11 +33,9 @@ _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
 _COLORS = {"error": 31, "interrupted": 31, "note": 33, "progress": 36}  # ANSI codes of red, yellow and cyan
-_MIN_WIDTH, _MAX_WIDTH = 40, 1000  # characters; help and tables need minutes and gigabytes outside
 _COMPLETION = "--tyro-print-completion"
 _LINE_INTERVAL, _MAX_LEFT = 30.0, 86_400.0  # seconds: between two lines of progress; left that are printed
 _REDRAW_INTERVAL = 0.25  # seconds between two states of a progress bar in a notebook
-_AGAIN = 0.02  # seconds after which a lost interrupt is raised again
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -58,45 +51,34 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
         The command's status; 2 for bad input, missing files and exhausted memory or disks, 70 for a defect of pansplat,
         130 after Ctrl+C, 143 after SIGTERM, 141 if the reader of standard output closed it.
     """
-    _prepare_terminal()
-    with _catch_signals() as signals:
-        stop: SystemExit | None = None
-        status = 0
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):  # what the terminal's encoding lacks is written as escapes
+        with contextlib.suppress(AttributeError, ValueError):
+            stream.reconfigure(errors="backslashreplace")
+    received: list[int] = []
+
+    def interrupt(number: int) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    with call_at_first_signal(_SIGNALS, interrupt):
         try:
             try:
                 status = command()
             except SystemExit as request:  # of the parser of arguments
-                stop = request
+                status = request
             sys.stdout.flush()
         except BaseException as error:
-            signals.raising = False
             if os.environ.get(DEBUG) == "1":
                 traceback.print_exc()
             # After a signal, a compiled kernel that runs on raises a SystemError instead of the KeyboardInterrupt.
-            if signals.received or isinstance(error, KeyboardInterrupt):
+            if received or isinstance(error, KeyboardInterrupt):
                 print_message("interrupted", interruption)
-                return 128 + (signals.received[0] if signals.received else signal.SIGINT)
+                return 128 + (received or [signal.SIGINT])[0]
             return _report(error, memory_advice)
-        if stop is not None:
-            raise stop
-        return status
-
-
-def exit_process(status: int) -> NoReturn:
-    """End the process with an exit status; a signal during the end prints nothing.
-
-    The functions that libraries have registered for the exit run. The rest of Python's finalisation does not: after
-    torch is imported, it takes about a second, and threads of libraries can abort it or block it for ever (those of
-    gloo, which DistributedDataParallel keeps alive, abort it when they release a tensor).
-    """
-    with contextlib.suppress(ValueError):  # only the main thread can set handlers
-        for number in _SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(AttributeError, OSError, ValueError):  # None, a full disk or a closed pipe
-            stream.flush()
-    os._exit(status)
+    if isinstance(status, SystemExit):
+        raise status
+    return status
 
 
 def _report(error: BaseException, memory_advice: str) -> int:
@@ -118,34 +100,19 @@ def _report(error: BaseException, memory_advice: str) -> int:
 
 def _report_system_error(error: OSError) -> int:
     """Print one line about an error of the operating system, unless standard output was closed by its reader."""
-    reason = error.strerror or str(error) or type(error).__name__
-    closed = errno.EINVAL if sys.platform == "win32" else errno.EPIPE  # of a pipe that its reader closed
-    if error.filename is None and (error.errno == closed or _is_output_broken()):
+    if error.filename is None:  # of standard output, whose unwritten text would fail again at the end
         _discard_output(sys.stdout)
-        if error.errno == closed:
-            return CLOSED_PIPE
-        print_message("error", f"standard output: needed a place to write, got '{reason}'; free some disk space")
-        return BAD_INPUT
-    name = os.fsdecode(error.filename) if isinstance(error.filename, (str, bytes, os.PathLike)) else "a file"
+    if isinstance(error, BrokenPipeError):
+        return CLOSED_PIPE
+    name, reason = error.filename or "standard output", error.strerror or str(error) or type(error).__name__
     print_message("error", f"{name}: needed a usable file or folder, got '{reason}'; check path, space and permissions")
     return BAD_INPUT
 
 
-def _is_output_broken() -> bool:
-    """Whether standard output cannot be written; its unwritten text is still in its buffer then."""
-    try:
-        sys.stdout.flush()
-    except (OSError, ValueError):
-        return True
-    return False
-
-
 def _discard_output(stream: TextIO | None) -> None:
     """Send unwritten text to the null device, so that the interpreter's end does not fail to write it."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, stream.fileno())
-        os.close(null)
+    with contextlib.suppress(OSError, ValueError, AttributeError), open(os.devnull, "w") as null:
+        os.dup2(null.fileno(), stream.fileno())
         stream.flush()
 
 
@@ -170,60 +137,6 @@ def _write_log(error: BaseException) -> str:
         return "its traceback (no log could be written)"
 
 
-@dataclass
-class _Signals:
-    """The numbers of the received signals, and whether a signal raises KeyboardInterrupt."""
-
-    received: list[int] = field(default_factory=list)
-    raising: bool = True
-
-
-@contextlib.contextmanager
-def _catch_signals() -> Iterator[_Signals]:
-    """Raise KeyboardInterrupt at Ctrl+C and SIGTERM.
-
-    An interrupt in a destructor or a callback of a library is printed by Python and lost. It is raised again instead.
-    """
-    signals = _Signals()
-
-    def handle(number: int, _: FrameType | None) -> None:
-        signals.received.append(number)
-        if signals.raising:
-            raise KeyboardInterrupt
-
-    def raise_again(problem: sys.UnraisableHookArgs) -> None:
-        lost = isinstance(problem.exc_value, KeyboardInterrupt)
-        if lost or (signals.received and isinstance(problem.exc_value, SystemError)):
-            number = signals.received[-1] if signals.received else signal.SIGINT
-            again = threading.Timer(_AGAIN, _send_signal, (number,))  # after this hook has returned
-            again.daemon = True
-            again.start()
-        else:
-            previous_hook(problem)
-
-    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    is_main = threading.current_thread() is threading.main_thread()
-    replaced = [number for number in _SIGNALS if is_main and signal.getsignal(number) == defaults[number]]
-    previous_hook = sys.unraisablehook
-    for number in replaced:
-        signal.signal(number, handle)
-    sys.unraisablehook = raise_again
-    try:
-        yield signals
-    finally:
-        sys.unraisablehook = previous_hook
-        for number in replaced:
-            signal.signal(number, defaults[number])
-
-
-def _send_signal(number: int) -> None:
-    """Send a signal to this process, from any of its threads."""
-    if sys.platform == "win32":
-        signal.raise_signal(number)  # `os.kill` would end the process at once
-    else:
-        os.kill(os.getpid(), number)  # also interrupts a system call of the main thread
-
-
 @contextlib.contextmanager
 def call_at_first_signal(numbers: Sequence[int], act: Callable[[int], object]) -> Iterator[None]:
     """Call a function with the number of the first of some signals; the second one raises KeyboardInterrupt."""
@@ -237,33 +150,13 @@ def call_at_first_signal(numbers: Sequence[int], act: Callable[[int], object]) -
         act(number)
 
     is_main = threading.current_thread() is threading.main_thread()  # others cannot set handlers
-    previous = {number: signal.signal(number, handle) for number in numbers if is_main}
+    numbers = [number for number in numbers if is_main and signal.getsignal(number) is not signal.SIG_IGN]
+    previous = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def _prepare_terminal() -> None:
-    """Open missing standard streams, write what the terminal's encoding lacks as escapes, and bound its width."""
-    with contextlib.suppress(OSError):
-        for descriptor in (0, 1, 2):  # a file that is opened later must not get one of these numbers
-            try:
-                os.fstat(descriptor)
-            except OSError:
-                os.open(os.devnull, os.O_RDWR)
-    sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
-    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(AttributeError, ValueError):
-            if stream.errors == "strict":
-                stream.reconfigure(errors="backslashreplace")
-    width = min(max(shutil.get_terminal_size().columns, _MIN_WIDTH), _MAX_WIDTH)
-    if os.environ.get("COLUMNS", str(width)) != str(width) or shutil.get_terminal_size().columns != width:
-        os.environ["COLUMNS"] = str(width)
-    if not os.environ.get("LINES", "24").isascii() or not os.environ.get("LINES", "24").isdecimal():
-        del os.environ["LINES"]
 
 
 def print_message(kind: str, text: object) -> None:
@@ -320,7 +213,7 @@ def own_warnings() -> Iterator[None]:
 
 
 def parse_arguments(parse: Callable[[], _T], program: str, arguments: Sequence[str] | None) -> _T:
-    """The result of a parser of arguments. The framed message of an error becomes one line, and SystemExit(2).
+    """The result of a parser of arguments, which prints help or an error and raises SystemExit.
 
     Args:
         parse: tyro's parser.
@@ -334,54 +227,14 @@ def parse_arguments(parse: Callable[[], _T], program: str, arguments: Sequence[s
 
         print(f"{program} {__version__}")
         raise SystemExit(0)
-    message, script = io.StringIO(), io.StringIO()
-    is_script = given[:1] == [_COMPLETION]
+    from pansplat.options import NUMBERS
+
+    script = io.StringIO()
     try:
-        with contextlib.redirect_stderr(message), contextlib.redirect_stdout(script if is_script else sys.stdout):
+        with NUMBERS, contextlib.redirect_stdout(script if given[:1] == [_COMPLETION] else sys.stdout):
             return parse()
-    except SystemExit as stop:
-        text = message.getvalue()
-        if stop.code not in (0, None):
-            print_message("error", _flatten(text))
-        elif text:
-            print(text, file=sys.stderr, end="")
-        # The shell would read the second line of a description as another word.
+    finally:  # the shell would read the second line of a description as another word
         print(re.sub(r"\\n(?=.*'type':)", " ", script.getvalue()), end="")
-        raise
-
-
-def _flatten(text: str) -> str:
-    """The words of a framed message as one line; the parts between its rules are separated by semicolons."""
-    parts: list[list[str]] = [[]]
-    for line in text.splitlines():
-        words = line.strip("│| ").strip()
-        if not words.strip("─-╭╮╰╯+"):
-            parts.append([])
-        elif not line.startswith(("╭", "╰", "+")):
-            parts[-1].append(words)
-    texts = [_shorten_suggestion(" ".join(part)) for part in parts if part]
-    texts = _suggest_subcommand(texts) or texts
-    return "; ".join(text.rstrip(".") for text in texts) or "the arguments cannot be used; see --help"
-
-
-def _suggest_subcommand(texts: Sequence[str]) -> list[str]:
-    """The parts of a message about an unknown subcommand, with the most similar ones; empty for another message."""
-    start, listed = "Unrecognized options: ", "Available subcommands: "
-    given = next((text.removeprefix(start).split(",")[0] for text in texts if text.startswith(start)), "-")
-    known = next((text.removeprefix(listed) for text in texts if text.startswith(listed)), "")
-    if given.startswith("-") or not known:
-        return []
-    similar = difflib.get_close_matches(given, known.split(", "), n=2)
-    advice = f"did you mean {' or '.join(similar)}?" if similar else f"choose one of {known}"
-    return [f"there is no subcommand {given!r}", advice]
-
-
-def _shorten_suggestion(text: str) -> str:
-    """Only the names of suggested options, without their help."""
-    if not text.startswith("Perhaps you meant"):
-        return text
-    names = dict.fromkeys(word for word in text.split() if word.startswith("--") and word != "--help")
-    return f"perhaps you meant {', '.join(names)}"
 
 
 def is_notebook() -> bool:
@@ -410,12 +263,13 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
     # Standard output goes through the bar if it is on the same terminal, and stays what it is if it is a file.
     is_shared = sys.stdout.isatty() and not in_notebook
     bar = Progress(*columns, *times, console=console, transient=True, redirect_stdout=is_shared)
-    with _draw_in_notebook(bar) if in_notebook else _draw_in_terminal(bar) as redraw:
+    with _draw_in_notebook(bar) if in_notebook else bar as redraw:
         task = bar.add_task("", total=1.0)
 
         def report(stage: str, fraction: float) -> None:
             bar.update(task, description=stage, completed=fraction)
-            redraw()
+            if callable(redraw):  # in a notebook
+                redraw()
 
         yield report
 
@@ -435,12 +289,6 @@ def _print_progress() -> Callable[[str, float], None]:
         print_message("progress", f"{stage or 'working'}, {100 * fraction:.0f} %{rest}")
 
     return report
-
-
-@contextlib.contextmanager
-def _draw_in_terminal(bar: Progress) -> Iterator[Callable[[], None]]:
-    with bar:
-        yield lambda: None
 
 
 @contextlib.contextmanager

@@ -35,7 +35,7 @@ from pansplat.model.layers import Precision
 from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
-from pansplat.predictor import MIN_HEIGHT, Predictor, Progress
+from pansplat.predictor import MIN_HEIGHT, Predictor, Progress, part_of
 from pansplat.refinement import (
     DISPLAY_HEIGHT,
     RefineConfig,
@@ -327,7 +327,7 @@ def predict(
     _require_views(pair, predictor)
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
-    report: Progress = progress or (lambda what, fraction: None)
+    report = part_of(progress)
     joint = joint and len(views.images) > 1
     if not refine_seconds or len(views.images) == 1:
         scene = _predict_views(pair, views, predictor, height, cache, report)
@@ -340,7 +340,7 @@ def predict(
     if final is not None and on_predicted is None:
         report("read from the cache", 1.0)
         return final
-    scene = _predict_views(pair, views, predictor, height, cache, lambda what, done: report(what, 0.5 * done))
+    scene = _predict_views(pair, views, predictor, height, cache, part_of(progress, 0, 0.5))
     if joint:
         scene = fuse_views(scene)
     if on_predicted is not None:
@@ -350,7 +350,7 @@ def predict(
     began = time.process_time()
     photographs = load_photographs(pair, height, gaussians) if isinstance(pair, Pair) else views
     refinement = Refinement(scene, photographs, config)
-    done = refinement.run(seconds=refine_seconds, progress=lambda what, done: report(what, 0.5 + 0.5 * done))
+    done = refinement.run(seconds=refine_seconds, progress=part_of(progress, 0.5))
     scene = refinement.scene()
     if cached is None:
         return scene
@@ -492,7 +492,6 @@ def predict_tour(
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     tour = _load_only_tour(tour, progress) if isinstance(tour, (str, Path)) else tour
     warn_of_single_views(tour, predictor)
-    report: Progress = progress or (lambda what, fraction: None)
     max_views = find_max_views(predictor)
     total = len(tour.choose_sources(max_views))
     part = math.inf if gaussians is None else gaussians / len(tour)  # of a panorama
@@ -500,6 +499,7 @@ def predict_tour(
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
         number, pair = next(counter), tour.make_pair(views)
+        begun = predicted * number
         rows, count = choose_tour_size(pair, part, height)
         return predict(
             pair,
@@ -508,9 +508,7 @@ def predict_tour(
             refine_seconds=0.0 if joint else scale_seconds(refine_seconds, pair),
             gaussians=count,
             cache=cache,
-            progress=lambda what, done: report(
-                f"scene {number + 1} of {total}: {what}", predicted * (number + done) / total
-            ),
+            progress=part_of(progress, begun / total, (begun + predicted) / total, f"scene {number + 1} of {total}: "),
         )
 
     scene = merge_scenes(tour, predict_scene, max_views)
@@ -520,7 +518,7 @@ def predict_tour(
         tour,
         scene,
         refine_seconds=refine_seconds,
-        progress=lambda what, done: report(what, predicted + (1 - predicted) * done),
+        progress=part_of(progress, predicted),
     )
 
 
@@ -547,7 +545,6 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
         refine_seconds: time limit of the refinement, of three panoramas; without one only colours are fitted.
         progress: see `predict`.
     """
-    report: Progress = progress or (lambda what, fraction: None)
     fused: list[Gaussians] = []
     gains = [(1.0, 1.0, 1.0)] * len(tour)
     parts = tour.list_parts()
@@ -558,10 +555,8 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
             views = replace(pair.load_context(scene.height), cam2world=part.cam2world, frame=part.frame)
             if refine_seconds:
                 refinement = Refinement(fuse_views(part), views)
-                refinement.run(
-                    seconds=scale_seconds(refine_seconds, pair),
-                    progress=lambda what, done, number=number: report(what, (number + done) / len(parts)),
-                )
+                shown = part_of(progress, number / len(parts), (number + 1) / len(parts))
+                refinement.run(seconds=scale_seconds(refine_seconds, pair), progress=shown)
                 part = refinement.scene()
             else:
                 part = fuse(part, views)

@@ -15,6 +15,16 @@ from pansplat.gaussians.scene import Gaussians
 Progress = Callable[[str, float], None]  # current step, fraction done in [0, 1]
 
 
+def part_of(progress: Progress | None, start: float = 0.0, end: float = 1.0, name: str = "") -> Progress:
+    """The progress of a part of the work with a name, between two fractions of the whole; None shows nothing."""
+
+    def report(what: str, done: float) -> None:
+        if progress is not None:
+            progress(name + what, start + (end - start) * done)
+
+    return report
+
+
 MIN_HEIGHT = 64  # pixels, of panoramas
 
 

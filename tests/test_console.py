@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from pansplat import console
+from pansplat.predictor import part_of
 
 
 class Terminal(io.StringIO):
@@ -57,3 +58,11 @@ def test_a_terminal_shows_a_bar_and_standard_output_stays_complete(
     assert "a result" in (out if is_file else err).getvalue()
     text = re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]", "", err.getvalue())
     assert "placing Gaussians" in text and "50 %" in text
+
+
+def test_parts_of_parts_are_between_their_fractions_of_the_whole() -> None:
+    calls: list[tuple[str, float]] = []
+    second = part_of(lambda *call: calls.append(call), 0.5, name="room: ")
+    part_of(second, 0.2, 0.4)("searching", 0.5)
+    part_of(None)("searching", 1.0)
+    assert calls == [("room: searching", pytest.approx(0.65))]

@@ -41,7 +41,7 @@ def _network(seed=0):
 
 
 def _sharpening():
-    return DepthSharpening(SharpeningConfig(64, 24, 1, 3, (16, 12, 8, 8), 8)).eval()
+    return DepthSharpening(SharpeningConfig(24, 1, 3, (16, 12, 8, 8), 64, 8)).eval()
 
 
 @pytest.fixture(scope="module")

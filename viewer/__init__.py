@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -14,9 +15,7 @@ if __name__ != "pansplat_viewer":
 
 def main() -> NoReturn:
     """Run `pansplat-view` and exit with its status (docs/errors.md)."""
-    from pansplat.console import exit_process
-
-    exit_process(run())
+    sys.exit(run())
 
 
 def run(args: Sequence[str] | None = None) -> int:

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+from msgspec import Meta
 
 from pansplat.console import own_warnings, parse_arguments, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_file, require_output_folder, require_replaceable
-from pansplat.options import EYE_DISTANCE, REAL, Depth, EyeDistance, Height, Positive, Range, Seconds, check_numbers
+from pansplat.options import EYE_DISTANCE, Depth, EyeDistance, Height, Positive, Seconds, check_numbers
 from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
@@ -83,7 +84,7 @@ class Options:
     renderer: RendererChoice = "auto"
     """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, for preset 3dgs and for
     stereo in a window, and cpu where OpenGL is software."""
-    at: Annotated[float, Range(0, 1), REAL] | None = None
+    at: Annotated[float, Meta(ge=0, le=1)] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     projection: Projection = "perspective"
     """What the frames of --out show: a perspective image, or all directions as a panorama or as six cube faces."""
@@ -93,11 +94,11 @@ class Options:
     """Distance of the eyes, metres."""
     size: str | None = None
     """Width x height of one eye, pixels (window 1280x720, film 1920x1080; panoramas 2880x1440, cubemaps 2160x1440)."""
-    seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] | None = None
+    seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """Length of the film (4); of a tour, by default the time at 1 metre per second."""
-    fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
+    fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
     """Frames per second of the film."""
-    memory: Annotated[float, Range(0, 1024, "GiB"), REAL] = 2.0
+    memory: Annotated[float, Meta(ge=0, le=1024)] = 2.0
     """Limit of the scenes of a tour that are kept in memory, GiB; the least recently used ones are read again."""
 
     @property

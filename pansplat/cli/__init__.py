@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated, Any, Protocol, Union
 
-from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
+from pansplat.console import own_warnings, parse_arguments, run_command
 
 _COMMANDS = (
     "predict", "refine", "render", "export", "batch", "evaluate", "pose", "check", "info", "bench", "convert"
@@ -24,7 +25,7 @@ class Command(Protocol):
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run a command and exit with its status (docs/errors.md)."""
-    exit_process(run(argv))
+    sys.exit(run(argv))
 
 
 def run(argv: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from msgspec import Meta
 from tyro.conf import Positional, subcommand
 
 import pansplat
@@ -15,7 +16,7 @@ from pansplat.cli.evaluate import LpipsChoice, choose_lpips
 from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.errors import InputError
 from pansplat.files import is_scene_file, require_output_folder, require_replaceable
-from pansplat.options import WHOLE, Positive, Range, Threads
+from pansplat.options import Positive, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
-_LatticeHeight = Annotated[int, Range(16, 4096, "pixels", multiple=8), WHOLE]
-_WindowSide = Annotated[int, Range(64, 8192, "pixels"), WHOLE]
+_LatticeHeight = Annotated[int, Meta(ge=16, le=4096, multiple_of=8)]
+_WindowSide = Annotated[int, Meta(ge=64, le=8192)]
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class BenchRaster(_Options):
     """A scene file, or the folder of a pair for `sweep`; by default a synthetic room, and the sample if it is there."""
     quick: bool = False
     """Some minutes on two cores instead of an hour: all choices at reduced height only."""
-    height: Annotated[int, Range(16, 8192, "pixels", multiple=8), WHOLE] = 512
+    height: Annotated[int, Meta(ge=16, le=8192, multiple_of=8)] = 512
     """Height of the panoramas, pixels; a multiple of 8."""
 
     def run(self) -> int:
@@ -119,7 +120,7 @@ class BenchModel(_Options):
     """Weights of PanSplat (.safetensors); by default random ones, which take the same time."""
     pair: Path | None = None
     """Folder of a pair; by default the sample, if it is there."""
-    height: Annotated[int, Range(64, 8192, "pixels", multiple=64), WHOLE] = 512
+    height: Annotated[int, Meta(ge=64, le=8192, multiple_of=64)] = 512
     """Panoramas are resized to this height, pixels; a multiple of 64, so that 4x4 tiles fit."""
     quick: bool = False
     """Precisions only, without tiles and the official code's defects."""
@@ -180,7 +181,7 @@ class BenchFlights(_Options):
     """Folders of pairs with targets, such as those of `pansplat-homes flights`; by default the sample."""
     model: str = "default"
     """Name of a predictor, or weights."""
-    height: Annotated[int, Range(64, 8192, "pixels", multiple=8), WHOLE] = 512
+    height: Annotated[int, Meta(ge=64, le=8192, multiple_of=8)] = 512
     """Height of the panoramas, pixels."""
     lpips: LpipsChoice = field(default_factory=LpipsChoice)
 

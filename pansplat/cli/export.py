@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from msgspec import Meta
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, ScenePrediction, Writer
@@ -22,7 +23,7 @@ from pansplat.files import (
     require_output_file,
     require_replaceable,
 )
-from pansplat.options import WHOLE, Count, Fraction, Range, Real
+from pansplat.options import Count, Fraction, Real
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -57,7 +58,7 @@ class Export(Writer):
     """For a mesh: largest number of triangles, 2,000,000 by default."""
     points: bool = False
     """Write a .ply of plain points with colours, for programs without Gaussians."""
-    degree: Annotated[int, Range(0, 4), WHOLE] | None = None
+    degree: Annotated[int, Meta(ge=0, le=4)] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds."""
     min_opacity: Fraction = 0.0
     """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+from msgspec import Meta
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import ModelChoice, Out, PairChoice, Writer, choose_pair
 from pansplat.console import progress_bar
 from pansplat.files import SCENE_SUFFIXES, require_output_file
-from pansplat.options import WHOLE, Fraction, Height, Range, Seconds
+from pansplat.options import Fraction, Height, Seconds
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Predict(Writer):
     layers: bool = False
     """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
     draw all Gaussians together (docs/formats.md). Networks keep all."""
-    degree: Annotated[int, Range(0, 4), WHOLE] | None = None
+    degree: Annotated[int, Meta(ge=0, le=4)] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds. The .ply of 4K
     panoramas has 5 GB with degree 4, 1 GB with degree 0."""
     min_opacity: Fraction = 0.0

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from msgspec import Meta
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, ScenePrediction, Writer, parse_blend
 from pansplat.console import progress_bar
 from pansplat.errors import InputError
 from pansplat.files import read_file, require_output_file
-from pansplat.options import EYE_DISTANCE, REAL, EyeDistance, ImageHeight, Range
+from pansplat.options import EYE_DISTANCE, EyeDistance, ImageHeight
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,7 +41,7 @@ class Render(Writer):
     """A scene file, one panorama, a folder of panoramas, or a web tour."""
     out: Out
     """The file to write; its suffix chooses the format."""
-    at: Annotated[float, Range(-1000, 1000), REAL] | None = None
+    at: Annotated[float, Meta(ge=-1000, le=1000)] | None = None
     """Camera position between the first (0) and the last (1) input camera, or on the flight through a tour of several
     parts; 0.5 by default."""
     pose: Path | None = None
@@ -61,11 +62,11 @@ class Render(Writer):
     blend: str | None = None
     """deferred (images of single views, weighted by nearness), joint (all Gaussians at once), or view0, view1, ...;
     by default what the scene is made for."""
-    fov: Annotated[float, Range(1, 170, "degrees"), REAL] = 90.0
+    fov: Annotated[float, Meta(ge=1, le=170)] = 90.0
     """Vertical field of view of `perspective`, degrees."""
-    seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] | None = None
+    seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """Length of a video; 4 by default, for a tour of several parts that of the flight at 1 m/s."""
-    fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
+    fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
     """Frames per second of a video."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
 

@@ -14,11 +14,11 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
 from pansplat.data.views import Sample, Views
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
-from pansplat.options import REAL, Range
 
 _MIRROR = torch.diag(torch.tensor((-1.0, 1.0, 1.0, 1.0), dtype=torch.float64))
 
@@ -31,11 +31,11 @@ class Augmentation:
     """Rotation about the vertical camera axes by whole pixels: one for all views of a sample, or one for each view."""
     mirror: Literal["off", "half"] = "half"
     """Mirror a sample with probability 1/2."""
-    tilt_degrees: Annotated[float, Range(0, 180, "degrees"), REAL] = 0.0
+    tilt_degrees: Annotated[float, Meta(ge=0, le=180)] = 0.0
     """Largest tilt of each view off its vertical axis; resamples the images."""
-    colour: Annotated[float, Range(0, 1), REAL] = 0.1
+    colour: Annotated[float, Meta(ge=0, le=1)] = 0.1
     """Strength of changes of brightness, contrast, hue and gamma, the same for all views; 0 for none."""
-    exposure: Annotated[float, Range(0, 10, "stops"), REAL] = 0.0
+    exposure: Annotated[float, Meta(ge=0, le=10)] = 0.0
     """Largest difference in exposure between views, in stops; 0 for none."""
 
 

@@ -25,7 +25,7 @@ from scipy import ndimage
 from pansplat.data.cube_images import BESIDE, CUBE_SUFFIX
 from pansplat.data.rig_images import RIG_SUFFIX
 from pansplat.errors import InputError
-from pansplat.strict_json import read_json, require_object
+from pansplat.strict_json import read_json
 
 BLUR_SUFFIX, MASK_SUFFIX = "_blur", "_mask"  # of the stem of a mask
 
@@ -97,7 +97,7 @@ def locate_panorama(image: Path) -> Path:
     """The path beside which the masks of a panorama are: its file, or where a file of its name would be."""
     for suffix in (CUBE_SUFFIX, RIG_SUFFIX):
         if image.name.endswith(suffix):
-            folder = require_object(read_json(image), image).get(BESIDE, image.parent)
+            folder = read_json(image, dict[str, Any]).get(BESIDE, image.parent)
             return Path(folder) / f"{image.name.removesuffix(suffix)}.png"
     return image
 

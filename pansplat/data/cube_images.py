@@ -29,7 +29,7 @@ from pansplat.cache_folders import cache_folders, write_cache_file
 from pansplat.errors import InputError
 from pansplat.files import read_file
 from pansplat.geometry.cubemap import face_of, face_rotations
-from pansplat.strict_json import read_json, require_object
+from pansplat.strict_json import read_json
 
 CUBE_SUFFIX = ".cube.json"
 BESIDE = "beside"  # key of a file that stands for a panorama: the folder of what belongs to it, such as masks
@@ -176,7 +176,7 @@ def read_cube(path: Path) -> CubeImage:
     Raises:
         InputError: it is no such file.
     """
-    content = require_object(read_json(path), path)
+    content = read_json(path, dict[str, Any])
     try:
         levels = tuple(_read_level(level) for level in content["levels"])
         return CubeImage(Path(content["folder"]), levels)

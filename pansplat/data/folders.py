@@ -16,11 +16,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
 from pansplat.data.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
@@ -57,7 +58,7 @@ from pansplat.data.web_tours import find_web_tour, is_web_tour_file, read_web_to
 from pansplat.data.web_tours.entries import plain_text
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import expand_home, is_written, read_file
-from pansplat.strict_json import list_field, number_field, read_json, require_object
+from pansplat.strict_json import read_field, read_json
 
 _POSES, _PAIRS = "poses.json", "pairs.json"
 VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
@@ -480,7 +481,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     linked = add_links([*panoramas, *unposed], folder)
     ranges = _read_ranges(content, source)
     near, far = (
-        default if (stated := number_field(content, key, source, needed="a number in metres")) is None else stated
+        read_field(content, key, float, source, default)
         for key, default in zip(("near", "far"), ranges.pop(0, (NEAR, FAR)), strict=True)
     )
     groups = _read_groups(folder / _PAIRS, list(entries)) if (folder / _PAIRS).is_file() else None
@@ -552,9 +553,8 @@ def _drop_groups_of_several_worlds(
 def _read_ranges(content: dict[str, Any], source: Path) -> dict[int, tuple[float, float]]:
     """Near and far of the worlds of poses.json that state both."""
     ranges = {}
-    for number, entry in enumerate(list_field(content, "worlds", source)):
-        world = require_object(entry, f"{source}, worlds {number}")
-        near, far = (number_field(world, key, source, needed="a number in metres") for key in ("near", "far"))
+    for number, world in enumerate(read_field(content, "worlds", list[dict[str, Any]], source, [])):
+        near, far = (read_field(world, key, float, f"{source}, worlds[{number}]") for key in ("near", "far"))
         if near is not None and far is not None:
             ranges[number] = near, far
     return ranges
@@ -591,8 +591,8 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
             )
         matrix = entry[key]
         mask, depth = (_optional_file(folder, entry, key, source) for key in ("mask", "depth"))
-        stated = number_field(entry, "world", source, low=0, high=_MAX_WORLD, whole=True, needed="a whole number")
-        world, room = int(stated or 0), plain_text(entry.get("room"))
+        world = read_field(entry, "world", Annotated[int, Meta(ge=0, le=_MAX_WORLD)], source, 0)
+        room = plain_text(entry.get("room"))
     cam2world = to_cam2world(rigid_matrix(matrix, source), convention)
     return Panorama(image.stem, image, cam2world, mask or find_mask(image, folder), depth, world=world, title=room)
 
@@ -624,7 +624,7 @@ def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
     unposed: dict[str, str] = {}  # image, and the first entry that names it
     dropped = 0
     for key in ("triplets", "pairs"):
-        entries = list_field(content, key, source)
+        entries = read_field(content, key, list, source, [])
         for number, entry in enumerate(entries, start=1):
             where = f"{source}, {key} {number}"
             context, target = (entry.get("context"), entry.get("target")) if isinstance(entry, dict) else (None, None)

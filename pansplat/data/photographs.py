@@ -15,11 +15,11 @@ from pansplat.data.cube_faces import find_layout, group_faces
 from pansplat.data.cube_images import CubeImage, write_cube
 from pansplat.data.images import is_two_to_one, read_size, require_complete, require_two_to_one
 from pansplat.data.pairs import Link, Panorama, find_mask, list_panorama_files
-from pansplat.data.web_tours.entries import finite_number, plain_text, resolve_links
+from pansplat.data.web_tours.entries import Number, plain_text, read_direction, resolve_links
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import is_written
 from pansplat.geometry.path import wrap_angle
-from pansplat.strict_json import list_field, read_json, require_object
+from pansplat.strict_json import convert, read_field, read_json
 
 LINKS = "links.json"
 
@@ -145,7 +145,7 @@ def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
     if not source.is_file():
         return list(panoramas)
     try:
-        content = require_object(read_json(source), source)
+        content = read_json(source, dict[str, Any])
     except InputError as error:
         warnings.warn(f"links are left out: {error}", category=InputWarning, stacklevel=3)
         return list(panoramas)
@@ -170,21 +170,15 @@ def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
 
 def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Path) -> Panorama:
     """The panorama with the content of its entry: a list of links, or {"title", "start", "links"}."""
-    content = {"links": entry} if isinstance(entry, list) else require_object(entry, source)
-    links = []
-    for item in list_field(content, "links", source):
-        link = require_object(item, source)
-        yaw, pitch = (
-            finite_number(link.get("yaw"), "yaw of a link"),
-            finite_number(link.get("pitch", 0), "pitch of a link"),
-        )
-        links.append(Link(str(link.get("to")), wrap_angle(yaw), pitch, plain_text(link.get("text"))))
-    start = list_field(content, "start", source)
-    if len(start) not in (0, 2):
-        raise InputError(f'{source}: needed [yaw, pitch] as "start", got {str(start)[:40]}; correct it.')
+    content = convert({"links": entry} if isinstance(entry, list) else entry, dict[str, Any], source)
+    links = [
+        Link(str(link.get("to")), *read_direction({"yaw": None, **link}, source), plain_text(link.get("text")))
+        for link in read_field(content, "links", list[dict[str, Any]], source, [])
+    ]
+    start = read_field(content, "start", tuple[Number, Number], source)
     return dataclasses.replace(
         panorama,
         title=plain_text(content.get("title")) or panorama.title,
         links=resolve_links(links, names, panorama.name, source),
-        start=(wrap_angle(finite_number(start[0], "start")), finite_number(start[1], "start")) if start else None,
+        start=start and (wrap_angle(start[0]), start[1]),
     )

@@ -24,7 +24,7 @@ from pansplat.data.cube_images import Decode, equirect_from_faces, write_descrip
 from pansplat.errors import InputError
 from pansplat.geometry.cubemap import face_rotations
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.strict_json import read_json, require_object
+from pansplat.strict_json import read_json
 
 RIG_SUFFIX = ".rig.json"
 
@@ -233,7 +233,7 @@ def read_rig(path: Path) -> RigImage:
     Raises:
         InputError: it is no such file.
     """
-    content = require_object(read_json(path), path)
+    content = read_json(path, dict[str, Any])
     try:
         views = tuple(_read_view(view) for view in content["views"])
         if not views:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pansplat.atomic import replacing
 from pansplat.data.panorama_metadata import Projection, Stereo, mark_spherical_video
-from pansplat.data.spherical_webm import mark_spherical_webm
 from pansplat.errors import InputError
 from pansplat.files import SOFTWARE, require_file
 
@@ -162,7 +161,7 @@ def write_video(
         fps: frames per second.
         quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
         panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
-            players then show them as 360 degrees.
+            players then show an .mp4 as 360 degrees. A .webm has no such mark.
         stereo: arrangement of the eyes in a panorama's frame.
 
     Raises:
@@ -194,10 +193,9 @@ def write_video(
                 raise InputError(f"cannot write {path}: needed at least one frame, got none; nothing was written.")
             for packet in stream.encode():
                 container.mux(packet)
-        if panorama:
-            mark = mark_spherical_video if path.suffix.lower() == ".mp4" else mark_spherical_webm
-            mark(temporary, "equirect" if panorama is True else panorama, stereo)
         if path.suffix.lower() == ".mp4":
+            if panorama:
+                mark_spherical_video(temporary, "equirect" if panorama is True else panorama, stereo)
             with open(temporary, "ab") as file:  # a box that players skip
                 file.write((8 + len(SOFTWARE)).to_bytes(4, "big") + b"free" + SOFTWARE.encode())
     return count

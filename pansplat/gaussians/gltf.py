@@ -17,10 +17,11 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from msgspec import Meta
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
@@ -37,8 +38,10 @@ from pansplat.gaussians.scene_files import (
     sort_by_label,
 )
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.strict_json import list_field, number_field, parse_json, require_object
+from pansplat.strict_json import convert, parse_json, read_field
 
+_Object = dict[str, Any]
+_Vector = tuple[float, float, float]
 _EXTENSION = "KHR_gaussian_splatting"
 _MAX_BYTES = (1 << 32) - 1  # lengths are 32 bits
 _MAX_DEGREE = 3
@@ -159,7 +162,7 @@ def load_glb(path: Path) -> Scene:
     """Read the Gaussians of a .glb where the nodes of its scene put them; an InputError if it is unusable."""
     content = read_file(path, "a .glb scene", limit=_MAX_BYTES)
     document, binary = _read_chunks(content, path)
-    required = [name for name in list_field(document, "extensionsRequired", path) if name != _EXTENSION]
+    required = [name for name in read_field(document, "extensionsRequired", list[str], path, []) if name != _EXTENSION]
     if required:
         raise InputError(f"{path}: it requires the extension {required[0]!s:.60}, which is not read; export it without")
     parts = [
@@ -170,7 +173,7 @@ def load_glb(path: Path) -> Scene:
         raise InputError(f"{path}: its scene holds no Gaussians ({_EXTENSION}); give another file")
     if len({part.degree for part in parts}) > 1:
         raise InputError(f"{path}: needed Gaussians of one degree of harmonics, got several; export it again")
-    extras = _field(_field(document, "asset", path), "extras", path).get("pansplat")
+    extras = read_field(read_field(document, "asset", _Object, path, {}), "extras", _Object, path, {}).get("pansplat")
     entry = None if extras is None else json.dumps(extras)
     return make_scene(Gaussians.cat(parts).rotated(Y_UP), entry, path)
 
@@ -194,14 +197,13 @@ def _read_chunks(content: bytes, path: Path) -> tuple[dict[str, Any], bytes]:
         length, kind = struct.unpack_from("<II", content, start)
         if kind == _BINARY:
             binary = content[start + 8 : min(start + 8 + length, total)]
-    return require_object(parse_json(text, path), path), binary
+    return convert(parse_json(text, path), _Object, path), binary
 
 
 def _list_primitives(document: dict[str, Any], path: Path) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """All primitives with Gaussians of the default scene, and the matrix (4, 4) from each to the world."""
-    default = number_field(document, "scene", path, low=0, high=_MAX_NODES, whole=True)
-    root = _item(document, "scenes", 0 if default is None else default, path)
-    pending = [(index, np.eye(4)) for index in list_field(root, "nodes", path)]
+    root = _item(document, "scenes", document.get("scene", 0), path)
+    pending = [(index, np.eye(4)) for index in read_field(root, "nodes", list, path, [])]
     visited = 0
     while pending:
         index, parent = pending.pop()
@@ -210,26 +212,24 @@ def _list_primitives(document: dict[str, Any], path: Path) -> Iterator[tuple[dic
             raise InputError(f"{path}: needed at most {_MAX_NODES} nodes, got more, or a cycle; export it again")
         node = _item(document, "nodes", index, path)
         matrix = parent @ _read_transform(node, path)
-        pending += [(child, matrix) for child in list_field(node, "children", path)]
+        pending += [(child, matrix) for child in read_field(node, "children", list, path, [])]
         if "mesh" in node:
-            for primitive in list_field(_item(document, "meshes", node["mesh"], path), "primitives", path):
-                if _EXTENSION in _field(require_object(primitive, path), "extensions", path):
+            for primitive in read_field(
+                _item(document, "meshes", node["mesh"], path), "primitives", list[_Object], path, []
+            ):
+                if _EXTENSION in read_field(primitive, "extensions", _Object, path, {}):
                     yield primitive, matrix
 
 
 def _read_transform(node: dict[str, Any], path: Path) -> np.ndarray:
     """The matrix (4, 4) of a node."""
-    if "matrix" in node:
-        return _numbers(node, "matrix", 16, path).reshape(4, 4).T
     matrix = np.eye(4)
-    if "rotation" in node:
-        x, y, z, w = _numbers(node, "rotation", 4, path)
-        quat = torch.nn.functional.normalize(torch.tensor([w, x, y, z], dtype=torch.float64), dim=0)
-        matrix[:3, :3] = rotations_from_quats(quat).numpy()
-    if "scale" in node:
-        matrix[:3, :3] *= _numbers(node, "scale", 3, path)
-    if "translation" in node:
-        matrix[:3, 3] = _numbers(node, "translation", 3, path)
+    if "matrix" in node:
+        return np.array(read_field(node, "matrix", tuple[(float,) * 16], path)).reshape(4, 4).T
+    x, y, z, w = read_field(node, "rotation", tuple[(float,) * 4], path, (0, 0, 0, 1))
+    quat = torch.nn.functional.normalize(torch.tensor([w, x, y, z], dtype=torch.float64), dim=0)
+    matrix[:3, :3] = rotations_from_quats(quat).numpy() * read_field(node, "scale", _Vector, path, (1, 1, 1))
+    matrix[:3, 3] = read_field(node, "translation", _Vector, path, (0, 0, 0))
     return matrix
 
 
@@ -249,8 +249,8 @@ def _move(gaussians: Gaussians, matrix: np.ndarray, path: Path) -> Gaussians:
 
 
 def _read_primitive(document: dict[str, Any], primitive: dict[str, Any], binary: bytes, path: Path) -> Gaussians:
-    attributes = _field(primitive, "attributes", path)
-    if "extensions" in _field(_field(primitive, "extensions", path), _EXTENSION, path):
+    attributes = read_field(primitive, "attributes", _Object, path, {})
+    if "extensions" in read_field(primitive["extensions"], _EXTENSION, _Object, path, {}):
         raise InputError(f"{path}: its Gaussians are compressed by an extension, which is not read; export it without")
 
     def read(name: str, components: int) -> torch.Tensor:
@@ -283,12 +283,11 @@ def _read_accessor(document: dict[str, Any], index: Any, components: int, binary
         )
     dtype = np.dtype(_COMPONENTS[code])
     view = _item(document, "bufferViews", accessor.get("bufferView"), path)
-    if number_field(view, "buffer", path, whole=True) != 0 or "uri" in _item(document, "buffers", 0, path):
+    if view.get("buffer") != 0 or "uri" in _item(document, "buffers", 0, path):
         raise InputError(f"{path}: needed all numbers inside the .glb, got another file; export it as one .glb")
 
     def length(holder: dict[str, Any], key: str, default: int, low: int = 0) -> int:
-        value = number_field(holder, key, path, low=low, high=_MAX_BYTES, whole=True)
-        return default if value is None else int(value)
+        return read_field(holder, key, Annotated[int, Meta(ge=low, le=_MAX_BYTES)], path, default)
 
     item = components * dtype.itemsize
     count, stride = length(accessor, "count", 0, low=1), length(view, "byteStride", item, low=1)
@@ -307,20 +306,7 @@ def _read_accessor(document: dict[str, Any], index: Any, components: int, binary
 
 def _item(document: dict[str, Any], key: str, index: Any, path: Path) -> dict[str, Any]:
     """An object of a list of the document."""
-    items = list_field(document, key, path)
+    items = read_field(document, key, list, path, [])
     if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(items):
         raise InputError(f"{path}: needed a number below {len(items)} of {key}, got {index!r:.20}; export it again")
-    return require_object(items[index], path)
-
-
-def _field(holder: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
-    """An object of an object; empty if it is missing."""
-    return require_object(holder.get(key, {}), path)
-
-
-def _numbers(holder: dict[str, Any], key: str, count: int, path: Path) -> np.ndarray:
-    """A list of numbers of an object."""
-    values = list_field(holder, key, path)
-    if len(values) != count or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in values):
-        raise InputError(f"{path}: needed {count} numbers as {key} of a node, got {values!r:.60}; export it again")
-    return np.array(values, np.float64)
+    return convert(items[index], _Object, f"{path}, {key}[{index}]")

@@ -10,10 +10,11 @@ Source: PanSplat, section 3.2 and Figure 3; docs/official.md, sections 6 and 7.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -22,16 +23,19 @@ from pansplat.geometry.equirect import Border
 from pansplat.geometry.warp import Sampling, relative_pose
 from pansplat.model.layers import (
     Compat,
+    ConvNorm,
     Maps,
     PanoramaConv2d,
     PerView,
     Poses,
     Precision,
+    Size,
     ViewMaps,
     Volume,
     attend,
     autocast_convolutions,
     choose_border,
+    make_head,
     require_rigid,
     require_size,
     require_views,
@@ -50,13 +54,13 @@ _HEAD_CHANNELS = 32
 class SweepLevel:
     """Shape of one level of the cost volume."""
 
-    level: int
+    level: Annotated[int, Meta(ge=0, le=3)]
     """Pyramid level of the features; the map has 2^-level of the image's size."""
-    channels: int
+    channels: Size
     """Channels of the features."""
-    candidates: int
+    candidates: Size
     """Depth candidates per pixel."""
-    width: int
+    width: Size
     """Channels of the U-Net."""
 
 
@@ -73,7 +77,7 @@ class CostVolumeConfig:
 
     sweep: Literal["hierarchical", "single"] = "hierarchical"
     """All levels, or the coarsest level only."""
-    mono_channels: int = 32
+    mono_channels: Annotated[int, Meta(ge=0, le=4096)] = 32
     """Channels of the monocular features; 0 for none."""
     refinement: Literal["unet", "none"] = "unet"
     """Refine the volume by a U-Net plus a 1x1 convolution, or by the convolution only."""
@@ -202,19 +206,22 @@ class LevelRefinement(nn.Module):
     """Computes the logits of a level's candidates from its cost volume; in the paper C~ from C."""
 
     def __init__(
-        self, sweep: SweepLevel, config: CostVolumeConfig, *, first: bool, compat: Compat, precision: Precision
+        self,
+        sweep: SweepLevel,
+        config: CostVolumeConfig,
+        *,
+        first: bool,
+        compat: Compat,
+        precision: Precision,
+        border: Border | None = None,
     ) -> None:
         super().__init__()
         self.compat: Compat = compat
-        border = choose_border(compat)
+        border = border or choose_border(compat)
         inputs = sweep.candidates + sweep.channels + (0 if first else 1) + config.mono_channels
         self.shortcut = nn.Conv2d(inputs, sweep.width, 1)
         self.refine = VolumeRefinement(inputs, sweep.width, border, precision) if config.refinement == "unet" else None
-        self.head = nn.Sequential(
-            PanoramaConv2d(sweep.width, 2 * sweep.width, 3, border=border),
-            nn.GELU(),
-            PanoramaConv2d(2 * sweep.width, sweep.candidates, 3, border=border),
-        )
+        self.head = make_head(sweep.width, 2 * sweep.width, sweep.candidates, border)
 
     def forward(
         self,
@@ -238,14 +245,14 @@ class LevelRefinement(nn.Module):
 
 
 class VolumeRefinement(nn.Module):
-    """A U-Net between two convolutions."""
+    """A U-Net between two convolutions; one of five scales, at the size of images, has none after it."""
 
-    def __init__(self, inputs: int, width: int, border: Border, precision: Precision) -> None:
+    def __init__(self, inputs: int, width: int, border: Border, precision: Precision, *, scales: int = 3) -> None:
         super().__init__()
         self.entry = PanoramaConv2d(inputs, width, 3, border=border)
-        self.norm = nn.GroupNorm(_GROUPS, width)
-        self.unet = UNet(UNetConfig(width), border, precision)
-        self.exit = PanoramaConv2d(width, width, 3, border=border)
+        self.norm = nn.GroupNorm(_GROUPS if scales == 3 else 4, width)
+        self.unet = UNet(width, border, precision, scales=scales)
+        self.exit = PanoramaConv2d(width, width, 3, border=border) if scales == 3 else nn.Identity()
 
     def forward(self, inputs: ViewMaps) -> Float[Tensor, "batch view c height width"]:
         views = inputs.shape[:2]
@@ -302,35 +309,29 @@ def regress_depth(level: int, logits: Volume, candidates: Volume) -> LevelDepth:
     return LevelDepth(level, inverse_depth, probability.amax(dim=2), logits, candidates)
 
 
-@dataclass(frozen=True)
-class UNetConfig:
-    """Shape of a U-Net."""
-
-    channels: int
-    """Channels of every map."""
-    scales: int = 3
-    """Number of map sizes, each half of the previous one; attention is at the last."""
-
-
 class UNet(nn.Module):
     """2-D U-Net over the maps of all views; scale 0 has the input's size, the last scale is the bottleneck.
 
     Source: PanSplat, section 3.2 (after MVSplat, after the U-Net of latent diffusion).
+
+    Args:
+        channels: of every map.
+        scales: number of map sizes, each half of the previous one; attention is at the last.
     """
 
-    def __init__(self, config: UNetConfig, border: Border, precision: Precision = "float32") -> None:
+    def __init__(self, channels: int, border: Border, precision: Precision = "float32", *, scales: int = 3) -> None:
         super().__init__()
-        channels, last = config.channels, config.scales - 1
+        last = scales - 1
         self.stem = PanoramaConv2d(channels, channels, 3, border=border)
         self.encoder = nn.ModuleList(
-            EncoderScale(channels, border, precision, bottleneck=scale == last) for scale in range(config.scales)
+            EncoderScale(channels, border, precision, bottleneck=scale == last) for scale in range(scales)
         )
         self.middle = nn.ModuleList(ResBlock(channels, channels, border) for _ in range(2))
         self.decoder = nn.ModuleList(
             DecoderScale(channels, border, precision, bottleneck=scale == last, finest=scale == 0)
-            for scale in range(config.scales)
+            for scale in range(scales)
         )
-        self.exit = ConvNorm(channels, channels, border)
+        self.exit = ConvNorm(channels, channels, border=border, bias=True, groups=_GROUPS)
 
     def forward(self, maps: ViewMaps) -> ViewMaps:
         """Refine the maps of all views; 2^(scales - 1) must divide height and width."""
@@ -387,25 +388,13 @@ class DecoderScale(nn.Module):
         return x
 
 
-class ConvNorm(nn.Module):
-    """Convolution and group normalisation."""
-
-    def __init__(self, inputs: int, outputs: int, border: Border) -> None:
-        super().__init__()
-        self.conv = PanoramaConv2d(inputs, outputs, 3, border=border)
-        self.norm = nn.GroupNorm(_GROUPS, outputs)
-
-    def forward(self, maps: Maps) -> Float[Tensor, "image c height width"]:
-        return self.norm(self.conv(maps))
-
-
 class ResBlock(nn.Module):
     """Two convolutions plus a shortcut; after initialisation the convolutions give zero."""
 
     def __init__(self, inputs: int, outputs: int, border: Border) -> None:
         super().__init__()
-        self.first = ConvNorm(inputs, outputs, border)
-        self.second = ConvNorm(outputs, outputs, border)
+        self.first = ConvNorm(inputs, outputs, border=border, bias=True, groups=_GROUPS)
+        self.second = ConvNorm(outputs, outputs, border=border, bias=True, groups=_GROUPS)
         nn.init.zeros_(self.second.norm.weight)
         self.shortcut = nn.Identity() if inputs == outputs else nn.Conv2d(inputs, outputs, 1)
 

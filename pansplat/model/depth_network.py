@@ -12,15 +12,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu
 
 from pansplat.model.efficientnet import CHANNELS, EfficientNetLite0
-from pansplat.model.layers import PanoramaConv2d, attend, convolve_and_normalize
+from pansplat.model.layers import PanoramaConv2d, Size, TwoConvs, attend, convolve_and_normalize
 
 MAX_LOG_SCALE = 3.0  # bound of the logarithm of the Laplace scale
 MEAN_LOG_DEPTH = 0.6  # of generated homes, in camera heights
@@ -30,11 +31,11 @@ MEAN_LOG_DEPTH = 0.6  # of generated homes, in camera heights
 class DepthNetworkConfig:
     """Widths of the depth network."""
 
-    room_channels: int = 192
+    room_channels: Size = 192
     """Channels of the cells at 1/32."""
-    attention_layers: int = 2
-    attention_heads: int = 6
-    decoder_channels: tuple[int, int, int, int] = field(default=(128, 80, 48, 32))
+    attention_layers: Annotated[int, Meta(ge=0, le=64)] = 2
+    attention_heads: Size = 6
+    decoder_channels: tuple[Size, Size, Size, Size] = field(default=(128, 80, 48, 32))
     """Channels at 1/16, 1/8, 1/4 and 1/2."""
 
 
@@ -50,12 +51,15 @@ class DepthEstimate(NamedTuple):
     log_scale: Float[Tensor, "batch h w"]
 
 
-class DepthNetwork(nn.Module):
-    """Monocular depth of panoramas."""
+class RoomNetwork(nn.Module):
+    """An encoder of panoramas, attention between all cells of 1/32, and a decoder to 1/2.
 
-    def __init__(self, config: DepthNetworkConfig | None = None) -> None:
+    Args:
+        extra: channels that enter each scale of the decoder with the encoder's features.
+    """
+
+    def __init__(self, config: DepthNetworkConfig, extra: int = 0) -> None:
         super().__init__()
-        self.config = config = config or DepthNetworkConfig()
         self.encoder = EfficientNetLite0()
         room = config.room_channels
         self.room = PanoramaConv2d(CHANNELS[-1], room, 1, border="sphere", bias=False)
@@ -65,9 +69,28 @@ class DepthNetwork(nn.Module):
         )
         widths = (room, *config.decoder_channels)
         self.decoder = nn.ModuleList(
-            UpsampleAndMerge(widths[n], skip, widths[n + 1]) for n, skip in enumerate(reversed(CHANNELS[:-1]))
+            UpsampleAndMerge(widths[n] + skip + extra, widths[n + 1]) for n, skip in enumerate(reversed(CHANNELS[:-1]))
         )
-        self.head = nn.Conv2d(widths[-1], 2, 1)
+
+    def encode_room(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[Tensor, list[Tensor]]:
+        """The cells after attention, in float32 or float64, and the encoder's features at 1/2 to 1/32."""
+        encoded = self.encoder(images)
+        x = relu(convolve_and_normalize(self.room, self.room_norm, encoded[-1]))
+        with torch.autocast(x.device.type, enabled=False):
+            x = x.to(torch.promote_types(x.dtype, torch.float32))
+            for layer in self.attention:
+                x = layer(x)
+        return x, encoded
+
+
+class DepthNetwork(RoomNetwork):
+    """Monocular depth of panoramas."""
+
+    def __init__(self, config: DepthNetworkConfig | None = None) -> None:
+        config = config or DepthNetworkConfig()
+        super().__init__(config)
+        self.config = config
+        self.head = nn.Conv2d(config.decoder_channels[-1], 2, 1)
         nn.init.zeros_(self.head.weight)
         nn.init.constant_(self.head.bias, 0)
 
@@ -86,31 +109,17 @@ class DepthNetwork(nn.Module):
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch c h w"], list[Tensor]]:
         """Decoded features at 1/2, and the encoder's features at 1/2 to 1/32."""
-        encoded = self.encoder(images)
-        x = relu(convolve_and_normalize(self.room, self.room_norm, encoded[-1]))
-        for layer in self.attention:
-            x = layer(x)
+        x, encoded = self.encode_room(images)
         for merge, skip in zip(self.decoder, reversed(encoded[:-1]), strict=True):
             x = merge(x, skip)
         return x, encoded
 
 
-class UpsampleAndMerge(nn.Module):
-    """Doubles the size of maps and merges them with the encoder's features of that size by two convolutions."""
+class UpsampleAndMerge(TwoConvs):
+    """Doubles the size of maps and merges them with others of that size by two convolutions."""
 
-    def __init__(self, inputs: int, skip: int, outputs: int) -> None:
-        super().__init__()
-        self.conv1 = PanoramaConv2d(inputs + skip, outputs, 3, border="sphere", bias=False)
-        self.norm1 = nn.BatchNorm2d(outputs)
-        self.conv2 = PanoramaConv2d(outputs, outputs, 3, border="sphere", bias=False)
-        self.norm2 = nn.BatchNorm2d(outputs)
-
-    def forward(
-        self, x: Float[Tensor, "batch c height width"], skip: Float[Tensor, "batch d 2*height 2*width"]
-    ) -> Float[Tensor, "batch e 2*height 2*width"]:
-        x = torch.cat((interpolate(x, scale_factor=2, mode="nearest"), skip), dim=1)
-        x = relu(convolve_and_normalize(self.conv1, self.norm1, x))
-        return relu(convolve_and_normalize(self.conv2, self.norm2, x))
+    def forward(self, x: Float[Tensor, "batch c height width"], *others: Tensor) -> Float[Tensor, "batch e h w"]:
+        return relu(self.convolve(torch.cat((interpolate(x, scale_factor=2, mode="nearest"), *others), dim=1)))
 
 
 class RoomAttention(nn.Module):

@@ -32,7 +32,7 @@ from pansplat.model.depth_network import (
     UpsampleAndMerge,
 )
 from pansplat.model.efficientnet import CHANNELS
-from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize, to_channels_last
+from pansplat.model.layers import ConvNorm, Factor, PanoramaConv2d, Size, to_channels_last
 
 _PATCH, _DILATION = 3, 2  # pixels of a patch, and their distance
 _PATCH_NOISE = 0.02  # standard deviation of a patch below which its correlation fades
@@ -44,13 +44,13 @@ class RefinementConfig:
     """Settings of the refinement."""
 
     mono: DepthNetworkConfig = field(default_factory=DepthNetworkConfig)
-    candidates: int = 27
-    reach: float = 1.2
+    candidates: Size = 27
+    reach: Factor = 1.2
     """Logarithm of the ratio of the outermost candidates to the present depth."""
-    concentration: float = 0.7
+    concentration: Factor = 0.7
     """Fraction of the reach that grows with the square of the candidate's index."""
-    matching_channels: int = 16
-    channels: tuple[int, int, int] = (40, 64, 96)
+    matching_channels: Size = 16
+    channels: tuple[Size, Size, Size] = (40, 64, 96)
     """Channels of the U-Net at 1/2, 1/4 and 1/8."""
 
 
@@ -93,8 +93,8 @@ class DepthRefinement(nn.Module):
         self.to_middle = _ConvNorm(fine + CHANNELS[1], middle, 3)
         self.to_coarse = _ConvNorm(middle + CHANNELS[2], coarse, 3)
         self.coarse = _ConvNorm(coarse, coarse, 3)
-        self.up_middle = UpsampleAndMerge(coarse, middle, middle)
-        self.up_fine = UpsampleAndMerge(middle, fine, fine)
+        self.up_middle = UpsampleAndMerge(coarse + middle, middle)
+        self.up_fine = UpsampleAndMerge(middle + fine, fine)
         self.head = nn.Conv2d(fine, count + 2, 1)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
@@ -178,16 +178,14 @@ def _multiply_at(
     return torch.einsum("nchw,ncdhw->ndhw", reference, sample_maps(other, columns, rows, "sphere"))
 
 
-class _ConvNorm(nn.Module):
-    """Convolution, batch normalisation, ReLU."""
+class _ConvNorm(ConvNorm):
+    """Convolution, batch normalisation, ReLU, in channels-last memory layout."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
-        super().__init__()
-        self.conv = PanoramaConv2d(inputs, outputs, kernel, border="sphere", bias=False)
-        self.norm = nn.BatchNorm2d(outputs)
+        super().__init__(inputs, outputs, kernel, border="sphere", activate=relu)
 
-    def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch d h w"]:
-        return relu(convolve_and_normalize(self.conv, self.norm, to_channels_last(x)))
+    def forward(self, maps: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch d h w"]:
+        return super().forward(to_channels_last(maps))
 
 
 def _make_patches(images: Float[Tensor, "view 3 h w"]) -> Float[Tensor, "view c h w"]:

@@ -9,58 +9,42 @@ Source of the weighted upsampling: Teed and Deng, https://arxiv.org/abs/2003.120
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, pixel_shuffle, pixel_unshuffle, relu, unfold
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle, relu, unfold
 
 from pansplat.geometry.equirect import pad_equirect, resize_equirect
-from pansplat.model.depth_network import MAX_LOG_SCALE, MEAN_LOG_DEPTH, DepthEstimate, RoomAttention
-from pansplat.model.efficientnet import CHANNELS, EfficientNetLite0
-from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize
+from pansplat.model.depth_network import MAX_LOG_SCALE, MEAN_LOG_DEPTH, DepthEstimate, DepthNetworkConfig, RoomNetwork
+from pansplat.model.layers import PanoramaConv2d, Size, convolve_and_normalize
 
 _ESTIMATE_CHANNELS = 3  # log-depth, its log-scale, latitude
 _NEIGHBOURS = 9  # whose depths a pixel chooses from
 
 
 @dataclass(frozen=True)
-class SharpeningConfig:
+class SharpeningConfig(DepthNetworkConfig):
     """Widths of the network, and the size that it is trained for."""
 
-    height: int = 384
+    height: Size = 384
     """Height of the panoramas, pixels."""
-    room_channels: int = 192
-    attention_layers: int = 2
-    attention_heads: int = 6
-    decoder_channels: tuple[int, int, int, int] = field(default=(128, 80, 48, 32))
-    """Channels at 1/16, 1/8, 1/4 and 1/2."""
-    selection_channels: int = 48
+    selection_channels: Size = 48
     """Channels from which the weights of the neighbours follow."""
 
 
-class DepthSharpening(nn.Module):
+class DepthSharpening(RoomNetwork):
     """From an estimate of depth and a larger panorama to depth with sharp edges."""
 
     def __init__(self, config: SharpeningConfig | None = None) -> None:
-        super().__init__()
-        self.config = config = config or SharpeningConfig()
-        self.encoder = EfficientNetLite0()
-        room = config.room_channels
-        self.room = PanoramaConv2d(CHANNELS[-1], room, 1, border="sphere", bias=False)
-        self.room_norm = nn.BatchNorm2d(room)
-        self.attention = nn.ModuleList(
-            RoomAttention(room, config.attention_heads) for _ in range(config.attention_layers)
-        )
-        widths = (room, *config.decoder_channels)
-        self.decoder = nn.ModuleList(
-            _UpsampleAndMerge(widths[n], skip, widths[n + 1]) for n, skip in enumerate(reversed(CHANNELS[:-1]))
-        )
-        self.head = PanoramaConv2d(widths[-1], 2, 3, border="sphere")
+        config = config or SharpeningConfig()
+        super().__init__(config, _ESTIMATE_CHANNELS)
+        self.config, width = config, config.decoder_channels[-1]
+        self.head = PanoramaConv2d(width, 2, 3, border="sphere")
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
-        self.full = PanoramaConv2d(widths[-1] + 12, config.selection_channels, 3, border="sphere", bias=False)
+        self.full = PanoramaConv2d(width + 12, config.selection_channels, 3, border="sphere", bias=False)
         self.full_norm = nn.BatchNorm2d(config.selection_channels)
         self.mask = nn.Conv2d(config.selection_channels, 4 * _NEIGHBOURS, 1)
 
@@ -73,12 +57,7 @@ class DepthSharpening(nn.Module):
             images: RGB in [0, 1]; 32 divides their height.
             estimate: of the same panoramas by the depth network, at any size.
         """
-        encoded = self.encoder(images)
-        x = relu(convolve_and_normalize(self.room, self.room_norm, encoded[-1]))
-        with torch.autocast(x.device.type, enabled=False):
-            x = x.float()
-            for layer in self.attention:
-                x = layer(x)
+        x, encoded = self.encode_room(images)
         known = torch.stack((estimate.log_depth - MEAN_LOG_DEPTH, estimate.log_scale), dim=1).float()
         for merge, skip in zip(self.decoder, reversed(encoded[:-1]), strict=True):
             height = skip.shape[-2]
@@ -103,22 +82,6 @@ class DepthSharpening(nn.Module):
         weights = maps.float().unflatten(1, (_NEIGHBOURS, 4)).softmax(dim=1)
         neighbours = unfold(pad_equirect(depth[:, None], 1, "sphere"), 3).unflatten(-1, depth.shape[-2:])
         return pixel_shuffle((weights * neighbours[:, :, None]).sum(dim=1), 2)[:, 0]
-
-
-class _UpsampleAndMerge(nn.Module):
-    """Doubles the size of maps and merges them with the encoder's features and the estimate by two convolutions."""
-
-    def __init__(self, inputs: int, skip: int, outputs: int) -> None:
-        super().__init__()
-        self.conv1 = PanoramaConv2d(inputs + skip + _ESTIMATE_CHANNELS, outputs, 3, border="sphere", bias=False)
-        self.norm1 = nn.BatchNorm2d(outputs)
-        self.conv2 = PanoramaConv2d(outputs, outputs, 3, border="sphere", bias=False)
-        self.norm2 = nn.BatchNorm2d(outputs)
-
-    def forward(self, x: Tensor, skip: Tensor, estimate: Tensor) -> Float[Tensor, "batch c h w"]:
-        x = torch.cat((interpolate(x, scale_factor=2, mode="nearest"), skip, estimate), dim=1)
-        x = relu(convolve_and_normalize(self.conv1, self.norm1, x))
-        return relu(convolve_and_normalize(self.conv2, self.norm2, x))
 
 
 def _resize(maps: Float[Tensor, "batch c h w"], height: int) -> Float[Tensor, "batch c height 2*height"]:

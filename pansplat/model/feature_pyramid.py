@@ -9,23 +9,25 @@ Source: PanSplat, section 3.1 and Figure 3; docs/official.md, section 4.
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 
 from pansplat.geometry.equirect import Border
 from pansplat.model.layers import (
     Compat,
+    ConvNorm,
     Images,
     Maps,
-    PanoramaConv2d,
     Precision,
+    Size,
     ViewMaps,
     attend,
     autocast_convolutions,
     choose_border,
-    convolve_and_normalize,
     require_size,
     require_views,
     to_channels_last,
@@ -41,11 +43,11 @@ _STD = (0.229, 0.224, 0.225)
 class TransformerConfig:
     """Shape of the transformer; shipped weights fix all of it."""
 
-    channels: int = 128
-    blocks: int = 6
-    splits: int = 2
+    channels: Size = 128
+    blocks: Annotated[int, Meta(ge=1, le=64)] = 6
+    splits: Annotated[int, Meta(ge=1, le=2)] = 2
     """Windows along each side of the map."""
-    expansion: int = 4
+    expansion: Annotated[int, Meta(ge=1, le=16)] = 4
     """Hidden channels of the feed-forward part, in multiples of its input."""
 
 
@@ -53,7 +55,7 @@ class TransformerConfig:
 class FeaturePyramidConfig:
     """Shape of the feature pyramid; shipped weights fix all of it."""
 
-    channels: tuple[int, int, int, int] = (32, 64, 96, 128)
+    channels: tuple[Size, Size, Size, Size] = (32, 64, 96, 128)
     """Channels of levels 0 (finest) to 3."""
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
 
@@ -102,10 +104,10 @@ class Encoder(nn.Module):
         c0, c1, c2, c3 = channels
         self.levels = nn.ModuleList(
             (
-                nn.Sequential(ConvNormAct(3, c0, 7, border), ConvNormAct(c0, c0, 5, border)),
-                _make_halving_level(c0, c1, 5, border),
-                _make_halving_level(c1, c2, 5, border),
-                _make_halving_level(c2, c3, 3, border),
+                _make_level(3, (c0, 7), (c0, 5), border=border),
+                _make_level(c0, (c1, 5), (c1, 3), (c1, 3), border=border, stride=2),
+                _make_level(c1, (c2, 5), (c2, 3), (c2, 3), border=border, stride=2),
+                _make_level(c2, (c3, 3), (c3, 3), (c3, 3), border=border, stride=2),
             )
         )
 
@@ -128,8 +130,10 @@ class Decoder(nn.Module):
         *finer, width = channels
         border = choose_border(compat)
         self.laterals = nn.ModuleList(nn.Conv2d(c, width, 1) for c in finer)
-        self.outputs = nn.ModuleList([LevelOutput(width, c, 3, border) for c in finer])
-        self.outputs.append(LevelOutput(width, width, 1, border))
+        outputs = [*((c, 3) for c in finer), (width, 1)]
+        self.outputs = nn.ModuleList(
+            ConvNorm(width, c, kernel, border=border, bias=True, activate=_silu) for c, kernel in outputs
+        )
 
     def forward(
         self, coarsest: Maps, fine_to_coarse: list[Float[Tensor, "image _ _ _"]]
@@ -158,29 +162,13 @@ class Decoder(nn.Module):
         return features
 
 
-class ConvNormAct(nn.Module):
-    """Convolution without bias, batch normalisation, leaky ReLU."""
-
-    def __init__(self, inputs: int, outputs: int, kernel: int, border: Border, stride: int = 1) -> None:
-        super().__init__()
-        self.conv = PanoramaConv2d(inputs, outputs, kernel, stride=stride, bias=False, border=border)
-        self.norm = nn.BatchNorm2d(outputs)
-
-    def forward(self, maps: Maps) -> Float[Tensor, "image c h w"]:
-        return nn.functional.leaky_relu(convolve_and_normalize(self.conv, self.norm, maps), 0.1, inplace=True)
+def _leaky_relu(maps: Tensor) -> Tensor:
+    return nn.functional.leaky_relu(maps, 0.1, inplace=True)
 
 
-class LevelOutput(nn.Module):
-    """Convolution, batch normalisation and SiLU; computes the features of a level from the decoder's map."""
-
-    def __init__(self, inputs: int, outputs: int, kernel: int, border: Border) -> None:
-        super().__init__()
-        self.conv = PanoramaConv2d(inputs, outputs, kernel, border=border)
-        self.norm = nn.BatchNorm2d(outputs)
-
-    def forward(self, maps: Maps) -> Float[Tensor, "image c height width"]:
-        normalized = convolve_and_normalize(self.conv, self.norm, maps)
-        return normalized * normalized.sigmoid()  # the official form of SiLU; torch's own rounds differently
+def _silu(maps: Tensor) -> Tensor:
+    """The official form of SiLU; torch's own rounds differently."""
+    return maps * maps.sigmoid()
 
 
 def normalize(images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image 3 height width"]:
@@ -189,12 +177,13 @@ def normalize(images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "i
     return (images - mean) / std
 
 
-def _make_halving_level(inputs: int, outputs: int, kernel: int, border: Border) -> nn.Sequential:
-    return nn.Sequential(
-        ConvNormAct(inputs, outputs, kernel, border, stride=2),
-        ConvNormAct(outputs, outputs, 3, border),
-        ConvNormAct(outputs, outputs, 3, border),
-    )
+def _make_level(inputs: int, *convs: tuple[int, int], border: Border, stride: int = 1) -> nn.Sequential:
+    """Convolutions of an encoder's level: their outputs and kernels; `stride` is that of the first."""
+    layers = []
+    for outputs, kernel in convs:
+        layers.append(ConvNorm(inputs, outputs, kernel, border=border, stride=stride, activate=_leaky_relu))
+        inputs, stride = outputs, 1
+    return nn.Sequential(*layers)
 
 
 class Transformer(nn.Module):

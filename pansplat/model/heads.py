@@ -15,10 +15,11 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float, Integer
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -28,7 +29,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import directions_from_uv
 from pansplat.geometry.pose import multiply_quats, quats_from_rotations
 from pansplat.model.cost_volume import Depths, LevelDepth
-from pansplat.model.layers import Compat, Images, PerView, Poses, Precision, autocast_convolutions
+from pansplat.model.layers import Compat, Factor, Images, PerView, Poses, Precision, Size, autocast_convolutions
 from pansplat.model.tiles import (
     Lattice,
     Margins,
@@ -52,11 +53,11 @@ _MAX_HEIGHT = 512  # of the cost volume's input
 class AdapterConfig:
     """Degree of the colours and range of the scales; shipped weights fix all of it."""
 
-    degree: int = 4
+    degree: Annotated[int, Meta(ge=0, le=4)] = 4
     """Degree of the spherical harmonics."""
-    min_scale: float = 0.5
+    min_scale: Factor = 0.5
     """Smallest standard deviation, in fifths of a map pixel's angle."""
-    max_scale: float = 15.0
+    max_scale: Factor = 15.0
     """Largest standard deviation, in fifths of a map pixel's angle."""
 
     @property
@@ -79,11 +80,11 @@ class HeadsConfig:
     """Whether a level reads the coarser level's map and adds to it."""
     depth: Literal["refined", "swept"] = "refined"
     """Depth and opacity from logits of the head, or the depth and confidence of the cost volume."""
-    feature_channels: tuple[int, ...] = (128, 96, 64, 32)
+    feature_channels: Annotated[tuple[Size, ...], Meta(max_length=16)] = (128, 96, 64, 32)
     """Channels of the feature maps, coarse to fine."""
-    candidates: int = 32
+    candidates: Size = 32
     """Depth candidates of the finest swept level."""
-    layers: int = 3
+    layers: Annotated[int, Meta(ge=1, le=64)] = 3
     """Convolutions of each level."""
     adapter: AdapterConfig = field(default_factory=AdapterConfig)
 

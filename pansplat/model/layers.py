@@ -6,10 +6,12 @@ at half-integers and continues every map across the seam and the poles.
 Source: PanSplat, section 3.1; docs/official.md, sections 4, 6 and 7.
 """
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -19,6 +21,11 @@ from pansplat.geometry.pose import orthonormal_error
 
 Compat = Literal["official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
+
+Size = Annotated[int, Meta(ge=1, le=4096)]
+"""A number of channels, candidates or rows in the settings of a network; larger ones take gigabytes."""
+Factor = Annotated[float, Meta(ge=1e-6, le=4096)]
+"""A number in the settings of a network."""
 
 Images = Float[Tensor, "batch view 3 height width"]
 """Panoramas, RGB in [0, 1]."""
@@ -115,14 +122,70 @@ class PanoramaConv2d(nn.Conv2d):
         )
 
 
-def convolve_and_normalize(conv: PanoramaConv2d, norm: nn.BatchNorm2d, maps: Maps) -> Float[Tensor, "image c h w"]:
-    """Convolution, then batch normalisation; in eval mode one convolution with scaled weights."""
-    mean, variance = norm.running_mean, norm.running_var
+def convolve_and_normalize(
+    conv: PanoramaConv2d, norm: nn.BatchNorm2d | nn.GroupNorm, maps: Maps
+) -> Float[Tensor, "image c h w"]:
+    """Convolution, then normalisation; of batches in eval mode, one convolution with scaled weights."""
+    mean, variance = getattr(norm, "running_mean", None), getattr(norm, "running_var", None)
     if norm.training or mean is None or variance is None:
         return norm(conv(maps))
     scale = norm.weight / (variance + norm.eps).sqrt()
     offset = -mean if conv.bias is None else conv.bias - mean
     return conv.convolve(maps, conv.weight * scale[:, None, None, None], norm.bias + scale * offset)
+
+
+class ConvNorm(nn.Module):
+    """Convolution, normalisation and an activation.
+
+    Args:
+        groups: of the normalisation; 0 to normalise batches.
+        activate: the activation; None for none.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        kernel: int = 3,
+        *,
+        border: Border,
+        stride: int = 1,
+        bias: bool = False,
+        groups: int = 0,
+        activate: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        self.conv = PanoramaConv2d(inputs, outputs, kernel, stride=stride, bias=bias, border=border)
+        self.norm = nn.GroupNorm(groups, outputs) if groups else nn.BatchNorm2d(outputs)
+        self.activate = activate
+
+    def forward(self, maps: Maps) -> Float[Tensor, "image c h w"]:
+        normalized = convolve_and_normalize(self.conv, self.norm, maps)
+        return normalized if self.activate is None else self.activate(normalized)
+
+
+def make_head(inputs: int, inner: int, outputs: int, border: Border) -> nn.Sequential:
+    """Two convolutions with a GELU between them."""
+    first, second = (PanoramaConv2d(*channels, 3, border=border) for channels in ((inputs, inner), (inner, outputs)))
+    return nn.Sequential(first, nn.GELU(), second)
+
+
+class TwoConvs(nn.Module):
+    """Two convolutions, each with normalisation of batches, and a ReLU after the first."""
+
+    def __init__(
+        self, inputs: int, outputs: int, *, border: Border = "sphere", kernel: int = 3, stride: int = 1
+    ) -> None:
+        super().__init__()
+        self.conv1 = PanoramaConv2d(inputs, outputs, kernel, stride=stride, bias=False, border=border)
+        self.norm1 = nn.BatchNorm2d(outputs)
+        self.conv2 = PanoramaConv2d(outputs, outputs, 3, bias=False, border=border)
+        self.norm2 = nn.BatchNorm2d(outputs)
+
+    def convolve(self, maps: Maps) -> Float[Tensor, "image c h w"]:
+        """The output of both convolutions, without an activation after the second."""
+        inner = functional.relu(convolve_and_normalize(self.conv1, self.norm1, maps))
+        return convolve_and_normalize(self.conv2, self.norm2, inner)
 
 
 def upsample(maps: Maps, factor: int, compat: Compat) -> Float[Tensor, "image channel h w"]:

@@ -28,6 +28,7 @@ from pansplat.model.layers import (
     Compat,
     Images,
     PanoramaConv2d,
+    TwoConvs,
     choose_border,
     convolve_and_normalize,
     resize,
@@ -124,48 +125,37 @@ class ResNet18(nn.Module):
         return features
 
 
-class ResidualBlock(nn.Module):
+class ResidualBlock(TwoConvs):
     """relu(x + conv(relu(conv(x)))) with batch normalisation after each convolution."""
 
     def __init__(self, inputs: int, outputs: int, *, stride: int, border: Border) -> None:
-        super().__init__()
-        self.conv1 = PanoramaConv2d(inputs, outputs, 3, stride=stride, bias=False, border=border)
-        self.norm1 = nn.BatchNorm2d(outputs)
-        self.conv2 = PanoramaConv2d(outputs, outputs, 3, bias=False, border=border)
-        self.norm2 = nn.BatchNorm2d(outputs)
+        super().__init__(inputs, outputs, stride=stride, border=border)
         self.shortcut_conv = self.shortcut_norm = None
         if stride > 1:
             self.shortcut_conv = PanoramaConv2d(inputs, outputs, 1, stride=stride, bias=False, border=border)
             self.shortcut_norm = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Float[Tensor, "batch c height width"]) -> Float[Tensor, "batch d h w"]:
-        inner = relu(convolve_and_normalize(self.conv1, self.norm1, x))
-        inner = convolve_and_normalize(self.conv2, self.norm2, inner)
+        inner = self.convolve(x)
         if self.shortcut_conv is not None and self.shortcut_norm is not None:
             x = convolve_and_normalize(self.shortcut_conv, self.shortcut_norm, x)
         return relu(x + inner)
 
 
-class Fusion(nn.Module):
+class Fusion(TwoConvs):
     """Adds to the face features a residual computed from both inputs, and joins the sum with the panorama features.
 
     Source: UniFuse, section III-B ("CEE", without squeeze and excitation).
     """
 
     def __init__(self, channels: int, border: Border) -> None:
-        super().__init__()
-        self.conv1 = PanoramaConv2d(2 * channels, channels, 1, bias=False, border=border)
-        self.norm1 = nn.BatchNorm2d(channels)
-        self.conv2 = PanoramaConv2d(channels, channels, 3, bias=False, border=border)
-        self.norm2 = nn.BatchNorm2d(channels)
+        super().__init__(2 * channels, channels, kernel=1, border=border)
         self.join = nn.Conv2d(2 * channels, channels, 1, bias=False)
 
     def forward(
         self, panorama: Float[Tensor, "batch c height width"], faces: Float[Tensor, "batch c height width"]
     ) -> Float[Tensor, "batch c height width"]:
-        both = torch.cat((panorama, faces), dim=1)
-        correction = relu(convolve_and_normalize(self.conv1, self.norm1, both))
-        correction = convolve_and_normalize(self.conv2, self.norm2, correction)
+        correction = self.convolve(torch.cat((panorama, faces), dim=1))
         return relu(self.join(torch.cat((panorama, faces + correction), dim=1)))
 
 

@@ -20,10 +20,11 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import Border
 from pansplat.model.base import Network
 from pansplat.model.cost_volume import (
+    CostVolumeConfig,
     Depths,
     LevelDepth,
-    UNet,
-    UNetConfig,
+    LevelRefinement,
+    SweepLevel,
     VolumeRefinement,
     correlate_views,
     make_first_candidates,
@@ -39,7 +40,9 @@ from pansplat.model.layers import (
     PerView,
     Poses,
     Precision,
+    Size,
     ViewMaps,
+    make_head,
     require_size,
     require_views,
     upsample,
@@ -54,13 +57,13 @@ _ENCODER_CHANNELS = (64, 64, 96, 96, 128, 128)  # of the residual blocks
 class MVSplatConfig:
     """Shape of the network; shipped weights fix all of it."""
 
-    channels: int = 128
+    channels: Size = 128
     """Channels of the features."""
-    candidates: int = 128
+    candidates: Size = 128
     """Depth candidates per pixel."""
-    width: int = 128
+    width: Size = 128
     """Channels of the cost volume's U-Net."""
-    refine_width: int = 32
+    refine_width: Size = 32
     """Channels of the U-Net at the image's size."""
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     adapter: AdapterConfig = field(default_factory=AdapterConfig)
@@ -107,16 +110,10 @@ class MVSplat(Network):
         self.depth = SweptDepth(config, compat, attention_precision)
         self.upsampler = PanoramaConv2d(2 * channels, channels, 3, border=border)
         self.project = PanoramaConv2d(channels, fine, 3, border=border)
-        self.refine = FullSizeRefinement(3 + fine + 2, fine, border, attention_precision)
+        self.refine = VolumeRefinement(3 + fine + 2, fine, border, attention_precision, scales=5)
         outputs = 2 + config.adapter.num_parameters
-        self.to_gaussians = nn.Sequential(
-            PanoramaConv2d(fine + 3 + channels, 2 * outputs, 3, border=border),
-            nn.GELU(),
-            PanoramaConv2d(2 * outputs, outputs, 3, border=border),
-        )
-        self.to_depth = nn.Sequential(
-            PanoramaConv2d(fine, 2 * fine, 3, border=border), nn.GELU(), PanoramaConv2d(2 * fine, 2, 3, border=border)
-        )
+        self.to_gaussians = make_head(fine + 3 + channels, 2 * outputs, outputs, border)
+        self.to_depth = make_head(fine, 2 * fine, 2, border)
 
     def match_views(self, images: Images, cam2world: Poses, near: PerView, far: PerView) -> MatchedViews:
         """Compute features and depths of all views at 1/4 scale."""
@@ -124,7 +121,7 @@ class MVSplat(Network):
         height, width = images.shape[-2:]
         require_size(height, width, 16)
         features, encoded = self.features(images)
-        swept = self.depth(features, cam2world, near, far)
+        swept = self.depth.regress(features, cam2world, near, far)
         return MatchedViews(images, features, encoded, Depths((swept,)), cam2world, near, far)
 
     def lift_gaussians(
@@ -138,7 +135,7 @@ class MVSplat(Network):
         inverse_depth = upsample(swept.inverse_depth, _SCALE, self.compat).flatten(0, 1)
         confidence = interpolate(swept.confidence, scale_factor=_SCALE, mode="nearest").flatten(0, 1)
         maps = (images, self.project(features), inverse_depth[:, None], confidence[:, None])
-        refined = self.refine(torch.cat(maps, dim=1), views)
+        refined = self.refine(torch.cat(maps, dim=1).unflatten(0, (-1, views))).flatten(0, 1)
         poses, near, far = (tensor.flatten(0, 1) for tensor in (matched.cam2world, matched.near, matched.far))
         by_view = [
             self._lift_view(
@@ -245,45 +242,21 @@ class ResidualBlock(nn.Module):
         return relu(self.shortcut(maps) + inner)
 
 
-class SweptDepth(nn.Module):
+class SweptDepth(LevelRefinement):
     """Inverse depth from a cost volume at 1/4 scale."""
 
     def __init__(self, config: MVSplatConfig, compat: Compat, precision: Precision) -> None:
-        super().__init__()
-        self.config = config
-        self.compat: Compat = compat
-        border = _choose_border(compat)
-        inputs = config.candidates + config.channels
-        self.shortcut = nn.Conv2d(inputs, config.width, 1)
-        self.refine = VolumeRefinement(inputs, config.width, border, precision)
-        self.head = nn.Sequential(
-            PanoramaConv2d(config.width, 2 * config.width, 3, border=border),
-            nn.GELU(),
-            PanoramaConv2d(2 * config.width, config.candidates, 3, border=border),
-        )
+        sweep = SweepLevel(2, config.channels, config.candidates, config.width)
+        border, without_mono = _choose_border(compat), CostVolumeConfig(mono_channels=0)
+        super().__init__(sweep, without_mono, first=True, compat=compat, precision=precision, border=border)
+        self.candidates = config.candidates
 
-    def forward(self, features: ViewMaps, cam2world: Poses, near: PerView, far: PerView) -> LevelDepth:
+    def regress(self, features: ViewMaps, cam2world: Poses, near: PerView, far: PerView) -> LevelDepth:
+        """The inverse depth of all views, from their features at 1/4 scale."""
         height, width = features.shape[-2:]
-        candidates = make_first_candidates((1 / far, 1 / near), self.config.candidates, (height, width))
+        candidates = make_first_candidates((1 / far, 1 / near), self.candidates, (height, width))
         volume = correlate_views(features, candidates, cam2world, self.compat)
-        inputs = torch.cat((volume, features), dim=2)
-        refined = self.shortcut(inputs.flatten(0, 1)) + self.refine(inputs).flatten(0, 1)
-        logits = self.head(refined).unflatten(0, features.shape[:2])
-        return regress_depth(2, logits, candidates)
-
-
-class FullSizeRefinement(nn.Module):
-    """U-Net of five scales at the image's size."""
-
-    def __init__(self, inputs: int, width: int, border: Border, precision: Precision) -> None:
-        super().__init__()
-        self.entry = PanoramaConv2d(inputs, width, 3, border=border)
-        self.norm = nn.GroupNorm(4, width)
-        self.unet = UNet(UNetConfig(width, scales=5), border, precision)
-
-    def forward(self, maps: Maps, views: int) -> Float[Tensor, "image c height width"]:
-        entered = gelu(self.norm(self.entry(maps)))
-        return self.unet(entered.unflatten(0, (-1, views))).flatten(0, 1)
+        return regress_depth(2, self(volume, features, None, None), candidates)
 
 
 def _choose_border(compat: Compat) -> Border:

@@ -34,7 +34,7 @@ from pansplat.model.weights import (
     read_checkpoint,
     require_shapes,
 )
-from pansplat.predictor import Progress, require_matching_inputs, select_item
+from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
 from pansplat.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
@@ -181,11 +181,11 @@ class NetworkPredictor:
         return matched, tiles
 
     def _lift(self, matched: Any, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
-        report = progress or (lambda stage, fraction: None)
-        report("making Gaussians", _MATCHING_FRACTION)
+        report = part_of(progress, _MATCHING_FRACTION)
+        report("making Gaussians", 0.0)
         for done, part in enumerate(self.network.lift_gaussians(matched, tiles=tiles), start=1):
             yield part
-            report("making Gaussians", _MATCHING_FRACTION + (1 - _MATCHING_FRACTION) * min(1.0, done / tiles**2))
+            report("making Gaussians", min(1.0, done / tiles**2))
         report("done", 1.0)
 
 

@@ -15,12 +15,12 @@ import json
 import os
 import pickle
 import re
-import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import msgspec
 import safetensors
 import safetensors.torch
 import torch
@@ -31,7 +31,7 @@ from pansplat.errors import InputError
 from pansplat.files import require_file
 from pansplat.geometry.cubemap import strip_lookup
 from pansplat.model.layers import Compat
-from pansplat.strict_json import parse_json, require_object
+from pansplat.strict_json import convert, parse_json
 
 FORMAT = 1  # increased when tensor names or the meaning of the metadata change
 
@@ -50,13 +50,6 @@ _BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tra
 _PREFIX = "encoder."  # of the network's tensors in a Lightning checkpoint
 _AUXILIARY_PREFIX = "losses.2.gaussian_head."
 _MAX_NAMES = 4  # in an error message
-_MAX_ITEMS = 16  # of a list in a network's settings
-_MIN_FLOAT = 1e-6
-_DEFAULT_LIMITS = (1, 4096)  # of a number in a network's settings: larger networks than any take gigabytes
-_LIMITS = {
-    "mono_channels": (0, 4096), "degree": (0, 4), "level": (0, 3), "splits": (1, 2), "expansion": (1, 16),
-    "blocks": (1, 64), "layers": (1, 64), "scales": (1, 6), "attention_layers": (0, 64),
-}  # fmt: skip
 
 
 class UnsafeCheckpointError(InputError):
@@ -127,7 +120,7 @@ def load_weights(path: str | Path) -> WeightsFile:
     if metadata["compat"] not in COMPATS:
         needed = " or ".join(COMPATS)
         raise InputError(f"{path}: needed compat {needed} in its metadata, got {metadata['compat']!r:.60}")
-    config = require_object(parse_json(metadata["config"], f"{path}: config"), f"{path}: config")
+    config = convert(parse_json(metadata["config"], f"{path}: config"), dict[str, Any], f"{path}: config")
     return WeightsFile(metadata["model"], config, COMPATS[metadata["compat"]], as_float32(tensors, path))
 
 
@@ -199,42 +192,23 @@ def get_state_dict(content: Mapping[str, Any], path: str | Path) -> dict[str, Te
 
 def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "config") -> _T:
     """A nested dataclass from the JSON of its `asdict`; an InputError for any other field, type or range."""
-    if not (dataclasses.is_dataclass(kind) and isinstance(values, Mapping)):
-        raise InputError(f"{where}: needed settings by name, got {values!r:.60}")
-    fields = {field.name for field in dataclasses.fields(kind)}
-    if fields != values.keys():
-        unknown, missing = sorted(values.keys() - fields), sorted(fields - values.keys())
+    config = convert(values, kind, where)
+    known, given = _list_leaves(msgspec.to_builtins(config), where), _list_leaves(values, where)
+    if known != given:
+        unknown, missing = sorted(given - known), sorted(known - given)
         raise InputError(
             f"{where}: needed the settings of this version, got unknown {unknown} and lacked {missing}; use the "
             "pansplat version that wrote the file, or convert the official checkpoint again"
         )
-    hints = typing.get_type_hints(kind)
-    return kind(**{name: _restore(hints[name], value, f"{where}.{name}") for name, value in values.items()})
+    return config
 
 
-def _restore(hint: Any, value: Any, where: str) -> Any:
-    """The value of a field: dataclasses and tuples, which JSON stores as objects and lists, and checked numbers."""
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return config_from_dict(hint, value, where)
-    if typing.get_origin(hint) is tuple:
-        inner = typing.get_args(hint)
-        count = len(value) if inner[-1] is Ellipsis and isinstance(value, (list, tuple)) else len(inner)
-        if not isinstance(value, (list, tuple)) or len(value) != count or count > _MAX_ITEMS:
-            raise InputError(f"{where}: needed a list of {min(count, _MAX_ITEMS)}, got {value!r:.60}")
-        return tuple(_restore(inner[0], item, f"{where}[{index}]") for index, item in enumerate(value))
-    if typing.get_origin(hint) is typing.Literal:
-        if value not in typing.get_args(hint):
-            raise InputError(f"{where}: needed one of {typing.get_args(hint)}, got {value!r:.60}")
-    elif hint in (int, float):
-        low, high = _LIMITS.get(re.split(r"[.\[]", where.removesuffix("]"))[-1], _DEFAULT_LIMITS)
-        low = low if hint is int else _MIN_FLOAT
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not is_number or (hint is int and not isinstance(value, int)) or not low <= value <= high:
-            kind = "a whole number" if hint is int else "a number"
-            raise InputError(f"{where}: needed {kind} of {low:g} to {high:g}, got {value!r:.60}")
-    elif hint is bool and not isinstance(value, bool):
-        raise InputError(f"{where}: needed true or false, got {value!r:.60}")
-    return value
+def _list_leaves(value: Any, name: str) -> set[str]:
+    """The names of the numbers and texts in nested settings."""
+    if not isinstance(value, (dict, list, tuple)):
+        return {name}
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    return {leaf for key, item in items for leaf in _list_leaves(item, f"{name}.{key}")}
 
 
 def build_on_meta(build: Callable[[], _T], model: str, source: object) -> _T:

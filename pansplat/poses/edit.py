@@ -10,11 +10,12 @@ import copy
 import itertools
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from numpy import ndarray as Array
 
 from pansplat.atomic import replacing
@@ -37,7 +38,7 @@ from pansplat.poses.pose_file import (
     matrix_of,
     world_of,
 )
-from pansplat.strict_json import MAX_BYTES, list_field, number_field, read_json, require_object
+from pansplat.strict_json import MAX_BYTES, convert, read_field, read_json
 
 POSES = "poses.json"
 
@@ -103,7 +104,7 @@ class PoseEditor:
         if self.file.exists():
             return read_pose_content(self.file)
         (source,) = self._sources
-        return _convert(require_object(read_json(source), source), self._names, self._by_name)
+        return _convert(read_json(source, Content), self._names, self._by_name)
 
     def read_suggestions(self) -> dict[tuple[Path, Path], tuple[Suggestion, ...]]:
         """For pairs of panoramas, places of the second one relative to the first, camera heights."""
@@ -231,14 +232,13 @@ class PoseEditor:
 
 def read_pose_content(file: Path) -> Content:
     """The content of a poses.json; an InputError if it cannot be read, or a pose or world is invalid."""
-    content = require_object(read_json(file), file)
+    content = read_json(file, Content)
     _convention_of(content, file)
-    for number, world in enumerate(list_field(content, "worlds", file)):
-        require_object(world, f"{file}, worlds {number}")
-    for name, entry in require_object(content.get("poses"), f"{file}, poses").items():
+    read_field(content, "worlds", list[Content], file)
+    for name, entry in convert(content.get("poses"), Content, f"{file}, poses").items():
         _read_pose(content, name, file)
         if isinstance(entry, dict):
-            number_field(entry, "world", f"{file}, {name!r}", low=0, whole=True, needed="a whole number")
+            read_field(entry, "world", Annotated[int, Meta(ge=0)], f"{file}, {name!r}")
     return content
 
 

@@ -52,7 +52,7 @@ from pansplat.poses.tour import Group, Pair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.ways import NO_WAYS, Ways
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
-from pansplat.predictor import Progress
+from pansplat.predictor import Progress, part_of
 from pansplat.source_hash import hash_sources
 from pansplat.threads import one_thread, worker_threads
 
@@ -259,7 +259,7 @@ def estimate_poses(
         InputError: fewer than two images, or a file is missing.
     """
     paths = tuple(dict.fromkeys(Path(image) for image in images))
-    report = progress or (lambda what, fraction: None)
+    report = part_of(progress)
     if len(paths) < 2:
         raise InputError(f"needed two or more different panoramas to estimate poses, got {len(paths)}; add one.")
     for path in paths:

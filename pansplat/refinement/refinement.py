@@ -30,7 +30,7 @@ from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.geometry.pose import nearest_views
-from pansplat.predictor import Progress
+from pansplat.predictor import Progress, part_of
 from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
@@ -362,7 +362,7 @@ class Refinement:
         if self._start.joint:
             min_steps = _MIN_STEPS * len(self._photographs)
         clock = _Clock(seconds, steps, self.config.release, self._created, min_steps)
-        report = progress or (lambda what, fraction: None)
+        report = part_of(progress)
         history: list[tuple[int, float, float]] = []
         if len(self._photographs) == 1:  # one photograph does not show what is wrong seen from elsewhere
             self._result, error = self._start, self.held_out_error()

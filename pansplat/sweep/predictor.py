@@ -16,7 +16,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_working_world
-from pansplat.predictor import Progress, require_matching_inputs, select_item
+from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.source_hash import hash_sources
 from pansplat.sweep.lift import LiftConfig, lift
@@ -110,10 +110,8 @@ class Sweep:
             near=low,
             far=high,
         )
-        report = progress or (lambda what, fraction: None)
-        surfaces, neighbours = search_surfaces(
-            posed, self.config.search, lambda what, f: report(what, 0.7 * f), self.prior
-        )
+        report = part_of(progress)
+        surfaces, neighbours = search_surfaces(posed, self.config.search, part_of(progress, 0, 0.7), self.prior)
         report("placing Gaussians", 0.7)
         gaussians = lift(posed, surfaces, self.config.lift, neighbours)
         report("fitting colours", 0.8)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
+from pansplat.console import own_warnings, parse_arguments, run_command
 
 if TYPE_CHECKING:
     from pansplat.training.config import TrainConfig
@@ -58,7 +59,7 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
 
 def main() -> NoReturn:
     """The entry point: `run`, then the end of this process."""
-    exit_process(run())
+    sys.exit(run())
 
 
 if __name__ == "__main__":

@@ -10,26 +10,33 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from msgspec import Meta, Struct
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError, InputWarning
-from pansplat.model.weights import COMPATS, UnsafeCheckpointError, WeightsFile, as_float32, read_checkpoint
-from pansplat.strict_json import parse_json, require_object
+from pansplat.model.layers import Compat
+from pansplat.model.weights import UnsafeCheckpointError, WeightsFile, as_float32, read_checkpoint
+from pansplat.strict_json import convert, parse_json
 
 _KIND, _FORMAT = "pansplat-training", 1
 _NAME = re.compile(r"step_(\d{8})\.pt")
-_MAX_STEP = 10**9
-_TYPES: dict[str, tuple[type, ...]] = {
-    "step": (int,), "config": (str,), "weights": (str,), "network": (dict,), "auxiliary": (dict, type(None)),
-    "mean": (dict, type(None)), "optimizer": (dict,), "random": (torch.Tensor,),
-}  # fmt: skip
-_NEEDED = dict.fromkeys(_TYPES, "tensors by name") | {
-    "step": "a whole number", "config": "JSON text", "weights": "JSON text", "optimizer": "the state of the optimiser",
-    "random": "a tensor",
-}  # fmt: skip
+_Tensors = dict[str, torch.Tensor]
+
+
+class _Content(Struct):
+    """The types of a checkpoint's values; `restore` names a key that is missing."""
+
+    step: Annotated[int, Meta(ge=0, lt=10**9)] = 0
+    config: str = ""
+    weights: str = ""
+    network: _Tensors = {}
+    auxiliary: _Tensors | None = None
+    mean: _Tensors | None = None
+    optimizer: dict[str, Any] = {}
+    random: torch.Tensor | None = None
 
 
 def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: int) -> Path:
@@ -56,6 +63,14 @@ def list_checkpoints(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if _NAME.fullmatch(path.name))
+
+
+class _Weights(Struct):
+    """What a checkpoint states of its network."""
+
+    model: str
+    config: dict[str, Any]
+    compat: Compat
 
 
 class DamagedCheckpointError(InputError):
@@ -125,25 +140,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
             f"{path}: needed format {_FORMAT} of training checkpoints, got {content.get('format')!s:.20}; use the "
             "pansplat version that wrote it."
         )
-    try:
-        _check_types(content)
-    except DamagedCheckpointError as error:
-        raise InputError(f"{path}: {error}") from error
+    convert(content, _Content, f"{path}: this checkpoint is damaged")
     return content
-
-
-def _check_types(content: Mapping[str, Any]) -> None:
-    """Raise a DamagedCheckpointError if a key has a value of another type."""
-    for key, kinds in _TYPES.items():
-        if key in content and (not isinstance(content[key], kinds) or isinstance(content[key], bool)):
-            got = type(content[key]).__name__
-            raise DamagedCheckpointError(f"this checkpoint is damaged: key `{key}`: needed {_NEEDED[key]}, got {got}")
-    for key in ("network", "mean", "auxiliary"):
-        odd = [name for name, value in (content.get(key) or {}).items() if not isinstance(value, torch.Tensor)]
-        if odd:
-            raise DamagedCheckpointError(f"this checkpoint is damaged: key `{key}`: {odd[0]!s:.60} is not a tensor")
-    if not 0 <= content.get("step", 0) < _MAX_STEP:
-        raise DamagedCheckpointError(f"this checkpoint is damaged: key `step`: got {content['step']!s:.20}")
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
@@ -164,9 +162,8 @@ def is_training_state(content: Mapping[str, Any]) -> bool:
 def extract_weights(content: Mapping[str, Any], path: Path) -> WeightsFile:
     """The weights of a training checkpoint, their moving average if there is one; an InputError if invalid."""
     try:
-        header = require_object(parse_json(content["weights"], f"{path}: weights"), f"{path}: weights")
+        header = convert(parse_json(content["weights"], f"{path}: weights"), _Weights, f"{path}: weights")
         tensors = content["mean"] if content.get("mean") else content["network"]
-        compat, config = COMPATS[header["compat"]], require_object(header["config"], f"{path}: config")
-        return WeightsFile(str(header["model"]), config, compat, as_float32(tensors, path))
+        return WeightsFile(header.model, header.config, header.compat, as_float32(tensors, path))
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: needed weights in the checkpoint, got {error!r}; use another file.") from error

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from pansplat.data.augment import Augmentation
 from pansplat.errors import InputError
 from pansplat.model.layers import Compat, Precision
-from pansplat.options import REAL, WHOLE, Count, CountOrNone, Fraction, Minutes, Range, Seed, check_numbers
-from pansplat.strict_json import parse_json, require_object
+from pansplat.options import Count, CountOrNone, Fraction, Minutes, Seed, check_numbers
+from pansplat.strict_json import convert, parse_json
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
 DataKind = Literal["room", "panogrf", "360loc", "insta360", "pairs", "triplets"]
@@ -39,7 +40,7 @@ class DataConfig:
     """Random pairs per sequence and epoch, of 360loc and insta360."""
     training_gap: Literal["uniform", "original"] = "uniform"
     """Frames between the inputs: uniformly random, or always the smallest gap, as in the official code."""
-    workers: Annotated[int, Range(0, 256), WHOLE] = 2
+    workers: Annotated[int, Meta(ge=0, le=256)] = 2
     """Processes that read data; 0 to read in the training process."""
     augmentation: Augmentation | None = field(default_factory=Augmentation)
     """Random changes of samples; the official code has none."""
@@ -71,7 +72,7 @@ class MemoryConfig:
 
     backpropagation: Backpropagation = "plain"
     """plain: one graph. one-step: the heads tile by tile. two-step: the image face by face too."""
-    tiles: Annotated[int, Range(1, 64), WHOLE] = 1
+    tiles: Annotated[int, Meta(ge=1, le=64)] = 1
     """Number of tiles along each side of the panorama."""
     style: Style = "panorama"
     """panorama: one ray per pixel. cubemap: six cube faces. original: six cube faces as in the official code."""
@@ -84,13 +85,13 @@ class OptimizerConfig:
     """Optimisation of the weights."""
 
     steps: Count = 1000
-    batch_size: Annotated[int, Range(1, 4096), WHOLE] = 2
+    batch_size: Annotated[int, Meta(ge=1, le=4096)] = 2
     """Samples per step, process and round of accumulation."""
-    accumulate: Annotated[int, Range(1, 4096), WHOLE] = 1
+    accumulate: Annotated[int, Meta(ge=1, le=4096)] = 1
     """Rounds of gradient accumulation per step."""
-    rate: Annotated[float, Range(0, 1e3, above=True), REAL] = 2e-4
+    rate: Annotated[float, Meta(gt=0, le=1e3)] = 2e-4
     """Peak learning rate of Adam."""
-    clip: Annotated[float, Range(0, math.inf, above=True), REAL] = 0.5
+    clip: Annotated[float, Meta(gt=0)] = 0.5
     """Largest norm of the gradient."""
     ema: Fraction = 0.0
     """Decay of the exponential moving average of the weights, which is validated and saved; 0 for none."""
@@ -126,7 +127,7 @@ class TrainConfig:
 
     out: Path = Path("runs/run")
     """Folder of the run; training is resumed from its latest checkpoint."""
-    heights: tuple[Annotated[int, Range(64, 8192, "pixels", multiple=32), WHOLE], ...] = (512,)
+    heights: tuple[Annotated[int, Meta(ge=64, le=8192, multiple_of=32)], ...] = (512,)
     """Heights of the panoramas, pixels; each is used for an equal number of steps (progressive resolution)."""
     seed: Seed = 111123
     perceptual: PerceptualName = "auto"
@@ -180,11 +181,12 @@ def require_same(saved: str, config: TrainConfig, source: Path) -> None:
         InputError: settings differ; the message names them.
     """
     where = f"{source}: config"
-    old, new = require_object(parse_json(saved, where), where), json.loads(as_json(config))
+    old, new = convert(parse_json(saved, where), dict[str, Any], where), json.loads(as_json(config))
     for settings in (old, new):
         for name in _CHANGEABLE:
             settings.pop(name, None)
-        require_object(settings.get("data", {}), f"{where}.data").pop("workers", None)
+        settings["data"] = convert(settings.get("data", {}), dict[str, Any], f"{where}.data")
+        settings["data"].pop("workers", None)
     changed = _differences(old, new)
     if changed:
         raise InputError(

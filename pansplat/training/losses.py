@@ -14,13 +14,14 @@ from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
+from msgspec import Meta
 from torch import Tensor
 from torch.nn import functional
 
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Backbone, find_backbone, load_lpips
 from pansplat.geometry.equirect import pad_equirect
-from pansplat.options import REAL, Range, Weight
+from pansplat.options import Weight
 
 DepthForm = Literal["depth", "inverse_depth"]
 Images = Float[Tensor, "batch 3 height width"]
@@ -40,7 +41,7 @@ class LossWeights:
     depth_form: DepthForm = "depth"
     """depth: absolute error in metres, with the true depth resized to each level (the paper). inverse_depth: absolute
     error in 1 / metres, with each level resized to the true depth (the official code)."""
-    decay: Annotated[float, Range(0, 1), REAL] = 0.9
+    decay: Annotated[float, Meta(ge=0, le=1)] = 0.9
     """Weight of a level of the cost volume relative to the next finer one (gamma in the paper)."""
 
 

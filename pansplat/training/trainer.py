@@ -23,7 +23,7 @@ from pansplat.data.loader import Loader
 from pansplat.data.views import Batch
 from pansplat.errors import InputError
 from pansplat.model.weights import pack_weights
-from pansplat.strict_json import parse_json, require_object
+from pansplat.strict_json import convert, parse_json
 from pansplat.training.checkpoint import load_latest, restore, restore_optimizer, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
 from pansplat.training.datasets import load_sources
@@ -269,7 +269,7 @@ class Trainer:
             DamagedCheckpointError: a key is missing or does not fit.
             InputError: the run was started with other settings.
         """
-        restore(state, "config", lambda text: require_object(parse_json(text, "config"), "config"))
+        restore(state, "config", lambda text: convert(parse_json(text, "config"), dict, "config"))
         require_same(state["config"], self.config, path)
         restore(state, "step", int)  # checked before anything is restored
         restore(state, "network", self.network.load_state_dict)

@@ -80,7 +80,7 @@ def test_the_command_writes_rows_page_and_plot(jobs, tmp_path):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["--heights", "20"], "multiple of 8"), (["--size", "8", "8"], "64 to 8192 pixels")],
+    [(["--heights", "20"], "multiple of 8"), (["--size", "8", "8"], "--size, [0]: needed a whole number >= 64")],
 )
 def test_invalid_arguments_are_refused(arguments, message, capsys):
     assert run(["bench", "viewer", *arguments]) == 2

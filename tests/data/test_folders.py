@@ -259,7 +259,7 @@ def test_trajectories_that_do_not_match_are_refused(tmp_path: Path) -> None:
         ({"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "mask": "m.png"}}}, "needed the mask file"),
         ({"near": 3, "far": 3}, "needed 0 < near < far in metres, got near=3 and far=3"),
         ({"near": 0}, "needed 0 < near < far"),
-        ({"far": "much"}, "needed a number in metres as \"far\", got 'much'"),
+        ({"far": "much"}, "far: needed a number, got 'much'"),
     ],
 )
 def test_invalid_pose_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
@@ -278,7 +278,7 @@ def test_invalid_pose_files_are_refused(tmp_path: Path, content: dict, message: 
         ({"pairs": [{"context": ["left.png", "left.png"]}]}, "needed two or more different images"),
         ({"pairs": ["left.png"]}, "needed two or more different images"),
         ({"pairs": [{"context": [["left.png"], {"b": 1}]}]}, "needed two or more different images"),
-        ({"pairs": {"context": ["left.png", "right.png"]}}, 'needed a list as "pairs"'),
+        ({"pairs": {"context": ["left.png", "right.png"]}}, "pairs: needed a list"),
         ({"pairs": [{"context": ["left.png", "right.png"], "target": 5}]}, 'needed an image .* as "target", got 5'),
         ({"pairs": [{"context": ["left.png", "rigth.png"]}]}, r"got 'rigth.png' \(did you mean 'right.png'\?\)"),
         ({"triplets": [{"context": ["left.png", "right.png"], "target": ["no.png"]}]}, "triplets 1: .*got 'no.png'"),

@@ -12,7 +12,6 @@ from PIL import Image
 
 from pansplat.data.images import read_depth, read_panorama, write_depth, write_image
 from pansplat.data.panorama_metadata import mark_spherical_video, parse_gpano, read_xmp
-from pansplat.data.spherical_webm import mark_spherical_webm
 from pansplat.data.video import open_video, write_video
 from pansplat.errors import InputError
 
@@ -69,55 +68,17 @@ def test_films_are_spherical_and_decode_as_before(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("projection", ["equirect", "cubemap"])
 @pytest.mark.parametrize("stereo, kind", [("mono", 0), ("top-bottom", 2), ("side-by-side", 1)])
-@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
-def test_films_state_the_arrangement_of_the_eyes(
-    tmp_path: Path, projection: str, stereo: str, kind: int, suffix: str
-) -> None:
+def test_films_state_the_arrangement_of_the_eyes(tmp_path: Path, projection: str, stereo: str, kind: int) -> None:
     """FFmpeg reads the metadata of version 2; version 1 states equirectangular films only."""
-    path = tmp_path / f"film{suffix}"
+    path = tmp_path / "film.mp4"
     write_video(path, frames(), 10, panorama=projection, stereo=stereo)
     with av.open(str(path)) as container:
         data = {data.type: bytes(data) for data in next(container.decode(video=0)).side_data}
     assert int.from_bytes(data[Type.SPHERICAL][:4], "little") == ["equirect", "cubemap"].index(projection)
-    if stereo != "mono" or suffix == ".mp4":
-        assert int.from_bytes(data[Type.STEREO3D][:4], "little") == kind  # AVStereo3DType
-    if suffix == ".webm":
-        return
+    assert int.from_bytes(data[Type.STEREO3D][:4], "little") == kind  # AVStereo3DType
     mode = re.search(rb"StereoMode>([a-z-]*)<", path.read_bytes())
     named = {"side-by-side": b"left-right"}.get(stereo, stereo.encode())
     assert (mode and mode[1]) == (named if projection == "equirect" else None)
-
-
-def test_webm_films_are_spherical_and_decode_as_before(tmp_path: Path) -> None:
-    """FFmpeg reads the projection, finds the frames by the index, and no byte behind the tracks has changed."""
-    decoded, size = {}, {}
-    for name, panorama in {"plain": False, "sphere": True}.items():
-        path = tmp_path / f"{name}.webm"
-        assert write_video(path, frames(), 10, panorama=panorama) == 30
-        decoded[name], size[name] = open_video(path).read((0, 17, 29)), path.stat().st_size
-        with av.open(str(path)) as container:
-            container.seek(2_000_000)
-            kinds = {data.type for data in next(container.decode(video=0)).side_data}
-        assert (Type.SPHERICAL in kinds) == panorama
-    assert size["plain"] == size["sphere"]
-    assert all(np.array_equal(decoded["plain"][i], decoded["sphere"][i]) for i in (0, 17, 29))
-    content = (tmp_path / "sphere.webm").read_bytes()
-    info, tracks = (content.index(bytes.fromhex(name), 120) for name in ("1549a966", "1654ae6b"))
-    segment = content.index(bytes.fromhex("18538067")) + 12
-    index = content[segment : segment + 70]
-    for name, place in (("1549a966", info), ("1654ae6b", tracks)):
-        at = index.index(bytes.fromhex(f"53ab84{name}53ac81")) + 10
-        assert index[at] == place - segment
-
-
-def test_a_webm_without_space_for_the_projection_is_refused_and_unchanged(tmp_path: Path) -> None:
-    path = tmp_path / "a.webm"
-    write_video(path, frames(), 10)
-    content = path.read_bytes().replace(b"\xec\x01\0\0\0\0\0\0", b"\xbf\x01\0\0\0\0\0\0", 1)
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match="no void"):
-        mark_spherical_webm(path)
-    assert path.read_bytes() == content
 
 
 def test_a_file_without_a_movie_is_refused_and_unchanged(tmp_path: Path) -> None:

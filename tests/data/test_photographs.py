@@ -108,12 +108,12 @@ def test_links_titles_and_start_views_are_read(rooms: Path) -> None:
             "a link of p01 is left out: it leads to 'p09.jpg', which is no panorama",
         ),
         ({"p09.jpg": []}, "'p09.jpg' is left out: it is no panorama of the folder"),
-        ({"p01.jpg": [{"to": "p02.jpg"}]}, "links of p01 are left out: needed a number as yaw of a link"),
-        ({"p01.jpg": [{"to": "p02.jpg", "yaw": "right"}]}, "links of p01 are left out: needed a number"),
-        ({"p01.jpg": 5}, "links of p01 are left out: .* needed a JSON object"),
-        ({"p01.jpg": {"start": [1]}}, r'links of p01 are left out: .* needed \[yaw, pitch\] as "start"'),
+        ({"p01.jpg": [{"to": "p02.jpg"}]}, "links of p01 are left out: .*yaw: needed a number, got None"),
+        ({"p01.jpg": [{"to": "p02.jpg", "yaw": "right"}]}, "links of p01 are left out: .*yaw: needed a number"),
+        ({"p01.jpg": 5}, "links of p01 are left out: .* needed an object"),
+        ({"p01.jpg": {"start": [1]}}, "links of p01 are left out: .*start: needed a list of length 2"),
         ("<html>", r"links are left out: .*links\.json: needed JSON"),
-        ([], r"links are left out: .*links\.json: needed a JSON object"),
+        ([], r"links are left out: .*links\.json: needed an object"),
     ],
 )
 def test_faulty_links_are_named_and_the_panoramas_open(rooms: Path, content: object, message: str) -> None:

@@ -128,67 +128,17 @@ SCENES = [
 # Group 2: numbers on command lines
 
 
-def bad(option: str, command: str, *values: str) -> Iterator[Fault]:
-    """Each value of an option is refused, and the message names the option."""
-    for value in values:
-        yield Fault(
-            f"{command[:16]} {option} {value[:12]} ({len(value)})",
-            f"{command} {option} {value}",
-            says=f"{option} must be",
-        )
-
-
 TRAIN = "pansplat-train tiny --out run --device cpu"
 
 SIZES = [
-    *bad("--height", "predict pair -o out.ply", "63", "32", "0", "-1", "1000000", "abc", "64.5", "1e3", "nan", "9" * 30, "9" * 5000),
-    *bad("--near", "predict pair -o out.ply", "0", "1e300", "x"),
-    *bad("--far", "predict pair -o out.ply", "1e38", "-inf"),
-    *bad("--degree", "predict pair -o out.ply", "5", "1.5"),
-    *bad("--min-opacity", "predict pair -o out.ply", "1"),
-    *bad("--refine", "predict pair -o out.ply", "-1", "soon"),
-    *bad("--height", "render scene.ply -o x.png", "0"),
-    *bad("--predict-height", "render pair -o x.png", "63"),
-    *bad("--fov", "render scene.ply -o x.png", "171"),
-    *bad("--at", "render scene.ply -o x.png", "1e300", "middle"),
-    *bad("--seconds", "render scene.ply -o x.mp4", "0"),
-    *bad("--fps", "render scene.ply -o x.mp4", "nan"),
-    *bad("--height", "evaluate pair --out report", "63"),
-    *bad("--refine", "evaluate pair --out report", "-1"),
-    *bad("--limit", "evaluate --protocol m3d --data . --out report", "0"),
-    *bad("--pictures", "evaluate --protocol m3d --data . --out report", "-1"),
-    *bad("--steps", "refine pair -o out.ply", "0"),
-    *bad("--gaussians", "refine pair -o out.ply", "0"),
-    *bad("--seed", "refine pair -o out.ply", "-1"),
-    *bad("--height", "refine pair -o out.ply", "10"),
-    *bad("--height", "bench raster", "20"),
-    *bad("--height", "bench model", "100"),
-    *bad("--threads", "bench raster", "0"),
-    *bad("--optimizer.steps", TRAIN, "many"),
-    *bad("--optimizer.rate", TRAIN, "inf"),
-    *bad("--optimizer.batch-size", TRAIN, "0"),
-    *bad("--optimizer.ema", TRAIN, "1"),
-    *bad("--heights", TRAIN, "32", "100"),
-    *bad("--data.workers", TRAIN, "-1"),
-    *bad("--checkpoint.keep", TRAIN, "0"),
-    *bad("--checkpoint.minutes", TRAIN, "nan"),
-    *bad("--loss.depth", TRAIN, "-1"),
-    *bad("--data.augmentation.colour", TRAIN, "2"),
-    *bad("--seed", TRAIN, "-1"),
-    *bad("--height", "pansplat-view scene.ply", "63"),
-    *bad("--refine", "pansplat-view scene.ply", "nan"),
-    *bad("--fps", "pansplat-view scene.ply", "0"),
-    *bad("--at", "pansplat-view scene.ply", "2"),
-    *bad("--camera-height", "pose pair", "0", "tall"),
-    *bad("--frames", "pose pair", "0"),
+    *(Fault(f"{command[:16]} {option} {value}", f"{command} {option} {value}", says=option) for command, option, value in (
+        ("predict pair -o out.ply", "--height", "63"), ("predict pair -o out.ply", "--height", "abc"), ("predict pair -o out.ply", "--height", "9" * 5000),
+        (TRAIN, "--optimizer.batch-size", "0"), (TRAIN, "--data.augmentation.colour", "2"), ("pansplat-view scene.ply", "--fps", "nan"), ("bench raster", "--height", "20"))),
     *(Fault(f"pose --baseline a.png b.png {distance}", f"pose pair --baseline a.png b.png {distance}", says="`baseline` must be") for distance in ("0", "nan")),
     Fault("pose --baseline of one panorama", "pose pair --baseline a.png a.png 1", says="`baseline` must be"),
     Fault("pose --baseline of a missing panorama", "pose pair --baseline a.png x.png 1", says="x.png"),
     Fault("pose --baseline without a distance", "pose pair --baseline a.png b.png", says="--baseline"),
-    *bad("--gaussians", "export scene.ply -o tour.html", "0"),
     Fault("export --gaussians 5000000", "export scene.ply -o tour.html --gaussians 5000000", says="4,000,000 in a page"),
-    *bad("--ipd", "pansplat-view scene.ply", "2"),
-    *bad("--ipd", "render scene.ply --stereo -o x.png", "0"),
     Fault("render --stereo of a perspective image", "render scene.ply --stereo --layout perspective -o x.png", says="--stereo is for"),
     Fault("view --projection without a film", "pansplat-view scene.ply --projection equirect", says="need --out"),
     Fault("view --projection equirect --size 64x64", "pansplat-view scene.ply --projection equirect --size 64x64", says="2:1"),
@@ -220,17 +170,6 @@ def pairs(value: Any) -> Damage:
     return text(json.dumps(value), "pair/pairs.json")
 
 
-def matrix(value: Any) -> Damage:
-    return poses(lambda content: content["poses"].update({"a.png": value}))
-
-
-def entry(row: int, column: int, value: float) -> Damage:
-    def change(content: dict[str, Any]) -> None:
-        content["poses"]["a.png"][row][column] = value
-
-    return poses(change)
-
-
 def trajectory(line: str, name: str = "poses.kitti") -> Damage:
     """A folder of two panoramas with a trajectory whose second line is given."""
 
@@ -256,31 +195,12 @@ def many_panoramas(folder: Path) -> None:
 _KITTI = "1 0 0 {} 0 1 0 0 0 0 1 0"
 
 NUMBERS = [
-    *(Fault(f"near {str(value)[:12]}", PREDICT, poses(lambda c, value=value: c.update(near=value)), "poses.json")
-      for value in (0, 1e-40, 1e300, 10, _HUGE, "x", True, {"a": 1})),
-    *(Fault(f"far {str(value)[:12]}", PREDICT, poses(lambda c, value=value: c.update(far=value)), "poses.json")
-      for value in (0.45000001, 1e38)),
     Fault("near of 5000 digits", PREDICT, text('{"near": 1' + "0" * 5000 + "}"), "near"),
-    Fault("a position of 1e30", PREDICT, entry(0, 3, 1e30), "a.png"),
-    Fault("a position of 1e300", PREDICT, entry(0, 3, 1e300), "a.png"),
-    Fault("a rotation of 1e200", PREDICT, entry(0, 0, 1e200), "a.png"),
-    Fault("a rotation of 1e-300", PREDICT, entry(0, 0, 1e-300), "a.png"),
-    Fault("a position of 400 digits", PREDICT, entry(0, 3, _HUGE), "poses.a.png[0][3]"),
-    Fault("a position of NaN", PREDICT, entry(0, 3, float("nan")), "NaN or infinite"),
-    Fault("a pose of texts", PREDICT, matrix([["a"] * 4] * 4), "a.png"),
-    Fault("a ragged pose", PREDICT, matrix([[1, 2], [3]]), "a.png"),
-    Fault("a pose of 3x3 numbers", PREDICT, matrix([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), "a.png"),
-    Fault("a pose that is a number", PREDICT, matrix(5), "a.png"),
-    Fault("a pose that is null", PREDICT, matrix(None), "a.png"),
-    Fault("a pose that is an object without a matrix", PREDICT, matrix({}), "a.png"),
-    Fault("a pose of booleans in an object", PREDICT, matrix({"cam2world": True}), "a.png"),
+    Fault("a pose that is a number", PREDICT, poses(lambda content: content["poses"].update({"a.png": 5})), "a.png"),
     Fault("a pose 30 levels deep", PREDICT, text('{"convention": "cam2world opencv", "poses": {"a.png": ' + "[" * 29 + "]" * 29 + "}}"), "a.png"),
-    Fault("a mask that is a number", PREDICT, poses(lambda c: c["poses"].update({"a.png": {"cam2world": c["poses"]["a.png"], "mask": 5}})), "mask"),
     Fault("poses nested 100,000 deep", PREDICT, text(_DEEP), "poses.json"),
     Fault("poses nested 100 deep", PREDICT, text("[" * 100 + "]" * 100), "levels"),
     *(Fault(f"poses: {value} at the top", PREDICT, text(value), "poses.json") for value in ("[]", "5", '"a"', "null", "true", "1e999", "NaN", "")),
-    Fault("poses: an object that is a list", PREDICT, text('{"convention": "cam2world opencv", "poses": []}'), "poses"),
-    Fault("poses: a convention that is a number", PREDICT, poses(lambda c: c.update(convention=5)), "convention"),
     Fault("poses: an image twice", PREDICT, text('{"convention": "cam2world opencv", "poses": {"a.png": 1, "a.png": 2}}'), "a.png"),
     Fault("poses: a lone surrogate", PREDICT, text('{"convention": "cam2world opencv", "poses": {"\\ud800.png": 1}}'), "Unicode"),
     Fault("poses: a NUL in a name", PREDICT, text('{"convention": "cam2world opencv", "poses": {"a\\u0000.png": 1}}'), "poses.json"),
@@ -288,11 +208,6 @@ NUMBERS = [
     Fault("poses: UTF-16", PREDICT, content("{}".encode("utf-16"), "pair/poses.json"), "UTF-8"),
     Fault("poses: binary", PREDICT, content(bytes(range(256)), "pair/poses.json"), "poses.json"),
     Fault("poses: cut off", PREDICT, content(lambda data: data[:100], "pair/poses.json"), "line 1"),
-    *(Fault(f"pairs: {json.dumps(value)[:70]}", PREDICT, pairs(value), "pairs.json") for value in (
-        [], 5, "a", None, {}, {"pairs": 5}, {"pairs": {}}, {"pairs": [5]}, {"pairs": [None]}, {"pairs": [{"context": 5}]},
-        {"pairs": [{"context": ["a.png"]}]}, {"pairs": [{"context": ["a.png", "a.png"]}]}, {"pairs": [{"context": ["a.png", 5]}]},
-        {"pairs": [{"context": ["a.png", "x.png"]}]}, {"pairs": [{"context": ["a.png", "b.png"], "target": 5}]},
-        {"pairs": [{"context": ["a.png", "b.png"], "target": {"c": 1}}]}, {"triplets": 7})),
     Fault("pairs: nested 100,000 deep", PREDICT, text('{"pairs": ' + _DEEP, "pair/pairs.json"), "pairs.json"),
     Fault("pairs: 1,000 context panoramas", PREDICT, many_panoramas, "at most 64"),
     *(Fault(f"KITTI: {line[:24]}", PREDICT, trajectory(line), "poses.kitti") for line in (
@@ -370,42 +285,8 @@ class Calls:
 
 
 CKPT = "predict pair -o out.ply --model old.ckpt --height 64"
-_SETTINGS: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "no channels": lambda c: c["features"].update(channels=[0, 8, 8, 16]),
-    "negative channels": lambda c: c["features"].update(channels=[-4, 8, 8, 16]),
-    "a billion channels": lambda c: c["features"].update(channels=[10**9, 8, 8, 16]),
-    "channels of texts": lambda c: c["features"].update(channels=["4", "8", "8", "16"]),
-    "channels of fractions": lambda c: c["features"].update(channels=[4.5, 8, 8, 16]),
-    "three channels": lambda c: c["features"].update(channels=[4, 8, 8]),
-    "channels that are a number": lambda c: c["features"].update(channels=4),
-    "channels that are true": lambda c: c["features"].update(channels=[True, 8, 8, 16]),
-    "odd channels": lambda c: c["features"].update(channels=[3, 7, 5, 11]),
-    "features that are a list": lambda c: c.update(features=[1]),
-    "features that are null": lambda c: c.update(features=None),
-    "no blocks": lambda c: c["features"]["transformer"].update(blocks=0),
-    "a million blocks": lambda c: c["features"]["transformer"].update(blocks=10**6),
-    "no splits": lambda c: c["features"]["transformer"].update(splits=0),
-    "seven splits": lambda c: c["features"]["transformer"].update(splits=7),
-    "no expansion": lambda c: c["features"]["transformer"].update(expansion=0),
-    "no levels": lambda c: c["cost_volume"].update(levels=[]),
-    "thousand levels": lambda c: c["cost_volume"].update(levels=c["cost_volume"]["levels"] * 400),
-    "a level twice": lambda c: c["cost_volume"].update(levels=c["cost_volume"]["levels"][:1] * 3),
-    "no candidates": lambda c: c["cost_volume"]["levels"][0].update(candidates=0),
-    "candidates of 400 digits": lambda c: c["cost_volume"]["levels"][0].update(candidates=_HUGE),
-    "an unknown sweep": lambda c: c["cost_volume"].update(sweep="spiral"),
-    "a sweep that is a list": lambda c: c["cost_volume"].update(sweep=[1]),
-    "monocular channels that are a list": lambda c: c["cost_volume"].update(mono_channels=[]),
-    "degree 9": lambda c: c["heads"]["adapter"].update(degree=9),
-    "a scale of NaN": lambda c: c["heads"]["adapter"].update(min_scale=float("nan")),
-    "a scale that is a text": lambda c: c["heads"]["adapter"].update(min_scale="0.5"),
-    "no layers": lambda c: c["heads"].update(layers=0),
-    "a switch that is a number": lambda c: c["heads"].update(residual=1),
-    "a missing field": lambda c: c["heads"].pop("layers"),
-    "an unknown field": lambda c: c["heads"].update(colour=1),
-}
-
 CHECKPOINTS = [
-    *(Fault(f"settings: {name}", WEIGHTS, settings(change), "weights.safetensors") for name, change in _SETTINGS.items()),
+    Fault("settings: a million blocks", WEIGHTS, settings(lambda c: c["features"]["transformer"].update(blocks=10**6)), "blocks"),
     *(Fault(f"settings: {value[:12]}", WEIGHTS, settings(value), "weights.safetensors: config") for value in (_DEEP, "[]", "5", "null", "{", '"a"', "{}")),
     Fault("metadata: an unknown network", WEIGHTS, settings(lambda c: None, model="gan"), "'gan'"),
     Fault("metadata: a depth network with other settings", WEIGHTS, settings(lambda c: None, model="depth"), "config"),
@@ -554,10 +435,7 @@ FILES = [
     Fault("a .splat of 31 bytes", "info x.splat", content(bytes(31), "x.splat"), says="x.splat: needed a complete"),
     Fault("an empty .glb", "render x.glb -o x.png", content(b"", "x.glb"), says="needed a binary glTF file"),
     *(Fault(f"manifest: {name}", "batch all.json --out out --model sphere", lambda f, text=text: (f / "all.json").write_text(text), says) for name, text, says in (
-        ("empty", "", "all.json: needed JSON"), ("a list", '["pair"]', "all.json: needed a JSON object"), ("no items", "{}", 'as "items", got none'),
-        ("items that are a text", '{"items": "pair"}', 'as "items"'), ("an item that is a number", '{"items": [7]}', "items[0]"),
-        ("an item without a path", '{"items": [{"name": "a"}]}', 'as "path", got none'), ("an unknown key", '{"items": [{"path": "pair", "nera": 1}]}', "got 'nera'"),
-        ("a depth that is a text", '{"items": [{"path": "pair", "near": "1"}]}', 'as "near"'), ("one name twice", '{"items": ["pair", "b/pair"]}', "'pair' twice"),
+        ("empty", "", "all.json: needed JSON"), ("no items", "{}", 'as "items", got none'), ("one name twice", '{"items": ["pair", "b/pair"]}', "'pair' twice"),
         ("a name above the folder", '{"items": [{"path": "pair", "name": "../x"}]}', "'../x'"), ("a name of 300 bytes", f'{{"items": [{{"path": "pair", "name": "{_LONG}"}}]}}', "items[0]"))),
     *(Fault(f"a batch {name}", f"batch pair --out out --model sphere {options}", says=says) for name, options, says in (
         ("of an unknown step", "--do predict,fly", "got 'fly'"), ("of an unknown format", "--format obj", "--format must be one of html"),

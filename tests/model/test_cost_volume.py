@@ -18,7 +18,6 @@ from pansplat.model.cost_volume import (
     SphericalCostVolume,
     SweepLevel,
     UNet,
-    UNetConfig,
     correlate_views,
     make_candidates_around,
     make_first_candidates,
@@ -419,7 +418,7 @@ def test_over_a_depth_ratio_of_10000_depths_are_finite(network):
 
 @pytest.fixture(scope="module")
 def unet(randomize):
-    return randomize(UNet(UNetConfig(32), "sphere"))
+    return randomize(UNet(32, "sphere"))
 
 
 def test_rolling_by_a_pixel_of_the_bottleneck_rolls_the_output(unet):
@@ -428,7 +427,7 @@ def test_rolling_by_a_pixel_of_the_bottleneck_rolls_the_output(unet):
 
 
 def test_zero_padding_breaks_the_roll(randomize):
-    maps, network = _noise(1, 2, 32, 8, 16), randomize(UNet(UNetConfig(32), "zeros"))
+    maps, network = _noise(1, 2, 32, 8, 16), randomize(UNet(32, "zeros"))
     assert not torch.allclose(network(maps.roll(8, -1)), network(maps).roll(8, -1), atol=1e-3)
 
 
@@ -442,7 +441,7 @@ def test_views_depend_on_each_other_and_batch_items_do_not(unet):
 
 @pytest.mark.parametrize("scales", [1, 5])
 def test_a_unet_of_any_number_of_scales_keeps_the_size(randomize, scales):
-    network = randomize(UNet(UNetConfig(32, scales=scales), "sphere"))
+    network = randomize(UNet(32, "sphere", scales=scales))
     assert network(_noise(1, 2, 32, 16, 32)).shape == (1, 2, 32, 16, 32)
     assert [scale.attention is not None for scale in network.encoder] == [False] * (scales - 1) + [True]
 

@@ -260,7 +260,7 @@ def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> N
             "needed weights of pansplat or mvsplat, got weights of 'splatter'",
         ),
         (dataclasses.replace(good, config={"channels": 16}), r"x: config: needed the settings of this version"),
-        (dataclasses.replace(good, config=good.config | {"transformer": 3}), "needed settings by name, got 3"),
+        (dataclasses.replace(good, config=good.config | {"transformer": 3}), "transformer: needed an object"),
         (dataclasses.replace(good, tensors=tensors | {"new": torch.zeros(1)}), r"found unknown 1 \(new\)"),
         (dataclasses.replace(good, config=good.config | {"width": 64}), r"got \d+ \(depth\.shortcut\.weight"),
     ]
@@ -272,7 +272,7 @@ def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> N
 def test_settings_that_contradict_each_other_are_refused() -> None:
     good = pack_weights("pansplat", PanSplatConfig(), {}, compat="fixed")
     wrong = good.config | {"heads": good.config["heads"] | {"candidates": 7}}
-    with pytest.raises(InputError, match=r"needed settings of a pansplat network, got .*candidates"):
+    with pytest.raises(InputError, match=r"`heads\.candidates` must be the 32 of the finest sweep, got 7; correct it"):
         build_empty_network(dataclasses.replace(good, config=wrong), "fixed", "x")
 
 

@@ -454,13 +454,13 @@ def test_the_first_change_by_hand_keeps_the_old_file(folder: Path):
     ("content", "message"),
     [
         ({"poses": {}}, 'needed a pose "convention"'),
-        ({"convention": "cam2world opencv"}, "poses: needed a JSON object"),
+        ({"convention": "cam2world opencv"}, "poses: needed an object"),
         (
             {"convention": "cam2world opencv", "poses": {"a.png": {"pose": EYE, "world": "x"}}},
             "a.png.*needed a whole number",
         ),
-        ({"convention": "cam2world opencv", "poses": {}, "worlds": 3}, 'needed a list as "worlds"'),
-        ({"convention": "cam2world opencv", "poses": {}, "worlds": [3]}, "worlds.*needed a JSON object"),
+        ({"convention": "cam2world opencv", "poses": {}, "worlds": 3}, "worlds: needed a list"),
+        ({"convention": "cam2world opencv", "poses": {}, "worlds": [3]}, r"worlds, \[0\]: needed an object"),
         ({"convention": "cam2world opencv", "poses": {"a.png": {"room": "x"}}}, "a.png.*needed a pose"),
     ],
 )

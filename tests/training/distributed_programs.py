@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from pansplat.console import exit_process
 from pansplat.data.views import collate
 from pansplat.model.pansplat import PanSplat
 from pansplat.training import network as network_module
@@ -115,4 +114,4 @@ if __name__ == "__main__":
     repeated_steps(folder, group)
     status = train(folder)  # it joins the group that exists
     group.destroy()
-    exit_process(status)
+    sys.exit(status)

@@ -13,19 +13,20 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 import torch
+from msgspec import Meta, Struct
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.strict_json import list_field, number_field, read_json, require_object
+from pansplat.strict_json import read_json
 from pansplat.tours import TourGraph
 from pansplat_viewer.scene.camera import MAX_FOV_DEGREES, MIN_FOV_DEGREES, Camera, move_to_pose
 
@@ -132,54 +133,44 @@ def _place(frame: KeyFrame, level: Camera) -> Camera:
     return move_to_pose(level, pose)
 
 
+_Coordinate = Annotated[float, Meta(ge=-1e9, le=1e9)]
+
+
+class _Entry(Struct, forbid_unknown_fields=True):
+    """A key frame of a file."""
+
+    seconds: Annotated[float, Meta(ge=0, le=MAX_SECONDS)]
+    position: tuple[_Coordinate, _Coordinate, _Coordinate]
+    direction: tuple[_Coordinate, _Coordinate, _Coordinate]
+    vertical_fov_degrees: Annotated[float, Meta(ge=MIN_FOV_DEGREES, le=MAX_FOV_DEGREES)] = _DEFAULT_FOV
+
+
+class _File(Struct, forbid_unknown_fields=True):
+    """The content of a file."""
+
+    key_frames: list[_Entry] = []
+    software: str = ""
+
+
 def read_path(file: Path) -> CameraPath:
     """The path of a JSON file.
 
     Raises:
         InputError: unreadable, an unknown or missing field, a value out of range, or times that do not increase.
     """
-    content = require_object(read_json(file), file)
-    _require_fields(content, ("key_frames", "software"), file)
-    frames = [
-        _read_frame(require_object(entry, f"{file}, key frame {number}"), f"{file}, key frame {number}")
-        for number, entry in enumerate(list_field(content, "key_frames", file), start=1)
-    ]
+    frames = [KeyFrame(*(getattr(entry, key) for key in _FIELDS)) for entry in read_json(file, _File).key_frames]
     if not frames:
         raise InputError(f'{file}: needed one or more "key_frames", got none; add them.')
-    for number, (before, after) in enumerate(itertools.pairwise(frames), start=2):
+    for number, frame in enumerate(frames):
+        if math.hypot(*frame.direction) < 1e-6:
+            raise InputError(f'{file}, key_frames[{number}]: needed a "direction" with a length, got 0; correct it.')
+    for number, (before, after) in enumerate(itertools.pairwise(frames), start=1):
         if after.seconds <= before.seconds:
             raise InputError(
-                f'{file}, key frame {number}: needed "seconds" after {before.seconds:g}, got {after.seconds:g}; '
+                f'{file}, key_frames[{number}]: needed "seconds" after {before.seconds:g}, got {after.seconds:g}; '
                 "sort the key frames by time."
             )
     return CameraPath(tuple(frames))
-
-
-def _read_frame(entry: dict[str, Any], source: str) -> KeyFrame:
-    _require_fields(entry, _FIELDS, source)
-    seconds = number_field(entry, "seconds", source, low=0, high=MAX_SECONDS)
-    if seconds is None:
-        raise InputError(f'{source}: needed "seconds", got none; add the time of the key frame.')
-    position, direction = (_read_vector(entry, key, source) for key in ("position", "direction"))
-    if math.hypot(*direction) < 1e-6:
-        raise InputError(f'{source}: needed a "direction" with a length, got {list(direction)}; correct it.')
-    fov = number_field(entry, "vertical_fov_degrees", source, low=MIN_FOV_DEGREES, high=MAX_FOV_DEGREES)
-    return KeyFrame(seconds, position, direction, _DEFAULT_FOV if fov is None else fov)
-
-
-def _read_vector(entry: dict[str, Any], key: str, source: str) -> Vector:
-    values = list_field(entry, key, source)
-    if len(values) != 3 or not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
-        raise InputError(f'{source}: needed three numbers as "{key}", got {str(values)[:60]}; correct it.')
-    if max(map(abs, values)) > 1e9:
-        raise InputError(f'{source}: needed "{key}" within 1e9, got {str(values)[:60]}; correct it.')
-    return (float(values[0]), float(values[1]), float(values[2]))
-
-
-def _require_fields(entry: dict[str, Any], fields: Sequence[str], source: object) -> None:
-    unknown = [key for key in entry if key not in fields]
-    if unknown:
-        raise InputError(f"{source}: needed only the fields {', '.join(fields)}, got {unknown[0]!r:.60}; correct it.")
 
 
 def write_path(path: CameraPath, file: Path) -> None:

@@ -7,9 +7,10 @@ import zlib
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import platformdirs
+from msgspec import Struct
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
@@ -34,6 +35,15 @@ class Preferences:
         return replace(self, recent=(name, *(other for other in self.recent if other != name))[:_MAX_RECENT])
 
 
+class _File(Struct):
+    """The content of the file."""
+
+    theme: Theme = "dark"
+    recent: list[str] = []
+    layout: str = ""
+    checksum: int | None = None
+
+
 def find_file() -> Path:
     """The user's file, such as ~/.config/pansplat/viewer.json; it may not exist."""
     return platformdirs.user_config_path("pansplat", appauthor=False) / "viewer.json"
@@ -44,18 +54,11 @@ def read_preferences(file: Path | None) -> Preferences:
     if file is None or not file.is_file():
         return Preferences()
     try:
-        values = read_json(file)
+        values = read_json(file, _File)
     except (InputError, OSError):
         return Preferences()
-    if not isinstance(values, dict):
-        return Preferences()
-    theme, recent, layout = values.get("theme"), values.get("recent"), values.get("layout")
-    known = [path for path in recent if isinstance(path, str)] if isinstance(recent, list) else []
-    return Preferences(
-        theme=theme if theme in get_args(Theme) else "dark",
-        recent=tuple(known[:_MAX_RECENT]),
-        layout=layout if isinstance(layout, str) and values.get("checksum") == _checksum(layout) else "",
-    )
+    layout = values.layout if values.checksum == _checksum(values.layout) else ""
+    return Preferences(values.theme, tuple(values.recent[:_MAX_RECENT]), layout)
 
 
 def write_preferences(preferences: Preferences, file: Path | None) -> None:

@@ -13,11 +13,12 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from numpy import ndarray as Array
 from torch import Tensor
 
@@ -30,7 +31,7 @@ from pansplat.data.stated_files import locate_inside
 from pansplat.errors import InputError
 from pansplat.files import read_file
 from pansplat.geometry.pose import invert_pose
-from pansplat.strict_json import list_field, number_field, read_json, require_object, text_field
+from pansplat.strict_json import read_field, read_json
 
 FILE = "transforms.json"
 CONVENTION = "cam2world opengl"
@@ -40,6 +41,11 @@ Z_UP = torch.tensor(((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)), d
 _EQUIRECT = "EQUIRECTANGULAR"
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_SIDE, _FOCAL = Annotated[float, Meta(ge=1, le=1 << 20)], Annotated[float, Meta(ge=1e-6, le=1e9)]
+_LENS = {
+    "w": _SIDE, "h": _SIDE, "fl_x": _FOCAL, "fl_y": _FOCAL, **dict.fromkeys(("cx", "cy", *_DISTORTION), float),
+    "camera_angle_x": Annotated[float, Meta(ge=1e-6, le=math.pi - 1e-6)],
+}  # fmt: skip
 _PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -58,11 +64,11 @@ def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstructi
     Raises:
         InputError: invalid content, a lens with distortion, or another camera model.
     """
-    content = require_object(read_json(source), source)
-    frames = list_field(content, "frames", source)
+    content = read_json(source, dict[str, Any])
+    frames = read_field(content, "frames", list[dict[str, Any]], source, [])
     if not frames:
         raise InputError(f'{source}: needed posed pictures as "frames", got none; export the poses again.')
-    scale = number_field(content, "applied_scale", source, low=1e-12, high=1e12) or 1.0
+    scale = read_field(content, "applied_scale", Annotated[float, Meta(ge=1e-12, le=1e12)], source, 1.0)
     applied = content.get("applied_transform")
     undo = torch.eye(4, dtype=torch.float64)
     if applied is not None:
@@ -70,15 +76,14 @@ def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstructi
     folder, shots, missing = source.parent, [], []
     for number, frame in enumerate(frames):
         where = f"{source}, frame {number}"
-        frame = require_object(frame, where)
-        name = text_field(frame, "file_path", where) or ""
+        name = read_field(frame, "file_path", str, where, "")
         image = find_picture(folder, name)
         if image is None:
             missing.append(name)
             continue
         pose = to_cam2world(rigid_matrix(frame.get("transform_matrix"), where), convention or CONVENTION)
         pose[:3, 3] /= scale
-        stated = text_field(frame, "mask_path", where)
+        stated = read_field(frame, "mask_path", str, where)
         mask = None if stated is None else find_picture(folder, stated)
         if stated is not None and mask is None:
             locate_inside(folder, stated, where)
@@ -99,22 +104,19 @@ def _read_lens(fields: Mapping[str, Any], image: Path, where: str) -> Lens | Non
             f"{where}: needed the camera model {_EQUIRECT} or {', '.join(_PERSPECTIVE)}, got {model[:40]}; undistort "
             "the pictures, or give equirectangular ones."
         )
-    distortion = [key for key in _DISTORTION if number_field(fields, key, where)]
+    numbers = {key: read_field(fields, key, kind, where) for key, kind in _LENS.items()}
+    distortion = [key for key in _DISTORTION if numbers[key]]
     if distortion:
         raise InputError(
             f"{where}: needed pictures without distortion, got {', '.join(distortion)}; undistort them first "
             "(colmap image_undistorter)."
         )
-    size = [number_field(fields, key, where, low=1, high=1 << 20) for key in ("w", "h")]
-    width, height = (int(a or b) for a, b in zip(size, read_size(image), strict=True))
-    focal = number_field(fields, "fl_x", where, low=1e-6, high=1e9)
-    angle = number_field(fields, "camera_angle_x", where, low=1e-6, high=math.pi - 1e-6)
-    if focal is None and angle is None:
+    width, height = (int(numbers[key] or size) for key, size in zip(("w", "h"), read_size(image), strict=True))
+    if numbers["fl_x"] is None and numbers["camera_angle_x"] is None:
         raise InputError(f'{where}: needed a focal length ("fl_x") or "camera_angle_x", got neither; add one.')
-    fx = focal if focal is not None else width / 2 / math.tan((angle or 0) / 2)
-    fy = number_field(fields, "fl_y", where, low=1e-6, high=1e9) or fx
-    cx, cy = (number_field(fields, key, where) for key in ("cx", "cy"))
-    return Lens(fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy, width, height)
+    fx = numbers["fl_x"] or width / 2 / math.tan(numbers["camera_angle_x"] / 2)
+    cx, cy = (size / 2 if numbers[key] is None else numbers[key] for key, size in (("cx", width), ("cy", height)))
+    return Lens(fx, numbers["fl_y"] or fx, cx, cy, width, height)
 
 
 def _read_points(content: Mapping[str, Any], source: Path) -> Float[Array, "point 3"]:

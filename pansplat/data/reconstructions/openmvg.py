@@ -19,10 +19,11 @@ from pansplat.data.poses import rigid_matrix, to_cam2world
 from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture
 from pansplat.data.stated_files import find_inside
 from pansplat.errors import InputError
-from pansplat.strict_json import list_field, read_json, require_object
+from pansplat.strict_json import read_field, read_json
 
 FILE = "sfm_data.json"
 
+_Items = list[dict[str, Any]]
 _FIRST = 1 << 31  # flag of a type's number where its name is stated
 
 
@@ -36,12 +37,12 @@ def read_openmvg(source: Path, convention: str | None = None) -> Reconstruction:
     Raises:
         InputError: invalid content, or no spherical view with a pose.
     """
-    content = require_object(read_json(source), source)
+    content = read_json(source, dict[str, Any])
     try:
         spherical = _find_spherical(content, source)
-        poses = {item["key"]: item["value"] for item in list_field(content, "extrinsics", source)}
-        views = [item["value"]["ptr_wrapper"]["data"] for item in list_field(content, "views", source)]
-        points = [item["value"]["X"] for item in list_field(content, "structure", source)]
+        poses = {item["key"]: item["value"] for item in read_field(content, "extrinsics", _Items, source, [])}
+        views = [item["value"]["ptr_wrapper"]["data"] for item in read_field(content, "views", _Items, source, [])]
+        points = [item["value"]["X"] for item in read_field(content, "structure", _Items, source, [])]
         root, shots, missing = str(content.get("root_path", "")), [], []
         posed = [view for view in views if view["id_pose"] in poses and view["id_intrinsic"] in spherical]
         for view in posed:
@@ -77,7 +78,7 @@ def _find_spherical(content: dict[str, Any], source: Path) -> set[int]:
     """Numbers of the spherical cameras. The name of a type is stated once; then its number stands for it."""
     names: dict[int, str] = {}
     spherical = set()
-    for item in list_field(content, "intrinsics", source):
+    for item in read_field(content, "intrinsics", _Items, source, []):
         value = item["value"]
         kind = int(value["polymorphic_id"]) % _FIRST
         names.setdefault(kind, str(value.get("polymorphic_name", "")))

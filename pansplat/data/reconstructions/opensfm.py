@@ -9,6 +9,7 @@ Source: https://opensfm.org/docs/geometry.html, https://opensfm.org/docs/dataset
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from pansplat.data.poses import rigid_matrix, to_cam2world
 from pansplat.data.reconstructions.shots import Reconstruction, Shot, find_picture, note_smaller
 from pansplat.errors import InputError
-from pansplat.strict_json import read_json, require_object
+from pansplat.strict_json import convert, read_json
 
 FILE = "reconstruction.json"
 
@@ -35,8 +36,7 @@ def read_opensfm(source: Path, convention: str | None = None) -> Reconstruction:
         InputError: invalid content, or no spherical shot.
     """
     content = read_json(source)
-    parts = content if isinstance(content, list) else [content]
-    parts = [require_object(part, source) for part in parts]
+    parts = convert(content if isinstance(content, list) else [content], list[dict[str, Any]], source)
     try:
         part = max(parts, key=lambda part: len(part["shots"]))
         cameras = {name for name, camera in part["cameras"].items() if camera.get("projection_type") in _SPHERICAL}

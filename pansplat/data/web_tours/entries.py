@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import posixpath
 import re
 import unicodedata
@@ -10,18 +9,23 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 from urllib.parse import unquote
 
 import torch
+from msgspec import Meta
 
 from pansplat.data.cube_images import CubeImage, write_cube
 from pansplat.data.pairs import Link, Panorama, find_mask
 from pansplat.data.stated_files import locate_inside
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import make_portable_name, read_file
+from pansplat.geometry.path import wrap_angle
+from pansplat.strict_json import convert
 
 _T = TypeVar("_T")
+Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Pixels = Annotated[int, Meta(ge=1, le=1 << 20)]
 
 MAX_BYTES = 1 << 24  # of a file that describes a tour
 _MAX_TEXT = 200  # characters of a title or label
@@ -99,23 +103,11 @@ def locate(folder: Path, *parts: Any, suffix: str = "") -> str:
     return plain if plain == decoded or (folder / plain).exists() else decoded
 
 
-def finite_number(value: Any, what: str) -> float:
-    """A finite number, also of a text; an InputError otherwise."""
-    try:
-        result = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        result = math.nan
-    if not math.isfinite(result):
-        raise InputError(f"needed a number as {what}, got {str(value)[:40]!r}")
-    return result
-
-
-def pixel_count(value: Any, what: str) -> int:
-    """A whole number of pixels above 0; an InputError otherwise."""
-    pixels = finite_number(value, what)
-    if not 1 <= pixels <= 1 << 20 or pixels != int(pixels):
-        raise InputError(f"needed a number of pixels as {what}, got {str(value)[:40]!r}")
-    return int(pixels)
+def read_direction(content: Any, source: object = "direction", unit: float = 1.0) -> tuple[float, float]:
+    """The angles yaw and pitch of an object, radians, 0 by default; an InputError names the source."""
+    content = convert(content, dict[str, Any], source)
+    yaw, pitch = (convert(content.get(key, 0), Number, f"{source}, {key}", strict=False) for key in ("yaw", "pitch"))
+    return wrap_angle(unit * yaw), unit * pitch
 
 
 def require_tiles(face: int, tile: int) -> None:

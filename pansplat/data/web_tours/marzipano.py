@@ -23,18 +23,18 @@ from pansplat.data.images import read_size, require_complete
 from pansplat.data.pairs import Link
 from pansplat.data.web_tours.entries import (
     Entry,
-    finite_number,
+    Pixels,
     locate,
     optional,
-    pixel_count,
     plain_text,
+    read_direction,
     read_entries,
     read_text,
     require_tiles,
 )
 from pansplat.data.web_tours.javascript import parse_literal
 from pansplat.errors import InputError, InputWarning
-from pansplat.geometry.path import wrap_angle
+from pansplat.strict_json import convert
 
 _DATA = "data.js"
 _FILES = "app-files"  # folder in the archive of the Tool
@@ -94,7 +94,7 @@ def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
         raise InputError('needed an "id", the name of the folder of its tiles, got none')
     levels = _find_levels(key, scene, source)
     view = scene.get("initialViewParameters")
-    start = optional(f"{source}: the start view of {key}", lambda: _read_direction(view)) if view else None
+    start = optional(f"{source}: the start view of {key}", lambda: read_direction(view)) if view else None
     links = [
         optional(f"{source}: a link of {key}", lambda spot=spot: _read_link(spot))
         for spot in _objects(scene.get("linkHotspots"))
@@ -104,13 +104,7 @@ def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
 
 
 def _read_link(spot: Mapping[str, Any]) -> Link:
-    return Link(plain_text(spot.get("target")), *_read_direction(spot), plain_text(spot.get("text")))
-
-
-def _read_direction(content: Any) -> tuple[float, float]:
-    if not isinstance(content, dict):
-        raise InputError(f"needed yaw and pitch, got {str(content)[:_SHOWN]!r}")
-    return wrap_angle(finite_number(content.get("yaw", 0), "yaw")), finite_number(content.get("pitch", 0), "pitch")
+    return Link(plain_text(spot.get("target")), *read_direction(spot), plain_text(spot.get("text")))
 
 
 def _objects(value: Any) -> list[dict[str, Any]]:
@@ -125,7 +119,7 @@ def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[Cube
     folder = source.parent
     base = locate(folder, "tiles", plain_text(scene.get("id")))
     stated = [
-        (pixel_count(level.get("size"), "size"), pixel_count(level.get("tileSize"), "tileSize"))
+        tuple(convert(level.get(key), Pixels, key, strict=False) for key in ("size", "tileSize"))
         for level in _objects(scene.get("levels"))
     ]
     for pixels, tile in stated:

@@ -16,7 +16,9 @@ import warnings
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from pansplat.data.cube_faces import find_gap, find_layout, require_faces
 from pansplat.data.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
@@ -25,18 +27,19 @@ from pansplat.data.pairs import Link
 from pansplat.data.web_tours.entries import (
     MAX_BYTES,
     Entry,
-    finite_number,
+    Number,
+    Pixels,
     locate,
     optional,
-    pixel_count,
     plain_text,
+    read_direction,
     read_entries,
     read_text,
     require_tiles,
 )
 from pansplat.data.web_tours.javascript import parse_literal, skip_space
 from pansplat.errors import InputError, InputWarning
-from pansplat.geometry.path import wrap_angle
+from pansplat.strict_json import convert
 
 SUFFIXES = (".json", ".html", ".htm", ".js")
 _NAMES = ("tour.json", "pannellum.json", "config.json")  # looked at first
@@ -194,8 +197,8 @@ def _read_link(spot: Mapping[str, Any]) -> Link:
 
 
 def _read_direction(content: Mapping[str, Any]) -> tuple[float, float]:
-    yaw, pitch = (math.radians(finite_number(content.get(name, 0), name)) for name in ("yaw", "pitch"))
-    return wrap_angle(yaw), -pitch
+    yaw, pitch = read_direction(content, unit=math.radians(1))
+    return yaw, -pitch
 
 
 def _base(scene: Mapping[str, Any]) -> list[Any]:
@@ -204,7 +207,9 @@ def _base(scene: Mapping[str, Any]) -> list[Any]:
 
 def _read_equirect(scene: Mapping[str, Any], folder: Path) -> Path | CubeImage:
     image = folder / locate(folder, *_base(scene), scene.get("panorama"))
-    spans = [finite_number(scene.get(name, whole), name) for name, whole in (("haov", 360), ("vaov", 180))]
+    spans = [
+        convert(scene.get(name, whole), Number, name, strict=False) for name, whole in (("haov", 360), ("vaov", 180))
+    ]
     if spans != [360, 180]:
         raise InputError(f"needed a picture of 360 x 180 degrees, got {spans[0]:g} x {spans[1]:g} (haov, vaov)")
     width, height = read_size(image)
@@ -232,11 +237,9 @@ def _read_tiles(scene: Mapping[str, Any], folder: Path) -> CubeImage:
         raise InputError('needed an object as "multiRes", got another value')
     base = _base(scene) + ([stated["basePath"]] if stated.get("basePath") else [])
     suffix = f".{stated.get('extension') or 'jpg'}"
-    tile, full = (pixel_count(stated.get(name), name) for name in ("tileResolution", "cubeResolution"))
-    highest = int(finite_number(stated.get("maxLevel"), "maxLevel"))
+    kinds = {"tileResolution": Pixels, "cubeResolution": Pixels, "maxLevel": Annotated[int, Meta(ge=1, le=_MAX_LEVEL)]}
+    tile, full, highest = (convert(stated.get(name), kind, name, strict=False) for name, kind in kinds.items())
     require_tiles(min(full, MAX_SIZE), tile)
-    if not 1 <= highest <= _MAX_LEVEL:
-        raise InputError(f"needed a maxLevel of 1 to {_MAX_LEVEL}, got {highest}")
     levels: list[CubeLevel] = []
     gaps: list[str] = []
     for number in range(1, highest + 1):

@@ -143,7 +143,7 @@ def test_a_scene_without_tiles_is_named_and_the_others_open(export: Export) -> N
 def test_a_broken_start_view_is_dropped(export: Export) -> None:
     views = [{"yaw": {}}, None]
     folder = export(*(_scene(f"{n}-room", initialViewParameters=view) for n, view in enumerate(views)))
-    with pytest.warns(UserWarning, match="the start view of 0-room is left out: needed a number as yaw"):
+    with pytest.warns(UserWarning, match="the start view of 0-room is left out: direction, yaw: needed a number"):
         panoramas = read_web_tour(folder / "data.js")
     assert [panorama.start for panorama in panoramas] == [None, None]
 
@@ -158,7 +158,7 @@ def test_links_to_nowhere_and_to_itself_are_dropped(export: Export) -> None:
     assert hall.links == ()
     messages = [str(warning.message) for warning in caught]
     assert len(messages) == 2
-    assert "a link of 0-hall is left out: needed a number as yaw, got 'x'" in messages[0]
+    assert "a link of 0-hall is left out: direction, yaw: needed a number, got 'x'" in messages[0]
     assert "a link of 0-hall is left out: it leads to '9-gone'" in messages[1]
 
 
@@ -199,8 +199,8 @@ def test_tiles_outside_of_the_folder_are_not_read(export: Export, key: str) -> N
     [
         ({"id": None}, 'number 2\' is left out: needed an "id"'),
         ({"levels": None}, "needed all tiles of a level"),
-        ({"levels": [{"size": "big"}]}, "needed a number as size, got 'big'"),
-        ({"levels": [{"size": 64, "tileSize": 0}]}, "needed a number of pixels as tileSize, got '0'"),
+        ({"levels": [{"size": "big"}]}, "size: needed a whole number, got 'big'"),
+        ({"levels": [{"size": 64, "tileSize": 0}]}, "tileSize: needed a whole number >= 1, got 0"),
     ],
 )
 def test_a_broken_scene_is_named_and_the_others_open(export: Export, content: dict, message: str) -> None:

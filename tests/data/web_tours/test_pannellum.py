@@ -183,10 +183,16 @@ def test_names_are_file_safe_and_unique(tmp_path: Path, write_scene) -> None:
         ({"type": "cubemap", "cubeMap": ["a.jpg"] * 5}, 'needed six files as "cubeMap"'),
         ({"type": "cubemap", "cubeMap": ["hall.jpg"] * 5 + [None]}, "needed the path of a file, got 'None'"),
         ({"type": "multires", "multiRes": MULTIRES}, "needed all tiles of a level, but tiles/3/f0_0.jpg is missing"),
-        ({"type": "multires", "multiRes": MULTIRES | {"maxLevel": 99}}, "needed a maxLevel of 1 to 20, got 99"),
+        (
+            {"type": "multires", "multiRes": MULTIRES | {"maxLevel": 99}},
+            "maxLevel: needed a whole number <= 20",
+        ),
         ({"type": "multires", "multiRes": MULTIRES | {"path": "/x"}}, "needed a path with %s"),
         ({"type": "multires", "multiRes": MULTIRES | {"basePath": "../.."}}, "needed a file inside"),
-        ({"type": "multires", "multiRes": MULTIRES | {"cubeResolution": 1e999}}, "needed a number as cubeResolution"),
+        (
+            {"type": "multires", "multiRes": MULTIRES | {"cubeResolution": 1e999}},
+            "cubeResolution: needed a whole",
+        ),
         ("text", "needed an object, got 'text'"),
     ],
 )

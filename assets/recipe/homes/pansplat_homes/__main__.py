@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar
 
+from msgspec import Meta
 from tyro.conf import Positional, subcommand
 
 from pansplat.cli.inputs import Out
-from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
+from pansplat.console import own_warnings, parse_arguments, run_command
 from pansplat.files import require_output_folder
-from pansplat.options import WHOLE, Count, Range, Seed, Threads, check_numbers
+from pansplat.options import Count, Seed, Threads, check_numbers
 from pansplat_homes.depth import DepthTrainConfig
 from pansplat_homes.matcher import ConvertMatcher
 from pansplat_homes.sharpening import SharpeningTrainConfig
@@ -30,9 +32,9 @@ class Homes:
     """Number of homes, rounded up to whole shards of 16."""
     seed: Seed = 0
     """Seed of the homes."""
-    height: Annotated[int, Range(32, 8192, "pixels", multiple=32), WHOLE] = 128
+    height: Annotated[int, Meta(ge=32, le=8192, multiple_of=32)] = 128
     """Height of the panoramas, pixels; a multiple of 32."""
-    cameras: Annotated[int, Range(2, 1000), WHOLE] = 4
+    cameras: Annotated[int, Meta(ge=2, le=1000)] = 4
     """Panoramas of each home."""
     furniture: Path | None = None
     """Folder with furniture catalogues (*.sh3f) of the Debian package sweethome3d-furniture; by default only our own
@@ -77,7 +79,7 @@ class Photographs:
     """Number of homes."""
     seed: Seed = 0
     """Seed of the homes."""
-    height: Annotated[int, Range(256, 8192, "pixels", multiple=32), WHOLE] = 1024
+    height: Annotated[int, Meta(ge=256, le=8192, multiple_of=32)] = 1024
     """Height of the panoramas, pixels."""
     furniture: Path | None = None
     """As for `homes`."""
@@ -106,7 +108,7 @@ class Flights:
     """Number of flights."""
     seed: Seed = 5200
     """Seed of the homes."""
-    height: Annotated[int, Range(64, 8192, "pixels", multiple=32), WHOLE] = 512
+    height: Annotated[int, Meta(ge=64, le=8192, multiple_of=32)] = 512
     """Height of the panoramas, pixels."""
 
     def run(self) -> int:
@@ -131,7 +133,7 @@ class Triplets:
     """Number of triplets, each in a home of its own."""
     seed: Seed = 0
     """Seed of the homes."""
-    height: Annotated[int, Range(64, 8192, "pixels", multiple=32), WHOLE] = 256
+    height: Annotated[int, Meta(ge=64, le=8192, multiple_of=32)] = 256
     """Height of the panoramas, pixels."""
 
     def run(self) -> int:
@@ -151,7 +153,7 @@ class Maps:
     """Folder of the triplets."""
     out: Out
     """Folder for the shards."""
-    height: Annotated[int, Range(32, 8192, "pixels"), WHOLE] = 128
+    height: Annotated[int, Meta(ge=32, le=8192)] = 128
     """Height of the panoramas, pixels."""
 
     def run(self) -> int:
@@ -204,7 +206,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 def main() -> None:
     """Run the command line and exit."""
-    exit_process(run())
+    sys.exit(run())
 
 
 if __name__ == "__main__":
