@@ -27,9 +27,6 @@ def replacing(path: Path | str, *, failures: tuple[type[Exception], ...] = ()) -
     Args:
         path: the file to write.
         failures: further exceptions of a library that mean a failed write, such as a full disk.
-
-    Raises:
-        InputError: the folder of `path` does not exist or cannot be written.
     """
     path = Path(path)
     if not path.parent.is_dir():
@@ -60,9 +57,6 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
 
     Args:
         folder: does not exist, or is empty; its parents are made.
-
-    Raises:
-        InputError: it cannot be written.
     """
     folder = Path(os.path.abspath(folder))
     temporary = folder.with_name(f".{folder.name[:_MAX_STEM]}.{secrets.token_hex(4)}")

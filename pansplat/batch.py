@@ -125,11 +125,7 @@ class ItemReport:
 
 
 def list_items(path: Path) -> list[Item]:
-    """The items of a manifest, or the folders with panoramas at or below a folder.
-
-    Raises:
-        InputError: a manifest that cannot be read, two items of one name, or no items.
-    """
+    """The items of a manifest, or the folders with panoramas at or below a folder."""
     path = expand_home(path).absolute()
     if path.is_dir():
         try:
@@ -283,11 +279,7 @@ def _connect(tour: TourGraph, outputs: _Outputs) -> TourGraph:
 
 
 def load_predictor(options: BatchOptions) -> Predictor:
-    """The predictor of a batch.
-
-    Raises:
-        InputError: it cannot be loaded.
-    """
+    """The predictor of a batch."""
     return _load_model(options.model, options.compat, options.precision)
 
 
@@ -514,11 +506,7 @@ def dask_setup(worker: Any) -> None:
 
 @contextlib.contextmanager
 def lock_folder(out: Path) -> Iterator[None]:
-    """Make the folder of a batch and lock it against a second batch on this machine.
-
-    Raises:
-        InputError: another batch writes to it, or it cannot be written.
-    """
+    """Make the folder of a batch and lock it against a second batch on this machine."""
     import locket  # Dask needs it, too
 
     out.mkdir(parents=True, exist_ok=True)
@@ -540,9 +528,6 @@ def run_items(address: str, items: Sequence[Item], options: BatchOptions, out: P
     Args:
         address: of the scheduler. The workers must see the items' folders and `out` under the same paths.
         out: absolute.
-
-    Raises:
-        InputError: the predictor cannot be loaded, or the scheduler is lost.
     """
     import logging
 

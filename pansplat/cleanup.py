@@ -101,9 +101,6 @@ def clean_up(
         cleaning: the steps.
         layers: the scene of the same cameras with all that each panorama shows, to find the rooms of a joint one.
         progress: called with the name of the step and the completed fraction.
-
-    Raises:
-        InputError: there are no such rooms, or nothing is left.
     """
     steps: dict[str, Callable[[Scene], Scene]] = {}
     box, least = cleaning.box, cleaning.min_opacity
@@ -164,9 +161,6 @@ def crop_to_rooms(scene: Scene, names: Sequence[str], layers: Scene | None = Non
         scene: with input cameras.
         names: of rooms of the floor plan, or of panoramas in them; upper and lower case are equal.
         layers: see `clean_up`.
-
-    Raises:
-        InputError: there is no such room or panorama, or the scene has no input cameras.
     """
     if not len(scene.cam2world):
         raise InputError("rooms need a scene with input cameras, got one without; crop it to a box")

@@ -65,9 +65,6 @@ def require_file(path: Path | str, needed: str = "a readable file") -> None:
     Args:
         path: the path, which error messages name.
         needed: what was needed, for error messages.
-
-    Raises:
-        InputError: no such file, a folder, a FIFO, a socket or a device.
     """
     try:
         kind = describe_kind(path)
@@ -98,9 +95,6 @@ def read_file(path: Path | str, needed: str = "a readable file", *, limit: int |
     Args:
         path, needed: see `require_file`.
         limit: largest size, bytes.
-
-    Raises:
-        InputError: not a regular file, not readable, or larger than `limit`.
     """
     require_file(path, needed)
     try:
@@ -127,9 +121,6 @@ def require_output_folder(option: str, folder: Path) -> None:
     Args:
         option: the option that error messages name, such as "--out".
         folder: the folder; it and its parents need not exist.
-
-    Raises:
-        InputError: a file is in the way, a name is too long, or the folder is not writable.
     """
     advice = "choose another folder"
     if reason := _find_system_problem(folder, errno.ENOENT):
@@ -146,11 +137,7 @@ def require_output_folder(option: str, folder: Path) -> None:
 
 
 def require_new_folder(option: str, folder: Path) -> None:
-    """Check that a folder can be made, before the work: it does not exist, or is empty. Arguments as above.
-
-    Raises:
-        InputError: it holds files, or cannot be made.
-    """
+    """Check that a folder can be made, before the work: it does not exist, or is empty. Arguments as above."""
     require_output_folder(option, folder)
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{option} {folder}: needed a new or empty folder, got one with files; choose another name")
@@ -164,10 +151,6 @@ def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = (),
         path: the file; its folder must exist.
         suffixes: the allowed suffixes in lower case; any suffix by default.
         overwrite: see `require_replaceable`.
-
-    Raises:
-        InputError: another suffix, a folder or a FIFO of this name, a folder that is missing or not writable, or a
-            file that pansplat did not write.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise InputError(f"{option} must end in {', '.join(suffixes)}, got {path}")
@@ -200,9 +183,6 @@ def require_replaceable(option: str, files: Iterable[Path], overwrite: bool | No
         option: the option that error messages name, such as "--out".
         files: all that are written.
         overwrite: whether files of others may be replaced; None if there is no --overwrite.
-
-    Raises:
-        InputError: it names the files of others.
     """
     others = [] if overwrite else [f for f in files if f.is_file() and f.stat().st_size and not is_written(f)]
     if others:

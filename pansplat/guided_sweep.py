@@ -59,11 +59,7 @@ class GuidedSweep(Sweep):
 
 
 def load_guided_sweep(path: Path, name: str = "default") -> GuidedSweep:
-    """The guided sweep of a weights file that `save_depth_network` wrote, with the package's sharpening network.
-
-    Raises:
-        InputError: the file is missing, damaged, or holds other weights.
-    """
+    """The guided sweep of a weights file that `save_depth_network` wrote, with the package's sharpening network."""
     network = _load_network(path, MODEL, RefinementConfig, DepthRefinement)
     sharpening = load_sharpening(_shipped("sharpening.safetensors"))
     return GuidedSweep(network, sharpening, _hash_files(path, _shipped("sharpening.safetensors")), name)
@@ -76,11 +72,7 @@ def load_default_sweep() -> GuidedSweep:
 
 
 def load_sharpening(path: Path) -> DepthSharpening:
-    """The sharpening network of a weights file that `save_sharpening` wrote, in eval mode.
-
-    Raises:
-        InputError: the file is missing, damaged, or holds other weights.
-    """
+    """The sharpening network of a weights file that `save_sharpening` wrote, in eval mode."""
     return _load_network(path, SHARPENING, SharpeningConfig, DepthSharpening)
 
 

@@ -51,9 +51,6 @@ def show(scene: Scene | str | Path, *, gaussians: int = DISPLAY_GAUSSIANS, heigh
 
     Returns:
         The temporary page, without a notebook.
-
-    Raises:
-        InputError: the scene has no visible Gaussians, or too many for a page.
     """
     if isinstance(scene, (str, Path)):
         from pansplat.gaussians.formats import load_scene

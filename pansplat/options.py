@@ -49,9 +49,6 @@ def check_numbers(options: Any, *, prefixed: bool = False, prefix: str = "--") -
         prefixed: whether an option of a nested dataclass has the name of its field as a prefix, as in
             `--optimizer.steps`.
         prefix: the start of the names of the options.
-
-    Raises:
-        InputError: a number is missing its range; the message names the option.
     """
     hints = typing.get_type_hints(type(options), include_extras=True)
     for name, hint in hints.items():

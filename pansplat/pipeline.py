@@ -110,9 +110,6 @@ def load_pairs(
         near, far: radial depth range in metres; overrides that of the files.
         camera_height: of the cameras over the floor, metres; the scale of estimated poses and of single views.
         progress: called with a description of the estimate of poses and the completed fraction.
-
-    Raises:
-        InputError: no known format was found, or a file is missing or invalid.
     """
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
@@ -146,9 +143,6 @@ def load_model(
             "trained" is the mode of the training, which is "official" for official weights.
         precision: for networks: number type of the convolutions; docs/bench_model.md shows time against error.
         **options: arguments of `pansplat.sweep.Sweep` or of `pansplat.model.network.load_predictor`.
-
-    Raises:
-        InputError: there is no such predictor, the processor lacks the precision, or the file cannot be used.
     """
     if compat not in get_args(CompatChoice):
         raise InputError(f"`compat` must be one of {', '.join(get_args(CompatChoice))}, got {compat!r}")
@@ -315,9 +309,6 @@ def predict(
         cache: whether to read and write the cache.
         progress: called with a description of the current work and the completed fraction.
         on_predicted: called with the prediction before it is refined.
-
-    Raises:
-        InputError: the input cannot be used, or the path holds several pairs.
     """
     if not 0 <= refine_seconds < math.inf:
         raise InputError(f"`refine_seconds` must be at least 0, got {refine_seconds}")
@@ -406,9 +397,6 @@ def refine(
 
     Returns:
         The refined scene, or the given one if held-out pixels show that it is better, or if it is of a single view.
-
-    Raises:
-        InputError: scene and views do not fit, or an argument is out of range.
     """
     return _run_refinement(scene, views, config, seed, seconds=seconds, steps=steps, progress=progress)[0]
 
@@ -435,9 +423,6 @@ def refine_to_file(
 
     Returns:
         The refined scene, and what the refinement did.
-
-    Raises:
-        InputError: see `refine` and `save`.
     """
     find_scene_suffix(path)  # an error before the work
     limits = {"seconds": seconds, "steps": steps}
@@ -485,9 +470,6 @@ def predict_tour(
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.
         joint: see `predict`; the refinement is then that of each part of the tour as a whole, and not cached.
-
-    Raises:
-        InputError: the input cannot be used.
     """
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     tour = _load_only_tour(tour, progress) if isinstance(tour, (str, Path)) else tour
@@ -596,9 +578,6 @@ def predict_to_file(
 
     Returns:
         The number of Gaussians in the file.
-
-    Raises:
-        InputError: see `predict` and `save`.
     """
     suffix = find_scene_suffix(path)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
@@ -655,9 +634,6 @@ def render(
         drawing: "exact", or "original": a panorama as the official code renders it, with its defects, to reproduce
             published figures (docs/paper.md).
         **raster: further arguments of `pansplat.rasterize`, with "exact".
-
-    Raises:
-        InputError: `blend` names no view of the scene, or `drawing` does not fit the other arguments.
     """
     pose = torch.as_tensor(cam2world, dtype=torch.float64, device=scene.gaussians.means.device)
     if pose.shape != (4, 4):
@@ -718,20 +694,12 @@ def _choose_rasterizer(
 
 
 def save(scene: Scene, path: str | Path) -> None:
-    """Write a scene in the format of the file's suffix (docs/formats.md), atomically, in the user's unit.
-
-    Raises:
-        InputError: unknown suffix, a scene that the format cannot hold, or a folder that cannot be written.
-    """
+    """Write a scene in the format of the file's suffix (docs/formats.md), atomically, in the user's unit."""
     save_scene(scene, path)
 
 
 def load(path: str | Path) -> Scene:
-    """Read a scene file of `save` or of another tool (docs/formats.md); it is brought to a unit near metres.
-
-    Raises:
-        InputError: unknown suffix, or a missing or damaged file.
-    """
+    """Read a scene file of `save` or of another tool (docs/formats.md); it is brought to a unit near metres."""
     return load_scene(path)
 
 

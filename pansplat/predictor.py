@@ -29,11 +29,7 @@ MIN_HEIGHT = 64  # pixels, of panoramas
 
 
 def require_matching_inputs(images: Tensor, cam2world: Tensor, masks: Tensor | None) -> None:
-    """Check images (view, 3, height, 2 height), their poses and their masks.
-
-    Raises:
-        InputError: the images are too small, the shapes do not fit, or a value is not finite.
-    """
+    """Check images (view, 3, height, 2 height), their poses and their masks."""
     shape = tuple(images.shape)
     if shape[2] < MIN_HEIGHT:
         raise InputError(f"`images` must be at least {MIN_HEIGHT} pixels high, got {shape[2]}; resize them")

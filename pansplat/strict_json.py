@@ -44,9 +44,6 @@ def parse_json(text: str, source: object) -> Any:
 
     Args:
         source: the file that error messages name.
-
-    Raises:
-        InputError: invalid text, or against one of these rules; the message names the field.
     """
 
     def as_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -102,9 +99,6 @@ def convert(value: Any, kind: Any, source: object, *, strict: bool = True) -> An
     Args:
         source: the file or option that messages name.
         strict: whether a text is no number.
-
-    Raises:
-        InputError: another type, a number out of range, a field that is missing or unknown; the message names it.
     """
     try:
         return msgspec.convert(value, kind, strict=strict)

@@ -103,11 +103,7 @@ class Options:
 
     @property
     def pixels(self) -> tuple[int, int]:
-        """`size` of films and stills as (width, height).
-
-        Raises:
-            InputError: `size` is not WIDTHxHEIGHT, or out of range.
-        """
+        """`size` of films and stills as (width, height)."""
         if self.size is None:
             return self.image_format.default_size
         match = re.fullmatch(r"(\d{2,5})x(\d{2,5})", self.size.lower())
@@ -137,11 +133,7 @@ class Options:
 
     @property
     def renderer_choice(self) -> RendererChoice:
-        """`renderer`; the processor does not draw preset 3dgs.
-
-        Raises:
-            InputError: the renderer does not draw the preset.
-        """
+        """`renderer`; the processor does not draw preset 3dgs."""
         if self.preset == "exact":
             return self.renderer
         if self.renderer == "cpu":
@@ -162,11 +154,7 @@ def run_arguments(args: Sequence[str] | None = None) -> int:
 
 
 def choose_entry(entries: list[SceneEntry], pair: str | None) -> int:
-    """Return the index of the entry with this name or number (from 1); None is the first.
-
-    Raises:
-        InputError: no entry has this name or number.
-    """
+    """Return the index of the entry with this name or number (from 1); None is the first."""
     if pair is None:
         return 0
     for index, entry in enumerate(entries):

@@ -112,9 +112,6 @@ def write_flythrough(
         film: sizes and times.
         progress: called with the task and the fraction done.
         show_file: called with each file that is written.
-
-    Raises:
-        InputError: the folder cannot be written, or the scene is empty.
     """
     folder.mkdir(parents=True, exist_ok=True)
     num_frames = film.count_frames()
@@ -303,9 +300,6 @@ def write_tour(
         film: size and times.
         progress: called with the task and the fraction done.
         show_file: called with each file that is written.
-
-    Raises:
-        InputError: the folder cannot be written, or a scene cannot be loaded.
     """
     folder.mkdir(parents=True, exist_ok=True)
     num_frames = film.count_frames(route)
@@ -366,9 +360,6 @@ def write_path_film(
             `walk_0000.png` or `walk_0000.exr`, and so on.
         fps: frames per second.
         progress: called with the task and the fraction done.
-
-    Raises:
-        InputError: a file cannot be written, or a scene cannot be loaded.
     """
     num_frames, written = path.count_frames(fps), []
 

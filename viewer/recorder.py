@@ -66,11 +66,7 @@ class Recorder:
         self._state.show_message(f"wrote {files[-1]}")
 
     def start_film(self, loaded: LoadedScene, tour: TourScenes | None, loader: SceneLoader) -> None:
-        """Write the film of the path in a worker thread, drawn on the processor, so that the window stays free.
-
-        Raises:
-            InputError: the format does not fit, or the folder cannot be made (OSError).
-        """
+        """Write the film of the path in a worker thread, drawn on the processor, so that the window stays free."""
         state, scene, settings = self._state, self._stage.slot.scene, self._state.draw_settings
         path, level, fps, scenes = state.path, state.camera, state.film_fps, None if tour is None else tour.copy()
         image_format = choose_format(state.film_projection, settings)

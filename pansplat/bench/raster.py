@@ -251,9 +251,6 @@ def measure_raster(groups: Iterable[Group], *, budget: float = 2.0, slow: float 
         groups: of cases, each with its scene.
         budget: seconds for the repeats of a case.
         slow: seconds; a case whose first image takes longer is not repeated.
-
-    Raises:
-        InputError: a scene cannot be read.
     """
     exact: dict[tuple[str, RasterCase], Tensor] = {}
     for group in groups:

@@ -110,9 +110,6 @@ def measure_viewer(height: int, cases: Sequence[ViewerCase], *, repeats: int, th
     Args:
         repeats: frames of each case; OpenGL draws a third.
         threads: of numba and of software OpenGL.
-
-    Raises:
-        InputError: the viewer is not installed, or there is no OpenGL.
     """
     if importlib.util.find_spec(_VIEWER_PACKAGE) is None:
         raise InputError("the viewer is not installed; install all of pansplat to measure it")

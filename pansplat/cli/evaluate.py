@@ -209,11 +209,7 @@ def _leave_out_each(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
 
 
 def choose_lpips(choice: LpipsChoice, height: int) -> Lpips | None:
-    """The chosen LPIPS; None for "none", or if "auto" finds no weights or the images are too small.
-
-    Raises:
-        InputError: the weights of a named backbone are missing.
-    """
+    """The chosen LPIPS; None for "none", or if "auto" finds no weights or the images are too small."""
     from pansplat.evaluation.lpips import MIN_IMAGE_SIZE, find_backbone, load_lpips
 
     if choice.lpips == "none":

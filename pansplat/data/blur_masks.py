@@ -76,11 +76,7 @@ def list_mask_files(folder: Path, kind: str) -> dict[str, list[Path]]:
 
 
 def find_masks_beside(pictures: Iterable[Path], kind: str) -> dict[Path, Path]:
-    """The masks of a kind beside pictures, which need not exist, by picture.
-
-    Raises:
-        InputError: a picture has several.
-    """
+    """The masks of a kind beside pictures, which need not exist, by picture."""
     pictures, found = list(pictures), {}
     masks = {folder: list_mask_files(folder, kind) for folder in {picture.parent for picture in pictures}}
     for picture in pictures:

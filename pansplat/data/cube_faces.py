@@ -111,11 +111,7 @@ def _is_square(file: Path) -> bool:
 
 
 def require_faces(files: Sequence[Path]) -> int:
-    """The size of six pictures of faces, pixels.
-
-    Raises:
-        InputError: one is missing, damaged, not square, or of another size.
-    """
+    """The size of six pictures of faces, pixels."""
     sizes = {file: read_size(file) for file in files}
     size = sizes[files[0]]
     for file, (width, height) in sizes.items():
@@ -146,9 +142,6 @@ def find_layout(image: Path) -> CubeImage | None:
 
     The proportions give the arrangement, and the edges of the faces give their order. The edges must fit, because
     photographs have such proportions, too.
-
-    Raises:
-        InputError: the picture cannot be read.
     """
     width, height = read_size(image)
     grids = [grid for grid in (*_GRIDS, *_CROSSES) if width * grid[0] == height * grid[1] and width % grid[1] == 0]

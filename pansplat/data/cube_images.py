@@ -75,11 +75,7 @@ class CubeLevel:
         return ((row, column) for row in range(count) for column in range(count))
 
     def read(self, folder: Path, decode: Decode) -> list[UInt8[Array, "size size 3"]]:
-        """The six faces.
-
-        Raises:
-            InputError: a picture is missing or cannot be read.
-        """
+        """The six faces."""
         if self.cells:
             picture = decode(folder / self.faces[0])
             rows, columns = self.grid
@@ -126,11 +122,7 @@ class CubeImage:
         return (self.folder / file for level in self.levels for file in level.list_files())
 
     def read(self, height: int, decode: Decode) -> tuple[UInt8[Array, "height width 3"], None]:
-        """The equirectangular panorama at (height, 2 height); None, as the pictures show all of it.
-
-        Raises:
-            InputError: a picture is missing or cannot be read.
-        """
+        """The equirectangular panorama at (height, 2 height); None, as the pictures show all of it."""
         level = next((level for level in self.levels if level.size >= _ENOUGH * height), self.levels[-1])
         return equirect_from_faces(level.read(self.folder, decode), height), None
 
@@ -149,9 +141,6 @@ def write_description(content: dict[str, Any], pictures: Iterable[Path], folder:
         pictures: that the panorama is made from.
         folder: of the tour, in whose cache folder the file is written.
         name: valid as a file name.
-
-    Raises:
-        InputError: there is no writable cache folder.
     """
     digest = hashlib.blake2b(digest_size=12)
     for picture in pictures:
@@ -171,11 +160,7 @@ def write_description(content: dict[str, Any], pictures: Iterable[Path], folder:
 
 
 def read_cube(path: Path) -> CubeImage:
-    """The cube that a file of `write_cube` stands for.
-
-    Raises:
-        InputError: it is no such file.
-    """
+    """The cube that a file of `write_cube` stands for."""
     content = read_json(path, dict[str, Any])
     try:
         levels = tuple(_read_level(level) for level in content["levels"])

@@ -93,7 +93,6 @@ def load_pairs(
 
     Raises:
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
-        InputError: no known format was found, or a file is missing or invalid.
     """
     root = expand_home(path)
     try:
@@ -111,9 +110,6 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
     Args:
         root: a file, or a folder that is searched as by `load_pairs`.
         panoramas: that were read there.
-
-    Raises:
-        InputError: a mask belongs to no picture, is no PNG, or cannot be used; or a panorama is a mask by its name.
     """
     views = {view.image: view for view in panoramas}
     for image in (*views, *([root] if root.is_file() else ())):
@@ -321,11 +317,7 @@ def _find_collections(folder: Path, depth: int, exports: bool, convention: str |
 
 
 def _leave_out_damaged(collection: Collection) -> Collection:
-    """The collection without the panoramas that cannot be used, and without the pairs that need them.
-
-    Raises:
-        InputError: fewer than two are left, or none of the stated pairs; it names the first one that cannot be used.
-    """
+    """The collection without the panoramas that cannot be used, and without the pairs that need them."""
     problems: dict[int, InputError] = {}
     for number, panorama in enumerate(collection.panoramas):
         try:

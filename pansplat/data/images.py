@@ -105,10 +105,6 @@ def read_panorama(
         path: JPG, PNG and TIFF (8 or 16 bit), WebP, HEIC or EXR file, 2:1 or a crop with GPano properties; or a file
             that stands for cube faces or perspective pictures (pansplat.data.cube_images, .rig_images).
         height: pixels.
-
-    Raises:
-        InputError: no such file, unknown format, damaged or truncated data, not 2:1, NaN, a dual fisheye picture, or
-            a blur mask that cannot be used.
     """
     decoded = _decode_panorama(path, height)
     image = resize_panorama(decoded.color, height)
@@ -124,11 +120,7 @@ def read_panorama(
 
 
 def read_height(path: Path | str) -> int:
-    """Height of an image file, pixels; of cube faces that of the panorama that they give. No pixels are decoded.
-
-    Raises:
-        InputError: no such file, or an unknown format.
-    """
+    """Height of an image file, pixels; of cube faces that of the panorama that they give. No pixels are decoded."""
     return read_size(path)[1]
 
 
@@ -214,9 +206,6 @@ def require_complete(path: Path | str) -> None:
     """Check that an image file is not damaged, by its structure; it is decoded only if the structure is in doubt.
 
     That of a JPG or WebP shows whether the file is whole, and that of a PNG has check sums. An EXR is decoded.
-
-    Raises:
-        InputError: no such file, an unknown format, damaged or truncated data.
     """
     path = Path(path)
     require_file(path, "a readable image file")
@@ -226,11 +215,7 @@ def require_complete(path: Path | str) -> None:
 
 
 def require_panorama(path: Path | str) -> None:
-    """Check that a file is a 2:1 image that is not damaged (`require_complete`).
-
-    Raises:
-        InputError: it is not.
-    """
+    """Check that a file is a 2:1 image that is not damaged (`require_complete`)."""
     require_two_to_one(Path(path), *read_size(path))
     require_complete(path)
 
@@ -276,11 +261,7 @@ def find_masks(path: Path, kind: str) -> dict[Path, Path]:
 
 
 def list_masks(path: Path, *, check: bool = False) -> list[Path]:
-    """The files of all masks of a panorama, and of the pictures that it is joined from.
-
-    Raises:
-        InputError: with `check`, a mask is damaged, or has other proportions than its picture.
-    """
+    """The files of all masks of a panorama, and of the pictures that it is joined from."""
     found = [item for kind in (BLUR_SUFFIX, MASK_SUFFIX) for item in find_masks(path, kind).items()]
     for picture, mask in found if check else ():
         _require_fit(mask, read_size(mask), read_size(picture))
@@ -327,11 +308,7 @@ def read_hidden(path: Path, height: int, kind: str = BLUR_SUFFIX) -> Bool[Array,
 def read_blur_mask(
     mask: Path, height: int, width: int | None = None, kind: str = BLUR_SUFFIX
 ) -> Bool[Array, "height width"]:
-    """A mask at (height, width), by default 2:1: every pixel that its white touches, or its black if of another kind.
-
-    Raises:
-        InputError: it cannot be read, or has other proportions.
-    """
+    """A mask at (height, width), 2:1 by default: each pixel that its white touches, or its black if of another kind."""
     decoded, width = _decode(mask), 2 * height if width is None else width
     _require_fit(mask, decoded.color.shape[1::-1], (width, height))
     grey = decoded.color.astype(np.float32).mean(axis=2) / (255 if decoded.color.dtype == np.uint8 else 1)
@@ -366,9 +343,6 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
     Args:
         path: 16-bit PNG in millimetres (0 is unknown), or EXR in metres (channel Z or Y).
         height: pixels.
-
-    Raises:
-        InputError: the file is not such a depth image.
     """
     path = Path(path)
     _check_height(height)
@@ -409,9 +383,6 @@ def write_image(
         depth: (H W) metres, written as channel Z of an EXR.
         panorama: whether the file is marked as an equirectangular panorama (GPano, in an EXR a latitude-longitude
             map); by default if it is 2:1. Other than photographs, it counts as a rendering.
-
-    Raises:
-        InputError: NaN, unknown suffix, depth for a format that cannot hold it, folder missing.
     """
     path = Path(path)
     pixels = _as_pixels(path, image)
@@ -438,9 +409,6 @@ def write_depth(path: Path | str, depth: Tensor | NDArray[Any], *, panorama: boo
         path: file to write, ending in .png.
         depth: (H W) metres, finite.
         panorama: see `write_image`.
-
-    Raises:
-        InputError: NaN, another suffix, folder missing.
     """
     path = Path(path)
     metres = depth.detach().cpu().numpy() if isinstance(depth, Tensor) else np.asarray(depth)

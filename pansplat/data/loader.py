@@ -50,9 +50,6 @@ class Loader:
 
     Attributes:
         skipped: by message, the number of times that an unreadable sample was skipped. The first time it warns.
-
-    Raises:
-        InputError: an empty source, or an invalid batch size, number of workers or rank.
     """
 
     def __init__(
@@ -79,11 +76,7 @@ class Loader:
         self.skipped: Counter[str] = Counter()
 
     def batches(self, step: int = 0) -> Iterator[Batch]:
-        """Infinite batches, starting at a step.
-
-        Raises:
-            InputError: too many consecutive samples are unreadable.
-        """
+        """Infinite batches, starting at a step."""
         loader = DataLoader(
             self.reader,
             batch_sampler=self._positions(step),

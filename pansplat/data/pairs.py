@@ -131,19 +131,11 @@ class Pair:
 
     @property
     def image_height(self) -> int:
-        """Height of the smallest context panorama, pixels.
-
-        Raises:
-            InputError: an image cannot be used.
-        """
+        """Height of the smallest context panorama, pixels."""
         return min(read_height(panorama.image) for panorama in self.context)
 
     def load_context(self, height: int) -> Views:
-        """The context panoramas at (height, 2 height). Warns when two camera centres coincide.
-
-        Raises:
-            InputError: an image, mask or depth file cannot be used.
-        """
+        """The context panoramas at (height, 2 height). Warns when two camera centres coincide."""
         centres = torch.stack([panorama.cam2world[:3, 3] for panorama in self.context])
         if len(self.context) > MAX_CONTEXT:
             raise too_many_panoramas(self.name, len(self.context))
@@ -158,11 +150,7 @@ class Pair:
         return self._load(self.context, height)
 
     def load_targets(self, height: int) -> Views:
-        """The target panoramas at (height, 2 height); `Views` of length 0 when the pair has no targets.
-
-        Raises:
-            InputError: an image, mask or depth file cannot be used.
-        """
+        """The target panoramas at (height, 2 height); `Views` of length 0 when the pair has no targets."""
         return self._load(self.targets, height)
 
     def _load(self, panoramas: tuple[Panorama, ...], height: int) -> Views:
@@ -247,9 +235,6 @@ class Collection:
         Args:
             folder: of the files.
             near, far: metres; they override the collection's values.
-
-        Raises:
-            InputError: no panorama has a pose, or the depth range is invalid.
         """
         if not self.panoramas:
             raise InputError(f"{self.source}: needed posed panoramas, got none; add them and their poses.")
@@ -363,9 +348,6 @@ def single_view_pairs(
         near, far: metres; None for the range of rooms.
         siblings: panoramas of the same camera, by default the same ones.
         first_world: of the first panorama; each has a world of its own.
-
-    Raises:
-        InputError: an invalid depth range.
     """
     near, far = NEAR if near is None else near, FAR if far is None else far
     require_depth_range(near, far, folder, 'set "near" and "far" on the command line')

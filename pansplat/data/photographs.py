@@ -25,11 +25,7 @@ LINKS = "links.json"
 
 
 def read_photograph(image: Path) -> Panorama:
-    """A 2:1 picture, or one that holds six cube faces, as a panorama at the origin of a world of its own.
-
-    Raises:
-        InputError: it cannot be read, or shows something else.
-    """
+    """A 2:1 picture, or one that holds six cube faces, as a panorama at the origin of a world of its own."""
     return _make_panorama(image.stem, _read_picture(image), image.parent)
 
 
@@ -37,9 +33,6 @@ def list_photographs(folder: Path) -> list[Panorama]:
     """The panoramas among the pictures of a folder, sorted by name, with the links of links.json.
 
     Pictures that pansplat rendered count only if there are no other panoramas. Warns about pictures that are left out.
-
-    Raises:
-        InputError: there are pictures, and none can be used.
     """
     every = list_panorama_files(folder)
     rendered = [image for image in every if is_written(image)]

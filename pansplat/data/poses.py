@@ -58,11 +58,7 @@ class Trajectory:
 
 
 def parse_convention(text: str | None, source: Path | str) -> str:
-    """The member of `CONVENTIONS` that a free text names. `source` is the file or argument that error messages name.
-
-    Raises:
-        InputError: no text, or a text without exactly one direction and one kind of axes.
-    """
+    """The member of `CONVENTIONS` that a free text names. `source` is the file or argument that error messages name."""
     names = ", ".join(f'"{name}"' for name in CONVENTIONS)
     advice = f"write one of {names} (habitat is the same as opengl); `pansplat check` finds the one that fits."
     if not isinstance(text, str) or not text.strip():
@@ -76,11 +72,7 @@ def parse_convention(text: str | None, source: Path | str) -> str:
 
 
 def rigid_matrix(values: Any, source: str) -> Float[Tensor, "4 4"]:
-    """The rigid 4x4 matrix, float64, nearest to nested lists of 3x4 or 4x4 numbers.
-
-    Raises:
-        InputError: another shape, not numbers, NaN, or a mirrored, scaled, sheared or transposed matrix.
-    """
+    """The rigid 4x4 matrix, float64, nearest to nested lists of 3x4 or 4x4 numbers."""
     if values is None:
         raise InputError(f"{source}: needed a pose, got none; add its 4x4 matrix or remove the image.")
     try:
@@ -159,11 +151,7 @@ def from_cam2world(matrix: Float[Tensor, "4 4"], convention: str) -> Float[Tenso
 
 
 def read_number(path: Path) -> float:
-    """The one positive number in a text file, such as a scale.
-
-    Raises:
-        InputError: the file holds anything else.
-    """
+    """The one positive number in a text file, such as a scale."""
     text = read_file(path, limit=_MAX_NUMBERS_BYTES).decode(errors="replace").strip()
     try:
         number = float(text)
@@ -184,9 +172,6 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
         path: text file; numbers separated by spaces or commas.
         convention: one of `CONVENTIONS`; overrides the default.
         expected: "kitti" or "tum" to refuse the other format; None to accept both.
-
-    Raises:
-        InputError: neither format, another format than expected, or a pose that is not rigid.
     """
     convention = "cam2world opencv" if convention is None else parse_convention(convention, "`convention`")
     rows = _number_rows(path)

@@ -104,9 +104,6 @@ class RigImage:
         """The panorama at (height, 2 height), and the share of each pixel that the pictures show; None for all.
 
         A pixel is the mean of 2 x 2 bicubic samples of the picture whose edge is farthest away.
-
-        Raises:
-            InputError: a picture is missing or cannot be read.
         """
         cube = self._find_cube()
         if cube is not None:
@@ -228,11 +225,7 @@ def write_rig(rig: RigImage, folder: Path, name: str) -> Path:
 
 
 def read_rig(path: Path) -> RigImage:
-    """The rig that a file of `write_rig` stands for.
-
-    Raises:
-        InputError: it is no such file.
-    """
+    """The rig that a file of `write_rig` stands for."""
     content = read_json(path, dict[str, Any])
     try:
         views = tuple(_read_view(view) for view in content["views"])

@@ -98,11 +98,7 @@ class FrameSequence(Protocol):
     def poses(self) -> Sequence[Float[Tensor, "4 4"]]: ...
 
     def read(self, frames: Sequence[int], height: int) -> Views:
-        """The given frames at (height, 2 height), in the order of `frames`.
-
-        Raises:
-            InputError: an image, video or mask cannot be used.
-        """
+        """The given frames at (height, 2 height), in the order of `frames`."""
         ...
 
 
@@ -173,11 +169,7 @@ def read_frame_pair(sequence: FrameSequence, pair: FramePair, height: int) -> Sa
 
 
 def read_loc360(root: Path | str, stage: Stage) -> list[ImageSequence]:
-    """The 360Loc sequences of a stage's locations, by name: ROOT/{location}/{mapping|query_360}/{*360*}/.
-
-    Raises:
-        InputError: a location is missing or has no sequence, or a camera_pose.json is invalid.
-    """
+    """The 360Loc sequences of a stage's locations, by name: ROOT/{location}/{mapping|query_360}/{*360*}/."""
     root = expand_home(root)
     sequences = []
     for location in LOCATIONS[stage]:
@@ -202,11 +194,7 @@ def read_loc360(root: Path | str, stage: Stage) -> list[ImageSequence]:
 
 
 def read_insta360(root: Path | str) -> list[VideoSequence]:
-    """The posed videos of a folder or of its subfolders, by name. Source: docs/official.md, section 2.3.
-
-    Raises:
-        InputError: no video was found, or a file is missing or invalid.
-    """
+    """The posed videos of a folder or of its subfolders, by name. Source: docs/official.md, section 2.3."""
     root = expand_home(root)
     if not root.is_dir():
         raise InputError(f"{root}: needed a folder with a video and its trajectory, got no such folder; check it.")
@@ -224,9 +212,6 @@ def read_video_folder(folder: Path) -> VideoSequence:
 
     Line i of a KITTI file is the pose of frame i. So is line i of a TUM file with one line per frame; otherwise a TUM
     line is the pose of the frame shown at its time (seconds since the first frame).
-
-    Raises:
-        InputError: no or several videos or trajectories, or poses that do not match the frames.
     """
     videos = _list_videos(folder)
     default = [video for video in videos if video.stem == "video"]

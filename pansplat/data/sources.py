@@ -43,11 +43,7 @@ class SampleSource(Protocol):
     def __len__(self) -> int: ...
 
     def sample(self, index: int, height: int, seed: int) -> Sample:
-        """Sample `index` at (height, 2 height).
-
-        Raises:
-            InputError: one of its files cannot be used.
-        """
+        """Sample `index` at (height, 2 height)."""
         ...
 
 
@@ -91,11 +87,7 @@ class TripletSet:
     sources: tuple[Path, ...]
 
     def pair(self, index: int) -> Pair:
-        """Triplet `index` as a pair with a target; without detection of static content.
-
-        Raises:
-            InputError: a file is missing or invalid.
-        """
+        """Triplet `index` as a pair with a target; without detection of static content."""
         source = self.sources[index]
         collection = read_triplet(source) if source.is_file() else read_matterport3d_scene(source)
         (pair,) = collection.pairs(source if source.is_dir() else source.parent)
@@ -202,9 +194,6 @@ def read_panogrf(
         stage: train and val have m3d at 0.5 m only.
         height: height at which the panoramas will be read, pixels.
         sets: data set and distance of each set; None for all of the stage.
-
-    Raises:
-        InputError: all sets are missing.
     """
     root = expand_home(root)
     sets = sets if sets is not None else TEST_SETS if stage == "test" else TRAINING_SETS
@@ -226,11 +215,7 @@ def read_panogrf(
 
 
 def read_game_maps(folder: Path | str) -> TripletSet:
-    """The game-map triplets (NAME.json) of a folder.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The game-map triplets (NAME.json) of a folder."""
     folder = expand_home(folder)
     sources = tuple(triplet_files(folder))
     if not sources:

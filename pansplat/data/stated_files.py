@@ -11,11 +11,7 @@ from pansplat.errors import InputError
 
 
 def locate_inside(folder: Path, name: str, where: object = "") -> Path:
-    """The normalised path of a file that a list names, relative to the folder or whole; it need not exist.
-
-    Raises:
-        InputError: it leads out of the folder, or is a description of other pictures; the message begins with `where`.
-    """
+    """The normalised path of a file that a list names, relative to the folder or whole; it need not exist."""
     top = Path(os.path.abspath(folder))
     path = Path(os.path.normpath(top / name))
     if "\0" not in name and path.is_relative_to(top) and not name.endswith((CUBE_SUFFIX, RIG_SUFFIX)):

@@ -47,11 +47,7 @@ class VideoFile:
         return [float((stamp - self.stamps[0]) * self.time_base) for stamp in self.stamps]
 
     def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
-        """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order.
-
-        Raises:
-            InputError: no such frame, or damaged data.
-        """
+        """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order."""
         numbers = sorted(set(frames))
         if numbers and not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
             raise InputError(
@@ -94,11 +90,7 @@ class VideoFile:
 
 
 def open_video(path: Path | str) -> VideoFile:
-    """A video file with the times of its frames, which are read from packets without decoding.
-
-    Raises:
-        InputError: no such file, no video stream, or frames without times.
-    """
+    """A video file with the times of its frames, which are read from packets without decoding."""
     path = Path(path)
     with _open_container(path) as container:
         from av.error import FFmpegError
@@ -163,9 +155,6 @@ def write_video(
         panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
             players then show an .mp4 as 360 degrees. A .webm has no such mark.
         stereo: arrangement of the eyes in a panorama's frame.
-
-    Raises:
-        InputError: neither .mp4 nor .webm, no frame, a frame of another shape, `fps` not positive.
     """
     path = Path(path)
     if path.suffix.lower() not in VIDEO_SUFFIXES:
@@ -202,11 +191,7 @@ def write_video(
 
 
 def video_encoder(suffix: str = ".mp4") -> str:
-    """Name of the encoder that `write_video` uses for files of a suffix.
-
-    Raises:
-        InputError: PyAV has no supported encoder.
-    """
+    """Name of the encoder that `write_video` uses for files of a suffix."""
     import av
     import av.codec
 

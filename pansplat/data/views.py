@@ -112,11 +112,7 @@ class Batch:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Stack samples into a batch.
-
-    Raises:
-        InputError: no sample, or samples with different numbers or sizes of views.
-    """
+    """Stack samples into a batch."""
     if not samples:
         raise InputError("needed at least one sample for a batch, got none.")
     first = samples[0]

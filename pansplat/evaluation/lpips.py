@@ -81,9 +81,6 @@ class Lpips(nn.Module):
         Args:
             prediction, target: RGB in [0, 1]; values outside are not clamped.
             weights: of the pixels; by default equal. The prediction is not used at pixels of weight 0.
-
-        Raises:
-            InputError: the images are too small for the classifier.
         """
         if min(target.shape[-2:]) < MIN_IMAGE_SIZE:
             size = "x".join(str(side) for side in target.shape[-2:])
@@ -272,9 +269,6 @@ def load_lpips(backbone: Backbone, folder: Path | None = None) -> Lpips:
         backbone: the paper's figures are those of "vgg".
         folder: searched first; then the folder of PANSPLAT_LPIPS, the cache of torch.hub, and, for the channels'
             weights, an installed `lpips` package.
-
-    Raises:
-        InputError: a file is missing (the message states its source and its folder) or damaged.
     """
     classifier, heads = find_classifier(backbone, folder), find_heads(backbone, folder)
     if classifier is None or heads is None:

@@ -324,12 +324,7 @@ def run_protocol(
     lpips: Lpips | None = None,
     progress: Progress | None = None,
 ) -> ProtocolResult:
-    """Evaluate the methods on the available sets; results.json is written after every case.
-
-    Raises:
-        InputError: no data is available (the message names the folders), none of it can be read, or `out` cannot be
-            written.
-    """
+    """Evaluate the methods on the available sets; results.json is written after every case."""
     options = options or ProtocolOptions()
     sets = find_sets(protocol, root, options)
     result = ProtocolResult(protocol, options.height, lpips.name if lpips else None)

@@ -64,9 +64,6 @@ def evaluate(
         refine_seconds: time limit of the refinement of each scene; 0 for none.
         blend, drawing: see `pipeline.render`. With "joint", scenes are fused (`fuse_views`), but those of networks are
             not: these are trained for joint drawing.
-
-    Raises:
-        InputError: no pair has a target, or `out` cannot be written.
     """
     with_targets = [pair for pair in pairs if pair.targets]
     if not with_targets:

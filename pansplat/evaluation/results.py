@@ -121,11 +121,7 @@ def _make_finite(value: Any) -> Any:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and its parents.
-
-    Raises:
-        InputError: it cannot be made.
-    """
+    """Make a folder and its parents."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

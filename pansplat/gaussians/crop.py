@@ -62,9 +62,6 @@ def crop(scene: Scene, box: Box) -> Scene:
     """The part of a scene whose Gaussians have their centres in a box.
 
     Cameras outside are left out with their layers; if all are outside, those stay that have Gaussians in the box.
-
-    Raises:
-        InputError: nothing is in the box.
     """
     is_inside = are_in_box(scene.gaussians.means, box)
     views = are_in_box(scene.cam2world[:, :3, 3], box).nonzero()[:, 0].tolist()

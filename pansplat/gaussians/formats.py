@@ -104,9 +104,6 @@ def save_scene(scene: Scene, path: str | Path) -> None:
     """Write a scene in the format of the file's suffix, atomically, in the user's unit.
 
     Gaussians with a non-finite value are left out with a warning, and so are harmonics above the format's degree.
-
-    Raises:
-        InputError: unknown suffix, a scene that the format cannot hold, or a folder that cannot be written.
     """
     path, scene = Path(path), scene.scaled(scene.frame.unit)
     coded = _CODED.get(find_scene_suffix(path))
@@ -122,9 +119,6 @@ def load_scene(path: str | Path) -> Scene:
     """Read a scene file of `save_scene` or of another tool.
 
     A file without a pansplat entry gives a scene without cameras, with all Gaussians at level 0 of view 0.
-
-    Raises:
-        InputError: unknown suffix, or the file is missing, damaged or without Gaussians.
     """
     path = Path(path)
     if path.is_dir():

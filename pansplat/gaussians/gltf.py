@@ -57,9 +57,6 @@ def save_glb(scene: Scene, path: Path) -> None:
     """Write a scene as a .glb, atomically, in float32.
 
     Gaussians with a non-finite value and harmonics above degree 3 are left out with a warning.
-
-    Raises:
-        InputError: no Gaussian, more than 4 GiB, or a folder that cannot be written.
     """
     gaussians = sort_by_label(limit_degree(select_finite(scene.gaussians, path), _MAX_DEGREE, path))
     if not len(gaussians):
@@ -81,9 +78,6 @@ def write_glb(
         blocks: of the buffer, in order; each takes a multiple of 4 bytes.
         path: the file.
         content, advice: what it holds, and what to do if that is too much, for the message.
-
-    Raises:
-        InputError: more than 4 GiB, or a folder that cannot be written.
     """
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)

@@ -88,10 +88,6 @@ def save_mesh(mesh: Mesh, path: Path, *, overwrite: bool | None = True) -> tuple
 
     Textures show only what triangles need of them: the rest has the colours around it. `overwrite` is that of
     `pansplat.files.require_replaceable`.
-
-    Raises:
-        InputError: no triangle, another suffix, more than 4 GiB, a file that pansplat did not write, or a folder that
-            cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:

@@ -62,9 +62,6 @@ def save_ply(scene: Scene, path: str | Path) -> None:
 
     Gaussians with a non-finite value are left out with a warning. The order is kept, unless levels and views alternate
     more than a few thousand times: then the Gaussians are sorted by level and view.
-
-    Raises:
-        InputError: when the folder does not exist or cannot be written.
     """
     path = Path(path)
     gaussians = sort_by_label(select_finite(scene.gaussians, path))
@@ -93,7 +90,6 @@ def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -
         Number of Gaussians in the file.
 
     Raises:
-        InputError: when the folder does not exist or cannot be written.
         ValueError: a part has another degree than the first.
     """
     path, unit = Path(path), scene.frame.unit
@@ -201,9 +197,6 @@ def load_ply(path: str | Path) -> Scene:
 
     A file of another tool gives a scene without cameras, with all Gaussians at level 0 of view 0. Gaussians with a
     non-finite value are left out with a warning.
-
-    Raises:
-        InputError: the file is missing, not a binary .ply of Gaussians, truncated, or has no finite Gaussian.
     """
     path = Path(path)
     require_file(path, "a .ply scene")
@@ -221,9 +214,6 @@ def read_ply(file: BufferedIOBase, path: Path) -> tuple[Gaussians, list[str]]:
     Args:
         file: the data, at its begin.
         path: the file that messages name.
-
-    Raises:
-        InputError: not a binary .ply of Gaussians, or truncated.
     """
     header = _read_header(file, path)
     _seek_vertices(file, header, path)

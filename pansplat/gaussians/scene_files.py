@@ -77,9 +77,6 @@ def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
         gaussians: all Gaussians of the file in its order; their labels are not used.
         entry: the pansplat entry, if the file has one.
         path: the file that messages name.
-
-    Raises:
-        InputError: no Gaussian is finite.
     """
     stated = _parse_entry(entry, path)
     levels, views = _read_labels(stated.runs, len(gaussians), len(stated.cam2world), path)

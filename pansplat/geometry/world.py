@@ -87,11 +87,7 @@ def choose_unit(near: float) -> float:
 
 
 def require_working_world(cam2world: Float[Tensor, "*batch 4 4"], near: float, far: float) -> None:
-    """Check poses and depths of a prediction.
-
-    Raises:
-        InputError: see `require_depth_range`; or another unit, or places, that a working world does not have.
-    """
+    """Check poses and depths of a prediction."""
     require_depth_range(near, far, "`near` and `far`")
     farthest = float(cam2world[..., :3, 3].abs().max())
     if choose_unit(near) != 1 or farthest > _MAX_LOCAL:
@@ -108,9 +104,6 @@ def require_depth_range(near: float, far: float, source: object, advice: str = "
     Args:
         source: file or argument that error messages name.
         advice: what to do, for messages.
-
-    Raises:
-        InputError: not 0 < near < far, out of the supported range, or equal in float32.
     """
     if not 0 < near < far < math.inf:
         raise InputError(f"{source}: needed 0 < near < far in metres, got near={near:g} and far={far:g}; {advice}.")

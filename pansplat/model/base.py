@@ -66,9 +66,6 @@ class Network(nn.Module):
 
         Args:
             near, far: bounds of the depth, metres.
-
-        Raises:
-            InputError: fewer than two views ("official": not two), or a size that the network cannot halve.
         """
         matched = self.match_views(images, cam2world, near, far)
         return Prediction(merge_tiles(list(self.lift_gaussians(matched, tiles=tiles)), self.compat), matched)

@@ -172,8 +172,6 @@ class SphericalCostVolume(nn.Module):
             mono_features: features of the monocular network, at any size.
 
         Raises:
-            InputError: fewer than two views ("official": not two), a pose that is not rigid, or a map size that 4 does
-                not divide.
             ValueError: `mono_features` are missing, or given although `mono_channels` is 0.
         """
         require_views(cam2world.shape[1], self.compat)

@@ -79,11 +79,7 @@ class FeaturePyramid(nn.Module):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # convolves faster
 
     def forward(self, images: Images) -> list[Float[Tensor, "batch view _ _ _"]]:
-        """Compute features of RGB images in [0, 1], coarse to fine.
-
-        Raises:
-            InputError: fewer than two views ("official": not two), or a size that 32 ("official": 16) does not divide.
-        """
+        """Compute features of RGB images in [0, 1], coarse to fine."""
         batch_and_view = images.shape[:2]
         require_views(images.shape[1], self.compat)
         height, width = images.shape[-2:]

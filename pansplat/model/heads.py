@@ -240,9 +240,6 @@ class GaussianHeads(nn.Module):
 
         Args:
             tiles: tiles along each side of the panorama. With `compat="fixed"` the result does not depend on it.
-
-        Raises:
-            InputError: the levels and tiles do not divide the height.
         """
         return merge_tiles(list(self.iterate_tiles(matched, tiles=tiles)), self.compat)
 
@@ -254,9 +251,6 @@ class GaussianHeads(nn.Module):
         Args:
             only: row-major indices of the tiles to compute; by default all. The Gaussians and gradients of a tile do
                 not depend on the other tiles.
-
-        Raises:
-            InputError: the levels and tiles do not divide the height.
         """
         height = matched.images.shape[-2]
         self._require_divisible(height, tiles)

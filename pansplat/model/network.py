@@ -97,9 +97,6 @@ class NetworkPredictor:
         Args:
             near, far: radial depth range, metres: a number, or a tensor with one value per batch item or view.
             masks: True where a pixel shows the scene; Gaussians elsewhere are removed.
-
-        Raises:
-            InputError: the network does not accept the shapes, sizes, number of views or values.
         """
         if images.ndim == 5:
             return [
@@ -241,9 +238,6 @@ def load_predictor(
             mode of the training ("official" for official checkpoints).
         precision: number type of PanSplat's convolutions; docs/bench_model.md lists the time and error of bfloat16.
         attention_precision: number type that attention rounds to; bfloat16 in the official code.
-
-    Raises:
-        InputError: the file cannot be used, or the processor has no bfloat16 instructions.
     """
     path = Path(path)
     require_precision(precision)
@@ -296,9 +290,6 @@ def build_network(weights: WeightsFile, compat: Compat, source: object, **choice
 
     Args:
         choices: `precision` and `attention_precision`, as in `load_predictor`.
-
-    Raises:
-        InputError: the file's settings or tensors fit no network.
     """
     network = build_empty_network(weights, compat, source, **choices)
     require_shapes(weights.tensors, network.state_dict(), source)

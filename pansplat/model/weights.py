@@ -150,7 +150,6 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
     Raises:
         UnsafeCheckpointError: the file contains code.
-        InputError: the file is missing, damaged, or not a checkpoint.
     """
     path = Path(path)
     _require_file(path)
@@ -280,9 +279,6 @@ def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, 
     Args:
         content: result of `read_checkpoint`.
         source: the file, for messages.
-
-    Raises:
-        InputError: tensors are missing, unknown or not finite.
     """
     report = match_tensors(content, source)
     report.require_complete(source)

@@ -58,9 +58,6 @@ class PoseEditor:
         Args:
             folder: of the tour.
             panoramas: all of it, as they were loaded.
-
-        Raises:
-            InputError: a poses.json cannot state the poses of this folder.
         """
         self.file = folder / POSES
         self._sources = {panorama.placement.source for panorama in panoramas} - {None}
@@ -96,11 +93,7 @@ class PoseEditor:
         return bool(self._undo)
 
     def read(self) -> Content:
-        """The content of the poses.json, or what it would be for estimated poses.
-
-        Raises:
-            InputError: the file cannot be read.
-        """
+        """The content of the poses.json, or what it would be for estimated poses."""
         if self.file.exists():
             return read_pose_content(self.file)
         (source,) = self._sources
@@ -129,9 +122,6 @@ class PoseEditor:
             poses: cam2world of each, metres.
             world: of the file, whose other panoramas they are placed beside; None for one of their own.
             unit: metres that are a camera height, of a new world.
-
-        Raises:
-            InputError: the file cannot be read or written.
         """
         content = self.read()
         if world is None:
@@ -149,9 +139,6 @@ class PoseEditor:
         """Drop the pose of a panorama that is probable or placed by hand, and what only its pairs hold.
 
         Panoramas that leave their group together get a world of their own.
-
-        Raises:
-            InputError: the pose is certain, or the file cannot be read or written.
         """
         content, name = self.read(), self._names[image]
         poses = content["poses"]
@@ -186,9 +173,6 @@ class PoseEditor:
         """Take back the last rejection of a panorama, also of those that left their group with it.
 
         A panorama that was placed otherwise since stays where it is.
-
-        Raises:
-            InputError: there is no such rejection, or the file cannot be read or written.
         """
         content, name = self.read(), self._names[image]
         records = content.get("rejected") or []
@@ -207,11 +191,7 @@ class PoseEditor:
         self._write(content)
 
     def undo(self) -> None:
-        """Undo the last change: the file is as before, or removed if the change made it.
-
-        Raises:
-            InputError: there is none, another program has changed the file since, or it cannot be written.
-        """
+        """Undo the last change: the file is as before, or removed if the change made it."""
         if not self._undo:
             raise InputError(f"{self.file}: needed a change to undo, got none.")
         before, after = self._undo[-1]

@@ -256,7 +256,6 @@ def estimate_poses(
 
     Raises:
         NoPosesError: no two panoramas could be placed.
-        InputError: fewer than two images, or a file is missing.
     """
     paths = tuple(dict.fromkeys(Path(image) for image in images))
     report = part_of(progress)

@@ -43,12 +43,7 @@ SUFFIXES = (".json", ".tum", ".kitti")
 
 
 def require_mergeable(path: Path, images: Sequence[Path], *, overwrite: bool) -> None:
-    """Check, before the estimate, the file that `write_poses` is to write; it need not exist.
-
-    Raises:
-        InputError: a faulty poses.json, or one in another folder than the images; or without `overwrite` a trajectory,
-            or poses of all images that stay.
-    """
+    """Check, before the estimate, the file that `write_poses` is to write; it need not exist."""
     if path.suffix.lower() == ".json":
         names = set(name_pictures(path, images).values())
         if path.exists() and not (names and names <= find_kept(read_pose_content(path), path, names)):
@@ -62,9 +57,6 @@ def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) 
     Names in a poses.json are relative to its folder; each group is a world. If the file exists, the poses are merged
     into it (`pansplat.poses.edit.merge_estimate`), and it stays as NAME.bak. A trajectory has one line for each
     panorama of the largest group, in the order of the names; the timestamps of TUM are the panoramas' numbers.
-
-    Raises:
-        InputError: another suffix, or the file cannot be written.
     """
     if path.suffix.lower() == ".json":
         names = name_pictures(path, estimate.images)
@@ -121,9 +113,6 @@ def estimate_pairs(
         near, far: metres; they override the estimated range.
         camera_height: of the cameras over the floor, metres.
         progress: called with a description of the current work and the completed fraction.
-
-    Raises:
-        InputError: a file is missing, or none can be read.
     """
     name = f"poses-{_hash_inputs(panoramas, camera_height)}.json"
     folders = cache_folders(folder)

@@ -32,9 +32,6 @@ def extract_key_frames(
 
     The video is divided into intervals of equal length. The sharpest of some frames of each interval is a candidate; it
     is left out if its parallax to the last key frame is small.
-
-    Raises:
-        InputError: not a 2:1 video, the camera did not move, or other pictures are in the way without `overwrite`.
     """
     video = open_video(path)
     require_known_masks(path.parent)

@@ -71,7 +71,6 @@ def load_matcher(path: Path | None = None) -> Matcher:
 
     Raises:
         MatcherMissingError: there is no such file.
-        InputError: the file is damaged, or holds other weights.
     """
     path = default_weights() if path is None else path
     if not path.is_file():

@@ -140,11 +140,7 @@ class Piece:
 
 
 def read_piece(image: Path) -> Piece:
-    """The piece of a panorama file, with its depth by the default model.
-
-    Raises:
-        InputError: the file cannot be used.
-    """
+    """The piece of a panorama file, with its depth by the default model."""
     pixels = read_panorama(image, min(read_height(image), _IMAGE_HEIGHT))[0].permute(1, 2, 0).numpy()
     grey = cv2.cvtColor((pixels * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
     axes = with_hints(find_axes(grey), read_hints(image).down, None)

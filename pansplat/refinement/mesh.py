@@ -42,9 +42,6 @@ def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Tex
         scene: with input cameras; of a joint scene all Gaussians are drawn for each.
         triangles: largest number; bounds the rows of the panoramas, of which there are at most 512.
         textures: by default the images of the views' Gaussians at their cameras.
-
-    Raises:
-        InputError: no input camera, or a limit that is too low for their number.
     """
     count = len(scene.cam2world)
     if not count:

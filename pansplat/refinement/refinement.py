@@ -132,10 +132,6 @@ class Refinement:
             not compared.
         config: settings.
         seed: of the choice of held-out blocks.
-
-    Raises:
-        InputError: scene and views do not fit, or an image is not finite. Poses are to be corrected in a scene for
-            joint drawing: each photograph shows mostly its own Gaussians, which would move with it.
     """
 
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
@@ -354,9 +350,6 @@ class Refinement:
             steps: number of steps; the result is the same in every run on one machine.
             progress: called with a description and the completed fraction.
             should_stop: checked before each step; True ends the run and keeps the state.
-
-        Raises:
-            InputError: neither or both of `seconds` and `steps` are given, or one is not positive.
         """
         min_steps = 0 if self.config.gaussians is None else _MIN_STEPS
         if self._start.joint:

@@ -60,11 +60,7 @@ class Selection:
 def select_drawable(
     gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, pose: Float[Tensor, "4 4"], options: RasterOptions
 ) -> Selection:
-    """Select Gaussians before any arithmetic, so that the gradients of all others are exactly zero.
-
-    Raises:
-        InputError: `options.strict` and a Gaussian is not finite.
-    """
+    """Select Gaussians before any arithmetic, so that the gradients of all others are exactly zero."""
     radius = _compute_radius(gaussians, pose)
     close = radius < options.near
     usable = _are_usable(gaussians, covariances, radius, close)

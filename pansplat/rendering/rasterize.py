@@ -46,9 +46,6 @@ class RasterOptions:
         near: Gaussians whose mean is nearer are not rasterised, metres.
         strict: raise an error for Gaussians that are not finite, instead of dropping them.
         stitching: of cube faces, "seamless", or "official" with the borders of the official code.
-
-    Raises:
-        InputError: a field is out of range.
     """
 
     kernel: Kernel = "ray"
@@ -147,9 +144,6 @@ class RasterBackend(Protocol):
             pose: cam2world, float64, rigid.
             planes: of one size and focal length; a panorama with an eye offset is the only one.
             options: `stitching` is not used.
-
-        Raises:
-            InputError: `options.strict`, and a Gaussian is not finite.
         """
         ...
 
@@ -240,10 +234,6 @@ def rasterize(
 
     Returns:
         The image, in the Gaussians' type.
-
-    Raises:
-        InputError: an argument is out of range or does not fit the Gaussians, the pose is not rigid, kernel "ewa" is
-            combined with layout "equirect" or backend "numba", or `strict` and a Gaussian is not finite.
     """
     given: dict[str, Any] = dict(
         kernel=kernel, order=order, lowpass=lowpass, near=near, strict=strict, stitching=stitching

@@ -76,10 +76,6 @@ class Sweep:
                 range then covers all views.
             masks: True where a pixel shows the scene. Other pixels are not matched and have no Gaussians. Patches of
                 exact black (0, 0, 0), the holes of scans, are masked too.
-
-        Raises:
-            InputError: wrong shapes, no view, non-finite values, near >= far, or a world of another unit or far from
-                its origin.
         """
         if images.ndim == 5:
             item_masks = [None] * len(images) if masks is None else masks

@@ -262,9 +262,6 @@ def write_floor_plan(scene: Scene, path: str | Path) -> None:
     Args:
         scene: with input cameras.
         path: the file, such as a .png.
-
-    Raises:
-        InputError: no view shows a floor, or the file cannot be written.
     """
     tour = make_graph(scene)
     outlines = find_floor_outlines(tour, scene, tuple(range(len(tour)))) if len(tour) else {}

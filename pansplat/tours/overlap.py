@@ -28,9 +28,6 @@ def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = Non
 
     Each panorama is compared with its nearest neighbours within 0.4 far, of those with poses in the same world. Given
     edges are walls if their panoramas show nothing in common.
-
-    Raises:
-        InputError: an image cannot be read.
     """
     report = progress or (lambda what, done: None)
     world = np.array([panorama.world for panorama in tour.panoramas])

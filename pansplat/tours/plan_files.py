@@ -62,9 +62,6 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
     Args:
         scene: with input cameras, not fused.
         path: a .svg, .png or .dxf.
-
-    Raises:
-        InputError: no panorama shows walls around it, another suffix, or the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -96,9 +93,6 @@ def write_picture(scene: Scene, path: str | Path) -> Plan | None:
 
     Returns:
         The plan; None if only the floors are shown, as in a scene with each surface once.
-
-    Raises:
-        InputError: no panorama shows a floor, or the file cannot be written.
     """
     if not scene.joint and _find_rooms(scene) is not None:
         return write_plan(scene, path)

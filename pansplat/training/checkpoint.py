@@ -43,9 +43,6 @@ def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: 
     """Write the checkpoint after `step` steps, then delete all but the newest `keep` checkpoints.
 
     The file is synced to disk before it is renamed, so that older checkpoints survive a kill or a power failure.
-
-    Raises:
-        InputError: the disk is full or not writable; older checkpoints are kept.
     """
     path = folder / f"step_{step:08d}.pt"
     folder.mkdir(parents=True, exist_ok=True)
@@ -98,7 +95,6 @@ def load_latest(
 
     Raises:
         UnsafeCheckpointError: a checkpoint contains code.
-        InputError: no checkpoint is usable, or `restore` refused one for another reason.
     """
     if folder.is_dir():
         for partial in folder.glob(".step_*.pt"):

@@ -176,9 +176,6 @@ def require_same(saved: str, config: TrainConfig, source: Path) -> None:
     Args:
         saved: settings of the run, from `as_json`.
         source: the checkpoint that error messages name.
-
-    Raises:
-        InputError: settings differ; the message names them.
     """
     where = f"{source}: config"
     old, new = convert(parse_json(saved, where), dict[str, Any], where), json.loads(as_json(config))

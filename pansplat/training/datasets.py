@@ -45,9 +45,6 @@ def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSour
 
     Args:
         height: height of the panoramas; selects the folder of some data sets.
-
-    Raises:
-        InputError: the data are missing or invalid.
     """
     if config.kind == "room":
         return RoomTriplets(seed), RoomTriplets(seed + _VALIDATION_SEED_OFFSET)

@@ -37,9 +37,6 @@ class ProcessGroup:
     Attributes:
         rank, count: index of this process, and number of processes.
         local_rank: index of this process on its machine.
-
-    Raises:
-        InputError: the environment is inconsistent.
     """
 
     def __init__(self) -> None:
@@ -58,9 +55,6 @@ class ProcessGroup:
 
         Args:
             name: "auto", "cpu" or "cuda".
-
-        Raises:
-            InputError: "cuda" without a CUDA device, or more processes than devices.
         """
         if name == "cpu" or not torch.cuda.is_available():
             if name == "cuda":

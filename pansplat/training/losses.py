@@ -189,9 +189,6 @@ def choose_perceptual(
     Args:
         folder: folder of the LPIPS weights; see `load_lpips`.
         device: device of the LPIPS weights; the CPU by default.
-
-    Raises:
-        InputError: unknown name, or files of the named LPIPS are missing.
     """
     if name in _BACKBONES:
         return load_lpips(_BACKBONES[name], folder).to(device)

@@ -52,11 +52,7 @@ def _small_config(
 
 
 def build_network(config: NetworkConfig, seed: int) -> Network:
-    """The network with the weights of `config.init`, or with random weights from the seed; frozen parts are frozen.
-
-    Raises:
-        InputError: the weights do not match, or are missing for the monocular network, which is not trained.
-    """
+    """The network with the weights of `config.init`, or with random weights from the seed; frozen parts are frozen."""
     require_precision(config.precision)
     initial = None if config.init is None else read_weights(config.init)
     torch.manual_seed(seed)

@@ -78,9 +78,6 @@ class Trainer:
         config: the settings.
         processes: the processes that train together.
         silent: print nothing.
-
-    Raises:
-        InputError: settings, data or weights that cannot be used.
     """
 
     def __init__(self, config: TrainConfig, processes: ProcessGroup | None = None, *, silent: bool = False) -> None:
@@ -267,7 +264,6 @@ class Trainer:
 
         Raises:
             DamagedCheckpointError: a key is missing or does not fit.
-            InputError: the run was started with other settings.
         """
         restore(state, "config", lambda text: convert(parse_json(text, "config"), dict, "config"))
         require_same(state["config"], self.config, path)

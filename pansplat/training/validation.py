@@ -42,9 +42,6 @@ def validate(
         pictures: number of samples that are written as PNG: the target above, its rendering below.
         folder: folder of the PNGs; None for none.
         name: file name of the PNGs before the sample's number.
-
-    Raises:
-        InputError: no sample is readable, or an image cannot be written.
     """
     network.eval()
     values: dict[str, list[float]] = {measure: [] for measure in MEASURES}

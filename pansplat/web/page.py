@@ -128,10 +128,6 @@ def write_page(
         title: of the page; by default the name of the file.
         embed: origins of host pages that move the camera by messages (docs/web.md, Embedding).
         progress: called with a description of the current work and the completed fraction.
-
-    Raises:
-        InputError: the scene has no visible Gaussians, the page would be too large, `embed` holds no origins, or the
-            page cannot be written.
     """
     path, embed = Path(path), parse_origins(embed)
     report: Progress = progress or (lambda what, fraction: None)
@@ -549,11 +545,7 @@ def _write_files(
 
 
 def parse_origins(texts: Sequence[str]) -> tuple[str, ...]:
-    """Origins as browsers write them: in lower case, without the default port.
-
-    Raises:
-        InputError: a text is not an origin.
-    """
+    """Origins as browsers write them: in lower case, without the default port."""
     origins = []
     for text in texts:
         found = _ORIGIN.fullmatch(text.lower()) if text.isascii() else None

@@ -68,9 +68,6 @@ class FrameRenderer(Protocol):
             RGBA texture: colour over the background, and coverage. Row 0 is the bottom row, so the texture is upright
             when drawn as any OpenGL texture. The next call overwrites its content. None while the processor draws the
             first image of a scene, and without a context.
-
-        Raises:
-            InputError: no scene is uploaded, or the size or a setting does not fit the scene or the renderer.
         """
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:

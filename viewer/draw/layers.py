@@ -192,9 +192,6 @@ class TargetStore:
         """Return the target of this name and size, with content of the same `key` or without valid content.
 
         A target with valid content keeps its depth texture even if the call does not need it.
-
-        Raises:
-            InputError: the size exceeds the GPU's limit.
         """
         if max(size) > self._max_size:
             raise InputError(

@@ -34,9 +34,6 @@ def create_context(backend: Literal["auto", "egl", "osmesa", "system"] = "auto")
     Args:
         backend: `auto` is `system` (a hidden window on Windows, none on macOS) where there is no EGL, and elsewhere EGL
             (GPU or software), then OSMesa (software only).
-
-    Raises:
-        InputError: OpenGL 3.3 is not available; the message has the reasons and what to install.
     """
     makers = {
         "egl": lambda: _create_newest(backend="egl"),

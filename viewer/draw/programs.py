@@ -24,11 +24,7 @@ _MAX_ERRORS = 8  # that OpenGL can report at once
 
 
 def choose_tier(ctx: moderngl.Context, tier: str, count: int = 0) -> str:
-    """Return `gl43` if the context has compute shaders for `count` Gaussians and `tier` allows it, else `gl33`.
-
-    Raises:
-        InputError: `tier` is unknown, or `gl43` on a context that does not support it.
-    """
+    """Return `gl43` if the context has compute shaders for `count` Gaussians and `tier` allows it, else `gl33`."""
     if tier not in ("auto", "gl33", "gl43"):
         raise InputError(f"`tier` must be auto, gl33 or gl43, got {tier!r}")
     if tier == "gl33":

@@ -70,9 +70,6 @@ class SplatRenderer:
             tier: `gl33` culls and sorts on the processor; `gl43` does it by compute shaders.
             color_bits: bits per channel of the render targets. None is 16 on a GPU, and 32 on software OpenGL, which
                 truncates half floats (images get darker with every layer) and is not slower with 32.
-
-        Raises:
-            InputError: the context does not support `tier`, or `color_bits` is neither 16 nor 32.
         """
         if color_bits is None:
             color_bits = 32 if is_software(ctx) else 16
@@ -279,11 +276,7 @@ class SplatRenderer:
 
 
 def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dict[int | None, float]:
-    """Return each layer's weight by its view (None: all Gaussians).
-
-    Raises:
-        InputError: the scene lacks the view, or the cameras that mode `deferred` needs.
-    """
+    """Return each layer's weight by its view (None: all Gaussians)."""
     settings, num_views = frame.settings, splats.num_views
     mode = settings.mode
     if mode == "joint":

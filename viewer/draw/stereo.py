@@ -63,11 +63,7 @@ class ImageFormat:
         return _DEFAULT_SIZES[self.projection]
 
     def check(self, size: tuple[int, int], preset: Preset = "exact") -> None:
-        """Refuse a size (width, height) or a preset that does not fit.
-
-        Raises:
-            InputError: a panorama that is not 2:1, a cubemap that is not 3:2, or stereo of these with preset `3dgs`.
-        """
+        """Refuse a size (width, height) or a preset that does not fit."""
         width, height = size
         if self.projection == "equirect" and width != 2 * height:
             raise InputError(f"`--size` must be 2:1 for projection equirect, got {width}x{height}")

@@ -50,11 +50,7 @@ def main() -> int:
 
 
 def run_job(job: dict[str, Any]) -> Iterator[dict[str, object]]:
-    """Yield the result lines of a job.
-
-    Raises:
-        InputError: OpenGL is missing, the scene cannot be read, or a setting is invalid.
-    """
+    """Yield the result lines of a job."""
     scene, pose = load_ply(job["scene"]), np.asarray(job["pose"], np.float64)
     sizes = [tuple(values.get("size", job["size"])) for values in job["settings"]]
     settings = [

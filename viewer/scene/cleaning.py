@@ -123,11 +123,7 @@ class MaskPainter:
         return found
 
     def save(self) -> Path:
-        """Write the mask beside its photograph, and return its file.
-
-        Raises:
-            InputError: it cannot be written, or hides all.
-        """
+        """Write the mask beside its photograph, and return its file."""
         path = name_blur_mask(self.panorama.image)
         if self.hidden.all():
             raise InputError(f"{path}: needed a part of the photograph that is shown, got a mask of all of it; erase")

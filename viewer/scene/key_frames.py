@@ -153,11 +153,7 @@ class _File(Struct, forbid_unknown_fields=True):
 
 
 def read_path(file: Path) -> CameraPath:
-    """The path of a JSON file.
-
-    Raises:
-        InputError: unreadable, an unknown or missing field, a value out of range, or times that do not increase.
-    """
+    """The path of a JSON file."""
     frames = [KeyFrame(*(getattr(entry, key) for key in _FIELDS)) for entry in read_json(file, _File).key_frames]
     if not frames:
         raise InputError(f'{file}: needed one or more "key_frames", got none; add them.')
@@ -174,11 +170,7 @@ def read_path(file: Path) -> CameraPath:
 
 
 def write_path(path: CameraPath, file: Path) -> None:
-    """Write a path to a JSON file, which appears complete or not at all.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a path to a JSON file, which appears complete or not at all."""
     rows = [{key: getattr(frame, key) for key in _FIELDS} for frame in path.key_frames]
     text = "[\n  " + ",\n  ".join(json.dumps(row) for row in rows) + "\n]"
     with replacing(file) as unfinished:

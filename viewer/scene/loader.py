@@ -120,9 +120,6 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
         path: a file or folder.
         options: arguments of reading.
         progress: called while the poses of panoramas without poses are estimated.
-
-    Raises:
-        InputError: the path does not exist, or holds neither pairs nor scene files.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene file")

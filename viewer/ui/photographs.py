@@ -69,11 +69,7 @@ class Photographs:
         return int(np.argmin(np.linalg.norm(self._positions - position, axis=1)))
 
     def get(self, index: int) -> moderngl.Texture | None:
-        """The texture of a photograph, top row first; None while it is being read, or if it cannot be read.
-
-        Raises:
-            InputError: the file cannot be used; raised once.
-        """
+        """The texture of a photograph, top row first; None while it is being read, or if it cannot be read."""
         if index in self._textures:
             self._textures.move_to_end(index)
             return self._textures[index]
@@ -120,11 +116,7 @@ class Photographs:
 
 
 def find_open_view(panorama: Panorama) -> float:
-    """The yaw with the most edges around it: a wide view rather than a bare wall. Radians right of the centre.
-
-    Raises:
-        InputError: the file cannot be used.
-    """
+    """The yaw with the most edges around it: a wide view rather than a bare wall. Radians right of the centre."""
     gray = read_panorama(panorama.image, _VIEW_HEIGHT)[0].mean(dim=0).numpy()
     around = np.concatenate((gray, gray[:, :1]), axis=1)[_VIEW_HEIGHT // 4 : -_VIEW_HEIGHT // 4]  # within 45 degrees
     edges = np.abs(np.diff(around, axis=1))[:-1] + np.abs(np.diff(around, axis=0))[:, :-1]

@@ -38,9 +38,6 @@ def read_reconstruction(source: Path, folder: Path, convention: str | None = Non
         source: the file.
         folder: in which it was found.
         convention: pose convention; overrides that of the format.
-
-    Raises:
-        InputError: it cannot be used; the message names it, and what to do.
     """
     if source.name in _READERS:
         found = _READERS[source.name](source, convention)

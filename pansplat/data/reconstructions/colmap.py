@@ -62,9 +62,6 @@ def read_colmap(source: Path, folder: Path, convention: str | None = None) -> Re
         source: its images file.
         folder: that was searched; pictures are in it, or in its folder images.
         convention: of the poses; by default COLMAP's.
-
-    Raises:
-        InputError: damaged files, or a lens with distortion.
     """
     read_cameras, read_images, read_points = _BINARY if source.suffix == ".bin" else _TEXT
     try:

@@ -68,9 +68,6 @@ def write_dataset(
 
     Returns:
         The number of pictures.
-
-    Raises:
-        InputError: a picture cannot be read or written.
     """
     sparse = folder / "sparse" / "0"
     for sub in (folder / "images", sparse):

@@ -45,9 +45,6 @@ def read_metashape(source: Path, convention: str | None = None) -> Reconstructio
     Args:
         source: the file.
         convention: of the poses; by default "cam2world opencv".
-
-    Raises:
-        InputError: invalid content, or no aligned camera of a spherical sensor.
     """
     data = read_file(source, limit=_MAX_BYTES)
     if b"<!DOCTYPE" in data[:_HEAD] or b"<!ENTITY" in data:

@@ -60,9 +60,6 @@ def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstructi
     Args:
         source: the file.
         convention: of the matrices, such as "cam2world opencv"; by default nerfstudio's.
-
-    Raises:
-        InputError: invalid content, a lens with distortion, or another camera model.
     """
     content = read_json(source, dict[str, Any])
     frames = read_field(content, "frames", list[dict[str, Any]], source, [])

@@ -33,9 +33,6 @@ def read_openmvg(source: Path, convention: str | None = None) -> Reconstruction:
     Args:
         source: the file.
         convention: of the poses; by default "world2cam opencv".
-
-    Raises:
-        InputError: invalid content, or no spherical view with a pose.
     """
     content = read_json(source, dict[str, Any])
     try:

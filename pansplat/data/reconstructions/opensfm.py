@@ -31,9 +31,6 @@ def read_opensfm(source: Path, convention: str | None = None) -> Reconstruction:
     Args:
         source: the file.
         convention: of the poses; by default "world2cam opencv".
-
-    Raises:
-        InputError: invalid content, or no spherical shot.
     """
     content = read_json(source)
     parts = convert(content if isinstance(content, list) else [content], list[dict[str, Any]], source)

@@ -118,9 +118,6 @@ def make_collection(found: Reconstruction) -> Collection:
     Positions are multiplied by the number in scale.txt, metres per unit of the file, if there is one. Near and far
     follow from the points, or else from the distances of the cameras if the unit is unknown. Warns about pictures that
     are missing, that show too little, and about an unknown unit.
-
-    Raises:
-        InputError: there is no panorama.
     """
     if found.missing and not found.shots:
         raise InputError(
@@ -189,11 +186,7 @@ def _find_range(
 
 
 def _add_masks(found: Reconstruction) -> list[Shot]:
-    """The pictures with the masks of the folder masks/, which have their names with or without the suffix, and ".png".
-
-    Raises:
-        InputError: a mask belongs to no picture: what it hides would be shown.
-    """
+    """The pictures with the masks of the folder masks/, which have their names with or without the suffix and .png."""
     folder = found.folder / "masks"
     files = [file for file in folder.rglob("*") if file.suffix.lower() in READABLE_SUFFIXES and file.is_file()]
     names = {file: file.relative_to(folder).with_suffix("").as_posix() for file in files}

@@ -36,9 +36,6 @@ def read_web_tour(source: Path) -> list[Panorama]:
     Args:
         source: data.js of an export of the Marzipano Tool, its index.html, or the configuration of Pannellum in JSON,
             HTML or JavaScript.
-
-    Raises:
-        InputError: the file describes no tour, or none of its panoramas can be used.
     """
     marzipano = find_marzipano(source.parent)
     if marzipano is not None and (marzipano == source or source.suffix.lower() in (".html", ".htm")):

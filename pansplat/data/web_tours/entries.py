@@ -86,9 +86,6 @@ def locate(folder: Path, *parts: Any, suffix: str = "") -> str:
     """The path of a file relative to the tour's folder, from the parts of a URL. It need not exist.
 
     A path from the root of a web site counts from the folder.
-
-    Raises:
-        InputError: no text, an address on the web, or a path that leaves the folder.
     """
     for part in parts:
         if not isinstance(part, str) or not part or "\0" in part:

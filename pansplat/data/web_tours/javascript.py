@@ -38,9 +38,6 @@ def parse_literal(text: str, start: int, source: object) -> tuple[Any, int]:
 
     Args:
         source: the file that error messages name.
-
-    Raises:
-        InputError: the text ends early, or the nesting is too deep; the message gives the line.
     """
     parser = _Parser(text, start, source)
     return parser.read_value(0), parser.position

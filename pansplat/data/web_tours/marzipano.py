@@ -51,11 +51,7 @@ def find_marzipano(folder: Path) -> Path | None:
 
 
 def read_marzipano(source: Path) -> list[Entry]:
-    """The scenes of an export that have a complete level.
-
-    Raises:
-        InputError: the file is no data.js of the Marzipano Tool.
-    """
+    """The scenes of an export that have a complete level."""
     content = _read_data(source)
     entries = read_entries(source, _list_scenes(content["scenes"]), lambda key, scene: _read_scene(key, scene, source))
     infos = sum(len(_objects(scene.get("infoHotspots"))) for scene in _objects(content["scenes"]))

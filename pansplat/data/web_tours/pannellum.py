@@ -76,11 +76,7 @@ def find_pannellum(folder: Path) -> Path | None:
 
 
 def read_pannellum(source: Path) -> list[Entry]:
-    """The scenes of a tour, or its only panorama; the first scene of the tour is the first.
-
-    Raises:
-        InputError: the file holds no configuration.
-    """
+    """The scenes of a tour, or its only panorama; the first scene of the tour is the first."""
     content = _find_configuration(source)
     if content is None:
         got = "an HTML page" if read_text(source).lstrip().startswith("<") else "other text"

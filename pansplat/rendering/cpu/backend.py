@@ -52,12 +52,7 @@ def rasterize_planes(
     planes: list[ImagePlane],
     options: RasterOptions,
 ) -> RasterSums:
-    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
-
-    Raises:
-        InputError: the kernel is EWA, the Gaussians are not in main memory, a side is longer than 32767 pixels, or
-            `options.strict` and a Gaussian is not finite.
-    """
+    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`."""
     require_exact_kernel(options)
     if gaussians.means.device.type != "cpu":
         raise InputError(

@@ -41,11 +41,7 @@ def rasterize_planes(
     planes: list[ImagePlane],
     options: RasterOptions,
 ) -> RasterSums:
-    """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`.
-
-    Raises:
-        InputError: as stated there; Triton is not installed; or the Gaussians are not on a CUDA device.
-    """
+    """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`."""
     device = gaussians.means.device
     _check_device(device)
     if planes[0].eye_offset:

@@ -400,11 +400,7 @@ class DepthTrainer:
 
 
 def load_matching(network: DepthRefinement, path: Path) -> None:
-    """Load the weights of a file, or the averaged weights of a checkpoint, that fit the network's names and shapes.
-
-    Raises:
-        InputError: none fit.
-    """
+    """Load the weights of a file, or the averaged weights of a checkpoint, that fit the network's names and shapes."""
     state = load_weights(path).tensors if path.suffix == ".safetensors" else load_checkpoint(path)["mean"]
     own = network.state_dict()
     fitting = {name: t for name, t in state.items() if name in own and own[name].shape == t.shape}

@@ -182,9 +182,6 @@ def load_furniture(folder: Path | str, cache: Path | str | None = None) -> Furni
 
     Args:
         cache: an .npz file that is written if it does not exist, and read instead of the catalogues if it does.
-
-    Raises:
-        InputError: there is neither a catalogue nor a cache.
     """
     if cache is not None and Path(cache).is_file():
         try:

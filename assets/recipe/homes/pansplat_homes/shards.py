@@ -99,9 +99,6 @@ def write_shards(
 
     Args:
         progress: called with the number of tours in the shards that are there, and in each new one.
-
-    Raises:
-        InputError: the folder holds shards of other settings, or cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _claim_folder(folder, settings)
@@ -121,9 +118,6 @@ def pack_triplets(source: Path, folder: Path, height: int) -> int:
     Args:
         source: files NAME_0.png to NAME_2.png (sRGB), NAME_0_depth.png to NAME_2_depth.png (millimetres, 16 bit), and
             NAME.json with "c2w", three poses in metres with y down.
-
-    Raises:
-        InputError: there are too few triplets, a file is missing or damaged, or the shards cannot be written.
     """
     names = sorted(path.with_suffix("") for path in source.glob("*.json"))
     names = names[: len(names) // TOURS_PER_SHARD * TOURS_PER_SHARD]
@@ -158,11 +152,7 @@ def _read_png(path: str, flags: int) -> Any:
 
 
 class ShardReader:
-    """The tours of one or more folders of shards, by index.
-
-    Raises:
-        InputError: a folder without shards.
-    """
+    """The tours of one or more folders of shards, by index."""
 
     def __init__(self, folders: list[Path]) -> None:
         self.paths: list[Path] = []
@@ -177,11 +167,7 @@ class ShardReader:
         return self._per_shard * len(self.paths)
 
     def read(self, index: int) -> Tour:
-        """Tour `index`.
-
-        Raises:
-            InputError: a damaged shard.
-        """
+        """Tour `index`."""
         shard, place = divmod(index, self._per_shard)
         path = self.paths[shard]
         try:
