@@ -33,6 +33,7 @@ from pansplat.tours.graph import (
     select_views,
 )
 from pansplat.tours.links import find_link_ring, find_way_along_link
+from pansplat.tours.outlook import choose_heading, measure_outlook
 from pansplat.tours.overlap import connect
 from pansplat.tours.route import FADE_SECONDS, Route, find_angles, plan_route
 from pansplat.tours.walls import find_walls
@@ -49,6 +50,7 @@ __all__ = [
     "TourGraph",
     "Views",
     "choose_camera_height",
+    "choose_heading",
     "connect",
     "draw_floor_plan",
     "find_angles",
@@ -67,6 +69,7 @@ __all__ = [
     "list_starts",
     "make_graph",
     "measure_box",
+    "measure_outlook",
     "merge_scenes",
     "paint_floor_plan",
     "plan_route",

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.links import find_way_along_link
+from pansplat.tours.outlook import choose_heading
 
 FADE_SECONDS = 1.0
 _FLY_SPEED = 1.0  # metres per second
@@ -101,7 +102,12 @@ class Route:
         return list(self.edges[max(self.leg(fraction), 0) :])
 
 
-def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4 4"] | None = None) -> Route:
+def plan_route(
+    tour: TourGraph,
+    walk: Sequence[int],
+    start: Float[np.ndarray, "4 4"] | None = None,
+    outlook: Float[np.ndarray, "bin"] | None = None,
+) -> Route:
     """A flight along a walk. The camera looks ahead along its way, and flies slower while it turns.
 
     Where the way turns back, the camera turns in place. All is smoothed over time, so that corners are rounded.
@@ -115,6 +121,7 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
         walk: nodes; consecutive ones share an edge, or are of different parts.
         start: pose from which the first node is approached; None starts at that node, in the direction of its start
             view, or of the second node.
+        outlook: of the last node (`measure_outlook`): a flight that ends at a wall turns to the widest view.
     """
     steps = list(itertools.pairwise(walk))
     fades = [leg for leg, step in enumerate(steps) if tour.is_fade(*step)]
@@ -145,7 +152,8 @@ def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4
             yaw, pitch = _find_arrival(tour, *steps[first]) or (yaw, 0.0)
         is_seen = start is None or 0 <= first < last < len(steps)  # of a user's flight, not the ends
         around = math.radians(_LOOK_AROUND_DEGREES) if is_seen and len(places) == 1 and steps else 0.0
-        sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch, around))
+        seen = outlook if last == len(steps) else None
+        sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch, around, seen))
         yaw = float(sections[-1][3][-1])
     *positions, yaws, pitches, numbers = (np.concatenate(values) for values in zip(*sections, strict=True))
     return Route(
@@ -181,6 +189,7 @@ def _fly(
     yaw: float | None,
     pitch: float,
     around: float = 0.0,
+    outlook: Float[np.ndarray, "bin"] | None = None,
 ) -> tuple[np.ndarray, ...]:
     """The flight through places of one part: right, down, forward, yaw, pitch and leg of each sample.
 
@@ -191,6 +200,7 @@ def _fly(
         yaw: at the start, radians; None looks along the path.
         pitch: at the start, radians.
         around: turn to the right at the end, radians.
+        outlook: of the end; the camera turns away from a wall.
     """
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     kept = lengths > 1e-6
@@ -217,7 +227,9 @@ def _fly(
         places.append(place)
         yaws.append(yaw)
     yaws[0] = yaws[1] if len(yaws) > 1 and yaws[0] is None else yaws[0] or 0.0
-    turns = np.arange(0, around, math.radians(_TURN_DEGREES) * step).tolist()
+    if outlook is not None:
+        around += math.remainder(choose_heading(outlook, yaws[-1]) - yaws[-1], 2 * math.pi)
+    turns = (math.copysign(1, around) * np.arange(0, abs(around), math.radians(_TURN_DEGREES) * step)).tolist()
     places += [place for _ in turns]
     yaws += [yaws[-1] + turn for turn in turns]
     along = np.array(places)

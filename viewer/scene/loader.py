@@ -15,6 +15,8 @@ from pansplat.files import is_scene_file, make_portable_name
 from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from pansplat.data.pairs import Pair, Panorama
     from pansplat.gaussians.scene import Scene
     from pansplat.tours import Edge, FloorOutline, TourGraph
@@ -88,6 +90,7 @@ class LoadedScene:
         is_final: False for a prediction whose refinement will follow.
         outlines: of a scene of a tour: floor outlines by panorama.
         walls: of a scene of a tour: edges that it shows to be none.
+        outlooks: of a scene of a tour: distances around the horizon by panorama (`measure_outlook`).
     """
 
     entry: SceneEntry
@@ -95,6 +98,7 @@ class LoadedScene:
     is_final: bool = True
     outlines: "dict[int, FloorOutline]" = field(default_factory=dict)
     walls: "Sequence[Edge]" = ()
+    outlooks: "dict[int, np.ndarray]" = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -224,7 +228,7 @@ def _load_tour_scene(
     The first scene of a window is not refined if it is predicted again with the rest of its part.
     """
     from pansplat import pipeline
-    from pansplat.tours import connect, find_floor_outlines, find_walls, select_views
+    from pansplat.tours import connect, find_floor_outlines, find_walls, measure_outlook, select_views
 
     tour, views, merged, seconds = entry.tour, entry.views, entry.merged, options.refine_seconds
     assert tour is not None
@@ -232,7 +236,8 @@ def _load_tour_scene(
         first, views = _choose_first_scene(tour, tour)
         entry = replace(entry, views=views, start=first)
         outlines = find_floor_outlines(tour, merged, tuple(range(len(tour))))
-        return LoadedScene(entry, select_views(merged, views), outlines=outlines)
+        outlooks = {node: measure_outlook(merged, node, tour.level_axes) for node in range(len(tour))}
+        return LoadedScene(entry, select_views(merged, views), outlines=outlines, outlooks=outlooks)
     predictor = pipeline.load_model(options.model, compat=options.compat, precision=options.precision)
     if not views:
         connected, max_views = connect(tour, progress), pipeline.find_max_views(predictor)
@@ -249,7 +254,8 @@ def _load_tour_scene(
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
         scene = tour.place(scene, views)
         outlines, walls = find_floor_outlines(tour, scene, views), find_walls(scene, views, tour.overlaps)
-        return LoadedScene(entry, scene, is_final=is_final, outlines=outlines, walls=walls)
+        outlooks = {node: measure_outlook(scene, view, tour.level_axes) for view, node in enumerate(views)}
+        return LoadedScene(entry, scene, is_final, outlines, walls, outlooks)
 
     scene = pipeline.predict(
         pair,

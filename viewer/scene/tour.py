@@ -71,6 +71,7 @@ class TourScenes:
         self.edge: Edge = next(iter(tour.overlaps))
         self._is_placed = False  # whether the camera has been at the edge
         self.outlines: dict[int, FloorOutline] = {}
+        self._outlooks: dict[int, np.ndarray] = {}
         self._views = tour.choose_scene_views()
         everything = tuple(range(len(tour)))
         # The prediction that has the Gaussians of a panorama; none if each scene is a prediction.
@@ -186,6 +187,7 @@ class TourScenes:
         """
         views = loaded.entry.views
         self.outlines |= loaded.outlines
+        self._outlooks |= loaded.outlooks
         self._block(loaded.walls)
         if views not in self._predictions:
             self._selected[views] = loaded
@@ -327,8 +329,8 @@ class TourScenes:
         return plan_route(self.tour, walk, camera)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
-        """A route from a pose to a panorama."""
-        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera)
+        """A route from a pose to a panorama; it does not end with the face to a wall."""
+        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, self._outlooks.get(node))
 
     def _find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
         return self.tour.find_way(position, node, self._find_part(position))
