@@ -1,4 +1,4 @@
-"""Threads: sections of torch code on one thread, and pools of threads."""
+"""Threads: sections of torch and numpy code on one thread, and pools of threads."""
 
 import contextlib
 import os
@@ -9,24 +9,27 @@ from contextvars import copy_context
 from typing import Any, TypeVar
 
 import torch
+from threadpoolctl import threadpool_limits
 
 _T = TypeVar("_T")
 _lock = threading.Lock()
 _num_running = 0  # sections that are running
 _num_threads = 1  # outside of all sections
+_blas: threadpool_limits | None = None  # the limit of matrix products in sections
 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch operations on the calling thread only, then restore the number of threads.
+    """Run operations of torch, and matrix products of numpy, on the calling thread only; then restore the numbers.
 
     Operations on a few thousand numbers do not benefit from a second core, and on a busy machine they wait for it:
     three jobs on two cores ran 40 times slower. One thread also fixes the order of summation.
     """
-    global _num_running, _num_threads
+    global _num_running, _num_threads, _blas
     with _lock:
         if _num_running == 0:
             _num_threads = torch.get_num_threads()
+            _blas = threadpool_limits(1, "blas")
         _num_running += 1
         torch.set_num_threads(1)
     try:
@@ -34,6 +37,8 @@ def one_thread() -> Iterator[None]:
     finally:
         with _lock:
             _num_running -= 1
+            if _num_running == 0 and _blas is not None:
+                _blas.restore_original_limits()
             torch.set_num_threads(_num_threads)
 
 

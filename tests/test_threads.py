@@ -4,17 +4,28 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info
 
 from pansplat.threads import one_thread
 
 
 def test_a_section_on_one_thread_restores_the_number_of_threads() -> None:
-    before = torch.get_num_threads()
-    with one_thread(), one_thread():
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == before
+    np.ones((8, 8)) @ np.ones((8, 8))  # loads the library
+
+    def count() -> tuple[int, set[int]]:
+        return torch.get_num_threads(), {
+            each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"
+        }
+
+    before = count()
+    with one_thread():
+        with one_thread():
+            assert count() == (1, {1})
+        assert count()[1] == {1}
+    assert count() == before
 
 
 @pytest.mark.parametrize(("given", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
