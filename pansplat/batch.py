@@ -434,17 +434,18 @@ def _count_of_page(options: BatchOptions) -> float:
     """The largest number of Gaussians of a page; infinite for other files."""
     if "export" not in options.steps or options.suffix != ".html":
         return math.inf
-    from pansplat.web import DEFAULT_GAUSSIANS
+    from pansplat.web import PHOTO_GAUSSIANS
 
-    return options.gaussians or DEFAULT_GAUSSIANS
+    return options.gaussians or PHOTO_GAUSSIANS
 
 
 def _export(scene: Scene, path: Path, unit: _Unit, options: BatchOptions) -> None:
     if options.suffix == ".html":
-        from pansplat.web import write_page
+        from pansplat.web import list_photographs, write_page
 
         count, title = int(_count_of_page(options)), unit.name.replace("_", " ")
-        write_page(scene, path, gaussians=count, title=title)
+        photographs = list_photographs(unit.tour or unit.pairs[0], range(len(scene.cam2world)))
+        write_page(scene, path, gaussians=count, title=title, photographs=photographs)
     elif options.suffix == ".png":
         write_floor_plan(scene, path)
     elif pipeline.can_stream(_load_model(options.model, options.compat, options.precision)):
