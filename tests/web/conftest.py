@@ -3,8 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -92,21 +90,23 @@ def flat() -> Scene:
     )
 
 
-@pytest.fixture
-def take_photographs(tmp_path: Path) -> Callable[..., list[Pair]]:
-    """A function that writes photographs of a height for the cameras of a scene."""
-    return partial(write_photographs, tmp_path / "photographs")
+@pytest.fixture(scope="session")
+def take_photographs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Scene, int], list[Pair]]:
+    """A function that writes smooth random panoramas of a height for the cameras of a scene to a new folder.
 
+    It returns a pair of one view each. They are not what the Gaussians show.
+    """
 
-def write_photographs(folder: Path, scene: Scene, height: int) -> list[Pair]:
-    """Smooth random panoramas, a pair of one view each; they are not what the Gaussians show."""
-    folder.mkdir(exist_ok=True)
-    pairs = []
-    for view, pose in enumerate(scene.cam2world):
-        noise = np.random.default_rng(view).uniform(60, 220, (16, 32, 1)) + np.array((0, 10, 0))
-        pixels = cv2.resize(np.pad(noise, ((0, 0), (1, 1), (0, 0)), mode="wrap"), None, fx=height / 16, fy=height / 16)
-        pixels = pixels[:, height // 16 : -height // 16] + np.linspace(-30, 30, height)[:, None, None]
-        path = folder / f"{view}.png"
-        Image.fromarray(pixels.clip(1, 255).astype(np.uint8)).save(path)
-        pairs.append(Pair(f"{view}", folder, (Panorama(f"{view}", path, pose),), (), 0.5, 10.0, (path,)))
-    return pairs
+    def take(scene: Scene, height: int) -> list[Pair]:
+        folder, pairs = tmp_path_factory.mktemp("photographs"), []
+        for view, pose in enumerate(scene.cam2world):
+            noise = np.random.default_rng(view).uniform(60, 220, (16, 32, 1)) + np.array((0, 10, 0))
+            noise = np.pad(noise, ((0, 0), (1, 1), (0, 0)), mode="wrap")
+            pixels = cv2.resize(noise, None, fx=height / 16, fy=height / 16)[:, height // 16 : -height // 16]
+            pixels = pixels + np.linspace(-30, 30, height)[:, None, None]
+            path = folder / f"{view}.png"
+            Image.fromarray(pixels.clip(1, 255).astype(np.uint8)).save(path)
+            pairs.append(Pair(f"{view}", folder, (Panorama(f"{view}", path, pose),), (), 0.5, 10.0, (path,)))
+        return pairs
+
+    return take

@@ -48,7 +48,7 @@ def grey(scene: Scene) -> Scene:
 
 
 def hide(photographs: list[Pair], kind: str) -> list[Pair]:
-    """The photographs with a purple square in the first one, and a mask that hides it; those of other kinds have none."""
+    """The photographs with a purple square in the first one, and a mask that hides it; for the kind "none" without."""
     first = photographs[0].context[0]
     pixels = np.asarray(Image.open(first.image)).copy()
     rows = len(pixels)
@@ -57,7 +57,7 @@ def hide(photographs: list[Pair], kind: str) -> list[Pair]:
     square = np.zeros(pixels.shape[:2], np.uint8)
     square[rows // 2 : rows // 2 + rows // 8, rows : rows + rows // 8] = 255
     mask = first.image.with_name(f"{first.name}_{kind}.png")
-    if kind in ("mask", "blur"):
+    if kind != "none":
         Image.fromarray(255 - square if kind == "mask" else square).save(mask)
     chosen = dataclasses.replace(first, mask=mask if kind == "mask" else None)
     return [dataclasses.replace(photographs[0], context=(chosen,)), *photographs[1:]]
