@@ -10,7 +10,7 @@ import { changed, fullSize, refresh, renderer } from "./loop.js";
 import { headset } from "./xr.js";
 
 const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
-const GONE = 0.5;                   // metres from where a photograph that fades is no longer shown
+const GONE = 0.3;                   // metres from a panorama, where its photograph has faded at any rate
 const PHOTO_FADE = 0.2;             // seconds
 const DENSITY = 0.8;                // texels of a pixel in the middle of a face, at least
 const KEPT = 3;                     // photographs whose textures are kept
@@ -110,7 +110,7 @@ class Level {
 
 class Photographs {
   constructor() {
-    Object.assign(this, { opacity: 0, target: 0, node: null, last: null, reading: 0, made: new Map(), renderer: null });
+    Object.assign(this, { opacity: 0, target: 0, node: null, wanted: null, last: null, reading: 0, made: new Map(), renderer: null });
   }
 
   // Whether nothing else is seen.
@@ -175,9 +175,13 @@ class Photographs {
     }
     const node = this.findNode(), isStill = this.last !== null && distanceOf(camera.position, this.last) === 0;
     this.last = [...camera.position];
-    this.read(node !== null || !flight ? nodeHere() : flight.spot, size);
+    this.wanted = node !== null || !flight ? nodeHere() : flight.spot;
+    this.read(this.wanted, size);
     const isShown = isStill && node !== null && !headset.session && this.levelsOf(node)[0].isReady;
-    if (this.node !== null && (headset.session || distanceOf(camera.position, GRAPH.positions[this.node]) > GONE * HEADER.unit)) this.opacity = 0;
+    if (this.node !== null && node !== this.node) {
+      const most = headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / (GONE * HEADER.unit);
+      this.opacity = clamp(this.opacity, 0, Math.max(most, 0));
+    }
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
     this.target = isShown ? 1 : 0;
     if (this.opacity === this.target) return;
@@ -209,6 +213,7 @@ class Photographs {
         console.warn(error);
       }
       this.reading -= 1;
+      if (this.wanted === node && this.renderer === renderer) this.read(node, size);
     });
   }
 
