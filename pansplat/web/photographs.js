@@ -121,9 +121,10 @@ class Photographs {
   // Whether the picture has all of the photograph that it needs.
   isFinal(size = fullSize()) {
     if (!HEADER.photographs.length || headset.session) return true;
-    const isStill = this.last !== null && distanceOf(camera.position, this.last) === 0;
-    const isThere = isStill && this.findNode() !== null;
-    return isStill && this.opacity === this.target && (!isThere || this.listMissing(nodeHere(), size, true).every(({ state }) => state === "failed"));
+    if (this.last === null || this.renderer !== renderer || distanceOf(camera.position, this.last) > 0) return false;
+    const node = this.findNode(), isDue = node !== null && this.levelsOf(node)[0].isReady;
+    if (this.target !== Number(isDue) || this.opacity !== this.target) return false;
+    return node === null || this.listMissing(node, size, true).every(({ state }) => state === "failed");
   }
 
   // The panorama at which the camera stands.
