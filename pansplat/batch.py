@@ -312,9 +312,11 @@ def _process_unit(
             readers = dict(zip(tour.choose_sources(max_views), (read for _, read in made), strict=True))
             scene = merge_scenes(tour, lambda views: readers[views](), max_views)
         if options.suffix == ".html":
-            from pansplat.web import write_page
+            from pansplat.web import list_photographs, write_page
 
-            write_page(scene, path, gaussians=int(_count_of_page(options)), title=name.replace("_", " "))
+            count, title = int(_count_of_page(options)), name.replace("_", " ")
+            photographs = list_photographs(tour or pairs[0], range(len(scene.cam2world)))
+            write_page(scene, path, gaussians=count, title=title, photographs=photographs)
         elif options.suffix == ".png":
             write_picture(scene, path)
         elif pipeline.can_stream(predictor):
@@ -387,9 +389,9 @@ def _count_of_page(options: BatchOptions) -> float:
     """The largest number of Gaussians of a page; infinite for other files."""
     if "export" not in options.steps or options.suffix != ".html":
         return math.inf
-    from pansplat.web import DEFAULT_GAUSSIANS
+    from pansplat.web import PHOTO_GAUSSIANS
 
-    return options.gaussians or DEFAULT_GAUSSIANS
+    return options.gaussians or PHOTO_GAUSSIANS
 
 
 def _hash_pair(pair: Pair) -> str:

@@ -61,7 +61,7 @@ class Batch(Writer):
     format: str = "html"
     """Format of the export: html, png (a floor plan), ply, compressed.ply, spz, splat, sog or glb."""
     gaussians: Count | None = None
-    """For html: largest number of Gaussians, 600,000 by default."""
+    """For html: largest number of Gaussians, 450,000 by default."""
 
     def run(self) -> int:
         """Run all items, write the report and print a summary."""

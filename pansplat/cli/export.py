@@ -21,6 +21,7 @@ from pansplat.files import (
     is_scene_file,
     require_new_folder,
     require_output_file,
+    require_output_folder,
     require_replaceable,
 )
 from pansplat.options import Count, Fraction, Real
@@ -29,29 +30,36 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from pansplat.cleanup import Change
+    from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
+    from pansplat.tours import TourGraph
     from pansplat.web import PageFiles
 
 _PAGE_SUFFIX, _PICTURE_SUFFIX, _DRAWING_SUFFIXES, _MESH_SUFFIX = ".html", ".png", (".svg", ".dxf"), ".obj"
 _SUFFIXES = (*SCENE_SUFFIXES, _PAGE_SUFFIX, _PICTURE_SUFFIX, *_DRAWING_SUFFIXES, _MESH_SUFFIX)
+_INDEX = "index.html"  # of a folder
 _TEXTURE_HEIGHT = 2048  # of the photographs on a mesh, at most
 _FEW_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # of a panorama in a page
 _MOST_GAUSSIANS = 2_000_000  # of a page in one file
+_BYTES = 22  # of a Gaussian in a page
 _MIN_POINT_OPACITY, _MOST_POINTS = 0.1, 200_000  # of the points to train from
 
 
 @dataclass(frozen=True)
 class Export(Writer):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
-    web page (.html, docs/web.md), as a floor plan with straight walls and areas (.svg, .png, .dxf), as textured
-    triangles (.obj, .glb with --mesh), or as a folder to train further from (a name without suffix): cube faces, poses
-    and points for COLMAP, nerfstudio, gsplat and brush."""
+    web page (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan
+    with straight walls and areas (.svg, .png, .dxf), as textured triangles (.obj, .glb with --mesh), or as a folder
+    to train further from (--training-set): cube faces, poses and points for COLMAP, nerfstudio, gsplat and brush."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg, .dxf or .png
-    for a floor plan; .obj for a mesh; a new folder, without a suffix, for cube faces with poses."""
+    for a floor plan; .obj for a mesh. A folder, without a suffix, for a web page with photographs of their own
+    resolution, which are loaded as they are needed; with --training-set a new one for cube faces with poses."""
+    training_set: bool = False
+    """Write a folder to train further from: cube faces with poses, and points."""
     mesh: bool = False
     """Write a .glb of triangles with the photographs as textures. An .obj always has them."""
     triangles: Count | None = None
@@ -75,7 +83,11 @@ class Export(Writer):
     """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
     draw all Gaussians together (docs/formats.md)."""
     gaussians: Count | None = None
-    """For .html: largest number of Gaussians, 600,000 by default; similar neighbours are merged."""
+    """For a page: largest number of Gaussians, 600,000 by default, beside photographs in one file 450,000; similar
+    neighbours are merged."""
+    photo_height: Annotated[int, Range(0, 4096, "pixels"), WHOLE] | None = None
+    """For a page: largest height of the photographs that it shows at panoramas; 0 for none. By default what fits into
+    15 MB, at least 1024, in a folder and with --split that of the files, at most 4096."""
     split: bool = False
     """For .html: write the data to a folder beside the page, for scenes that are large for one file."""
     serve: bool = False
@@ -93,13 +105,17 @@ class Export(Writer):
         from pansplat.gaussians.ply import save_points
         from pansplat.web import parse_origins
 
-        is_dataset = not self.out.suffix
+        is_dataset, is_folder = self.training_set, not self.out.suffix
         if is_dataset:
             require_new_folder("--out", self.out)
+        elif is_folder:
+            require_output_folder("--out", self.out)
+            require_replaceable("--out", [self.out / _INDEX], self.overwrite)
         else:
             require_output_file("--out", self.out, _SUFFIXES, overwrite=self.overwrite)
         suffix = self.out.suffix.lower()
-        is_page, is_picture, is_drawing = suffix == _PAGE_SUFFIX, suffix == _PICTURE_SUFFIX, suffix in _DRAWING_SUFFIXES
+        is_page = (is_folder and not is_dataset) or suffix == _PAGE_SUFFIX
+        is_picture, is_drawing = suffix == _PICTURE_SUFFIX, suffix in _DRAWING_SUFFIXES
         is_mesh = self.mesh or suffix == _MESH_SUFFIX
         if self.mesh and suffix not in (_MESH_SUFFIX, ".glb"):
             raise InputError(f"--mesh writes a .glb or .obj, got {self.out}; leave it out, or choose another name")
@@ -109,8 +125,8 @@ class Export(Writer):
         if self.points and not (is_scene and find_scene_suffix(self.out) == ".ply"):
             raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
         of_page = (self.gaussians is not None, self.split, self.serve, self.embed, self.title is not None)
-        if not is_page and any(of_page):
-            names = "--gaussians, --split, --serve, --embed and --title"
+        if not is_page and any((*of_page, self.photo_height is not None)):
+            names = "--gaussians, --photo-height, --split, --serve, --embed and --title"
             raise InputError(f"{names} are for an .html page, got {self.out}; leave them out")
         parse_origins(self.embed)
         if self.up is not None and not is_scene_file(self.path):
@@ -124,9 +140,10 @@ class Export(Writer):
         if is_mesh:
             self._write_mesh()
             return 0
-        scene, changes = self._edit(*self._open(not is_scene))
+        scene, layers, source = self._open(not is_scene, is_page)
+        scene, changes = self._edit(scene, layers)
         if is_page:
-            page = self._write_page(scene)
+            page = self._write_page(scene, source)
             _print_changes(changes)
             if self.serve:
                 from pansplat.web.serve import serve_page
@@ -150,27 +167,28 @@ class Export(Writer):
             _print_changes(changes)
         return 0
 
-    def _open(self, in_layers: bool) -> tuple[Scene, Scene | None]:
+    def _open(self, in_layers: bool, is_page: bool) -> tuple[Scene, Scene | None, Pair | TourGraph | None]:
         """The scene of the file, pair or tour; of a file for other programs with each surface once.
 
-        Also the scene with all that each panorama shows, if the rooms of one with each surface once are looked for.
+        Also the scene with all that each panorama shows, if the rooms of one with each surface once are looked for; and
+        the pair or tour.
         """
         from pansplat.refinement import fuse_views
 
         joint = not in_layers and not self.layers
-        count = self._count_of_page() if self.out.suffix.lower() == _PAGE_SUFFIX else None
+        count = self._count_of_page() if is_page else None
         if not is_scene_file(self.path):
             scene, source = self.prediction.open_panoramas(self.path, count, joint=joint)
-            return scene, self.prediction.predict_layers(source) if self.rooms and scene.joint else None
+            return scene, self.prediction.predict_layers(source) if self.rooms and scene.joint else None, source
         scene = self.prediction.open(self.path)
         if not joint or scene.joint or len(scene.cam2world) < 2:
-            return scene, None
+            return scene, None, None
         print(
             f"note: {self.path}: each surface is kept once (--layers keeps all); an export of the folder of the "
             "photographs fits the Gaussians to them, too",
             file=sys.stderr,
         )
-        return fuse_views(scene), scene
+        return fuse_views(scene), scene, None
 
     def _edit(self, scene: Scene, layers: Scene | None = None) -> tuple[Scene, list[Change]]:
         """The scene with its axis up, and the Gaussians and harmonics that are wanted, and what is left out.
@@ -199,9 +217,9 @@ class Export(Writer):
 
     def _write_mesh(self) -> None:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
-        from pansplat.data.pairs import Pair
         from pansplat.gaussians.mesh_files import name_mesh_files, save_mesh
         from pansplat.refinement.mesh import DEFAULT_TRIANGLES, make_mesh
+        from pansplat.web import list_photographs
 
         require_replaceable("--out", name_mesh_files(self.out, 1), self.overwrite)  # before the prediction
         load: Callable[[int], Tensor] | None = None
@@ -213,12 +231,10 @@ class Export(Writer):
             known = scene.cam2world.tolist()
             views = [known.index(pose) for pose in edited.cam2world.tolist()]  # a crop leaves others out
 
+            photographs = list_photographs(source, views)
+
             def load(number: int) -> Tensor:
-                view = views[number]
-                if isinstance(source, Pair):
-                    pair = dataclasses.replace(source, context=(source.context[view],))
-                else:
-                    pair = source.make_pair([view])
+                pair = photographs[number]
                 return pair.load_context(min(pair.image_height, _TEXTURE_HEIGHT)).images[0]
 
         mesh = make_mesh(edited, triangles=self.triangles or DEFAULT_TRIANGLES, textures=load)
@@ -271,29 +287,52 @@ class Export(Writer):
 
     def _count_of_page(self) -> int:
         """The largest number of Gaussians of a page."""
-        from pansplat.web import DEFAULT_GAUSSIANS
+        from pansplat.web import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS
 
-        return DEFAULT_GAUSSIANS if self.gaussians is None else self.gaussians
+        is_one_file = self.out.suffix and not self.split
+        default = PHOTO_GAUSSIANS if is_one_file and self._has_photographs() else DEFAULT_GAUSSIANS
+        return default if self.gaussians is None else self.gaussians
 
-    def _write_page(self, scene: Scene) -> PageFiles:
+    def _has_photographs(self) -> bool:
+        """Whether the page shows photographs: they would show what a crop leaves out."""
+        return not (is_scene_file(self.path) or self.crop or self.rooms or self.photo_height == 0)
+
+    def _write_page(self, scene: Scene, source: Pair | TourGraph | None) -> PageFiles:
         """Write the web page and print its size."""
-        from pansplat.web import write_page
+        from pansplat.web import list_photographs, write_page
 
+        out, split = (self.out, self.split) if self.out.suffix else (self.out / _INDEX, True)
+        out.parent.mkdir(parents=True, exist_ok=True)
         title = self.title or self.path.resolve().stem.replace("_", " ")
+        has_photographs = source is not None and self._has_photographs()
+        photographs = list_photographs(source, range(len(scene.cam2world))) if has_photographs else []
         with progress_bar() as progress:
-            options = {"gaussians": self._count_of_page(), "split": self.split, "title": title, "embed": self.embed}
-            page = write_page(scene, self.out, **options, progress=progress)
-        beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if self.split else ""
+            page = write_page(
+                scene,
+                out,
+                gaussians=self._count_of_page(),
+                split=split,
+                title=title,
+                embed=self.embed,
+                photographs=photographs,
+                photo_height=self.photo_height,
+                progress=progress,
+            )
+        beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if split else ""
+        pictures = f" {len(photographs)} photographs of {page.photo_height} rows," if photographs else ""
         print(
-            f"{self.out}{beside}: {page.num_gaussians:,} Gaussians, {page.num_bytes / 1e6:.1f} MB; open it in a browser"
+            f"{out}{beside}: {page.num_gaussians:,} Gaussians,{pictures} {page.num_bytes / 1e6:.1f} MB; open it in a "
+            "browser"
         )
+        if (self.crop or self.rooms) and source is not None:
+            print(f"note: {out}: without photographs, which would show what is left out", file=sys.stderr)
         panoramas = max(len(scene.cam2world), 1)
         each = self._count_of_page() // panoramas
         if self.gaussians is None and each < _FEW_GAUSSIANS:
             more = min(_GOOD_GAUSSIANS * panoramas, _MOST_GAUSSIANS)
-            size = more * page.num_bytes / page.num_gaussians / 1e6
+            size = (page.num_bytes + _BYTES * (more - page.num_gaussians)) / 1e6
             print(
-                f"note: {self.out}: {each:,} Gaussians for each of {panoramas} panoramas; "
+                f"note: {out}: {each:,} Gaussians for each of {panoramas} panoramas; "
                 f"--gaussians {more} shows more detail in about {size:.0f} MB",
                 file=sys.stderr,
             )

@@ -13,17 +13,24 @@ import { clamp, column, distanceOf, dot, minus, scaled } from "./graph.js";
 import { walkByKeys } from "./input.js";
 import { arrived, isComplete, worker } from "./loading.js";
 import { measure } from "./measure.js";
+import { photographs } from "./photographs.js";
 import { plan } from "./plan.js";
 import { placeRings, showPlace } from "./rings.js";
 import { headset, SORT_DISTANCE } from "./xr.js";
 
 const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
+const scales = [1, 1];              // of the resolution while it moves: of Gaussians, and of photographs
 
-export let renderer = null, sorted = null, sorting = false, dirty = true, scale = 1, drawnScale = 0, lastChange = 0, lastFrame = 0;
+export let renderer = null, sorted = null, sorting = false, dirty = true, drawnScale = 0, lastChange = 0, lastFrame = 0;
 
 export function changed() {
   dirty = true;
   lastChange = performance.now();
+}
+
+// Draws the same camera again, when something of its picture has arrived.
+export function refresh() {
+  dirty = true;
 }
 
 // Draws the next frame, which another one has replaced.
@@ -64,7 +71,7 @@ export function onSorted(data) {
 export function isSettled() {
   const isDrawn = headset.session !== null || !dirty && drawnScale === 1, tolerance = headset.session ? SORT_DISTANCE : 0;
   const isMoving = [flight, route, doll.flight, fade, frozen].some((each) => each !== null);
-  return isDrawn && !isMoving && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) && sorted.views.every((view) => shown[view] === 1);
+  return isDrawn && !isMoving && photographs.isFinal() && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) && sorted.views.every((view) => shown[view] === 1);
 }
 
 // Of the canvas at the full resolution.
@@ -77,7 +84,9 @@ export function fullSize() {
 export function drawAt(width, height) {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
   const rotation = rotationOf(camera), tangent = tangentOf(width, height), half = [tangent * width / height, tangent];
-  renderer.draw({ position: camera.position, rotation, center: [0, 0], half }, blendWeights(camera.position), null, [0, 0, width, height]);
+  const seen = { position: camera.position, rotation, center: [0, 0], half };
+  if (!photographs.isOpaque) renderer.draw(seen, blendWeights(camera.position), null, [0, 0, width, height]);
+  photographs.draw(seen, width, height);
   return rotation;
 }
 
@@ -89,6 +98,7 @@ export function advance(now, seconds) {
   if (edges.length && !doll.isOn) updateEdge(now);
   updateStill(now);
   showViews(1000 * seconds / FADE_MS);
+  photographs.update(seconds);
   const node = nodeHere(), isMoving = flight !== null || doll.flight !== null || isWaiting();
   const isThere = !isMoving && !doll.isOn && distanceOf(GRAPH.positions[node], camera.position) < HEADER.spots[node].radius;
   embed.follow(isThere ? node : null, isMoving);
@@ -103,8 +113,9 @@ export function onFrame(now) {
   advance(now, seconds);
   requestSort();
   const moving = now - lastChange < 200;
-  if (moving && drawnScale && elapsed < 1000) scale = clamp(scale * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);
-  const wanted = moving ? scale : 1;
+  const kind = Number(photographs.isOpaque);
+  if (moving && drawnScale && elapsed < 1000) scales[kind] = clamp(scales[kind] * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);
+  const wanted = moving ? scales[kind] : 1;
   if (!renderer || !sorted || !(dirty || wanted > drawnScale)) return;
   dirty = false;
   drawnScale = wanted;

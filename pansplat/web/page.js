@@ -7,6 +7,7 @@ import { flyTo, jumpTo, setPose, setTouring } from "./flight.js";
 import { listen } from "./input.js";
 import { fail, failure, isComplete, load } from "./loading.js";
 import { drawAt, isSettled, isSortedFor, onFrame, redraw, renderer, setRenderer, sorted } from "./loop.js";
+import { photographs } from "./photographs.js";
 import { Renderer } from "./renderer.js";
 import { makeList, makeRings } from "./rings.js";
 import { parsePose, poseOf } from "./share.js";
@@ -91,9 +92,10 @@ window.pansplat = Object.assign(new EventTarget(), {
     await this.ready;
     const place = [...camera.position];
     settleAt(place);
-    while (!renderer || !isComplete() || !isSortedFor(place, currentPart())) {
+    while (!renderer || !isComplete() || !isSortedFor(place, currentPart()) || !photographs.isFinal([width, height])) {
       if (failure) throw failure;
       await wait(5);
+      photographs.update(1, [width, height]);
     }
     settleAt(place);
     sorted.views.forEach((view) => { shown[view] = 1; });

@@ -32,6 +32,7 @@ from torch import Tensor
 from pansplat import constants, pipeline
 from pansplat.atomic import replacing
 from pansplat.console import with_progress_bar
+from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import SOFTWARE, is_written
@@ -59,11 +60,15 @@ from pansplat.tours import (
 )
 from pansplat.tours.layout import REACH
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
+from pansplat.web.photographs import PackedPhotograph, pack_photographs
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
+PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
 MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
 MAX_FILE_BYTES = 64_000_000  # of a page in one file
-_TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages
+_TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages, and photographs are smaller
+_GAUSSIANS_SHARE = 2 / 3  # of it, beside photographs
+_PROGRAM_BYTES = 200_000  # of a page without its data
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
 _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _START_FOV = 75.0  # degrees, vertical, of a landscape image
@@ -76,6 +81,7 @@ _BATCH = 256  # quads that are drawn together
 _MAX_CAMERAS = 1024  # of a doll's house; their number has 10 bits (page.vert)
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
+_SHADERS |= {"photograph": ("screen.vert", "photograph.frag")}
 
 _ORIGIN = re.compile(r"(https?)://([a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::([0-9]{1,5}))?/?")
 _DEFAULT_PORTS = {"http": 80, "https": 443}
@@ -96,6 +102,7 @@ class PageFiles:
         num_gaussians: in the page.
         degree: of its harmonics.
         embed: origins of the pages that may frame it and exchange messages with it.
+        photo_height: of its photographs, pixels; 0 without photographs.
     """
 
     files: tuple[Path, ...]
@@ -103,6 +110,7 @@ class PageFiles:
     num_gaussians: int
     degree: int
     embed: tuple[str, ...] = ()
+    photo_height: int = 0
 
 
 @with_progress_bar
@@ -114,6 +122,8 @@ def write_page(
     split: bool = False,
     title: str | None = None,
     embed: Sequence[str] = (),
+    photographs: Sequence[Pair] = (),
+    photo_height: int | None = None,
     progress: Progress | None = None,
 ) -> PageFiles:
     """Write a scene as a web page.
@@ -127,6 +137,8 @@ def write_page(
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
         embed: origins of host pages that move the camera by messages (docs/web.md, Embedding).
+        photographs: of each view, which the page shows there (`pansplat.web.list_photographs`); none without them.
+        photo_height: their largest height, pixels; by default what fits, if it is split that of the files.
         progress: called with a description of the current work and the completed fraction.
     """
     path, embed = Path(path), parse_origins(embed)
@@ -150,18 +162,28 @@ def write_page(
         report("merging Gaussians", 0.1)
         scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0)
     report("compressing", 0.6)
-    degree = _choose_degree(scene)
+    degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if photographs and not split else 1))
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     cameras = None if rooms is None else _find_cameras(scene, rooms)
     packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree, cameras)
-    report("drawing the poster", 0.8)
+    report("drawing the poster", 0.7)
     poster = _draw_poster(scene, flights.start)
-    report("writing", 0.9)
+    pictures: list[PackedPhotograph] = []
+    if photographs:
+        left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - len(packed.content) - len(poster)
+        pictures = pack_photographs(
+            scene,
+            photographs,
+            math.inf if split else left,
+            photo_height,
+            lambda what, fraction: report(what, 0.75 + 0.2 * fraction),
+        )
+    report("writing", 0.95)
     header = _describe_scene(scene, packed, origin, flights, tour)
-    header |= {"embed": embed, "doll": None}
+    header |= {"embed": embed, "doll": None, "photographs": [picture.describe() for picture in pictures]}
     if rooms is not None and cameras is not None:
         header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
-    return _write_files(path, header, packed.content, poster, split, title or path.stem)
+    return _write_files(path, header, packed.content, pictures, poster, split, title or path.stem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,11 +343,11 @@ def _merge_part(scene: Scene, count: int, steps: int) -> Scene:
     return dataclasses.replace(merged, gaussians=fitted)
 
 
-def _choose_degree(scene: Scene) -> int:
-    """The highest degree of harmonics with which the page has its target size even if nothing is compressed."""
+def _choose_degree(scene: Scene, num_bytes: float) -> int:
+    """The highest degree of harmonics with which the data of a page is small enough even if nothing is compressed."""
     count = len(scene.gaussians)
     degrees = range(min(scene.gaussians.degree, MAX_DEGREE), 0, -1)
-    return next((degree for degree in degrees if count_bytes(count, degree) * 4 / 3 <= _TARGET_BYTES), 0)
+    return next((degree for degree in degrees if count_bytes(count, degree) * 4 / 3 <= num_bytes), 0)
 
 
 def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"]) -> bytes:
@@ -500,28 +522,41 @@ def _round(vector: np.ndarray) -> list[float]:
 
 
 def _write_files(
-    path: Path, header: dict[str, Any], content: bytes, poster: bytes, split: bool, title: str
+    path: Path,
+    header: dict[str, Any],
+    content: bytes,
+    pictures: Sequence[PackedPhotograph],
+    poster: bytes,
+    split: bool,
+    title: str,
 ) -> PageFiles:
     """Write the page, and its parts if it is split."""
     count = header["count"]
     parts = [base64.b64encode(content[k : k + _PART_BYTES]).decode() for k in range(0, len(content), _PART_BYTES)]
-    scripts = [f'addPart("{part}"); // {SOFTWARE}\n' for part in parts] if split else []
+    texts = [f'addPart("{part}"); // {SOFTWARE}\n' for part in parts] if split else []
+    scripts = {f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js": text for text in texts}
     folder = path.with_name(f"{path.stem}_files")
-    names = [f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js" for text in scripts]
-    tags = [f'<script src="{quote(os.fsencode(folder.name))}/{name}"></script>' for name in names]
+    address = quote(os.fsencode(folder.name))
+    tags = [f'<script src="{address}/{name}"></script>' for name in scripts]
+    if split:
+        for picture in pictures:
+            scripts |= picture.make_scripts()
+    else:
+        tags = [f'<script type="text/plain">{part}</script><script>addPart()</script>' for part in parts]
+        elements = [pictures[view].make_element() for view in header["loading"] if pictures]
+        tags[1:1] = elements[:1]  # of the first panorama early
+        tags += elements[1:]
     page = _fill_template(
         script_sources="'self' file: blob:" if split else "blob:",
         title=html.escape(title),
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
         count=f"{count:,}",
-        header=_to_script(header | {"dataParts": len(parts)}),
+        header=_to_script(header | {"dataParts": len(parts), "folder": address if split else None}),
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         worker=_to_script("".join(map(_read, _WORKER))),
         programs=_bundle_programs(),
-        parts="\n".join(
-            tags or (f'<script type="text/plain">{part}</script><script>addPart()</script>' for part in parts)
-        ),
+        parts="\n".join(tags),
     ).encode(errors="replace")  # a title from a file name that is not UTF-8
     if len(page) > MAX_FILE_BYTES and not split:
         fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
@@ -529,19 +564,20 @@ def _write_files(
             f"{path}: needed a page of at most {MAX_FILE_BYTES // 1_000_000} MB in one file, got "
             f"{len(page) / 1e6:.0f} MB; split it (--split), or keep at most {fitting:,} Gaussians (--gaussians)"
         )
-    files = [folder / name for name in names]
+    files = [folder / name for name in scripts]
     if split:
         _make_folder(folder)
-    for file, text in zip(files, scripts, strict=False):
+    for file, text in zip(files, scripts.values(), strict=True):
         with replacing(file) as temporary:
             temporary.write_text(text, "utf-8")
     with replacing(path) as temporary:
         temporary.write_bytes(page)
     if split:
-        _remove_old_parts(folder, set(names))
+        _remove_old_parts(folder, set(scripts))
     files.insert(0, path)
-    total = len(page) + sum(map(len, scripts))
-    return PageFiles(tuple(files), total, count, header["degree"], header["embed"])
+    total = len(page) + sum(map(len, scripts.values()))
+    photo_height = max((picture.height for picture in pictures), default=0)
+    return PageFiles(tuple(files), total, count, header["degree"], header["embed"], photo_height)
 
 
 def parse_origins(texts: Sequence[str]) -> tuple[str, ...]:
@@ -578,7 +614,7 @@ def _make_folder(folder: Path) -> None:
 def _remove_old_parts(folder: Path, kept: set[str]) -> None:
     """Remove the parts of the page that was replaced."""
     for file in folder.glob("*.js"):
-        if file.name not in kept and re.fullmatch(r"[0-9a-f]{16}\.js", file.name) and is_written(file):
+        if file.name not in kept and re.fullmatch(r"[0-9a-f]{16}(_\d+)?\.js", file.name) and is_written(file):
             with suppress(OSError):
                 file.unlink()
 

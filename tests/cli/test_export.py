@@ -124,8 +124,32 @@ def test_a_web_page_is_written(scene: Path, tmp_path: Path, capsys: pytest.Captu
     assert '"embed": ["https://a.org", "http://b"]' in out.read_text()
 
 
+def test_a_page_of_panoramas_shows_them_and_a_crop_does_not(
+    tmp_path: Path,
+    write_tour: Callable[..., Path],
+    refusal: Callable[..., str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
+    house, out = write_tour(tmp_path / "house", height=64), tmp_path / "tour"
+    command = ["export", str(house), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
+    for _ in range(2):  # a page of ours is replaced
+        assert run([*command, str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{out / 'index.html'} and 19 files in index_files/" in printed and "3 photographs of 64 rows" in printed
+    assert '"folder": "index_files"' in (out / "index.html").read_text()
+    for options in (["--photo-height", "0"], ["--crop", "-9", "-9", "-9", "9", "9", "9"]):
+        assert run([*command, str(tmp_path / "page.html"), *options]) == 0
+        assert '"photographs": []' in (tmp_path / "page.html").read_text()
+    assert "without photographs, which would show what is left out" in capsys.readouterr().err
+    (out / "index.html").write_text("mine")
+    assert "index.html" in refusal(*command, out), "a page of another program stays"
+
+
 def test_options_of_pages_are_for_pages(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--split")
+    assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--photo-height", "1024")
     assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--embed", "https://example.com")
     refused = refusal("export", tmp_path / "none", "-o", tmp_path / "tour.html", "--embed", "example.com")
     assert "got 'example.com'" in refused, "before anything is loaded"
@@ -254,7 +278,7 @@ def test_a_crop_keeps_the_cameras_in_the_box_and_states_what_it_leaves_out(
     message = refusal("export", scene, "-o", out, "--layers", "--crop", 50, 50, 50, 60, 60, 60)
     assert f"{scene}: needed a box with Gaussians, got (50.00" in message
     assert "--crop" in refusal("export", scene, "-o", out, "--crop", "a", 0, 0, 1, 1, 1)
-    message = refusal("export", room, "-o", tmp_path / "set", "--crop", 0, 0, 0, 1, 1, 1)
+    message = refusal("export", room, "-o", tmp_path / "set", "--training-set", "--crop", 0, 0, 0, 1, 1, 1)
     assert "--crop, --rooms and --no-floaters are not for a folder to train from" in message
 
 

@@ -28,7 +28,7 @@ def test_a_folder_to_train_from_has_the_poses_and_gaussians_of_the_scene(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "sets" / "room"
-    assert run(["export", str(room), "-o", str(out), *OPTIONS]) == 0
+    assert run(["export", str(room), "-o", str(out), "--training-set", *OPTIONS]) == 0
     scene = pipeline.predict(pipeline.load_pairs(room)[0], "sphere", height=64, joint=True)
     assert f"12 cube faces of 2 panoramas, {len(scene.gaussians)} points" in capsys.readouterr().out
     assert sorted(path.name for path in out.iterdir()) == [
@@ -55,7 +55,7 @@ def test_a_folder_to_train_from_is_where_the_poses_are(room: Path, tmp_path: Pat
             row[3] += x
         content["poses"][name] = rows
     source.write_text(json.dumps(content))
-    assert run(["export", str(room), "-o", str(out), *OPTIONS]) == 0
+    assert run(["export", str(room), "-o", str(out), "--training-set", *OPTIONS]) == 0
     points = [line.split()[1:4] for line in (out / "sparse/0/points3D.txt").read_text().splitlines()[1:]]
     points = np.array(points, float)
     assert np.abs(points - origin).max() < 100
@@ -74,11 +74,15 @@ def test_a_folder_to_train_from_is_where_the_poses_are(room: Path, tmp_path: Pat
 def test_a_folder_with_files_and_a_scene_file_are_refused(
     room: Path, scene: Path, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
-    assert "needed a new or empty folder, got one with files" in refusal("export", room, "-o", room, *OPTIONS)
-    message = refusal("export", scene, "-o", tmp_path / "set", *OPTIONS)
+    assert "needed a new or empty folder, got one with files" in refusal(
+        "export", room, "-o", room, "--training-set", *OPTIONS
+    )
+    message = refusal("export", scene, "-o", tmp_path / "set", "--training-set", *OPTIONS)
     assert "needed the folder of the panoramas to write their cube faces, got a scene file" in message
     assert not (tmp_path / "set").exists()
-    assert "--points writes a .ply" in refusal("export", room, "-o", tmp_path / "set", "--points", *OPTIONS)
+    assert "--points writes a .ply" in refusal(
+        "export", room, "-o", tmp_path / "set", "--training-set", "--points", *OPTIONS
+    )
 
 
 def test_an_export_into_a_folder_of_photographs_does_not_hide_them(
@@ -86,7 +90,7 @@ def test_an_export_into_a_folder_of_photographs_does_not_hide_them(
 ) -> None:
     room = write_room(tmp_path / "room", target=False)
     out = room / "exports" / "training_set"
-    assert run(["export", str(room), "-o", str(out), *OPTIONS]) == 0
+    assert run(["export", str(room), "-o", str(out), "--training-set", *OPTIONS]) == 0
     for name in ("poses.json", "pairs.json"):
         (room / name).unlink()
     recwarn.clear()
@@ -137,15 +141,16 @@ def test_no_export_repeats_the_metadata_of_the_photographs(
     (room / "poses.json").write_text(json.dumps(content))
     out = tmp_path / "out"
     out.mkdir()
-    for name in ("s.ply", "s.glb", "s.spz", "s.html", "set"):
-        assert run(["export", str(room), "-o", str(out / name), *OPTIONS]) == 0
+    for name in ("s.ply", "s.glb", "s.spz", "s.html", "page", "set"):
+        kind = ["--training-set"] if name == "set" else []
+        assert run(["export", str(room), "-o", str(out / name), *kind, *OPTIONS]) == 0
     for name in ("r.png", "r.jpg", "r.webp", "r.exr", "r.mp4"):
         assert run(["render", str(out / "s.ply"), "-o", str(out / name), "--height", "32"]) == 0
     files = [path for path in sorted(out.rglob("*")) if path.is_file()]
     assert len(files) > 20
     for path in files:
         parts = [path.read_bytes()]
-        for text in re.findall(rb"[A-Za-z0-9+/]{64,}={0,2}", parts[0]) if path.suffix == ".html" else ():
+        for text in re.findall(rb"[A-Za-z0-9+/]{64,}={0,2}", parts[0]) if path.suffix in (".html", ".js") else ():
             parts.append(base64.b64decode(text + b"=" * (-len(text) % 4)))
         parts += [gzip.decompress(part) for part in parts if part.startswith(b"\x1f\x8b")]
         assert not any(b"SECRET" in part or str(tmp_path).encode() in part for part in parts), path

@@ -2,10 +2,15 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
+import cv2
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from pansplat.data.pairs import Pair, Panorama
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 
@@ -83,3 +88,25 @@ def flat() -> Scene:
         links=((0, 2, 0.5 * math.pi, 0.6, "<i>down"), (2, 0, 0.0, 0.3, "")),
         starts=((0.3, 0.2), None, None, (1.0, -0.2)),
     )
+
+
+@pytest.fixture(scope="session")
+def take_photographs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Scene, int], list[Pair]]:
+    """A function that writes smooth random panoramas of a height for the cameras of a scene to a new folder.
+
+    It returns a pair of one view each. They are not what the Gaussians show.
+    """
+
+    def take(scene: Scene, height: int) -> list[Pair]:
+        folder, pairs = tmp_path_factory.mktemp("photographs"), []
+        for view, pose in enumerate(scene.cam2world):
+            noise = np.random.default_rng(view).uniform(60, 220, (16, 32, 1)) + np.array((0, 10, 0))
+            noise = np.pad(noise, ((0, 0), (1, 1), (0, 0)), mode="wrap")
+            pixels = cv2.resize(noise, None, fx=height / 16, fy=height / 16)[:, height // 16 : -height // 16]
+            pixels = pixels + np.linspace(-30, 30, height)[:, None, None]
+            path = folder / f"{view}.png"
+            Image.fromarray(pixels.clip(1, 255).astype(np.uint8)).save(path)
+            pairs.append(Pair(f"{view}", folder, (Panorama(f"{view}", path, pose),), (), 0.5, 10.0, (path,)))
+        return pairs
+
+    return take

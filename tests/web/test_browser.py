@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -24,8 +24,10 @@ from jaxtyping import Float
 from PIL import Image
 
 from pansplat import pipeline
-from pansplat.data.pairs import Link, Panorama
+from pansplat.data.images import read_panorama
+from pansplat.data.pairs import Link, Pair, Panorama
 from pansplat.gaussians.scene import Scene
+from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import path_poses
 from pansplat.tours import EDGE_HYSTERESIS, TourGraph, find_fronts, find_rooms, make_graph, select_views
 from pansplat.tours.layout import REACH
@@ -114,8 +116,17 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sites]:
 
 
 @pytest.fixture(scope="module")
-def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites) -> Path:
-    """tour.html, split.html with files, house.html with a graph, flat.html with parts; embedded.html has a host."""
+def photographs(scene: Scene, take_photographs: Callable[..., list[Pair]]) -> list[Pair]:
+    """Of the scene, 1024 rows."""
+    return take_photographs(scene, 1024)
+
+
+@pytest.fixture(scope="module")
+def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: list[Pair]) -> Path:
+    """tour.html, split.html with files, house.html with a graph, flat.html with parts; embedded.html has a host.
+
+    photos.html and photos/index.html have photographs.
+    """
     folder = sites.folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
@@ -125,6 +136,9 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites) -> Path:
         write_page(house, folder / "house.html")
         write_page(house, folder / "embedded.html", embed=[sites.host, "https://example.com"])
         write_page(flat, folder / "flat.html")
+        write_page(scene, folder / "photos.html", photographs=photographs)
+        (folder / "photos").mkdir()
+        write_page(scene, folder / "photos" / "index.html", photographs=photographs, split=True)
     return folder
 
 
@@ -280,6 +294,100 @@ def test_the_dolls_house_is_the_picture_of_the_fronts_in_the_rooms_and_a_click_g
     home.wait("HEADER.spots.some((s) => s.position.every((x, i) => x === pansplat.camera.position[i]))")
     assert home.camera["fov"] == start["fov"] and home.page.get_attribute("#doll", "aria-pressed") == "false"
     home.page.emulate_media(reduced_motion="no-preference")
+
+
+def look_at_photograph(photograph: Pair, level: np.ndarray, camera: dict[str, Any]) -> np.ndarray:
+    """The picture of a photograph for a camera of the page at its panorama; the mean of 3x3 samples of a pixel."""
+    cy, sy, cp, sp = (f(camera[angle]) for angle in ("yaw", "pitch") for f in (math.cos, math.sin))
+    turn = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
+    (panorama,) = photograph.context
+    image, _ = read_panorama(panorama.image, 1024)
+    width, height = (3 * side for side in SIZE)
+    tangent = math.tan(math.radians(camera["fov"]) / 2)
+    y, x = ((2 * (np.arange(side) + 0.5) - side) / height * tangent for side in (height, width))
+    rays = np.stack((*np.meshgrid(x, y), np.ones((height, width))), axis=-1)
+    rays = torch.from_numpy(rays @ (panorama.cam2world[:3, :3].numpy().T @ level @ turn).T)
+    seen = sample_equirect(image, uv_from_directions(rays).float()).permute(1, 2, 0).double().numpy()
+    return seen.reshape(SIZE[1], 3, SIZE[0], 3, 3).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("name", ["photos.html", "photos/index.html"])
+def test_at_a_panorama_the_page_shows_its_photograph_and_gaussians_elsewhere(
+    chromium: Any, folder: Path, scene: Scene, photographs: list[Pair], name: str
+) -> None:
+    origin = scene.cam2world[:, :3, 3].mean(0).numpy()
+    with opened(chromium, folder / name) as page:
+        level = np.array(page.run("HEADER.level"))
+        for node, yaw, pitch, fov in ((0, 0, 0, 75), (0, 130, -60, 75), (1, 45, 40, 110), (2, -100, 10, 25)):
+            spot = page.run("(node) => HEADER.spots[node].position", node)
+            for offset, is_photograph in ((0.0, True), (0.02, True), (0.1, False)):
+                pose = {"position": [spot[0] + offset, *spot[1:]], "yaw": yaw, "pitch": pitch, "fov": fov}
+                page.run("(pose) => pansplat.setPose(pose)", pose)
+                image, camera = page.draw(), page.camera
+                seen = look_at_photograph(photographs[node], level, camera)
+                if is_photograph:
+                    assert psnr(image, seen) > 38
+                    assert psnr(image[:, ::-1], seen) < 30 and psnr(image[::-1], seen) < 30
+                else:
+                    assert psnr(image, draw_reference(scene, level, origin, camera)) > 40
+            page.settle()
+        assert page.messages == []
+
+
+def test_a_photograph_fades_without_a_jump(chromium: Any, folder: Path) -> None:
+    record = """(offset) => new Promise((resolve) => {
+        const copy = Object.assign(document.createElement("canvas"), { width: 16, height: 12 }).getContext("2d");
+        const seen = [];
+        const look = () => {
+            copy.drawImage(document.getElementById("view"), 0, 0, 16, 12);
+            seen.push([...copy.getImageData(0, 0, 16, 12).data]);
+            if (seen.length > 3 && pansplat.isSettled()) resolve(seen);
+            else requestAnimationFrame(look);
+        };
+        pansplat.camera.position[0] += offset;
+        pansplat.setPose({});
+        requestAnimationFrame(look);
+    })"""
+    with opened(chromium, folder / "photos.html") as page:
+        for offset in (0.05, -0.05):
+            page.settle()
+            seen = np.array(page.run(record, offset), float).reshape(-1, 192, 4)[..., :3].reshape(-1, 576)
+            seen = seen[seen.max(axis=1) > 0]  # a canvas that is not drawn in a frame is empty
+            along = seen[-1] - seen[0]
+            assert np.abs(along).mean() > 10
+            parts = (seen - seen[0]) @ along / (along @ along)
+            assert (np.diff(parts) > -0.05).all() and ((parts > 0.1) & (parts < 0.9)).any()
+
+
+def test_a_folder_loads_the_tiles_that_are_needed_and_shows_them_again_after_lost_graphics(
+    chromium: Any, folder: Path
+) -> None:
+    with opened(chromium, folder / "photos" / "index.html") as page:
+        page.settle()
+        names = page.run("HEADER.photographs.map(({ name }) => name)")
+
+        def list_loaded() -> list[int]:
+            return [node for node, name in enumerate(names) if any(f"/{name}_" in url for url in page.requests)]
+
+        (first,) = list_loaded()
+        image = page.draw()
+        page.run("pansplat.goTo(3, { jump: true })")
+        page.settle()
+        assert list_loaded() == sorted({first, 2})
+        page.run("(node) => pansplat.goTo(node, { jump: true })", first + 1)
+        page.settle()
+        page.run(
+            """() => {
+                const lost = document.getElementById("view").getContext("webgl2").getExtension("WEBGL_lose_context");
+                lost.loseContext();
+                setTimeout(() => lost.restoreContext(), 50);
+            }"""
+        )
+        page.page.wait_for_timeout(200)
+        page.settle()
+        page.run("(node) => pansplat.goTo(node, { jump: true })", first + 1)
+        page.settle()
+        assert psnr(page.draw(), image) > 30
 
 
 def test_the_page_loads_without_network_or_messages(page: OpenPage, folder: Path) -> None:

@@ -1,0 +1,246 @@
+// The photographs of the panoramas: where the camera stands at one, its photograph is shown, and Gaussians while it moves.
+// docs/web.md describes it. Tiles of cube faces arrive as text in scripts: a page from disk may not read the pixels of
+// image files. A large level is drawn over the smallest one, as far as it has arrived.
+
+import { camera, GRAPH, nodeHere, rotationOf, tangentOf } from "./camera.js";
+import { doll } from "./doll.js";
+import { flight } from "./flight.js";
+import { clamp, column, distanceOf, dot, multiply, scaled } from "./graph.js";
+import { changed, fullSize, refresh, renderer } from "./loop.js";
+import { headset } from "./xr.js";
+
+const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
+const GONE = 0.3;                   // metres from a panorama, where its photograph has faded at any rate
+const PHOTO_FADE = 0.2;             // seconds
+const DENSITY = 0.8;                // texels of a pixel in the middle of a face, at least
+const KEPT = 3;                     // photographs whose textures are kept
+const AT_ONCE = 6;                  // tiles that are read at the same time
+const SMALL_FACE = 2048;            // largest face on a phone, texels
+// Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number among those of OpenGL.
+const FACES = [
+  [[1, 0, 0], [0, 1, 0], [0, 0, 1], 4], [[0, 0, -1], [0, 1, 0], [1, 0, 0], 0], [[-1, 0, 0], [0, 1, 0], [0, 0, -1], 5],
+  [[0, 0, 1], [0, 1, 0], [-1, 0, 0], 1], [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2], [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
+];
+const texts = new Map();            // of a page in one file: base64 of the tiles that have arrived
+const requests = new Map();         // of other pages: what takes the text of a tile
+
+// A script for each tile calls this; in a page of one file, one for all tiles of a photograph, which are in the element before.
+window.addTile = (name, number, text) => {
+  if (number !== undefined) {
+    requests.get(`${name}_${number}`)(text);
+    return;
+  }
+  const { currentScript: script } = document, { previousElementSibling: element } = script;
+  element.textContent.split(" ").forEach((each, k) => texts.set(`${name}_${k}`, each));
+  element.remove();
+  script.remove();
+};
+
+function readText(key) {
+  if (HEADER.folder === null) return Promise.resolve(texts.get(key));
+  return new Promise((resolve, reject) => {
+    const script = document.createElement("script");
+    requests.set(key, resolve);
+    script.src = `${HEADER.folder}/${key}.js`;
+    script.onload = () => script.remove();
+    script.onerror = () => reject(new Error(`${script.src} is missing`));
+    document.head.append(script);
+  });
+}
+
+async function readTile(key) {
+  const image = new Image();
+  image.src = `data:image/jpeg;base64,${await readText(key)}`;
+  await image.decode();
+  return image;
+}
+
+// One size of a photograph. `states` of its tiles: undefined, or "reading", "ready" or "failed".
+class Level {
+  constructor(name, rotation, first, [size, step]) {
+    Object.assign(this, { size, texture: null, isFresh: true, tiles: [] });
+    const count = Math.ceil(size / step);
+    FACES.forEach(([right, down, forward, face]) => {
+      for (let row = 0; row < count; row++) {
+        for (let across = 0; across < count; across++) {
+          const [x, y] = [across, row].map((k) => (2 * k + 1) * step / size - 1);
+          const ray = [0, 1, 2].map((k) => x * right[k] + y * down[k] + forward[k]);
+          const direction = scaled(rotation.map((axis) => dot(axis, ray)), 1 / Math.hypot(...ray));
+          const reach = Math.atan(Math.SQRT2 * step / size);
+          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, state: null });
+        }
+      }
+    });
+  }
+
+  get isReady() {
+    return this.tiles.every(({ state }) => state === "ready");
+  }
+
+  take(tile, image) {
+    const { gl } = renderer;
+    gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture || this.makeTexture());
+    gl.texSubImage2D(gl.TEXTURE_CUBE_MAP_POSITIVE_X + tile.face, 0, tile.x, tile.y, gl.RGBA, gl.UNSIGNED_BYTE, image);
+    this.isFresh = false;
+  }
+
+  makeTexture() {
+    const { gl } = renderer;
+    this.texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture);
+    gl.texStorage2D(gl.TEXTURE_CUBE_MAP, Math.floor(Math.log2(this.size)) + 1, gl.RGBA8, this.size, this.size);
+    gl.texParameteri(gl.TEXTURE_CUBE_MAP, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    return this.texture;
+  }
+
+  bind(unit) {
+    const { gl } = renderer;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture);
+    if (!this.isFresh) gl.generateMipmap(gl.TEXTURE_CUBE_MAP);
+    this.isFresh = true;
+  }
+
+  release() {
+    if (this.texture && !renderer.gl.isContextLost()) renderer.gl.deleteTexture(this.texture);
+    this.texture = null;
+    this.tiles.forEach((tile) => { tile.state = null; });
+  }
+}
+
+class Photographs {
+  constructor() {
+    Object.assign(this, { opacity: 0, target: 0, node: null, wanted: null, last: null, reading: 0, made: new Map(), renderer: null });
+  }
+
+  // Whether nothing else is seen.
+  get isOpaque() {
+    return this.opacity === 1;
+  }
+
+  // Whether the picture has all of the photograph that it needs.
+  isFinal(size = fullSize()) {
+    if (!HEADER.photographs.length || headset.session) return true;
+    if (this.last === null || this.renderer !== renderer || distanceOf(camera.position, this.last) > 0) return false;
+    const node = this.findNode(), isDue = node !== null && this.levelsOf(node)[0].isReady;
+    if (this.target !== Number(isDue) || this.opacity !== this.target) return false;
+    return node === null || this.listMissing(node, size, true).every(({ state }) => state === "failed");
+  }
+
+  // The panorama at which the camera stands.
+  findNode() {
+    const node = nodeHere();
+    return !doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
+  }
+
+  // The levels of a photograph that the device can hold, the smallest first.
+  levelsOf(node) {
+    if (!this.made.has(node)) {
+      const { name, levels, rotation } = HEADER.photographs[node], { gl } = renderer;
+      const most = Math.min(gl.getParameter(gl.MAX_CUBE_MAP_TEXTURE_SIZE), matchMedia("(pointer: coarse)").matches ? SMALL_FACE : Infinity);
+      let first = 0;
+      const made = levels.map((level) => {
+        const each = new Level(name, rotation, first, level);
+        first += each.tiles.length;
+        return each;
+      });
+      this.made.set(node, made.filter(({ size }, k) => k === 0 || size <= most));
+    }
+    return this.made.get(node);
+  }
+
+  // The level that is sharp enough for a size of the picture.
+  chooseLevel(node, [width, height]) {
+    const density = 0.5 * height / tangentOf(width, height), levels = this.levelsOf(node);
+    return levels.find(({ size }) => 0.5 * size >= DENSITY * density) || levels.at(-1);
+  }
+
+  // The tiles that have not arrived: those of the smallest level, then of the chosen one those in view, then the others.
+  listMissing(node, size, isOnlySeen = false) {
+    const forward = column(rotationOf(camera), 2), tangent = tangentOf(...size);
+    const corner = Math.atan(Math.hypot(tangent, tangent * size[0] / size[1]));
+    const away = ({ direction, reach }) => Math.acos(clamp(dot(direction, forward), -1, 1)) - reach - corner;
+    const [preview] = this.levelsOf(node), level = this.chooseLevel(node, size);
+    const tiles = [...preview.tiles, ...(level === preview ? [] : level.tiles)].filter(({ state }) => state !== "ready");
+    const found = tiles.map((tile) => ({ tile, isPreview: preview.tiles.includes(tile), angle: away(tile) }));
+    found.sort((a, b) => b.isPreview - a.isPreview || a.angle - b.angle);
+    return found.filter(({ isPreview, angle }) => !isOnlySeen || isPreview || angle < 0).map(({ tile }) => tile);
+  }
+
+  // Reads what the photograph at the camera needs, or that where a flight ends, and fades; `seconds` after the last time.
+  update(seconds, size = fullSize()) {
+    if (!HEADER.photographs.length || !renderer) return;
+    if (this.renderer !== renderer) {  // the graphics were lost
+      this.made.clear();
+      Object.assign(this, { renderer, program: renderer.link(SHADERS.photograph), opacity: 0 });
+    }
+    const node = this.findNode(), isStill = this.last !== null && distanceOf(camera.position, this.last) === 0;
+    this.last = [...camera.position];
+    this.wanted = node !== null || !flight ? nodeHere() : flight.spot;
+    this.read(this.wanted, size);
+    const isShown = isStill && node !== null && !headset.session && this.levelsOf(node)[0].isReady;
+    if (this.node !== null && node !== this.node) {
+      const most = headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / (GONE * HEADER.unit);
+      this.opacity = clamp(this.opacity, 0, Math.max(most, 0));
+    }
+    if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
+    this.target = isShown ? 1 : 0;
+    if (this.opacity === this.target) return;
+    const step = seconds / PHOTO_FADE;
+    this.opacity = clamp(this.target, this.opacity - step, this.opacity + step);
+    changed();
+  }
+
+  read(node, size) {
+    for (const old of [...this.made.keys()].filter((each) => each !== node && each !== this.node).slice(0, -KEPT + 1)) {
+      this.made.get(old).forEach((level) => level.release());
+      this.made.delete(old);
+    }
+    const levels = this.levelsOf(node);
+    const tiles = this.listMissing(node, size).filter(({ key, state }) => !state && (HEADER.folder !== null || texts.has(key)));
+    tiles.slice(0, Math.max(AT_ONCE - this.reading, 0)).forEach(async (tile) => {
+      const level = levels.find(({ tiles: each }) => each.includes(tile));
+      tile.state = "reading";
+      this.reading += 1;
+      try {
+        const image = await readTile(tile.key);
+        if (this.made.get(node) === levels && this.renderer === renderer) {
+          level.take(tile, image);
+          tile.state = "ready";
+          refresh();
+        }
+      } catch (error) {
+        tile.state = "failed";
+        console.warn(error);
+      }
+      this.reading -= 1;
+      if (this.wanted === node && this.renderer === renderer) this.read(node, size);
+    });
+  }
+
+  // Draws over the viewport of the canvas; `seen` is a camera of Renderer.draw.
+  draw({ rotation, center, half }, width, height) {
+    if (!this.opacity) return;
+    const { gl, screen } = renderer, { program, places } = this.program, levels = this.levelsOf(this.node);
+    const chosen = this.chooseLevel(this.node, [width, height]);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    gl.useProgram(program);
+    gl.uniform1i(places.preview, 0);
+    gl.uniform1i(places.detail, 1);
+    levels[0].bind(0);
+    (chosen.texture ? chosen : levels.filter(({ texture }) => texture).at(-1)).bind(1);
+    // The rows of the inverse are the columns of the rotation; y of a cube map is up.
+    const inverse = [0, 1, 2].map((k) => column(rotation, k)), turned = multiply(inverse, HEADER.photographs[this.node].rotation);
+    gl.uniformMatrix3fv(places.camera_to_cube, false, turned.flatMap(([x, y, z]) => [x, -y, z]));
+    gl.uniform4f(places.window, ...center, ...half);
+    gl.uniform2f(places.size, width, height);
+    gl.uniform1f(places.opacity, this.opacity);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(screen);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+}
+
+export const photographs = new Photographs();

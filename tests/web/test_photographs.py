@@ -1,0 +1,183 @@
+"""The photographs of a page, without a browser: their pixels, size, masks and exposure."""
+
+import base64
+import dataclasses
+import io
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from PIL import Image
+
+from pansplat.data.cube_images import equirect_from_faces
+from pansplat.data.images import read_panorama
+from pansplat.data.pairs import Pair, Panorama
+from pansplat.gaussians.scene import Scene
+from pansplat.web import page as page_module
+from pansplat.web import photographs as module
+from pansplat.web import write_page
+from pansplat.web.photographs import PackedPhotograph, pack_photographs, read_photograph
+
+PURPLE = (200, 0, 200)  # of what masks hide; nothing else has so little green
+
+
+@pytest.fixture(autouse=True)
+def small_poster(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
+
+
+def count_purple(pixels: np.ndarray) -> int:
+    """Pixels (H W 3) that are more purple than grey."""
+    values = np.asarray(pixels).astype(int)
+    return int((values[..., [0, 2]].min(-1) - values[..., 1] > 40).sum())
+
+
+@pytest.fixture
+def grey(scene: Scene) -> Scene:
+    """The scene without colours."""
+    harmonics = scene.gaussians.harmonics.mean(dim=2, keepdim=True).expand(-1, -1, 3).contiguous()
+    return dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, harmonics=harmonics))
+
+
+def hide(photographs: list[Pair], kind: str) -> list[Pair]:
+    """The photographs with a purple square in the first one, and a mask that hides it; for the kind "none" without."""
+    first = photographs[0].context[0]
+    pixels = np.asarray(Image.open(first.image)).copy()
+    rows = len(pixels)
+    pixels[rows // 2 : rows // 2 + rows // 8, rows : rows + rows // 8] = PURPLE
+    Image.fromarray(pixels).save(first.image)
+    square = np.zeros(pixels.shape[:2], np.uint8)
+    square[rows // 2 : rows // 2 + rows // 8, rows : rows + rows // 8] = 255
+    mask = first.image.with_name(f"{first.name}_{kind}.png")
+    if kind != "none":
+        Image.fromarray(255 - square if kind == "mask" else square).save(mask)
+    chosen = dataclasses.replace(first, mask=mask if kind == "mask" else None)
+    return [dataclasses.replace(photographs[0], context=(chosen,)), *photographs[1:]]
+
+
+def decode_faces(packed: PackedPhotograph, level: int = -1) -> list[np.ndarray]:
+    """The six faces of a level of a photograph."""
+    first = 0
+    for number, (size, step) in enumerate(packed.levels):
+        count = math.ceil(size / step)
+        if number == level % len(packed.levels):
+            tiles = [np.asarray(Image.open(io.BytesIO(tile))) for tile in packed.tiles[first : first + 6 * count**2]]
+            rows = [np.concatenate(tiles[k : k + count], axis=1) for k in range(0, len(tiles), count)]
+            return [np.concatenate(rows[k : k + count]) for k in range(0, len(rows), count)]
+        first += 6 * count**2
+    raise AssertionError(level)
+
+
+def decode_page(path: Path) -> list[np.ndarray]:
+    """The pixels of every picture in the files of a page."""
+    pictures = []
+    for file in [path, *path.parent.glob(f"{path.stem}_files/*.js")]:
+        for text in re.findall(rb"[A-Za-z0-9+/]{64,}={0,2}", file.read_bytes()):
+            data = base64.b64decode(text + b"=" * (-len(text) % 4))
+            if data.startswith(b"\xff\xd8"):
+                image = Image.open(io.BytesIO(data))
+                assert not image.getexif() and "xmp" not in image.info and "comment" not in image.info
+                pictures.append(np.asarray(image.convert("RGB")))
+    return pictures
+
+
+def psnr(a: Float[np.ndarray, "..."], b: Float[np.ndarray, "..."]) -> float:
+    return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-12))
+
+
+def pack(scene: Scene, photographs: list[Pair], **options: Any) -> list[PackedPhotograph]:
+    arguments = {"num_bytes": math.inf, "height": None} | options
+    return pack_photographs(scene, photographs, progress=lambda what, fraction: None, **arguments)
+
+
+def test_the_tiles_of_the_largest_level_are_the_photograph(
+    scene: Scene, take_photographs: Callable[..., list[Pair]]
+) -> None:
+    photographs = take_photographs(scene, 1024)
+    for view, packed in enumerate(pack(scene, photographs)):
+        image, _ = read_panorama(photographs[view].context[0].image, 1024)
+        assert [size for size, _ in packed.levels] == [384, 672] and packed.height == 1024
+        for level, least in ((0, 34), (1, 38)):
+            faces = decode_faces(packed, level)
+            assert faces[0].shape == (packed.levels[level][0],) * 2 + (3,)
+            seen = equirect_from_faces(faces, 1024) / 255
+            assert psnr(seen, image.permute(1, 2, 0).numpy()) > least
+        assert np.allclose(packed.rotation, scene.cam2world[view, :3, :3])
+
+
+@pytest.mark.parametrize("kind", ["mask", "blur"])
+@pytest.mark.parametrize("split", [False, True])
+def test_what_masks_hide_is_in_no_file_of_a_page(
+    grey: Scene, tmp_path: Path, take_photographs: Callable[..., list[Pair]], kind: str, split: bool
+) -> None:
+    for chosen, is_hidden in (("none", False), (kind, True)):
+        photographs = hide(take_photographs(grey, 512), chosen)
+        written = write_page(grey, tmp_path / "tour.html", photographs=photographs, split=split)
+        pictures = decode_page(tmp_path / "tour.html")
+        assert written.photo_height == 512 and len(pictures) > 6 * 3
+        assert (sum(map(count_purple, pictures)) == 0) == is_hidden, "the test fails if masks are left out"
+        (tmp_path / "tour.html").unlink()
+
+
+def test_a_photograph_shows_the_gaussians_in_what_its_mask_hides_and_itself_elsewhere(
+    grey: Scene, take_photographs: Callable[..., list[Pair]]
+) -> None:
+    (photograph, *_) = hide(take_photographs(grey, 256), "mask")
+    image = read_photograph(grey, 0, photograph, 256)
+    original, _ = read_panorama(photograph.context[0].image, 256)
+    mask = cv2.imread(str(photograph.context[0].mask), cv2.IMREAD_GRAYSCALE)
+    near = cv2.dilate(255 - mask, np.ones((13, 13), np.uint8)) > 0
+    assert torch.equal(image[:, ~near], original[:, ~near])
+    assert count_purple((image.permute(1, 2, 0) * 255).numpy()) == 0 and image[:, mask == 0].std() > 0.01
+
+
+def test_photographs_have_the_exposure_of_their_gaussians(
+    scene: Scene, take_photographs: Callable[..., list[Pair]]
+) -> None:
+    gains = ((1.25, 1.0, 0.8), (0.8, 1.0, 1.25), (1.0, 1.0, 1.0))
+    photographs = take_photographs(scene, 64)
+    original, _ = read_panorama(photographs[0].context[0].image, 64)
+    for joint, factors in ((False, (1.0, 1.0, 1.0)), (True, gains[0])):
+        image = read_photograph(dataclasses.replace(scene, gains=gains, joint=joint), 0, photographs[0], 64)
+        assert torch.allclose(image, (original / torch.tensor(factors)[:, None, None]).clamp(0, 1), atol=1e-6)
+
+
+def test_photographs_fit_into_the_bytes_or_have_the_stated_height(
+    scene: Scene, take_photographs: Callable[..., list[Pair]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MIN_HEIGHT", 128)
+    photographs = take_photographs(scene, 512)
+    full = pack(scene, photographs, num_bytes=1e9)
+    size = sum(packed.num_bytes for packed in full)
+    assert {packed.height for packed in full} == {512}
+    fitted = pack(scene, photographs, num_bytes=0.6 * size)
+    assert sum(packed.num_bytes for packed in fitted) <= 0.6 * size and 128 < fitted[0].height < 512
+    assert {packed.height for packed in pack(scene, photographs, num_bytes=10)} == {128}, "as small as allowed"
+    assert {packed.height for packed in pack(scene, photographs, num_bytes=10, height=300)} == {300}
+    assert sum(packed.num_bytes for packed in pack(scene, photographs)) > size, "a folder has a higher quality"
+
+
+def test_a_new_page_removes_the_tiles_of_the_old_one(
+    plain_scene: Scene, tmp_path: Path, take_photographs: Callable[..., list[Pair]]
+) -> None:
+    photographs = take_photographs(plain_scene, 64)
+    first = write_page(plain_scene, tmp_path / "index.html", split=True, photographs=photographs)
+    header = json.loads(re.findall(r"^const HEADER = (.*);$", first.files[0].read_text(), flags=re.MULTILINE)[0])
+    assert header["folder"] == "index_files" and len(header["photographs"]) == 2
+    assert len(first.files) == 2 + 2 * 6 and all(file.is_file() for file in first.files)
+    second = write_page(plain_scene, tmp_path / "index.html", split=True)
+    assert second.photo_height == 0 and set((tmp_path / "index_files").iterdir()) == set(second.files[1:])
+
+
+def test_a_panorama_of_a_pair_is_a_pair_of_its_own(scene: Scene, tmp_path: Path) -> None:
+    panoramas = tuple(Panorama(f"{k}", tmp_path / f"{k}.png", pose) for k, pose in enumerate(scene.cam2world))
+    pair = Pair("room", tmp_path, panoramas, (), 0.5, 10.0)
+    assert [each.context for each in module.list_photographs(pair, [2, 0])] == [panoramas[2:], panoramas[:1]]
