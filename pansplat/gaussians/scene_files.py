@@ -260,7 +260,7 @@ def _read_pose(rows: Any) -> np.ndarray:
         pose = np.array(rows, np.float64)
     except (TypeError, ValueError):
         pose = np.zeros(0)
-    if pose.shape != (4, 4) or np.abs(pose).max() > MAX_POSITION:
+    if pose.shape != (4, 4) or not np.abs(pose).max() <= MAX_POSITION:  # null is NaN
         raise InputError(f"comment: needed 4x4 numbers up to {MAX_POSITION:g} in cam2world, got {rows!r:.60}")
     return pose
 
