@@ -34,11 +34,6 @@ ERRORS = {
 }
 
 
-def save_and_load(scene: Scene, path: Path) -> Scene:
-    save_scene(scene, path)
-    return load_scene(path)
-
-
 def match(original: Gaussians, found: Gaussians) -> Gaussians:
     """The Gaussians of `original` in the order of `found`, by the nearest mean."""
     distances = torch.cdist(found.means, original.means, compute_mode="donot_use_mm_for_euclid_dist")
@@ -47,18 +42,28 @@ def match(original: Gaussians, found: Gaussians) -> Gaussians:
     return original.select(index)
 
 
-def test_every_suffix_has_its_reader() -> None:
-    assert set(SCENE_SUFFIXES) == {*formats._CODED, ".glb", ".ply"}
+def _vary(scene: Scene, seed: int) -> Scene:
+    """The scene with random labels in any order, and the extremes of opacities."""
+    random = torch.Generator().manual_seed(seed)
+    gaussians, count = scene.gaussians, len(scene.gaussians)
+    labels = {name: torch.randint(2, (count,), generator=random) for name in ("levels", "views")}
+    gaussians.harmonics.clamp_(-0.9, 0.9)  # .spz holds -1 to 1
+    gaussians.opacities[: count // 20], gaussians.opacities[count // 20 : count // 10] = 0.0, 1.0
+    return dataclasses.replace(scene, gaussians=dataclasses.replace(gaussians, **labels))
 
 
+@pytest.mark.parametrize(("count", "seed"), [(1, 0), (40, 1), (700, 2)])
 @pytest.mark.parametrize("suffix", SCENE_SUFFIXES)
-def test_a_scene_survives_each_format_within_its_error(tmp_path: Path, suffix: str, make_scene) -> None:
-    scene = make_scene(degree=0 if suffix == ".splat" else 3)
-    back = save_and_load(scene, tmp_path / f"scene{suffix}")
+def test_any_scene_survives_each_format_within_its_error(
+    tmp_path: Path, suffix: str, count: int, seed: int, make_scene
+) -> None:
+    scene = _vary(make_scene(count, 0 if suffix == ".splat" else (3, 0, 2)[seed], seed=seed), seed)
+    save_scene(scene, tmp_path / f"scene{suffix}")
+    back = load_scene(tmp_path / f"scene{suffix}")
     found = back.gaussians
     original = match(scene.gaussians, found)
     position, rotation, scale, opacity, color, rest = ERRORS[suffix]
-    assert found.degree == scene.gaussians.degree
+    assert len(found) == count and found.degree == scene.gaussians.degree
     assert float((found.means - original.means).abs().max()) <= position
     cosines = (torch.nn.functional.normalize(found.quats, dim=1) * original.quats).sum(dim=1).abs()
     assert float(1 - cosines.min()) <= rotation
@@ -66,14 +71,14 @@ def test_a_scene_survives_each_format_within_its_error(tmp_path: Path, suffix: s
     assert float((found.opacities - original.opacities).abs().max()) <= opacity
     errors = (found.harmonics - original.harmonics).abs()
     assert float(errors[:, 0].max()) <= color
-    if rest is not None:
-        assert float(errors[:, 1:].max()) <= rest
+    assert rest is None or not errors[:, 1:].numel() or float(errors[:, 1:].max()) <= rest
     if suffix == ".splat":
         assert not len(back.cam2world) and not found.views.any()
         return
     assert torch.equal(found.levels, original.levels) and torch.equal(found.views, original.views)
     assert torch.equal(back.cam2world, scene.cam2world)  # bit-exact
-    assert (back.near, back.far, back.height, back.model, back.names) == (0.45, 10.0, 256, "sweep", scene.names)
+    kept = {field.name for field in dataclasses.fields(Scene)} - {"gaussians", "cam2world"}
+    assert {name: getattr(back, name) for name in kept} == {name: getattr(scene, name) for name in kept}
 
 
 def test_an_spz_has_y_up(tmp_path: Path, make_scene) -> None:
@@ -115,7 +120,8 @@ def test_a_compressed_ply_holds_harmonics_channel_by_channel(tmp_path: Path, mak
 
 def test_a_sog_is_an_archive_of_images(tmp_path: Path, make_scene) -> None:
     scene = make_scene(count=9, degree=0)
-    means = save_and_load(scene, tmp_path / "a.sog").gaussians.means.numpy()
+    save_scene(scene, tmp_path / "a.sog")
+    means = load_scene(tmp_path / "a.sog").gaussians.means.numpy()
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         meta = json.loads(archive.read("meta.json"))
         low, high = (
@@ -224,14 +230,6 @@ def test_a_crash_of_the_decoder_is_an_error(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(formats, "_DECODE_SECONDS", 0.2)
     with pytest.raises(InputError, match=r"no result after 0\.2 s"):
         load_scene(tmp_path / "a.sog")
-
-
-def test_a_damaged_entry_is_ignored_with_a_warning(tmp_path: Path, make_scene) -> None:
-    save_scene(make_scene(), tmp_path / "a.compressed.ply")
-    data = (tmp_path / "a.compressed.ply").read_bytes()
-    (tmp_path / "a.compressed.ply").write_bytes(data.replace(b'"near":0.45', b'"near":"no"'))
-    with pytest.warns(InputWarning, match="comment is damaged"):
-        assert not len(load_scene(tmp_path / "a.compressed.ply").cam2world)
 
 
 def test_a_file_of_gaussforge_alone_is_read_without_cameras(tmp_path: Path, make_scene) -> None:

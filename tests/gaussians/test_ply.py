@@ -49,21 +49,6 @@ def _split_file(path: Path) -> list[bytes]:
     return path.read_bytes().split(b"end_header\n", 1)
 
 
-@pytest.mark.parametrize("degree", range(5))
-def test_a_saved_scene_is_loaded_unchanged(tmp_path: Path, degree: int, make_scene) -> None:
-    scene = make_scene(degree=degree)
-    save_ply(scene, tmp_path / "scene.ply")
-    back = load_ply(tmp_path / "scene.ply")
-    for name in FIELDS:
-        torch.testing.assert_close(getattr(back.gaussians, name), getattr(scene.gaussians, name), rtol=2e-6, atol=1e-7)
-    assert torch.equal(back.gaussians.levels, scene.gaussians.levels)
-    assert torch.equal(back.gaussians.views, scene.gaussians.views)
-    assert torch.equal(back.cam2world, scene.cam2world)  # bit-exact
-    assert (back.near, back.far, back.height, back.model) == (0.45, 10.0, 256, "sweep")
-    assert back.names == scene.names and back.gains == scene.gains and back.overlaps == scene.overlaps
-    assert (back.links, back.starts) == (scene.links, scene.starts)
-
-
 def test_the_file_has_the_3dgs_layout(tmp_path: Path, make_scene) -> None:
     """The property order of 3DGS, all floats, channel-major f_rest, and one JSON comment."""
     scene = make_scene(count=4, degree=1)
@@ -125,20 +110,6 @@ def test_extreme_opacities_and_scales_stay_finite(tmp_path: Path, make_scene) ->
     assert float(back.scales[2, 0]) == pytest.approx(SCALE_EPSILON, rel=1e-3)
 
 
-def test_labels_in_any_order_are_kept(tmp_path: Path, make_scene) -> None:
-    """With alternating labels the Gaussians may be sorted, but each keeps its own labels."""
-    scene = make_scene(count=9001, degree=0)
-    g = scene.gaussians
-    g.levels[:] = torch.arange(9001) % 4
-    g.views[:] = torch.arange(9001) % 2
-    save_ply(scene, tmp_path / "scene.ply")
-    back = load_ply(tmp_path / "scene.ply").gaussians
-    order = torch.argsort(g.means[:, 0])
-    again = torch.argsort(back.means[:, 0])
-    assert torch.equal(g.levels[order], back.levels[again])
-    assert torch.equal(g.views[order], back.views[again])
-
-
 def test_a_file_with_another_count_loses_its_labels_but_not_its_cameras(tmp_path: Path, make_scene) -> None:
     path = tmp_path / "scene.ply"
     save_ply(make_scene(count=40, degree=0), path)
@@ -163,17 +134,11 @@ def test_non_finite_gaussians_are_counted_and_left_out(tmp_path: Path, make_scen
     with pytest.warns(UserWarning, match="left out 3 of 3"), pytest.raises(InputError, match="none of its 3"):
         load_ply(tmp_path / "a.ply")
     scene = make_scene()
-    scene.gaussians.harmonics[3, 1, 0] = np.nan
-    with pytest.warns(UserWarning, match="left out 1 of 40"):
+    for number, name in enumerate(FIELDS):
+        getattr(scene.gaussians, name)[number].view(-1)[-1] = np.nan
+    with pytest.warns(UserWarning, match="left out 5 of 40"):
         save_ply(scene, tmp_path / "b.ply")
-    assert len(load_ply(tmp_path / "b.ply").gaussians) == 39
-
-
-def test_an_empty_scene_is_kept(tmp_path: Path, make_scene) -> None:
-    scene = make_scene()
-    empty = Scene(scene.gaussians.select(torch.zeros(40, dtype=torch.bool)), scene.cam2world, 0.1, 5.0)
-    save_ply(empty, tmp_path / "empty.ply")
-    assert len(load_ply(tmp_path / "empty.ply").gaussians) == 0
+    assert len(load_ply(tmp_path / "b.ply").gaussians) == 35
 
 
 def header_with(lines: str) -> bytes:
@@ -294,11 +259,6 @@ def test_non_finite_gaussians_of_parts_are_left_out_with_one_warning(tmp_path: P
     kept = torch.ones(60, dtype=torch.bool)
     kept[[3, 50]] = False
     assert torch.equal(load_ply(tmp_path / "a.ply").gaussians.means, means[kept])
-
-
-def test_no_parts_give_an_empty_scene(tmp_path: Path, scene: Scene) -> None:
-    assert save_ply_parts(scene, [], tmp_path / "a.ply") == 0
-    assert len(load_ply(tmp_path / "a.ply").gaussians) == 0
 
 
 def test_an_interrupted_save_leaves_the_old_file(tmp_path: Path, scene: Scene, make_scene) -> None:

@@ -29,11 +29,6 @@ def test_covariances_have_the_squared_scales_as_eigenvalues():
     assert torch.allclose(eigenvalues, (gaussians.scales**2).sort(dim=1).values)
 
 
-@pytest.mark.parametrize(("k", "degree"), [(1, 0), (4, 1), (9, 2), (16, 3), (25, 4)])
-def test_the_degree_follows_from_the_number_of_coefficients(k, degree):
-    assert _make(2, k).degree == degree
-
-
 def test_wrong_shapes_are_refused_with_the_name(unchecked):
     good = _make(3)
     fields = {name: getattr(good, name) for name in good.__dataclass_fields__}
@@ -69,11 +64,6 @@ def test_changing_the_type_keeps_integer_labels():
 def translucent() -> Gaussians:
     """Degree 4, with opacities in increasing order."""
     return dataclasses.replace(_make(50, 25), opacities=torch.linspace(0, 1, 50))
-
-
-def test_pruning_without_limits_changes_nothing(translucent):
-    assert prune(translucent) is translucent
-    assert prune(translucent, degree=4) is translucent
 
 
 def test_pruning_keeps_the_opaque_gaussians(translucent):
