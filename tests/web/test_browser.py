@@ -1307,9 +1307,12 @@ def in_level(page: OpenPage, vector: Any) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_both_eyes_see_the_pictures_of_the_rasteriser(chromium: Any, folder: Path, scene: Scene, iwer: str) -> None:
+@pytest.mark.parametrize("name", ["tour.html", "photos.html"])
+def test_both_eyes_see_the_pictures_of_the_rasteriser(
+    chromium: Any, folder: Path, scene: Scene, iwer: str, name: str
+) -> None:
     level, origin = path_poses(scene.cam2world)[0, :3, :3].numpy(), scene.cam2world[:, :3, 3].mean(0).numpy()
-    with in_headset(chromium, folder / "tour.html", iwer) as page:
+    with in_headset(chromium, folder / name, iwer) as page:
         start, mark = page.run("[HEADER.start, HEADER.spots[0].mark]")
         assert page.camera["yaw"] == pytest.approx(start["yaw"]), "the head looks where the page has looked"
         image = see(page, (0.1 + 0.15, 1.7, -0.2 - 0.1), -0.3, 0.6)
