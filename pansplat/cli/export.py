@@ -85,7 +85,7 @@ class Export(Writer):
     gaussians: Count | None = None
     """For a page: largest number of Gaussians, 600,000 by default, beside photographs in one file 450,000; similar
     neighbours are merged."""
-    photo_height: Annotated[int, Range(0, 4096, "pixels"), WHOLE] | None = None
+    photo_height: Annotated[int, Meta(ge=0, le=4096)] | None = None
     """For a page: largest height of the photographs that it shows at panoramas; 0 for none. By default what fits into
     15 MB, at least 1024, in a folder and with --split that of the files, at most 4096."""
     split: bool = False
