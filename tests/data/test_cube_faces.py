@@ -107,9 +107,3 @@ def test_an_ordinary_photograph_is_no_cube(tmp_path: Path, size: tuple[int, int]
     for pixels in (np.stack((x, y, 255 - y), axis=-1), np.full((height, width, 3), 90)):
         Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / "photo.png")
         assert find_layout(tmp_path / "photo.png") is None
-
-
-@pytest.mark.parametrize("size", [(64, 64), (64, 32), (100, 31), (97, 65)])
-def test_pictures_of_other_proportions_are_no_cube(tmp_path: Path, size: tuple[int, int]) -> None:
-    Image.new("RGB", size).save(tmp_path / "photo.png")
-    assert find_layout(tmp_path / "photo.png") is None

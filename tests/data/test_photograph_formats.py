@@ -202,14 +202,6 @@ def test_files_of_cameras_and_videos_name_what_to_do(tmp_path: Path) -> None:
         load_pairs(tmp_path)
 
 
-def test_panoramas_without_poses_name_the_command(tmp_path: Path) -> None:
-    (tmp_path / "tour").mkdir()
-    for name in ("a.png", "b.png"):
-        write_image(tmp_path / "tour" / name, torch.rand(3, 16, 32))
-    with pytest.raises(UnposedPanoramasError, match=r"run `pansplat pose .*tour -o .*tour.poses\.json`"):
-        load_pairs(tmp_path / "tour")
-
-
 def test_a_missing_cube_face_is_named(tmp_path: Path, write_tiles) -> None:
     write_tiles(32, 32, lambda face, *_: tmp_path / f"room_{face}.jpg")
     (tmp_path / "room_u.jpg").unlink()
@@ -253,12 +245,3 @@ def test_a_pose_without_its_picture_and_a_missing_depth_are_notes(tmp_path: Path
     with pytest.warns(InputWarning, match=r"'a\.png': its depth is left out: there is no file .*a\.exr"):
         (pair,) = load_pairs(folder)
     assert pair.context[0].depth is None
-
-
-def test_a_pair_that_needs_a_missing_picture_is_left_out(tmp_path: Path) -> None:
-    folder = _posed(tmp_path / "room", {"a.png": 32, "b.png": 32, "c.png": 32})
-    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": ["a.png", "b.png"]}, {"context": ["b.png", "c.png"]}]}))  # fmt: skip  # noqa: E501
-    (folder / "c.png").unlink()
-    with pytest.warns(InputWarning, match=r"left out: .*c\.png, got no such file"):
-        (pair,) = load_pairs(folder)
-    assert pair.name == "a-b"

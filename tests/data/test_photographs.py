@@ -10,7 +10,6 @@ from PIL import Image
 from pansplat.data.images import read_panorama
 from pansplat.data.pairs import Link
 from pansplat.data.photographs import list_photographs
-from pansplat.errors import InputError
 
 
 def test_panoramas_faces_and_strips_of_a_folder_are_listed_by_name(
@@ -25,21 +24,6 @@ def test_panoramas_faces_and_strips_of_a_folder_are_listed_by_name(
     assert [panorama.name for panorama in panoramas] == ["attic", "cellar", "hall_jpg", "hall_png"]
     for panorama in panoramas:
         check_colors(read_panorama(panorama.image, 32)[0])
-
-
-def test_pictures_that_cannot_be_used_are_named_and_the_others_open(tmp_path: Path, write_scene) -> None:
-    write_scene(tmp_path / "a.jpg", 16)
-    (tmp_path / "b.jpg").write_bytes(b"")
-    Image.new("RGB", (40, 40)).save(tmp_path / "c.png")
-    with pytest.warns(UserWarning) as caught:
-        panoramas = list_photographs(tmp_path)
-    assert [panorama.name for panorama in panoramas] == ["a"]
-    assert ["b.jpg: needed an image" in str(caught[0].message), "c.png: needed a 2:1" in str(caught[1].message)] == [
-        True
-    ] * 2
-    (tmp_path / "a.jpg").unlink()
-    with pytest.raises(InputError, match=r"b\.jpg: needed an image, got a file of 0 bytes.*; .*c\.png: needed a 2:1"):
-        list_photographs(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])

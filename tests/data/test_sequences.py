@@ -34,12 +34,6 @@ def test_training_gaps_cover_the_whole_range() -> None:
     assert {pair.targets[0] - pair.left for pair in pairs if pair.right - pair.left == 3} == {0, 1, 2, 3}
 
 
-def test_the_official_training_gap_is_the_smallest() -> None:
-    generator = np.random.default_rng(0)
-    sampler = BoundedSampler(2, 30, training_gap="original")
-    assert {pair.right - pair.left for pair in (sampler.training(400, generator) for _ in range(100))} == {2}
-
-
 def test_gaps_are_limited_by_the_length_of_the_sequence() -> None:
     sampler = BoundedSampler(2, 30)
     assert sampler.training(2, np.random.default_rng(0)).right == 1

@@ -1,8 +1,10 @@
-"""One rule for all files that name pictures: what leads out of the folder is not read, and is named in a note."""
+"""The contract of all files that state panoramas: cut, changed, too large, with missing pictures or ones elsewhere."""
 
 from __future__ import annotations
 
 import json
+import os
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +19,6 @@ from pansplat.data.rig_images import Lens, RigImage, RigView, write_rig
 from pansplat.data.stated_files import find_inside, locate_inside
 from pansplat.errors import InputError
 
-POSE = np.eye(4).tolist()
 OUTSIDE = "needed a file inside .*room, got the path"
 
 
@@ -153,6 +154,103 @@ def test_lists_that_lead_out_of_their_folder_are_refused(
 ) -> None:
     state(room, ["a.png", "b.png", outside.format(room.parent)])
     with pytest.raises(InputError, match=OUTSIDE):
+        read(room)
+
+
+def state_kitti(folder: Path, names: list[str]) -> None:
+    lines = (" ".join(map(str, np.ravel(_move(n)[:3]))) for n in range(len(names)))
+    (folder / "poses.kitti").write_text("\n".join(lines))
+    (folder / "scale.txt").write_text("1")
+
+
+def state_tum(folder: Path, names: list[str]) -> None:
+    (folder / "poses.tum").write_text("\n".join(f"{n} {n} 0 0 0 0 0 1" for n in range(len(names))))
+    (folder / "scale.txt").write_text("1")
+
+
+def state_panogrf(folder: Path, names: list[str]) -> None:
+    for n, name in enumerate(names):
+        view = folder / Path(name).stem
+        view.mkdir()
+        if (folder / name).is_file():
+            (folder / name).rename(view / "rgb.png")
+        np.savetxt(view / "rot.txt", np.eye(3))
+        np.savetxt(view / "tran.txt", [n, 0, 0])
+
+
+READERS = {  # the file that states poses or panoramas, and whether it names pictures
+    state_nerfstudio: ("transforms.json", True),
+    state_colmap: ("sparse/0/images.txt", True),
+    state_openmvg: ("sfm_data.json", True),
+    state_opensfm: ("reconstruction.json", True),
+    state_metashape: ("c.xml", True),
+    state_poses: ("poses.json", True),
+    state_frames: ("camera_pose.json", False),
+    state_kitti: ("poses.kitti", False),
+    state_tum: ("poses.tum", False),
+    state_panogrf: ("b/tran.txt", False),
+}
+contract = pytest.mark.parametrize(("state", "stated"), [(state, stated) for state, (stated, _) in READERS.items()])
+
+
+def read_or_refuse(folder: Path, stated: str) -> None:
+    """Panoramas of the folder are read, or the file is named."""
+    try:
+        files, notes = read(folder)
+    except InputError as error:
+        assert Path(stated).stem in str(error) or str(Path(stated).parent) in str(error), error
+    else:
+        assert files <= {"a.png", "b.png", "rgb.png"} and (files in ({"a.png", "b.png"}, {"rgb.png"}) or notes)
+
+
+@contract
+def test_a_file_is_read_and_one_that_is_cut_or_changed_is_read_or_named(
+    room: Path, state: Callable[[Path, list[str]], None], stated: str
+) -> None:
+    state(room, ["a.png", "b.png"])
+    assert read(room)[0] in ({"a.png", "b.png"}, {"rgb.png"})
+    content, random = (room / stated).read_bytes(), np.random.default_rng(0)
+    for end in (0, 1, len(content) // 3, 2 * len(content) // 3, len(content) - 2):
+        (room / stated).write_bytes(content[:end])
+        read_or_refuse(room, stated)
+    for _ in range(20):
+        changed = bytearray(content)
+        for place in random.integers(0, len(content), 3):
+            changed[place] = random.integers(0, 256)
+        (room / stated).write_bytes(changed)
+        read_or_refuse(room, stated)
+
+
+@contract
+def test_a_file_that_is_too_large_is_named_and_not_read(
+    room: Path, state: Callable[[Path, list[str]], None], stated: str
+) -> None:
+    state(room, ["a.png", "b.png"])
+    os.truncate(room / stated, 1 << 32)  # without blocks on the disk
+    with pytest.raises(InputError, match=rf"{re.escape(Path(stated).name)}.* of at most [\d,]+ bytes, got 4,294"):
+        read(room)
+
+
+@pytest.mark.parametrize("state", [state for state, (_, names) in READERS.items() if names])
+def test_a_picture_that_is_missing_is_named_and_the_others_are_read(
+    room: Path, state: Callable[[Path, list[str]], None]
+) -> None:
+    state(room, ["a.png", "b.png", "gone.png"])
+    files, notes = read(room)
+    assert files == {"a.png", "b.png"} and "gone" in notes
+
+
+@pytest.mark.parametrize("state", [state_kitti, state_tum, state_panogrf])
+def test_fewer_pictures_than_poses_are_refused(room: Path, state: Callable[[Path, list[str]], None]) -> None:
+    state(room, ["a.png", "b.png", "gone.png"])
+    with pytest.raises(InputError, match=r"needed (one pose per image \(2 images\), got 3|rgb\.png next to)"):
+        read(room)
+
+
+def test_two_trajectories_of_one_folder_are_refused(room: Path) -> None:
+    state_kitti(room, ["a.png", "b.png"])
+    state_tum(room, ["a.png", "b.png"])
+    with pytest.raises(InputError, match=r"needed one trajectory file, got poses\.kitti, poses\.tum"):
         read(room)
 
 

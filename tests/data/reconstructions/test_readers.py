@@ -422,23 +422,3 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
         (model / f"{name}.bin").write_bytes(b"\x05\0\0\0\0\0\0\0\1")
     with pytest.raises(InputError, match=r"sparse.0: needed a complete model of COLMAP, got damaged \.bin files"):
         load_pairs(tmp_path)
-
-
-def test_missing_pictures_are_noted(tmp_path: Path, cameras: list[Array], write_panorama) -> None:
-    frames = []
-    for name, pose in zip(NAMES, cameras, strict=True):
-        write_panorama(tmp_path / name, pose)
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-    (tmp_path / NAMES[1]).unlink()
-    write_panorama(tmp_path / "other.png", cameras[1])
-    write_transforms(tmp_path, frames, camera_model="EQUIRECTANGULAR")
-    with pytest.warns(InputWarning) as caught:
-        pair, other = load_pairs(tmp_path)
-    notes = " ".join(str(warning.message) for warning in caught)
-    assert (
-        "because the pictures are missing in" in notes
-        and "followed: p2.png" in notes
-        and "has no pose of other.png" in notes
-    )
-    assert [view.name for view in pair.context] == ["p1", "p3"]
-    assert [view.name for view in other.context] == ["other"]  # a picture without a pose is a scene of its own
