@@ -56,10 +56,6 @@ def test_the_lookup_equals_the_one_in_checkpoints(scale, recipe_weights):
     assert (torch.stack((x, y, face / 2.5 - 1), dim=-1) - stored).abs().max() < 2e-6
 
 
-def test_faces_of_a_strip_are_in_the_order_of_faces():
-    assert torch.equal(2 * strip_directions(3)[1, 1::3], face_rotations()[:, :, 2])
-
-
 def test_adjacent_faces_share_their_edge():
     rays = strip_directions(5)
     for right in range(4):

@@ -114,13 +114,6 @@ def test_flight_is_rigid_and_continuous():
     assert float(torch.rad2deg(torch.acos(cosines)).max()) < 4
 
 
-@pytest.mark.slow
-def test_flight_passes_through_every_camera():
-    cameras = torch.stack((_pose((0, 0, 0)), _pose((1, 0, 0)), _pose((1, 0, 2))))
-    path = fly_path(cameras, [i / 2000 for i in range(2001)])[:, :3, 3]
-    assert float((path - cameras[1, :3, 3]).norm(dim=-1).min()) < 2e-3
-
-
 def test_a_flight_between_coincident_cameras_keeps_position_and_heading():
     cameras = torch.stack((_pose((1, 2, 3)), _pose((1, 2, 3))))
     path = fly_path(cameras, [0, 0.3, 1])

@@ -40,11 +40,6 @@ def test_the_zero_quaternion_is_the_identity():
     assert torch.equal(rotations_from_quats(torch.zeros(4)), torch.eye(3))
 
 
-def test_half_a_turn_about_x_negates_y_and_z():
-    rotation = rotations_from_quats(torch.tensor((0.0, 1.0, 0.0, 0.0)))
-    assert torch.allclose(rotation, torch.diag(torch.tensor((1.0, -1.0, -1.0))))
-
-
 def test_rotations_are_converted_back_to_their_quaternions():
     q = torch.nn.functional.normalize(_quats(200), dim=1)
     half_turns = torch.eye(4, dtype=torch.float64)[1:]
@@ -88,11 +83,6 @@ def test_interpolation_starts_and_ends_at_the_poses_on_the_shortest_arc():
     assert middle[:3, 3].tolist() == [1, 0, 0]
     assert float(torch.atan2(middle[0, 2], middle[2, 2])) == pytest.approx(angle / 2)
     assert orthonormal_error(middle) < 1e-12
-
-
-def test_interpolating_equal_poses_gives_that_pose():
-    pose = _pose(_quats(1)[0], (1.0, 2.0, 3.0))
-    assert torch.allclose(interpolate_poses(pose, pose, 0.3), pose, atol=1e-12)
 
 
 def test_nearest_views_are_ordered_by_distance_without_the_view_itself() -> None:
