@@ -71,20 +71,6 @@ def test_a_gaussian_at_the_horizon_is_shifted_by_asin_of_offset_over_distance(ba
         assert abs((2 * float(middle) / width - 1) * math.pi - expected) < 0.05 * 2 * math.pi / width
 
 
-def test_the_eyes_of_a_mirrored_scene_are_exchanged(balls):
-    means = torch.tensor(((0.5, 0.1, 1.0), (-0.8, -0.3, 0.7), (0.2, 0.4, -1.5), (0.05, 0.3, 0.02)))
-    mirrored = means * torch.tensor((-1.0, 1, 1))
-    right = make_images(balls(means).to(dtype=torch.float32), ORIGIN, (32, 64), eye_offset=0.2)
-    left = make_images(balls(mirrored).to(dtype=torch.float32), ORIGIN, (32, 64), eye_offset=-0.2)
-    assert (right - left.flip(2)).abs().max() < 1e-5
-
-
-def test_the_panorama_is_continuous_at_offset_zero(make_scene):
-    scene, size = make_scene(40, extent=3.0).to(dtype=torch.float32), (16, 32)
-    assert torch.equal(make_images(scene, ORIGIN, size, eye_offset=0.0), make_images(scene, ORIGIN, size))
-    assert (make_images(scene, ORIGIN, size, eye_offset=1e-7) - make_images(scene, ORIGIN, size)).abs().max() < 1e-4
-
-
 def test_gradients_are_those_of_the_reference(balls):
     scene = balls([(0.5, 0.1, 1.0), (-0.8, -0.3, 0.7)])
 

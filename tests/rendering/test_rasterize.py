@@ -10,11 +10,9 @@ from torch._dynamo.utils import counters
 from pansplat.bench.scenes import full_lattice_room
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import multiply_quats, rotations_from_quats
 from pansplat.rendering import rasterize
-from pansplat.rendering.image_planes import stitch_faces
 from pansplat.rendering.official import OFFICIAL
 from pansplat.rendering.rasterize import RasterOptions
 
@@ -77,22 +75,6 @@ def test_keywords_override_fields_of_the_options(make_scene, pose):
 # --- channels ---
 
 
-@pytest.mark.parametrize(("channels", "degree"), [(3, 2), (32, 0)])
-def test_channels_rasterised_together_equal_those_rasterised_alone(channels, degree, make_scene, pose):
-    scene = make_scene(40, scale=0.25, degree=degree)
-    generator = torch.Generator().manual_seed(1)
-    shape = (40, (degree + 1) ** 2, channels)
-    scene = dataclasses.replace(scene, harmonics=0.4 * torch.randn(shape, generator=generator, dtype=torch.float64))
-    background = torch.linspace(0, 1, channels, dtype=torch.float64)
-    together = rasterize(scene, pose, size=(12, 24), background=background)
-    assert together.color.shape == (channels, 12, 24)
-    for c in range(0, channels, 7):
-        one = dataclasses.replace(scene, harmonics=scene.harmonics[:, :, c : c + 1])
-        alone = rasterize(one, pose, size=(12, 24), background=background[c : c + 1])
-        assert torch.allclose(alone.color[0], together.color[c], rtol=0, atol=1e-12)
-        assert torch.equal(alone.alpha, together.alpha) and torch.equal(alone.depth, together.depth)
-
-
 def test_the_default_background_is_black_for_any_number_of_channels(make_scene, pose):
     scene = make_scene(3)
     for channels in (1, 5):
@@ -102,29 +84,6 @@ def test_the_default_background_is_black_for_any_number_of_channels(make_scene, 
 
 
 # --- covariances in place of scales and quaternions ---
-
-_COVARIANCE_CASES = [
-    dict(layout="equirect", kernel="ray", lowpass="angular"),
-    dict(layout="pinhole", kernel="ray", lowpass="3dgs"),
-    dict(layout="pinhole", kernel="ewa", lowpass="angular"),
-    dict(layout="cubemap", kernel="ewa", lowpass="3dgs", order="z"),
-]
-
-
-@pytest.mark.parametrize("options", _COVARIANCE_CASES, ids=lambda o: "-".join(o.values()))
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_scenes_own_covariances_change_nothing_and_scales_are_not_read(options, dtype, make_scene, pose):
-    scene = make_scene(80, scale=0.2)
-    expected = rasterize(scene, pose, size=(16, 32), **options)
-    covariances = scene.covariances.to(dtype)
-    without_shape = dataclasses.replace(scene, scales=torch.full_like(scene.scales, torch.nan), quats=0 * scene.quats)
-    options = dict(size=(16, 32), covariances=covariances, backend="torch", **options)
-    got = rasterize(scene.to(dtype=dtype), pose, **options)
-    tolerance = 1e-9 if dtype == torch.float64 else 2e-5
-    assert float(expected.alpha.mean()) > 0.05 and got.color.dtype == dtype
-    for name in ("color", "alpha"):
-        assert (getattr(got, name) - getattr(expected, name)).abs().max() < tolerance
-    assert torch.equal(rasterize(without_shape.to(dtype=dtype), pose, **options).color, got.color)
 
 
 def test_each_entry_of_a_symmetric_pair_gets_half_the_gradient(make_scene, pose):
@@ -187,28 +146,6 @@ def test_a_panorama_pixel_is_a_one_pixel_pinhole_image(make_scene, pose):
         look = rasterize(scene, pose @ rotation, size=(1, 1), layout="pinhole", vertical_fov_degrees=fov)
         assert torch.allclose(look.color[:, 0, 0], panorama.color[:, row, column], atol=1e-9)
         assert torch.allclose(look.depth[0, 0], panorama.depth[row, column], atol=1e-9)
-
-
-@pytest.mark.parametrize("kernel", ["ray", "ewa"])
-def test_a_face_of_the_cubemap_is_a_pinhole_image(kernel, make_scene, pose):
-    scene = make_scene(80, scale=0.3)
-    faces = [rasterize(scene, p, size=(16, 16), layout="pinhole", kernel=kernel, order="z") for p in face_poses(pose)]
-    panorama = rasterize(scene, pose, size=(12, 24), layout="cubemap", face_size=16, kernel=kernel, order="z")
-    expected = stitch_faces(torch.stack([f.color for f in faces]), (12, 24))
-    assert torch.allclose(panorama.color, expected, atol=1e-9)
-
-
-def test_the_cubemap_converges_to_the_direct_panorama(make_scene, pose):
-    scene = make_scene(60, scale=0.4)
-    # Far wider than either layout's filter, whose variance falls with the pixel.
-    scene = dataclasses.replace(scene, scales=scene.scales.clamp_min(0.5))
-    direct = rasterize(scene, pose, size=(32, 64))
-    errors = []
-    for face_size in (20, 40, 80):
-        stitched = rasterize(scene, pose, size=(32, 64), layout="cubemap", face_size=face_size)
-        errors.append(float((stitched.color - direct.color).abs().mean()))
-    # Alpha is a step at its cut, so the error is proportional to the face's pixel and not to its square.
-    assert errors[1] < errors[0] and errors[2] < 0.4 * errors[0] and errors[2] < 2e-3
 
 
 # --- torch.compile ---

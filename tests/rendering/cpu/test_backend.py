@@ -89,16 +89,6 @@ def test_sums_and_gradients_equal_the_reference(layout, options, scene, pose):
     _compare(scene, pose, layout, options)
 
 
-@pytest.mark.parametrize(("layout", "lowpass"), [("equirect", "3dgs"), ("cubemap", "angular")])
-def test_covariances_equal_the_reference(layout, lowpass, scene, pose):
-    _compare(scene, pose, layout, RasterOptions(lowpass=lowpass), scene.covariances)
-
-
-@pytest.mark.parametrize("channels", [1, 2, 5, 32])
-def test_any_number_of_channels_equals_the_reference(channels, make_colored_scene, pose):
-    _compare(make_colored_scene(channels), pose, "equirect")
-
-
 def test_bands_change_no_bit_of_the_sums(scene, pose, monkeypatch):
     whole, gradients = _run(scene, pose, "pinhole")
     monkeypatch.setattr(tiling, "MAX_INTERSECTIONS", 20)
@@ -124,13 +114,6 @@ def test_the_number_of_threads_changes_no_bit(layout, make_colored_scene, pose):
         runs.append(_run(scene, pose, layout))
     for run in runs[1:]:
         _assert_same_bits(run, runs[0])
-
-
-def test_only_requested_gradients_are_computed(scene, pose):
-    scene.opacities.requires_grad_()
-    rasterize_planes(scene, None, pose, _planes("pinhole"), RasterOptions()).sums.sum().backward()
-    assert scene.opacities.grad.any()
-    assert all(getattr(scene, name).grad is None for name in _NAMES if name != "opacities")
 
 
 def test_without_grad_nothing_is_saved(scene, pose):

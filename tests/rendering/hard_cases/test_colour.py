@@ -46,15 +46,6 @@ def test_an_image_is_linear_in_its_colours(channels, render, make_scene, pose, l
         assert float((found - expected).norm()) <= render.gradient * float(expected.norm()), name
 
 
-@pytest.mark.hard_case(31)
-def test_distance_as_a_channel_is_the_depth(render, make_scene, pose):
-    scene = make_scene(10, scale=0.3, degree=0)
-    distance = (scene.means - pose[:3, 3]).norm(dim=1)[:, None]
-    got = render(_coloured(scene, distance), pose)
-    assert (got.color[0] - got.depth * got.alpha).abs().max() < 10 * render.image
-    assert float(got.depth.max()) > 1
-
-
 @pytest.mark.slow
 @pytest.mark.hard_case(34)
 def test_every_harmonic_up_to_degree_4_has_its_value(render, balls):

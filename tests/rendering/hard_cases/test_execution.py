@@ -7,8 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from pansplat.rendering import rasterize
-
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
 
@@ -111,12 +109,3 @@ def test_a_second_derivative_is_an_error(render, make_scene, pose, leaves):
     image = render(inputs, pose)
     with pytest.raises(RuntimeError, match="second derivatives"):
         torch.autograd.grad(image.color.sum(), inputs.means, create_graph=True)
-
-
-@pytest.mark.hard_case(37)
-def test_an_image_has_the_name_of_its_backend(render, balls):
-    image = render(balls((0, 0, 2.0)))
-    assert image.info is not None and image.info.backend == {"auto": "numba"}.get(render.name, render.name)
-    assert image.color.dtype == image.alpha.dtype == image.depth.dtype == render.dtype
-    automatic = rasterize(balls((0, 0, 2.0)), torch.eye(4, dtype=torch.float64), size=(2, 4))
-    assert automatic.info is not None and automatic.info.backend == "torch"  # for float64

@@ -71,10 +71,10 @@ def test_gradients_of_a_saturated_pixel_are_exactly_zero_behind_the_front(render
     assert torch.isfinite(got.color).all()
     size = scene.opacities.grad.abs()
     assert torch.isfinite(size).all() and float(size[0]) > 0.01
-    assert not size[100:].any()
     tiny = torch.finfo(render.dtype).tiny
     for field in (scene.means, scene.opacities, scene.harmonics):
         gradient = field.grad.abs()
+        assert not gradient[100:].any()
         # Denormal numbers are slow; the last step of a backend may contain a few.
         assert int(((gradient > 0) & (gradient < tiny)).sum()) <= 64
     smallest = 0.05**12
@@ -105,17 +105,6 @@ def test_only_pixels_within_rounding_of_the_alpha_cut_may_differ(render, make_sc
     off = (render(scene, pose).color - color).abs().amax(dim=0)
     assert float(off[~band].max()) < render.image
     assert float(off.max()) <= ALPHA_CUT * 1.5
-
-
-@pytest.mark.torch_float32
-@pytest.mark.hard_case(20)
-def test_alpha_is_cut_at_one_255th_and_clamped_at_0_99(render, balls):
-    def alpha(opacity: float) -> float:
-        return float(render(balls((0, 0, 2.0), 1.9, opacity), size=(1, 1), **_PINHOLE).alpha)
-
-    assert alpha(ALPHA_CUT * (1 - 1e-5)) == 0
-    assert alpha(ALPHA_CUT * (1 + 1e-5)) == pytest.approx(ALPHA_CUT, rel=1e-4)
-    assert alpha(0.99 - 1e-4) == pytest.approx(0.9899, abs=1e-6) and alpha(0.9901) == pytest.approx(0.99, abs=1e-6)
 
 
 @pytest.mark.hard_case(30)

@@ -35,16 +35,6 @@ def test_permuting_other_gaussians_keeps_the_order_of_ties(render, balls):
     assert (got - expected).abs().max() < 10 * render.image
 
 
-@pytest.mark.hard_case(11)
-def test_ties_do_not_depend_on_the_number_of_threads(render, balls, with_threads):
-    generator = torch.Generator().manual_seed(5)
-    means = torch.nn.functional.normalize(torch.randn(15, 3, generator=generator, dtype=torch.float64), dim=1)
-    colours = torch.rand(60, 3, generator=generator, dtype=torch.float64)
-    scene = balls(2 * means.repeat(4, 1), 0.4, colours=colours)
-    image, *others = with_threads(lambda: render(scene).color)
-    assert all(torch.equal(other, image) for other in others)
-
-
 @pytest.mark.hard_case(12)
 def test_swapping_nearly_tied_gaussians_changes_an_image_within_its_bound(render, balls):
     still = balls([(0.1, 0.05, 2.0)] * 2, 0.4, (0.7, 0.6), colours=_RED_GREEN)
