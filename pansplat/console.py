@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
 import math
@@ -102,8 +103,9 @@ def _report_system_error(error: OSError) -> int:
     """Print one line about an error of the operating system, unless standard output was closed by its reader."""
     if error.filename is None:  # of standard output, whose unwritten text would fail again at the end
         _discard_output(sys.stdout)
-    if isinstance(error, BrokenPipeError):
-        return CLOSED_PIPE
+        closed = errno.EINVAL if sys.platform == "win32" else errno.EPIPE  # of a pipe that its reader closed
+        if error.errno == closed:
+            return CLOSED_PIPE
     name, reason = error.filename or "standard output", error.strerror or str(error) or type(error).__name__
     print_message("error", f"{name}: needed a usable file or folder, got '{reason}'; check path, space and permissions")
     return BAD_INPUT

@@ -178,6 +178,7 @@ def test_errors_of_poses_and_depth_range_cost_little(sample):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:left, right. the cameras are at one place")
 def test_coincident_cameras_give_a_scene_that_is_better_than_a_sphere(sample, sphere_predictor):
     views, targets, _ = sample
     same = {name: getattr(views, name)[:1].repeat(2, *[1] * (getattr(views, name).ndim - 1)) for name in _OF_A_VIEW}

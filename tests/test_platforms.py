@@ -3,9 +3,7 @@
 import errno
 import json
 import os
-import signal
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -87,18 +85,6 @@ def test_weights_keep_no_hold_of_their_file(tmp_path: Path, small_config: object
 
 
 # Processes
-
-
-def test_an_interrupt_does_not_end_the_process_at_once_on_windows(
-    windows: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    received: list[int] = []
-    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("`os.kill` ends the process"))
-    signal.signal(signal.SIGINT, lambda number, _: received.append(number))
-    thread = threading.Thread(target=console._send_signal, args=(signal.SIGINT,))
-    thread.start()
-    thread.join()
-    assert received == [signal.SIGINT]
 
 
 def test_a_crash_without_a_message_is_described(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ def test_readme_names_every_file_uniform_and_input():
     readme = (FOLDER / "README.md").read_text("utf-8")
     for name in SOURCES:
         text = (FOLDER / name).read_text("utf-8")
-        names = re.findall(r"^uniform \w+ (\w+)", text, re.MULTILINE)
+        names = re.findall(r"^uniform (?:highp )?\w+ (\w+)", text, re.MULTILINE)
         if name.endswith(".vert"):
             names += re.findall(r"^in \w+ (\w+)", text, re.MULTILINE)
         missing = [each for each in (name, *names) if f"`{each}`" not in readme]
