@@ -52,7 +52,7 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
         The command's status; 2 for bad input, missing files and exhausted memory or disks, 70 for a defect of pansplat,
         130 after Ctrl+C, 143 after SIGTERM, 141 if the reader of standard output closed it.
     """
-    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w", encoding="utf-8") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):  # what the terminal's encoding lacks is written as escapes
         with contextlib.suppress(AttributeError, ValueError):
             stream.reconfigure(errors="backslashreplace")
@@ -113,7 +113,7 @@ def _report_system_error(error: OSError) -> int:
 
 def _discard_output(stream: TextIO | None) -> None:
     """Send unwritten text to the null device, so that the interpreter's end does not fail to write it."""
-    with contextlib.suppress(OSError, ValueError, AttributeError), open(os.devnull, "w") as null:
+    with contextlib.suppress(OSError, ValueError, AttributeError), open(os.devnull, "w", encoding="utf-8") as null:
         os.dup2(null.fileno(), stream.fileno())
         stream.flush()
 
