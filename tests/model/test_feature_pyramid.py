@@ -13,8 +13,6 @@ from pansplat.model.feature_pyramid import (
     TransformerConfig,
     encode_positions,
     make_shift_mask,
-    merge_windows,
-    split_windows,
 )
 
 _SMALL = FeaturePyramidConfig(channels=(8, 8, 8, 16), transformer=TransformerConfig(16, blocks=2, expansion=1))
@@ -42,19 +40,6 @@ def test_features_match_the_official_code(run_official, golden, error):
         assert error(outputs["features.encoder"][3 - stage], truth[f"backbone.cnn.{stage}"][0]) < 2e-4
     for view in range(2):
         assert error(outputs["features.transformer"][:, view], truth[f"transformer.{view}"]) < 2e-4
-
-
-def test_levels_halve_from_coarse_to_fine(small):
-    features = small(_images(2, 3, 3, 32, 64))
-    assert [tuple(maps.shape) for maps in features] == [
-        (2, 3, 16, 4, 8), (2, 3, 8, 8, 16), (2, 3, 8, 16, 32), (2, 3, 8, 32, 64),
-    ]  # fmt: skip
-
-
-def test_rolling_by_half_a_turn_rolls_the_features(small):
-    images = _images(1, 2, 3, 32, 64)
-    for rolled, maps in zip(small(images.roll(32, -1)), small(images), strict=True):
-        assert torch.allclose(rolled, maps.roll(maps.shape[-1] // 2, -1), atol=1e-11)
 
 
 def test_decoding_images_one_by_one_equals_decoding_all_at_once(small):
@@ -115,30 +100,6 @@ def test_fixed_shift_mask_wraps_at_the_seam_but_not_at_the_poles():
     assert torch.equal(mask[2:] == -math.inf, apart.expand(2, -1, -1))
 
 
-def test_merging_windows_inverts_splitting():
-    tokens = _noise(2, 3, 8, 12, 5)
-    windows = split_windows(tokens, 2)
-    assert windows.shape == (2, 3, 4, 24, 5)
-    assert torch.equal(windows[0, 0, 1, 0], tokens[0, 0, 0, 6])
-    assert torch.equal(merge_windows(windows, 8, 12), tokens)
-
-
-def test_rolling_by_half_a_turn_rolls_the_output(transformer):
-    maps = _noise(1, 2, 16, 8, 16)
-    rolled = transformer()(maps.roll(8, -1))
-    assert torch.allclose(rolled, transformer()(maps).roll(8, -1), atol=1e-11)
-
-
-def test_rolling_by_half_a_turn_does_not_roll_the_official_output(transformer):
-    maps, official = _noise(1, 2, 16, 8, 16), transformer("official")
-    assert not torch.allclose(official(maps.roll(8, -1)), official(maps).roll(8, -1), atol=1e-3)
-
-
-def test_rolling_by_a_quarter_turn_does_not_roll_the_output(transformer):
-    maps = _noise(1, 2, 16, 8, 16)
-    assert not torch.allclose(transformer()(maps.roll(4, -1)), transformer()(maps).roll(4, -1), atol=1e-3)
-
-
 def test_blocks_without_output_add_only_the_position_encoding(transformer):
     network, maps = transformer(), _noise(1, 2, 16, 4, 8)
     with torch.no_grad():
@@ -154,14 +115,6 @@ def test_a_repeated_view_changes_nothing(transformer):
     maps = _noise(1, 2, 16, 4, 8)
     twice = network(torch.cat((maps, maps[:, 1:]), dim=1))
     assert torch.allclose(twice[:, 0], network(maps)[:, 0], atol=1e-12)
-
-
-def test_each_view_depends_on_the_others(transformer):
-    maps = _noise(1, 3, 16, 4, 8)
-    before = transformer(blocks=1)(maps)
-    maps[:, 2] += 1
-    moved = (transformer(blocks=1)(maps) - before).abs().amax(dim=(2, 3, 4))
-    assert (moved > 1e-3).all()
 
 
 def test_a_map_that_cannot_be_split_into_windows_is_refused(transformer):

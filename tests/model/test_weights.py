@@ -277,12 +277,6 @@ def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_ligh
     assert "found unknown 2 (encoder.new.weight, losses.2.gaussian_head.new)" in message
 
 
-def test_a_missing_grid_is_reported(shared: Path, as_lightning: Wrap) -> None:
-    weights = make_tensors(shared, "pansplat-512")
-    del weights["mono_depth.c2e.3.sample_grid"]
-    assert match_tensors(as_lightning(weights), "x").missing == ["encoder.mono_depth.c2e.3.sample_grid"]
-
-
 def test_checkpoints_of_other_models_are_refused(as_lightning: Wrap) -> None:
     with pytest.raises(InputError, match=r"official PanSplat or its MVSplat baseline, got tensors 1 \(encoder.fc\)"):
         match_tensors(as_lightning({"fc": torch.zeros(1)}), "x")
