@@ -11,7 +11,6 @@ from pansplat.sweep.bend import (
     BendConfig,
     _as_meridians,
     _from_meridians,
-    _smooth_line,
     bend_surfaces,
     fit_field,
     measure_evidence,
@@ -29,22 +28,6 @@ def _surface(depth: np.ndarray) -> Surface:
 
 def _area() -> np.ndarray:
     return np.repeat(row_weights(HEIGHT).numpy()[:, None], 2 * HEIGHT, axis=1)
-
-
-def test_a_line_is_smoothed_as_by_the_dense_solution():
-    generator = np.random.default_rng(0)
-    length, strength = 11, 3.7
-    couplings = generator.random((2, length))
-    maps = generator.normal(size=(2, 2, length))
-    for line in range(2):
-        matrix = np.eye(length)
-        for k, coupling in enumerate(couplings[line]):
-            following = (k + 1) % length
-            matrix[[k, following], [k, following]] += strength * coupling
-            matrix[[k, following], [following, k]] -= strength * coupling
-        expected = np.linalg.solve(matrix, maps[:, line].T).T
-        _smooth_line(maps, couplings, strength, line)
-        assert np.allclose(maps[:, line], expected, rtol=1e-12, atol=1e-12)
 
 
 def test_meridians_are_closed_lines_over_both_poles():

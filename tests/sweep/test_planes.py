@@ -51,14 +51,6 @@ def test_tilted_cameras_do_not_tilt_the_scene(make_room, turn):
     assert _yaw_degrees_off(axes, np.eye(3)) < 1.2
 
 
-@pytest.mark.parametrize("paint", ("blank", "tiles"))
-def test_axes_are_orthonormal(make_room, turn, paint):
-    room = make_room(paint=paint)
-    posed = room.observe(64, [room.pose((0, 0, 0), turn("x", 20)), room.pose((0.5, 0, 0), turn("z", 9))]).posed
-    axes = estimate_axes(posed.images, posed.cam2world[:, :3, :3])
-    assert np.allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-
-
 def test_without_edges_down_is_the_mean_of_the_cameras(turn):
     rotations = [turn("z", 12), turn("z", -2)]
     axes = estimate_axes([np.full((64, 128, 3), 0.5, np.float32)] * 2, rotations)
@@ -91,10 +83,6 @@ def planes(empty_room) -> ScenePlanes:
         wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)
         surfaces.append(Surface(plain.inverse_depth, (wall + 1).astype(np.uint8)))
     return collect_planes(surfaces, list(empty_room.posed.masks), poses, make_empty_planes(poses, _AXES, 0.5, 8.0))
-
-
-def test_the_histogram_sums_to_one(planes):
-    assert np.isclose(planes.histogram.sum(), 1, atol=1e-3)
 
 
 def test_every_wall_has_support_at_its_distance_and_none_between(planes, empty_room, view):
@@ -179,12 +167,6 @@ def test_every_wall_has_the_most_votes_on_its_side(voted, empty_room):
             side = np.where(sign * voted.offsets > 0.5, voted.votes[axis], 0)
             assert voted.offsets[side.argmax()] == pytest.approx(true, abs=1.5 * voted.bin)
             assert side.max() > 0.5
-
-
-def test_votes_are_between_zero_and_one(voted):
-    assert voted.votes.min() >= 0
-    assert voted.votes.max() == pytest.approx(1, abs=1e-3)
-    assert np.median(voted.votes) < 0.2
 
 
 def test_the_floor_and_the_ceiling_are_found(voted, empty_room):

@@ -158,14 +158,6 @@ def test_upside_down_camera_is_turned_by_half(turn):
     assert prior_module.upright_rotation(turn("y", 77), _DOWN) is None
 
 
-def test_prior_rotated_there_and_back_is_the_same(make_room, turn):
-    depth = make_room().cast(np.eye(4), 64)[1]
-    prior = DepthPrior(np.log(depth).astype(np.float32), np.full(depth.shape, 0.1, np.float32))
-    rotation = turn("x", 20)
-    back = prior.rotate(rotation).rotate(rotation.T)
-    assert np.median(np.abs(back.log_depth - prior.log_depth)) < 5e-3
-
-
 @pytest.mark.parametrize("cap", (0.5, 3.0))
 @pytest.mark.parametrize("count_priors", (1, 3))
 def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap, count_priors):
@@ -187,13 +179,6 @@ def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap,
         for n, prior in enumerate(priors)
     ]
     np.testing.assert_allclose(cost, 1 + 0.7 * np.minimum(np.min(away, axis=0), cap), rtol=1e-4)
-
-
-def test_resized_prior_keeps_its_values():
-    prior = DepthPrior(np.full((8, 16), 1.5, np.float32), np.full((8, 16), 0.2, np.float32)).resize(32)
-    assert prior.log_depth.shape == (32, 64)
-    np.testing.assert_allclose(prior.log_depth, 1.5)
-    np.testing.assert_allclose(resize_sphere(prior.scale, 4), 0.2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("views", (1, 2))

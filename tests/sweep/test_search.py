@@ -19,13 +19,6 @@ def _error(observed, view: int) -> np.ndarray:
     return np.abs(1 / (observed.surfaces[view].inverse_depth * observed.depths[view]) - 1)
 
 
-def test_surfaces_have_the_rooms_depth(empty_room, view):
-    error = _error(empty_room, view)
-    assert np.median(error) < 0.012
-    assert (error < 0.05).mean() > 0.92
-    assert (error < 0.10).mean() > 0.98
-
-
 @pytest.mark.parametrize(
     ("region", "min_accurate"),
     (((slice(None), np.arange(-3, 3)), 0.95), (slice(8), 0.97), (slice(-8, None), 0.97)),
@@ -45,10 +38,6 @@ def test_a_box_is_in_front_of_the_walls(furnished_room, empty_room, view):
     assert box.sum() > 300
     assert (error[box] < 0.10).mean() > 0.85
     assert (error[~box] < 0.10).mean() > 0.95
-
-
-def test_finer_panoramas_give_finer_surfaces(empty_room, small_room):
-    assert np.median(_error(empty_room, 0)) < 0.8 * np.median(_error(small_room, 0))
 
 
 def test_surfaces_stay_within_the_depth_range(small_furnished_room):

@@ -16,7 +16,6 @@ from pansplat.sweep.surface import (
     nearest_pixel,
     ray_grid,
     resize_sphere,
-    world_points,
 )
 
 
@@ -40,18 +39,6 @@ def test_points_in_front_of_on_and_behind_a_surface_are_classified(turn):
     assert classify_visibility(pose[None, :3, 3], _sphere(2.0), pose, 0.06).tolist() == [FREE_SPACE]  # the camera
 
 
-def test_a_point_is_compared_with_the_surface_in_its_own_direction():
-    inverse = np.full((32, 64), 0.5)
-    inverse[:, 32:] = 0.25  # right half: 4 m
-    points = np.array(((3.0, 0, 0), (-3.0, 0, 0)))
-    assert classify_visibility(points, _surface(inverse), np.eye(4), 0.06).tolist() == [FREE_SPACE, OCCLUDED]
-
-
-def test_world_points_lie_on_the_rooms_walls(empty_room):
-    for pose, surface in zip(empty_room.posed.cam2world, empty_room.make_exact_surfaces(), strict=True):
-        assert empty_room.room.wall_distances(world_points(surface, pose)).min(axis=-1).max() < 1e-5
-
-
 def test_exact_surfaces_are_inconsistent_only_at_occlusions(empty_room, furnished_room, view):
     empty, furnished = (
         consistency_mask(room.make_exact_surfaces(), room.posed.cam2world, view, [1 - view])
@@ -60,11 +47,6 @@ def test_exact_surfaces_are_inconsistent_only_at_occlusions(empty_room, furnishe
     assert empty.mean() > 0.995 > furnished.mean() > 0.85
     surfaces, poses = furnished_room.make_exact_surfaces()[::-1], furnished_room.posed.cam2world[::-1]
     assert np.array_equal(furnished, consistency_mask(surfaces, poses, 1 - view, [view]))  # in any order of the views
-
-
-def test_surfaces_at_other_depths_are_inconsistent(empty_room):
-    surfaces = [_surface(1 / empty_room.depths[0]), _surface(2.5 / empty_room.depths[1])]
-    assert consistency_mask(surfaces, empty_room.posed.cam2world, 0, [1]).mean() < 0.1
 
 
 @pytest.mark.parametrize("height", (64, 48, 36, 24, 8))
@@ -80,18 +62,6 @@ def test_resizing_wraps_around_and_continues_over_the_poles(height):
         opposite = np.roll(image[0], 32, axis=0)
         pole = (0.5 + row) * image[0] + (0.5 - row) * opposite
         assert np.allclose(large[0], resize_sphere(np.repeat(pole[None], 32, axis=0), height)[height // 2], atol=1e-6)
-
-
-def _smooth(height: int) -> np.ndarray:
-    rays = ray_grid(height)
-    return 0.5 + 0.07 * rays[..., 0] - 0.05 * rays[..., 1] + 0.04 * rays[..., 2] * rays[..., 0]
-
-
-@pytest.mark.parametrize("textured", (True, False))
-def test_a_smooth_surface_is_interpolated_within_a_percent(empty_room, textured):
-    fine = empty_room.posed.images[0] if textured else np.full((96, 192, 3), 0.5, np.float32)
-    large = guided_upsample(_surface(_smooth(48)), resize_sphere(fine, 48), fine)
-    assert np.abs(large.inverse_depth / _smooth(96) - 1).max() < 0.01
 
 
 @pytest.mark.parametrize("edge", (96, 101))
