@@ -33,7 +33,7 @@ from pansplat.tours.graph import (
     select_views,
 )
 from pansplat.tours.links import find_link_ring, find_way_along_link
-from pansplat.tours.outlook import choose_heading, measure_outlook
+from pansplat.tours.outlook import measure_outlook
 from pansplat.tours.overlap import connect
 from pansplat.tours.route import FADE_SECONDS, Route, find_angles, plan_route
 from pansplat.tours.walls import find_walls
@@ -50,7 +50,6 @@ __all__ = [
     "TourGraph",
     "Views",
     "choose_camera_height",
-    "choose_heading",
     "connect",
     "draw_floor_plan",
     "find_angles",

@@ -26,10 +26,10 @@ from pansplat.tours.floor import (
     find_camera_height,
     find_ceiling,
     find_floor_outline,
-    locate_surfaces,
 )
 from pansplat.tours.graph import make_graph
 from pansplat.tours.plan import make_plan
+from pansplat.tours.surfaces import locate_surfaces
 
 _CEILING = 0.88  # of its height over the camera; above that nothing is drawn
 _FLOOR = 1.12  # of the height of the camera; below that nothing is drawn

@@ -17,6 +17,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.graph import TourGraph, Views, make_graph
 from pansplat.tours.route import Route
+from pansplat.tours.surfaces import locate_surfaces
 
 _PLAN_SIZE = 1024  # of the longer side of a floor plan as a file, pixels
 _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
@@ -62,14 +63,6 @@ def choose_camera_height(heights: Iterable[float | None], far: float) -> float:
     """
     known = [height for height in heights if height is not None]
     return float(np.median(known)) if known else _CAMERA_HEIGHT * far
-
-
-def locate_surfaces(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Places (right, down, forward) relative to a view's camera of its Gaussians that show surfaces, metres."""
-    gaussians = scene.gaussians
-    # Coarse levels have Gaussians behind the surfaces.
-    shown = (gaussians.views == view) & (gaussians.opacities > 0.1) & (gaussians.levels <= 1)
-    return (gaussians.means[shown].double().numpy() - scene.cam2world[view, :3, 3].double().numpy()).dot(level)
 
 
 def find_ceiling(places: Float[np.ndarray, "n 3"]) -> float | None:

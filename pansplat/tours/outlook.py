@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
+from pansplat.tours.surfaces import locate_surfaces
 
 BINS = 24  # of the horizon; the first one begins at the yaw -pi
 _ELEVATION = math.sin(math.radians(20))  # of the surfaces that count, above and below the horizon
-_BACKGROUND_LEVEL, _OPAQUE = 2, 0.5  # of Gaussians behind all surfaces; least opacity of a surface
+_OPAQUE = 0.5  # least opacity of a surface
 _BLANK = 0.45  # of the median distance of surfaces, below which a view is blank
 _WINDOW = 3  # bins of a view, 45 degrees
 
@@ -24,9 +25,7 @@ def measure_outlook(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) ->
         view: number of the camera.
         level: axes of a level camera, as columns right, down and forward.
     """
-    gaussians = scene.gaussians
-    is_own = (gaussians.views == view) & (gaussians.levels < _BACKGROUND_LEVEL) & (gaussians.opacities >= _OPAQUE)
-    offsets = (gaussians.means[is_own].double().cpu().numpy() - scene.cam2world[view, :3, 3].cpu().numpy()) @ level
+    offsets = locate_surfaces(scene, view, level, min_opacity=_OPAQUE)
     distances = np.linalg.norm(offsets, axis=1)
     is_ahead = np.abs(offsets[:, 1]) < _ELEVATION * distances
     bins = ((np.arctan2(offsets[:, 0], offsets[:, 2]) / (2 * math.pi) + 0.5) * BINS).astype(int) % BINS

@@ -23,8 +23,9 @@ from scipy.sparse.csgraph import connected_components
 from shapely.geometry import MultiPolygon, Polygon
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, locate_surfaces, trace_floor
+from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, trace_floor
 from pansplat.tours.graph import TourGraph
+from pansplat.tours.surfaces import locate_surfaces
 
 _RAYS = 360
 _SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it

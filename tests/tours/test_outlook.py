@@ -7,8 +7,8 @@ import pytest
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import choose_heading, measure_outlook, plan_route
-from pansplat.tours.outlook import BINS
+from pansplat.tours import measure_outlook, plan_route
+from pansplat.tours.outlook import BINS, choose_heading
 
 
 def test_the_outlook_is_the_distance_of_the_walls_around():
