@@ -189,7 +189,7 @@ class _View:
         axes: gravity and walls.
         small: grey, for the search of the floor.
         surroundings: all that it shows, with estimated depth.
-        key: a hash of all that it was computed from.
+        stem, key: hashes of the panorama, and of all that this was computed from.
     """
 
     features: Features
@@ -198,6 +198,7 @@ class _View:
     axes: SceneAxes
     small: Float[Array, "height width"]
     surroundings: Surroundings
+    stem: str = ""
     key: str = ""
 
     @functools.cached_property
@@ -447,18 +448,20 @@ def _describe_views(
         heading = hints[n].heading if is_compass else None
         stated = f"{hints[n].down} {heading} {matcher is None}"
         key = hash_parts(image, np.packbits(scene), stated)
-        return cache.get(f"view-{stems[n]}", key, lambda: describe(key, grey, scene, image, hints[n].down, heading))
+        return cache.get(f"view-{stems[n]}", key, lambda: describe(n, key, scene, image, heading))
 
-    def describe(key: str, grey: Array, scene: Array, image: Array, down: Array | None, heading: float | None) -> _View:
+    def describe(n: int, key: str, scene: Array, image: Array, heading: float | None) -> _View:
+        grey = pixels[n]
         small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
-        axes = with_hints(find_axes(grey), down, heading)
+        axes = with_hints(find_axes(grey), hints[n].down, heading)
         turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
         learned = None
         if matcher is not None:
             learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
         shown = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
         depth = estimate_depth(shown, axes.axes[0] if axes.has_down else None)
-        return _View(detect_features(grey, scene), turned, learned, axes, small, Surroundings(shown, depth), key)
+        surroundings = Surroundings(shown, depth)
+        return _View(detect_features(grey, scene), turned, learned, axes, small, surroundings, stems[n], key)
 
     views = []
     with worker_threads() as pool:
@@ -536,8 +539,9 @@ def _relate_views(
         return polish_relative_pose(relation, first.joined, second.joined, every, prior)
 
     def look_up(pair: Pair) -> RelativePose:
-        stem = hash_parts(*(views[view].key for view in pair))
-        return cache.get(f"pair-{stem}", f"{ways[pair]} {seed}", lambda: relate(pair))
+        first, second = views[pair[0]], views[pair[1]]
+        key = hash_parts(first.key, second.key, f"{ways[pair]} {seed}")
+        return cache.get(f"pair-{hash_parts(first.stem, second.stem)}", key, lambda: relate(pair))
 
     relations = {}
     with worker_threads() as pool:
