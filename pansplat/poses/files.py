@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,7 @@ def estimate_pairs(
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
     progress: Progress | None = None,
+    on_unposed: Callable[[list[Pair]], None] | None = None,
 ) -> list[Pair]:
     """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
 
@@ -113,11 +114,16 @@ def estimate_pairs(
         near, far: metres; they override the estimated range.
         camera_height: of the cameras over the floor, metres.
         progress: called with a description of the current work and the completed fraction.
+        on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
+            panorama.
     """
     name = f"poses-{_hash_inputs(panoramas, camera_height)}.json"
     folders = cache_folders(folder)
     source = next((cache / name for cache in folders if (cache / name).is_file()), None)
     if source is None:
+        if on_unposed is not None:
+            single = single_view_pairs(panoramas, folder, near, far, siblings=panoramas)
+            on_unposed(localize_pairs(make_names_unique(single)))
         content = _estimate(folder, panoramas, camera_height, progress)
         source = write_cache_file(folders, name, json.dumps(content).encode())
         if source is None:

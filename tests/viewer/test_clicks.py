@@ -88,7 +88,7 @@ class User:
     def __init__(self, viewer: Viewer, target: moderngl.Framebuffer, clock: list[float], load: Callable) -> None:
         self.viewer, self.target, self.clock = viewer, target, clock
         self.load = self.first_load = load
-        self.find = lambda path, progress: [SceneEntry("opened")]
+        self.find = lambda path, progress, show: [SceneEntry("opened")]
         self.state, self.panels = viewer.state, viewer.panels
 
     def draw_frames(self, count: int, seconds: float = 1 / 30) -> None:
@@ -249,7 +249,7 @@ def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp
 @pytest.fixture
 def user(session, ctx) -> User:
     """The session with scene, state and camera as at the start."""
-    session.load, session.find = session.first_load, lambda path, progress: [SceneEntry("opened")]
+    session.load, session.find = session.first_load, lambda path, progress, show: [SceneEntry("opened")]
     if session.viewer.library.names != NAMES or session.viewer.library.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
@@ -457,7 +457,7 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
 def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
     opened = []
 
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+    def find(path: Path, progress: Progress, show: object) -> list[SceneEntry]:
         opened.append(path.name)
         return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
 
@@ -985,7 +985,7 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
     content = {"convention": "cam2world opencv", "worlds": [{"unit": 1.0}], "poses": poses, "estimate": estimate}
     (tmp_path / "poses.json").write_text(json.dumps(content))
 
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+    def find(path: Path, progress: Progress, show: object) -> list[SceneEntry]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_pairs(path))]
