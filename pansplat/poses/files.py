@@ -15,6 +15,7 @@ import torch
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
+from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import list_masks, read_thumbnail
 from pansplat.inputs.folders import make_names_unique
 from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
@@ -22,6 +23,7 @@ from pansplat.inputs.placements import Placement, judge, read_ties
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.views import CAMERA_HEIGHT
+from pansplat.inputs.web_tours import is_scene_of_tour
 from pansplat.poses.edit import find_kept, merge_estimate, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
 from pansplat.poses.pose_file import (
@@ -87,9 +89,18 @@ def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) 
 
 
 def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
-    """The names of images in a poses.json, relative to its folder; an InputError for one outside of it."""
-    inside = {image: locate_inside(path.parent, os.path.abspath(image), path) for image in images}
-    return {image: file.relative_to(path.parent).as_posix() for image, file in inside.items()}
+    """The names of images in a poses.json, relative to its folder; an InputError for one outside of it.
+
+    Scenes of a web tour in this folder that are made from cube faces have their own names.
+    """
+    names = {}
+    for image in images:
+        if is_scene_of_tour(path.parent, image):
+            names[image] = image.name.removesuffix(CUBE_SUFFIX)
+        else:
+            file = locate_inside(path.parent, os.path.abspath(image), path)
+            names[image] = file.relative_to(path.parent).as_posix()
+    return names
 
 
 def estimate_pairs(

@@ -1081,6 +1081,9 @@ def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(plac
     user.click_at(*at)  # on the ghost
     assert placing.shown.suggestion == 0
     user.click("Save##pose")
+    assert user.viewer.placing.is_doubted, "noise has nothing in common"
+    user.draw_frames(1)
+    user.click("Save, although it fits poorly##pose")
     entry = json.loads((tmp_path / "poses.json").read_text())["poses"]["d.png"]
     assert entry["placed"] == "by hand" and entry["cam2world"][0][3] == pytest.approx(1.0)
     user.draw_frames(2)
