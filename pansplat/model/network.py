@@ -23,7 +23,6 @@ from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import (
     CHECKPOINT_SUFFIXES,
-    CompatChoice,
     WeightsFile,
     build_on_meta,
     config_from_dict,
@@ -34,6 +33,7 @@ from pansplat.model.weights import (
     read_checkpoint,
     require_shapes,
 )
+from pansplat.options import CompatChoice
 from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
 from pansplat.source_hash import hash_sources
 
