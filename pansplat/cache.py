@@ -15,14 +15,14 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from pansplat.cache_folders import cache_folders, write_cache_file
-from pansplat.data.pairs import Pair
-from pansplat.data.views import Views
-from pansplat.files import read_file
 from pansplat.gaussians.scene import Gains, Gaussians, Scene
-from pansplat.options import PredictOptions
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import Views
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, RefineReport, refinement_fingerprint
+from pansplat.system.cache_folders import cache_folders, write_cache_file
+from pansplat.system.files import read_file
+from pansplat.system.options import PredictOptions
 
 _MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash

@@ -22,19 +22,16 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from pansplat.cache import CachedPrediction, CachedScene
-from pansplat.console import with_progress_bar
-from pansplat.data import folders
-from pansplat.data.pairs import Pair
-from pansplat.data.views import CAMERA_HEIGHT, Views
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import expand_home, find_scene_suffix
 from pansplat.gaussians.formats import load_scene as load
 from pansplat.gaussians.formats import save_scene as save
 from pansplat.gaussians.ply import save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
+from pansplat.inputs import folders
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import CAMERA_HEIGHT, Views
 from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
-from pansplat.options import CompatChoice, Precision, PredictOptions
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
 from pansplat.predictor import MIN_HEIGHT, Predictor, Progress, part_of
@@ -49,6 +46,9 @@ from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
+from pansplat.system.console import with_progress_bar
+from pansplat.system.files import expand_home, find_scene_suffix
+from pansplat.system.options import CompatChoice, Precision, PredictOptions
 from pansplat.tours import (
     MAX_SCENE_VIEWS,
     TourGraph,
@@ -157,7 +157,7 @@ def load_model(
         )
     path = expand_home(name)
     if read_model_name(path) == "depth":
-        from pansplat.guided_sweep import load_guided_sweep
+        from pansplat.sweep.guided_sweep import load_guided_sweep
 
         return load_guided_sweep(path, path.stem)
     from pansplat.model.network import load_predictor
@@ -171,7 +171,7 @@ def load_predictor(options: PredictOptions) -> Predictor:
 
 
 def _load_default() -> Predictor:
-    from pansplat.guided_sweep import load_default_sweep
+    from pansplat.sweep.guided_sweep import load_default_sweep
 
     return load_default_sweep()
 

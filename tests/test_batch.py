@@ -23,10 +23,10 @@ from pansplat.batch import BatchOptions, Item, list_items, process_item
 from pansplat.cli import run
 from pansplat.cli.batch import Batch, _write_report
 from pansplat.errors import InputError
+from pansplat.export import page as page_module
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
-from pansplat.options import PredictOptions
-from pansplat.web import page as page_module
+from pansplat.system.options import PredictOptions
 
 HEIGHT = 64
 SPHERE = PredictOptions("sphere", height=HEIGHT)

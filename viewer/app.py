@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from msgspec import Meta
 
-from pansplat.console import own_warnings, parse_arguments, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import expand_home, require_output_file, require_output_folder, require_replaceable
-from pansplat.options import EYE_DISTANCE, EyeDistance, PredictOptions, ReadOptions, check_numbers
+from pansplat.system.console import own_warnings, parse_arguments, progress_bar
+from pansplat.system.files import expand_home, require_output_file, require_output_folder, require_replaceable
+from pansplat.system.options import EYE_DISTANCE, EyeDistance, PredictOptions, ReadOptions, check_numbers
 from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
@@ -154,7 +154,7 @@ def _run(options: Options) -> int:
         raise InputError("--projection, and --stereo without a window, need --out; give --path and --out FILE")
     if options.offscreen is not None:
         require_output_folder("--offscreen", options.offscreen)
-    from pansplat.data.video import VIDEO_SUFFIXES
+    from pansplat.images.video import VIDEO_SUFFIXES
     from pansplat_viewer.scene.key_frames import read_path
 
     if options.out is not None:

@@ -21,9 +21,9 @@ import torch
 from imgui_bundle import imgui
 
 from pansplat.errors import InputError
-from pansplat.files import find_scene_suffix, require_replaceable
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
+from pansplat.system.files import find_scene_suffix, require_replaceable
 from pansplat.tours import list_starts, plan_route
 from pansplat_viewer.recorder import Recorder
 from pansplat_viewer.scene import camera as cameras

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from pansplat.console import progress_bar
 from pansplat.errors import InputError
-from pansplat.files import is_scene_file
-from pansplat.options import Height, PredictOptions, ReadOptions
+from pansplat.system.console import progress_bar
+from pansplat.system.files import is_scene_file
+from pansplat.system.options import Height, PredictOptions, ReadOptions
 
 if TYPE_CHECKING:
-    from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
+    from pansplat.inputs.pairs import Pair
     from pansplat.tours import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
@@ -129,7 +129,7 @@ def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
 def predict_scene(source: Pair | TourGraph, options: PredictOptions) -> Scene:
     """Predict and refine the scene of a pair or tour, and show a progress bar; networks draw layers jointly."""
     from pansplat import pipeline
-    from pansplat.data.pairs import Pair
+    from pansplat.inputs.pairs import Pair
 
     model = pipeline.load_predictor(options)
     options = replace(options, joint=options.joint and not pipeline.can_stream(model))

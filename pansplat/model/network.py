@@ -33,9 +33,9 @@ from pansplat.model.weights import (
     read_checkpoint,
     require_shapes,
 )
-from pansplat.options import CompatChoice
 from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
-from pansplat.source_hash import hash_sources
+from pansplat.system.options import CompatChoice
+from pansplat.system.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
     "pansplat": (PanSplat, PanSplatConfig),

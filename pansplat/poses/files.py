@@ -13,19 +13,15 @@ from typing import Any
 
 import torch
 
-from pansplat.atomic import replacing
-from pansplat.cache_folders import cache_folders, write_cache_file
-from pansplat.data.folders import make_names_unique
-from pansplat.data.images import list_masks, read_thumbnail
-from pansplat.data.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
-from pansplat.data.placements import Placement, judge, read_ties
-from pansplat.data.poses import rigid_matrix, to_cam2world
-from pansplat.data.stated_files import locate_inside
-from pansplat.data.views import CAMERA_HEIGHT
-from pansplat.descriptions import list_first
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import require_replaceable
 from pansplat.geometry.pose import quats_from_rotations
+from pansplat.images.image_files import list_masks, read_thumbnail
+from pansplat.inputs.folders import make_names_unique
+from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
+from pansplat.inputs.placements import Placement, judge, read_ties
+from pansplat.inputs.poses import rigid_matrix, to_cam2world
+from pansplat.inputs.stated_files import locate_inside
+from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.poses.edit import find_kept, merge_estimate, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
 from pansplat.poses.pose_file import (
@@ -36,8 +32,12 @@ from pansplat.poses.pose_file import (
     make_world,
 )
 from pansplat.predictor import Progress
-from pansplat.source_hash import hash_sources
-from pansplat.strict_json import read_json
+from pansplat.system.atomic import replacing
+from pansplat.system.cache_folders import cache_folders, write_cache_file
+from pansplat.system.descriptions import list_first
+from pansplat.system.files import require_replaceable
+from pansplat.system.source_hash import hash_sources
+from pansplat.system.strict_json import read_json
 
 SUFFIXES = (".json", ".tum", ".kitti")
 

@@ -19,9 +19,9 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from pansplat.data.images import read_height, read_panorama
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.path import level_pose, up_direction, wrap_angle
+from pansplat.images.image_files import read_height, read_panorama
 from pansplat.poses.axes import find_axes, with_hints
 from pansplat.poses.dense import Comparison, Surroundings, compare
 from pansplat.poses.depth import estimate_depth

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import pansplat
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.files import write_poses

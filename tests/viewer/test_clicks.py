@@ -17,13 +17,13 @@ import torch
 from imgui_bundle import imgui
 from PIL import Image
 
-from pansplat.data.folders import load_pairs
-from pansplat.data.images import write_image
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.images.image_files import write_image
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece

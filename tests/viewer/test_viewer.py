@@ -15,12 +15,12 @@ import torch
 from imgui_bundle import imgui
 from PIL import Image
 
-from pansplat.cleanup import find_floaters
-from pansplat.data.images import read_blur_mask, write_image
-from pansplat.data.pairs import Pair, Panorama
 from pansplat.errors import InputError
+from pansplat.export.cleanup import find_floaters
 from pansplat.gaussians.formats import load_scene
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.images.image_files import read_blur_mask, write_image
+from pansplat.inputs.pairs import Pair, Panorama
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, load_entry

@@ -17,14 +17,14 @@ import torch
 
 from pansplat import pipeline
 from pansplat.errors import InputError, InputWarning
+from pansplat.export import page as page_module
+from pansplat.export.page import write_page
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.refinement.budget import merge_to
 from pansplat.tours import find_camera_height, find_rooms, select_views
-from pansplat.web import page as page_module
-from pansplat.web import write_page
 
 
 @pytest.fixture(autouse=True)

@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pansplat.errors import InputError, collect_notes
-from pansplat.files import is_scene_file, make_portable_name
-from pansplat.options import PredictOptions, ReadOptions
+from pansplat.system.files import is_scene_file, make_portable_name
+from pansplat.system.options import PredictOptions, ReadOptions
 from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from pansplat.data.pairs import Pair, Panorama
     from pansplat.gaussians.scene import Scene
+    from pansplat.inputs.pairs import Pair, Panorama
     from pansplat.tours import Edge, FloorOutline, TourGraph
 
 
@@ -66,8 +66,8 @@ class SceneEntry:
         source = self.tour or self.pair
         if self.file is not None or source is None:
             return () if self.file is None else (self.file,)
-        from pansplat.data.folders import list_stated_files
-        from pansplat.data.images import list_masks, list_pictures
+        from pansplat.images.image_files import list_masks, list_pictures
+        from pansplat.inputs.folders import list_stated_files
 
         files = dict.fromkeys(list_stated_files(source.folder))
         folders = {source.folder: None}

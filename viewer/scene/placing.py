@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.data.folders import read_pose_file_folder
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.geometry.path import wrap_angle
+from pansplat.inputs.folders import read_pose_file_folder
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import (
     Fit,

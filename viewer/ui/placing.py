@@ -13,7 +13,7 @@ import numpy as np
 from imgui_bundle import imgui
 from jaxtyping import Float
 
-from pansplat.data.placements import State
+from pansplat.inputs.placements import State
 from pansplat.poses.placing import Piece
 from pansplat_viewer.scene.placing import Nodes, Place, Placing, PlanView
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 import pansplat
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import WALL_ANGLE, Piece, Place

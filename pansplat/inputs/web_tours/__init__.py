@@ -1,0 +1,47 @@
+"""Tours that people already have: exports of the Marzipano Tool, and tours of Pannellum.
+
+Only files inside the tour's folder are read. Nothing is fetched from the web, and no script is run.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pansplat.errors import InputError
+from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.web_tours.entries import make_panoramas
+from pansplat.inputs.web_tours.marzipano import find_marzipano, read_marzipano
+from pansplat.inputs.web_tours.pannellum import SUFFIXES, find_pannellum, read_pannellum
+
+
+def find_web_tour(folder: Path) -> Path | None:
+    """The file that describes the tour in a folder; None if there is none. It may be faulty.
+
+    Raises:
+        OSError: the folder cannot be listed.
+    """
+    return find_marzipano(folder) or find_pannellum(folder)
+
+
+def is_web_tour_file(file: Path) -> bool:
+    """Whether a file may describe a tour, by its suffix."""
+    return file.suffix.lower() in SUFFIXES
+
+
+def read_web_tour(source: Path) -> list[Panorama]:
+    """The panoramas of a tour, with titles, links and start views, and without poses. No pixels are read.
+
+    Warns about panoramas, links and levels that cannot be used.
+
+    Args:
+        source: data.js of an export of the Marzipano Tool, its index.html, or the configuration of Pannellum in JSON,
+            HTML or JavaScript.
+    """
+    marzipano = find_marzipano(source.parent)
+    if marzipano is not None and (marzipano == source or source.suffix.lower() in (".html", ".htm")):
+        source, entries = marzipano, read_marzipano(marzipano)
+    else:
+        entries = read_pannellum(source)
+    if not entries:
+        raise InputError(f"{source}: needed panoramas, got none that can be used; the notes name the reasons.")
+    return make_panoramas(entries, source)

@@ -1,0 +1,133 @@
+"""Options of reading and prediction, types of the numbers on command lines, and one check of all of them.
+
+An option has a type such as `Height`, an integer with a range. `check_numbers` refuses a number out of range, with one
+line that names the option, before anything is loaded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import typing
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
+from tyro.conf import Fixed, Suppress, arg
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from pansplat.system.strict_json import convert
+
+EYE_DISTANCE = 0.063  # metres, the mean of adults
+MIN_HEIGHT, MAX_HEIGHT = 64, 8192  # pixels, of panoramas that are predicted from
+
+Height = Annotated[int, Meta(ge=MIN_HEIGHT, le=MAX_HEIGHT)]
+"""Height of panoramas to predict from, pixels."""
+ImageHeight = Annotated[int, Meta(ge=2, le=MAX_HEIGHT)]
+"""Height of an image to draw, pixels."""
+Count = Annotated[int, Meta(ge=1, le=10**9)]
+CountOrNone = Annotated[int, Meta(ge=0, le=10**9)]
+"""A number of things; 0 for none."""
+Threads = Annotated[int, Meta(ge=1, le=1024)]
+Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+EyeDistance = Annotated[float, Meta(gt=0, le=1)]
+"""Distance of the eyes, metres."""
+Depth = Annotated[float, Meta(ge=1e-9, le=1e9)]
+"""A distance, metres."""
+Seconds = Annotated[float, Meta(ge=0, le=1e6)]
+"""A time limit; 0 for none."""
+Minutes = Annotated[float, Meta(ge=0)]
+Fraction = Annotated[float, Meta(ge=0, lt=1)]
+Positive = Annotated[float, Meta(gt=0, le=1e9)]
+Real = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Weight = Annotated[float, Meta(ge=0, le=1e9)]
+
+CompatChoice = Literal["trained", "official", "fixed"]
+Precision = Literal["float32", "bfloat16"]
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How panoramas are read."""
+
+    # The names are those of the keywords of `pansplat.load_pairs`.
+    convention: str | None = None
+    """Pose convention, if the folder does not state it: "cam2world opencv", "cam2world opengl",
+    "world2cam opencv" or "world2cam opengl" (Habitat and Blender use opengl)."""
+    near: Depth | None = None
+    """Nearest depth to search, metres; by default the folder's."""
+    far: Depth | None = None
+    """Farthest depth to search, metres; by default the folder's."""
+    camera_height: Positive = 1.5
+    """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
+
+
+@dataclass(frozen=True)
+class PredictOptions:
+    """How the scene of panoramas is predicted and refined."""
+
+    # The names are those of the keywords of `pansplat.predict`.
+    model: str = "default"
+    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an official
+    .ckpt)."""
+    compat: CompatChoice = "trained"
+    """For a network: official computes what the official code does, fixed corrects its defects; by default the one
+    that the weights were trained with, which is official for official weights."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions; bfloat16 is less exact, and faster if the processor supports it."""
+    height: Height | None = None
+    """Panoramas are resized to this height before the prediction, pixels; by default that of the photographs, at
+    most 1024 (for networks and tours 512)."""
+    refine_seconds: Annotated[Seconds | None, arg(name="refine")] = None
+    """Time limit of the refinement after the prediction, seconds; 0 for none. By default 10; where each surface is kept
+    once 20, for the page of a pair 30."""
+    gaussians: Annotated[Count | None, Fixed, Suppress] = None
+    joint: Annotated[bool, Fixed, Suppress] = False
+    cache: Annotated[bool, Fixed, Suppress] = True
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """All but the model, which is loaded once for many scenes."""
+        return {name: value for name, value in vars(self).items() if name != "model"}
+
+
+def check_numbers(options: Any, *, prefixed: bool = False, prefix: str = "--") -> None:
+    """Check all numbers of a command's options.
+
+    Args:
+        options: a dataclass; its fields may be dataclasses.
+        prefixed: whether an option of a nested dataclass has the name of its field as a prefix, as in
+            `--optimizer.steps`.
+        prefix: the start of the names of the options.
+    """
+    hints = typing.get_type_hints(type(options), include_extras=True)
+    for name, hint in hints.items():
+        named = (getattr(mark, "name", None) for mark in getattr(hint, "__metadata__", ()))
+        value, option = getattr(options, name), prefix + next(filter(None, named), name).replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            check_numbers(value, prefixed=prefixed, prefix=f"{option}." if prefixed else prefix)
+        elif "Meta(" in str(hint):
+            convert(value, hint, option)
+
+
+NUMBERS = ConstructorRegistry()
+"""How numbers of command lines are parsed; a text that is no number stays a text, which `check_numbers` refuses."""
+
+
+@NUMBERS.primitive_rule
+def _parse_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    def parse(words: list[str]) -> Any:
+        if words[0] == "None":
+            raise ValueError("no number")  # an optional number is absent
+        for kind in (info.type, float):
+            with contextlib.suppress(ValueError):
+                return kind(words[0])
+        return words[0]
+
+    if info.type not in (int, float):
+        return None
+    return PrimitiveConstructorSpec(1, info.type.__name__.upper(), parse, _is_number, lambda value: [str(value)])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
