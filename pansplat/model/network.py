@@ -23,7 +23,6 @@ from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import (
     CHECKPOINT_SUFFIXES,
-    CompatChoice,
     WeightsFile,
     build_on_meta,
     config_from_dict,
@@ -35,6 +34,7 @@ from pansplat.model.weights import (
     require_shapes,
 )
 from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
+from pansplat.system.options import CompatChoice
 from pansplat.system.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {

@@ -92,4 +92,5 @@ def test_the_default_refinement_is_longer_for_joint_drawing(room: Path, tmp_path
     monkeypatch.setattr(pipeline, "predict_to_file", record)
     for options in ([], ["--layers"], ["--refine", "3"]):
         assert run(["predict", str(room), "--model", "sphere", "-o", str(tmp_path / "x.ply"), *options]) == 0
-    assert seconds == [pipeline.choose_refine_seconds(None, joint=True), 0.0, 3.0] and seconds[0] > 10
+    assert seconds == [None, 0.0, 3.0]
+    assert pipeline.choose_refine_seconds(None, joint=True) > pipeline.choose_refine_seconds(None)
