@@ -299,13 +299,18 @@ class Export(Writer):
 
     def _write_page(self, scene: Scene, source: Pair | TourGraph | None) -> PageFiles:
         """Write the web page and print its size."""
+        from pansplat.data.web_tours import is_web_tour_file
         from pansplat.web import list_photographs, write_page
 
         out, split = (self.out, self.split) if self.out.suffix else (self.out / _INDEX, True)
         out.parent.mkdir(parents=True, exist_ok=True)
-        title = self.title or self.path.resolve().stem.replace("_", " ")
-        has_photographs = source is not None and self._has_photographs()
-        photographs = list_photographs(source, range(len(scene.cam2world))) if has_photographs else []
+        is_whole = source is not None and not (self.crop or self.rooms)
+        photographs = list_photographs(source, range(len(scene.cam2world))) if is_whole else []
+        named = self.path.resolve()
+        if photographs and is_web_tour_file(named):
+            named = named.parent
+        tour = photographs[0].context[0].tour if photographs else ""
+        title = self.title or tour or named.stem.replace("_", " ")
         with progress_bar() as progress:
             page = write_page(
                 scene,
@@ -319,7 +324,7 @@ class Export(Writer):
                 progress=progress,
             )
         beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if split else ""
-        pictures = f" {len(photographs)} photographs of {page.photo_height} rows," if photographs else ""
+        pictures = f" {len(photographs)} photographs of {page.photo_height} rows," if page.photo_height else ""
         print(
             f"{out}{beside}: {page.num_gaussians:,} Gaussians,{pictures} {page.num_bytes / 1e6:.1f} MB; open it in a "
             "browser"
