@@ -163,7 +163,7 @@ install_headset() {
 # Numba caches the compiled kernels, so only the first run takes long.
 compile_kernels() {
     say "compiling the CPU kernels (about a minute the first time)"
-    .venv/bin/python -m pansplat.warm_up || say "could not compile the CPU kernels; the first command that uses them compiles them"
+    .venv/bin/python -m pansplat.cli.warm_up || say "could not compile the CPU kernels; the first command that uses them compiles them"
 }
 
 find_python

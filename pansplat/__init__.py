@@ -5,7 +5,7 @@ import sys
 from importlib import import_module
 from typing import Any
 
-from pansplat.kernel_cache import choose_kernel_cache
+from pansplat.system.kernel_cache import choose_kernel_cache
 
 choose_kernel_cache(os.path.dirname(__file__), os.environ)
 
@@ -19,10 +19,10 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "Gaussians": "pansplat.gaussians.scene",
     "InputError": "pansplat.errors",
-    "Pair": "pansplat.data.pairs",
+    "Pair": "pansplat.inputs.pairs",
     "Rendering": "pansplat.rendering",
     "Scene": "pansplat.gaussians.scene",
-    "Views": "pansplat.data.views",
+    "Views": "pansplat.inputs.views",
     "estimate_poses": "pansplat.pipeline",
     "load": "pansplat.pipeline",
     "load_model": "pansplat.pipeline",

@@ -28,20 +28,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta, Struct
 
 from pansplat import __version__, pipeline, tours
-from pansplat.atomic import replacing
-from pansplat.console import is_out_of_memory
-from pansplat.data.folders import find_panorama_folders
-from pansplat.data.images import list_masks
-from pansplat.data.pairs import Pair
-from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.errors import InputError, InputWarning, collect_notes
-from pansplat.files import SCENE_SUFFIXES, expand_home, is_portable_name, read_file
+from pansplat.export.plan_files import write_picture
 from pansplat.gaussians.scene import Scene
+from pansplat.images.image_files import list_masks
+from pansplat.inputs.folders import find_panorama_folders
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
-from pansplat.strict_json import read_json
+from pansplat.system.atomic import replacing
+from pansplat.system.console import is_out_of_memory
+from pansplat.system.files import SCENE_SUFFIXES, expand_home, is_portable_name, read_file
+from pansplat.system.strict_json import read_json
 from pansplat.tours import TourGraph, find_tours, merge_scenes
-from pansplat.tours.plan_files import write_picture
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
@@ -54,7 +54,7 @@ MIN_MEMORY = 1 << 29  # bytes of a worker; torch and the kernels take half of it
 _LAYOUT = "2"  # of the outputs; part of their hashes
 _BYTES_PER_PIXEL = 40  # of panoramas, in the .ply of their prediction; most predictors write more
 _MAX_NAME = 80  # characters of a pair's name in the name of an output
-# Temporary names (pansplat.atomic) of outputs.
+# Temporary names (pansplat.system.atomic) of outputs.
 _UNFINISHED = re.compile(rf"\.(graph|{'|'.join(STEPS)})-[0-9a-f]{{16}}.*\.[0-9a-f]{{8}}\.\w+")
 _DEFAULT_MEMORY = 4 << 30  # bytes; decides the default number of workers
 
@@ -312,7 +312,8 @@ def _process_unit(
             readers = dict(zip(tour.choose_sources(max_views), (read for _, read in made), strict=True))
             scene = merge_scenes(tour, lambda views: readers[views](), max_views)
         if options.suffix == ".html":
-            from pansplat.web import list_photographs, write_page
+            from pansplat.export.page import write_page
+            from pansplat.export.page_photographs import list_photographs
 
             count, title = int(_count_of_page(options)), name.replace("_", " ")
             photographs = list_photographs(tour or pairs[0], range(len(scene.cam2world)))
@@ -389,7 +390,7 @@ def _count_of_page(options: BatchOptions) -> float:
     """The largest number of Gaussians of a page; infinite for other files."""
     if "export" not in options.steps or options.suffix != ".html":
         return math.inf
-    from pansplat.web import PHOTO_GAUSSIANS
+    from pansplat.export.page import PHOTO_GAUSSIANS
 
     return options.gaussians or PHOTO_GAUSSIANS
 

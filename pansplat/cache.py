@@ -15,12 +15,12 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from pansplat.cache_folders import cache_folders, write_cache_file
-from pansplat.data.pairs import Pair
-from pansplat.data.views import Views
-from pansplat.files import read_file
 from pansplat.gaussians.scene import Gains, Gaussians
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import Views
 from pansplat.predictor import Predictor
+from pansplat.system.cache_folders import cache_folders, write_cache_file
+from pansplat.system.files import read_file
 
 _MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash

@@ -16,16 +16,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pansplat.console import is_notebook, print_message
 from pansplat.errors import InputError
+from pansplat.system.console import is_notebook, print_message
 
 if TYPE_CHECKING:
     import numpy as np
     from IPython.core.formatters import DisplayFormatter
 
-    from pansplat.data.pairs import Pair
-    from pansplat.data.views import Views
     from pansplat.gaussians.scene import Scene
+    from pansplat.inputs.pairs import Pair
+    from pansplat.inputs.views import Views
     from pansplat.rendering import Rendering
 
 DISPLAY_GAUSSIANS = 100_000  # of a scene in a notebook: 2.4 MB of its file
@@ -96,7 +96,7 @@ def _bundle_scene(scene: Scene, gaussians: int = DISPLAY_GAUSSIANS, height: int 
 
 def _make_page(scene: Scene, gaussians: int) -> str:
     """The text of a page of at most a number of Gaussians."""
-    from pansplat.web import write_page
+    from pansplat.export.page import write_page
 
     with tempfile.TemporaryDirectory(prefix="pansplat-") as folder:
         path = Path(folder) / "scene.html"
@@ -150,7 +150,7 @@ def _bundle_views(views: Views) -> _BUNDLE:
 
 def _bundle_pair(pair: Pair) -> _BUNDLE:
     """The context photographs; nothing if one cannot be read."""
-    from pansplat.data.images import read_panorama
+    from pansplat.images.image_files import read_panorama
 
     shown = pair.context[:_MAX_PICTURES]
     try:
@@ -182,7 +182,7 @@ def _bundle_pictures(pictures: Sequence[np.ndarray]) -> _BUNDLE:
 _DISPLAYS: tuple[tuple[str, str, Callable[[Any], _BUNDLE]], ...] = (
     ("pansplat.gaussians.scene", "Scene", _bundle_scene),
     ("pansplat.rendering.rasterize", "Rendering", _bundle_rendering),
-    ("pansplat.data.views", "Views", _bundle_views),
-    ("pansplat.data.pairs", "Pair", _bundle_pair),
+    ("pansplat.inputs.views", "Views", _bundle_views),
+    ("pansplat.inputs.pairs", "Pair", _bundle_pair),
 )
 """Module and name of each class that is displayed, and the function for it."""

@@ -21,16 +21,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.cache import CachedPrediction, CachedScene
-from pansplat.console import with_progress_bar
-from pansplat.data import folders
-from pansplat.data.pairs import Pair
-from pansplat.data.views import CAMERA_HEIGHT, Views
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import expand_home, find_scene_suffix
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.ply import save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
+from pansplat.inputs import folders
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import CAMERA_HEIGHT, Views
 from pansplat.model.layers import Precision
 from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
 from pansplat.poses.estimate import estimate_poses
@@ -48,6 +46,8 @@ from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
+from pansplat.system.console import with_progress_bar
+from pansplat.system.files import expand_home, find_scene_suffix
 from pansplat.tours import (
     MAX_SCENE_VIEWS,
     TourGraph,
@@ -97,6 +97,7 @@ def load_pairs(
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
     progress: Progress | None = None,
+    on_unposed: Callable[[list[Pair]], None] | None = None,
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
@@ -110,6 +111,8 @@ def load_pairs(
         near, far: radial depth range in metres; overrides that of the files.
         camera_height: of the cameras over the floor, metres; the scale of estimated poses and of single views.
         progress: called with a description of the estimate of poses and the completed fraction.
+        on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
+            panorama.
     """
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
@@ -119,7 +122,9 @@ def load_pairs(
         unposed = error.folder, error.panoramas
     else:
         return [_with_camera_height(pair, camera_height) for pair in pairs]
-    pairs = estimate_pairs(*unposed, near=near, far=far, camera_height=camera_height, progress=progress)
+    pairs = estimate_pairs(
+        *unposed, near=near, far=far, camera_height=camera_height, progress=progress, on_unposed=on_unposed
+    )
     return [_with_camera_height(pair, camera_height) for pair in pairs]
 
 
@@ -158,7 +163,7 @@ def load_model(
         )
     path = expand_home(name)
     if read_model_name(path) == "depth":
-        from pansplat.guided_sweep import load_guided_sweep
+        from pansplat.sweep.guided_sweep import load_guided_sweep
 
         return load_guided_sweep(path, path.stem)
     from pansplat.model.network import load_predictor
@@ -167,7 +172,7 @@ def load_model(
 
 
 def _load_default() -> Predictor:
-    from pansplat.guided_sweep import load_default_sweep
+    from pansplat.sweep.guided_sweep import load_default_sweep
 
     return load_default_sweep()
 

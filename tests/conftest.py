@@ -22,7 +22,7 @@ from jaxtyping import config, install_import_hook
 from PIL import Image
 from torch import Tensor
 
-from pansplat.testing import restart_checks
+from pansplat.system.testing import restart_checks
 
 # One thread per pytest-xdist worker and its child processes: workers must not compete for cores.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -45,8 +45,20 @@ settings.load_profile("untimed")
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 # All tests check the annotated shapes and types of these packages, which nothing has imported yet.
-_CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predictor", "evaluation", "pipeline")
-install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
+_CHECKED = (
+    "geometry",
+    "gaussians",
+    "model",
+    "networks",
+    "rendering",
+    "refinement",
+    "predictor",
+    "evaluation",
+    "pipeline",
+)
+install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.system.testing.check_types")
+
+pytest_plugins = ["panorama_fixtures"]  # imported after the hook
 
 
 def _selects(config: pytest.Config, marker: str) -> bool:

@@ -23,9 +23,9 @@ from pansplat.batch import BatchOptions, Item, list_items, process_item
 from pansplat.cli import run
 from pansplat.cli.batch import Batch, _write_report
 from pansplat.errors import InputError
+from pansplat.export import page as page_module
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
-from pansplat.web import page as page_module
 
 HEIGHT = 64
 

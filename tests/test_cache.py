@@ -228,7 +228,7 @@ def test_pairs_of_similar_names_share_a_cache_folder(pair_folder: Path, sphere_p
 
 def test_unfinished_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
     code = (
-        "import os, sys\nfrom pansplat.atomic import replacing\n"
+        "import os, sys\nfrom pansplat.system.atomic import replacing\n"
         "with replacing(sys.argv[1]) as file:\n    file.write_bytes(b'half')\n    os.kill(os.getpid(), 9)\n"
     )
     for name in ("old.scene", "new.scene"):

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pansplat.data.images import read_size
 from pansplat.errors import InputWarning, collect_notes
-from pansplat.threads import worker_threads
+from pansplat.images.image_files import read_size
+from pansplat.system.threads import worker_threads
 
 ROOT = Path(__file__).resolve().parents[1]
 OWNERS = {
     "console.py": {"own_warnings", "print_once"},
     "batch.py": {"dask_setup"},
-    "images.py": {""},  # once, at import
+    "image_files.py": {""},  # once, at import
 }
 
 

@@ -17,8 +17,8 @@ pytestmark = pytest.mark.lint
 VIOLATIONS = [
     ("pansplat.errors", "pansplat.geometry.pose"),
     ("pansplat.geometry.pose", "pansplat.gaussians.ply"),
-    ("pansplat.data.views", "pansplat.gaussians.scene"),
-    ("pansplat.gaussians.ply", "pansplat.data.views"),
+    ("pansplat.inputs.views", "pansplat.gaussians.scene"),
+    ("pansplat.gaussians.ply", "pansplat.inputs.views"),
     ("pansplat.predictor", "pansplat.rendering.blend"),
     ("pansplat.rendering.blend", "pansplat.pipeline"),
     ("pansplat.pipeline", "pansplat.evaluation.metrics"),
@@ -87,3 +87,16 @@ def test_public_names_are_callable_after_an_import_of_submodules() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_architecture_names_every_module() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    rows = {names: row for row in text.splitlines() for names in re.findall(r"^\| `([a-z_/]+)/`", row)}
+    missing = []
+    for source in (*(ROOT / "pansplat").rglob("*.py"), *(ROOT / "viewer").rglob("*.py")):
+        folder = source.relative_to(ROOT).parent.as_posix().removeprefix("pansplat/")
+        parts = [row for name, row in rows.items() if folder == name or folder.startswith(f"{name}/")]
+        described = "".join(parts) or (text if folder == "pansplat" else "")
+        if source.name != "__init__.py" and not re.search(rf"\b{source.stem}\b", described):
+            missing.append(source.relative_to(ROOT).as_posix())
+    assert not missing, missing

@@ -18,12 +18,13 @@ from PIL import Image
 from torch import Tensor
 
 import pansplat
-from pansplat import console, notebook
-from pansplat.data.views import Views
+from pansplat import notebook
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.inputs.views import Views
 from pansplat.rendering import Rendering
+from pansplat.system import console
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +77,7 @@ def test_similar_gaussians_of_a_large_scene_are_merged_without_a_fit(
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("a fit takes up to a minute")
 
-    monkeypatch.setattr("pansplat.web.page._merge", refuse)
+    monkeypatch.setattr("pansplat.export.page._merge", refuse)
     bundle = notebook._bundle_scene(scene, 100)
     assert "100 of 400 Gaussians" in bundle["text/html"] and "100 Gaussians." in open_page(bundle)
 

@@ -16,11 +16,11 @@ import torch
 from packaging.requirements import Requirement
 
 import pansplat
-from pansplat.data.video import open_video
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat.source_hash import hash_sources
+from pansplat.images.video import open_video
+from pansplat.system.source_hash import hash_sources
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -127,8 +127,8 @@ def test_an_installed_wheel_reads_its_own_shaders(installed: Path) -> None:
 
 
 def test_an_installed_wheel_has_the_hashes_of_sources_of_the_checkout(installed: Path) -> None:
-    modules = ("pansplat.guided_sweep", "pansplat.refinement", "pansplat.poses.files", "pansplat.model.network")
-    program = f"from pansplat.source_hash import hash_sources; print(*map(hash_sources, {modules}))"
+    modules = ("pansplat.sweep.guided_sweep", "pansplat.refinement", "pansplat.poses.files", "pansplat.model.network")
+    program = f"from pansplat.system.source_hash import hash_sources; print(*map(hash_sources, {modules}))"
     done = run_in(installed, sys.executable, "-c", program)
     assert done.stdout.split() == [hash_sources(module) for module in modules], done.stderr
 

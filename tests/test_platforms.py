@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat import batch, console
+from pansplat import batch
 from pansplat.bench import harness
-from pansplat.data.folders import load_pairs
 from pansplat.errors import InputError
-from pansplat.files import is_portable_name, make_portable_name, require_output_folder
 from pansplat.gaussians import formats
-from pansplat.kernel_cache import choose_kernel_cache
+from pansplat.inputs.folders import load_pairs
 from pansplat.model.weights import load_weights, pack_weights, save_weights
+from pansplat.system import console
+from pansplat.system.files import is_portable_name, make_portable_name, require_output_folder
+from pansplat.system.kernel_cache import choose_kernel_cache
 
 
 @pytest.fixture

@@ -24,15 +24,15 @@ from PIL import Image
 
 from pansplat.batch import list_items
 from pansplat.cli import _COMMANDS
-from pansplat.data.folders import load_pairs
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene
 from pansplat.gaussians.gltf import save_glb
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.gaussians.scene_files import format_entry, make_scene
+from pansplat.inputs.folders import load_pairs
 from pansplat.model.network import build_empty_network
 from pansplat.model.weights import WeightsFile
-from pansplat.options import check_numbers
+from pansplat.system.options import check_numbers
 from pansplat.training.checkpoint import extract_weights, load_checkpoint
 from pansplat.training.config import TrainConfig
 from pansplat_viewer.app import Options
@@ -286,7 +286,7 @@ def test_types_say_what_they_need() -> None:
     class Inner(msgspec.Struct, forbid_unknown_fields=True):
         sides: list[float] = []
 
-    from pansplat.strict_json import convert
+    from pansplat.system.strict_json import convert
 
     for value, message in (
         ({"sides": [1, "x"]}, "f.json, sides[1]: needed a number, got 'x'; correct it."),

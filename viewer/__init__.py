@@ -20,7 +20,7 @@ def main() -> NoReturn:
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run `pansplat-view` and return its exit status; help and misspelt arguments raise SystemExit."""
-    from pansplat.console import run_command
+    from pansplat.system.console import run_command
 
     def run_arguments() -> int:  # imported after the signals are caught
         from pansplat_viewer.app import run_arguments

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pansplat.data.images import write_image
-from pansplat.data.video import VIDEO_SUFFIXES, write_video
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
+from pansplat.images.image_files import write_image
+from pansplat.images.video import VIDEO_SUFFIXES, write_video
 from pansplat.tours import FADE_SECONDS, Route, TourGraph, paint_floor_plan
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.stereo import ImageFormat, render_image

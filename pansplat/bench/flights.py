@@ -22,13 +22,13 @@ from numpy import ndarray as Array
 from pansplat import pipeline
 from pansplat.bench.harness import MEAN, Header, Suite, announce, make_axes
 from pansplat.bench.refine import time_prediction
-from pansplat.data.pairs import Pair
-from pansplat.data.views import Views
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import ws_psnr
 from pansplat.evaluation.report import warm_up
 from pansplat.evaluation.results import Column, Row, average_rows
 from pansplat.gaussians.scene import Scene
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import Views
 from pansplat.refinement import fuse_views
 
 if TYPE_CHECKING:

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from pansplat.atomic import replacing
-from pansplat.console import make_table_console
 from pansplat.evaluation.results import Column, Row, markdown_table, rich_table, write_json
-from pansplat.files import SOFTWARE
+from pansplat.system.atomic import replacing
+from pansplat.system.console import make_table_console
+from pansplat.system.files import SOFTWARE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

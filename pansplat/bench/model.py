@@ -32,10 +32,10 @@ from pansplat.bench.harness import (
     time_call,
     time_workload,
 )
-from pansplat.data.views import Views
 from pansplat.evaluation.metrics import psnr
 from pansplat.evaluation.results import Column, Row
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.inputs.views import Views
 from pansplat.model.heads import merge_tiles
 from pansplat.model.layers import Compat, Precision
 from pansplat.model.network import build_network

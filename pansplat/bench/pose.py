@@ -25,10 +25,10 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.bench.harness import Header, Suite, announce, make_axes
-from pansplat.data.folders import load_pairs
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.evaluation.results import Column, Row
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.estimate import PoseEstimate, estimate_poses
 from pansplat.poses.solvers import angle_between, rotation_angle
 

@@ -23,13 +23,13 @@ from torch import Tensor
 
 from pansplat import pipeline
 from pansplat.bench.harness import MEAN, Header, Suite, announce, make_axes, time_workload
-from pansplat.data.pairs import Pair
-from pansplat.data.views import Views, select_views
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.evaluation.report import measure_own_views, warm_up
 from pansplat.evaluation.results import Column, Row, average_rows
 from pansplat.gaussians.scene import Scene
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import Views, select_views
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, Refinement
 

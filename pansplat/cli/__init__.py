@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated, Any, Protocol, Union
 
-from pansplat.console import own_warnings, parse_arguments, run_command
+from pansplat.system.console import own_warnings, parse_arguments, run_command
 
 _COMMANDS = (
     "predict", "refine", "render", "export", "batch", "evaluate", "pose", "check", "info", "bench", "convert"
@@ -32,7 +32,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status; help and misspelt arguments raise SystemExit."""
 
     def run_parsed() -> int:
-        from pansplat.options import check_numbers
+        from pansplat.system.options import check_numbers
 
         command = parse(argv)
         check_numbers(command)

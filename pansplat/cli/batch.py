@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from pansplat.cli.inputs import Compat, Out, Precision, Writer
-from pansplat.console import print_message, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import expand_home, require_output_folder, require_replaceable
-from pansplat.options import Count, Height, Positive, Seconds, Threads
+from pansplat.system.console import print_message, progress_bar
+from pansplat.system.files import expand_home, require_output_folder, require_replaceable
+from pansplat.system.options import Count, Height, Positive, Seconds, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -15,16 +15,16 @@ import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
 from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.errors import InputError
-from pansplat.files import is_scene_file, require_output_folder, require_replaceable
-from pansplat.options import Positive, Threads
+from pansplat.system.files import is_scene_file, require_output_folder, require_replaceable
+from pansplat.system.options import Positive, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from pansplat.bench.harness import Suite
     from pansplat.bench.raster import BenchScene
-    from pansplat.data.pairs import Pair
     from pansplat.evaluation.results import Row
+    from pansplat.inputs.pairs import Pair
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels

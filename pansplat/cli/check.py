@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import PairChoice, choose_pair
-from pansplat.console import make_table_console
+from pansplat.system.console import make_table_console
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, Writer
-from pansplat.console import make_table_console
-from pansplat.files import require_output_file
+from pansplat.system.console import make_table_console
+from pansplat.system.files import require_output_file
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Literal, cast
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import ModelChoice, Out, Writer, parse_blend
-from pansplat.console import make_table_console, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import expand_home, require_output_folder, require_replaceable
-from pansplat.options import Count, CountOrNone, Depth, Height, Seconds
+from pansplat.system.console import make_table_console, progress_bar
+from pansplat.system.files import expand_home, require_output_folder, require_replaceable
+from pansplat.system.options import Count, CountOrNone, Depth, Height, Seconds
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pansplat.data.pairs import Pair
     from pansplat.evaluation.lpips import Backbone, Lpips
     from pansplat.evaluation.protocol import Blend, Method, ProtocolName
+    from pansplat.inputs.pairs import Pair
 
 _WRITTEN = "results.json", "*/prediction.png", "*/target.png", "*/error.png"
 _WRITTEN_OF_PROTOCOL = "results.json", "table.md", "frame_distance.png", "*/*/*.png"

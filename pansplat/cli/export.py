@@ -13,9 +13,9 @@ from msgspec import Meta
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, ScenePrediction, Writer
-from pansplat.console import progress_bar
 from pansplat.errors import InputError
-from pansplat.files import (
+from pansplat.system.console import progress_bar
+from pansplat.system.files import (
     SCENE_SUFFIXES,
     find_scene_suffix,
     is_scene_file,
@@ -24,16 +24,16 @@ from pansplat.files import (
     require_output_folder,
     require_replaceable,
 )
-from pansplat.options import Count, Fraction, Real
+from pansplat.system.options import Count, Fraction, Real
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from pansplat.cleanup import Change
-    from pansplat.data.pairs import Pair
+    from pansplat.export.cleanup import Change
+    from pansplat.export.page import PageFiles
     from pansplat.gaussians.scene import Scene
+    from pansplat.inputs.pairs import Pair
     from pansplat.tours import TourGraph
-    from pansplat.web import PageFiles
 
 _PAGE_SUFFIX, _PICTURE_SUFFIX, _DRAWING_SUFFIXES, _MESH_SUFFIX = ".html", ".png", (".svg", ".dxf"), ".obj"
 _SUFFIXES = (*SCENE_SUFFIXES, _PAGE_SUFFIX, _PICTURE_SUFFIX, *_DRAWING_SUFFIXES, _MESH_SUFFIX)
@@ -101,9 +101,9 @@ class Export(Writer):
 
     def run(self) -> int:
         """Write the file and print its size."""
+        from pansplat.export.page import parse_origins
         from pansplat.gaussians.formats import save_scene
         from pansplat.gaussians.ply import save_points
-        from pansplat.web import parse_origins
 
         is_dataset, is_folder = self.training_set, not self.out.suffix
         if is_dataset:
@@ -146,11 +146,11 @@ class Export(Writer):
             page = self._write_page(scene, source)
             _print_changes(changes)
             if self.serve:
-                from pansplat.web.serve import serve_page
+                from pansplat.export.page_server import serve_page
 
                 serve_page(page)
         elif is_drawing or is_picture:
-            from pansplat.tours.plan_files import describe_plan, write_picture, write_plan
+            from pansplat.export.plan_files import describe_plan, write_picture, write_plan
 
             plan = write_plan(scene, self.out) if is_drawing else write_picture(scene, self.out)
             floors = [f"the floors of {len(scene.cam2world)} panoramas"]
@@ -197,7 +197,7 @@ class Export(Writer):
         """
         import torch
 
-        from pansplat.cleanup import Cleaning, clean_up
+        from pansplat.export.cleanup import Cleaning, clean_up
         from pansplat.gaussians.scene import prune
 
         if self.up is not None:
@@ -217,9 +217,9 @@ class Export(Writer):
 
     def _write_mesh(self) -> None:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
-        from pansplat.gaussians.mesh_files import name_mesh_files, save_mesh
-        from pansplat.refinement.mesh import DEFAULT_TRIANGLES, make_mesh
-        from pansplat.web import list_photographs
+        from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
+        from pansplat.export.mesh_files import name_mesh_files, save_mesh
+        from pansplat.export.page_photographs import list_photographs
 
         require_replaceable("--out", name_mesh_files(self.out, 1), self.overwrite)  # before the prediction
         load: Callable[[int], Tensor] | None = None
@@ -252,12 +252,12 @@ class Export(Writer):
         """Write cube faces, poses and points to a new folder."""
         import torch
 
-        from pansplat.atomic import replacing_folder
-        from pansplat.data.pairs import Pair
-        from pansplat.data.reconstructions.dataset import POINTS, PosedPanorama, write_dataset
-        from pansplat.data.reconstructions.nerfstudio import Z_UP
+        from pansplat.export.training_set import POINTS, PosedPanorama, write_dataset
         from pansplat.gaussians.ply import make_colors, save_points
         from pansplat.gaussians.scene import prune
+        from pansplat.inputs.pairs import Pair
+        from pansplat.inputs.reconstructions.nerfstudio import Z_UP
+        from pansplat.system.atomic import replacing_folder
 
         if is_scene_file(self.path):
             raise InputError(
@@ -287,7 +287,7 @@ class Export(Writer):
 
     def _count_of_page(self) -> int:
         """The largest number of Gaussians of a page."""
-        from pansplat.web import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS
+        from pansplat.export.page import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS
 
         is_one_file = self.out.suffix and not self.split
         default = PHOTO_GAUSSIANS if is_one_file and self._has_photographs() else DEFAULT_GAUSSIANS
@@ -299,8 +299,9 @@ class Export(Writer):
 
     def _write_page(self, scene: Scene, source: Pair | TourGraph | None) -> PageFiles:
         """Write the web page and print its size."""
-        from pansplat.data.web_tours import is_web_tour_file
-        from pansplat.web import list_photographs, write_page
+        from pansplat.export.page import write_page
+        from pansplat.export.page_photographs import list_photographs
+        from pansplat.inputs.web_tours import is_web_tour_file
 
         out, split = (self.out, self.split) if self.out.suffix else (self.out / _INDEX, True)
         out.parent.mkdir(parents=True, exist_ok=True)

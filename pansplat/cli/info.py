@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.console import can_print, make_table_console
+from pansplat.system.console import can_print, make_table_console
 
 if TYPE_CHECKING:
     from rich.table import Table

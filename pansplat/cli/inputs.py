@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from pansplat.console import progress_bar
 from pansplat.errors import InputError
-from pansplat.files import is_scene_file
-from pansplat.options import Depth, Height, Positive, Seconds
+from pansplat.system.console import progress_bar
+from pansplat.system.files import is_scene_file
+from pansplat.system.options import Depth, Height, Positive, Seconds
 
 if TYPE_CHECKING:
-    from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
+    from pansplat.inputs.pairs import Pair
     from pansplat.predictor import Predictor
     from pansplat.tours import TourGraph
 
@@ -137,7 +137,7 @@ class ScenePrediction:
     def predict_layers(self, source: Pair | TourGraph) -> Scene:
         """The unrefined scene of the panoramas of `open_panoramas` with all that each of them shows, from the cache."""
         from pansplat import pipeline
-        from pansplat.data.pairs import Pair
+        from pansplat.inputs.pairs import Pair
 
         model = self.model.load()
         with progress_bar() as progress:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import OptionalOut, Writer
-from pansplat.console import make_table_console, print_message, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import require_output_file, require_output_folder
-from pansplat.options import Count, Positive
+from pansplat.system.console import make_table_console, print_message, progress_bar
+from pansplat.system.files import require_output_file, require_output_folder
+from pansplat.system.options import Count, Positive
 
 if TYPE_CHECKING:
     from pansplat.poses.estimate import PoseEstimate
@@ -37,7 +37,7 @@ class Pose(Writer):
 
     def run(self) -> int:
         """Estimate, print the table and write the file."""
-        from pansplat.data.folders import VIDEO_FILES
+        from pansplat.inputs.folders import VIDEO_FILES
         from pansplat.poses.estimate import estimate_poses
         from pansplat.poses.files import SUFFIXES, require_mergeable, write_poses
         from pansplat.poses.key_frames import extract_key_frames
@@ -75,9 +75,9 @@ class Pose(Writer):
 
 def _list_images(paths: tuple[Path, ...]) -> list[Path]:
     """The files, and the photographs in the folders, as other commands find them."""
-    from pansplat.data.folders import require_known_masks
-    from pansplat.data.images import is_assembled
-    from pansplat.data.photographs import list_photographs
+    from pansplat.images.image_files import is_assembled
+    from pansplat.inputs.folders import require_known_masks
+    from pansplat.inputs.photographs import list_photographs
 
     images: list[Path] = []
     for path in paths:

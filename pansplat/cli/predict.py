@@ -11,9 +11,9 @@ from msgspec import Meta
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import ModelChoice, Out, PairChoice, Writer, choose_pair
-from pansplat.console import progress_bar
-from pansplat.files import SCENE_SUFFIXES, require_output_file
-from pansplat.options import Fraction, Height, Seconds
+from pansplat.system.console import progress_bar
+from pansplat.system.files import SCENE_SUFFIXES, require_output_file
+from pansplat.system.options import Fraction, Height, Seconds
 
 
 @dataclass(frozen=True)

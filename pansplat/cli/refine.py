@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import ModelChoice, Out, PairChoice, Writer, choose_pair, predict_scene
-from pansplat.console import call_at_first_signal, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import SCENE_SUFFIXES, is_scene_file, require_output_file
-from pansplat.options import Count, Height, Seconds, Seed
+from pansplat.system.console import call_at_first_signal, progress_bar
+from pansplat.system.files import SCENE_SUFFIXES, is_scene_file, require_output_file
+from pansplat.system.options import Count, Height, Seconds, Seed
 
 if TYPE_CHECKING:
-    from pansplat.data.views import Views
     from pansplat.gaussians.scene import Scene
+    from pansplat.inputs.views import Views
     from pansplat.refinement import RefineReport
 
 

@@ -11,10 +11,10 @@ from msgspec import Meta
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, ScenePrediction, Writer, parse_blend
-from pansplat.console import progress_bar
 from pansplat.errors import InputError
-from pansplat.files import read_file, require_output_file
-from pansplat.options import EYE_DISTANCE, EyeDistance, ImageHeight
+from pansplat.system.console import progress_bar
+from pansplat.system.files import read_file, require_output_file
+from pansplat.system.options import EYE_DISTANCE, EyeDistance, ImageHeight
 
 if TYPE_CHECKING:
     import numpy as np
@@ -75,8 +75,8 @@ class Render(Writer):
         import torch
 
         from pansplat import pipeline
-        from pansplat.data.images import write_depth, write_image
-        from pansplat.data.video import write_video
+        from pansplat.images.image_files import write_depth, write_image
+        from pansplat.images.video import write_video
 
         self._refuse_invalid_arguments()
         poses = None if self.pose is None else read_poses(self.pose)
@@ -181,8 +181,8 @@ def _plan_flight(scene: Scene) -> Route | None:
 
 def read_poses(path: Path) -> list[Tensor]:
     """Poses of a file (a JSON matrix, 16 numbers, a KITTI or TUM trajectory): cam2world, OpenCV axes."""
-    from pansplat.data.poses import parse_convention, read_trajectory, rigid_matrix, to_cam2world
-    from pansplat.strict_json import read_json
+    from pansplat.inputs.poses import parse_convention, read_trajectory, rigid_matrix, to_cam2world
+    from pansplat.system.strict_json import read_json
 
     if path.suffix.lower() == ".json":
         content = read_json(path)

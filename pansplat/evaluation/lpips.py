@@ -28,8 +28,8 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from pansplat.errors import InputError
-from pansplat.files import expand_home
 from pansplat.model.weights import read_checkpoint
+from pansplat.system.files import expand_home
 
 Backbone = Literal["vgg", "alex", "squeeze"]
 

@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.data.pairs import Pair
-from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pad_equirect, pixel_directions, row_weights, uv_from_directions
 from pansplat.geometry.pose import invert_pose
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import Views
 
 AS_GIVEN = "as given"
 

@@ -21,8 +21,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat import pipeline
-from pansplat.data.images import write_image
-from pansplat.data.sequences import (
+from pansplat.errors import InputError
+from pansplat.evaluation.lpips import Lpips
+from pansplat.evaluation.metrics import depth_errors
+from pansplat.evaluation.report import error_image, measure_image, warm_up
+from pansplat.evaluation.results import Row, average_rows, make_folder, write_json
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.images.image_files import write_image
+from pansplat.inputs.views import Sample, Views
+from pansplat.model.network import NetworkPredictor
+from pansplat.pipeline import Drawing
+from pansplat.predictor import Predictor, Progress
+from pansplat.training.sequences import (
     BoundedSampler,
     FramePair,
     FrameSequence,
@@ -30,17 +40,7 @@ from pansplat.data.sequences import (
     read_insta360,
     read_loc360,
 )
-from pansplat.data.sources import TripletSet, panogrf_folder, read_panogrf
-from pansplat.data.views import Sample, Views
-from pansplat.errors import InputError
-from pansplat.evaluation.lpips import Lpips
-from pansplat.evaluation.metrics import depth_errors
-from pansplat.evaluation.report import error_image, measure_image, warm_up
-from pansplat.evaluation.results import Row, average_rows, make_folder, write_json
-from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.model.network import NetworkPredictor
-from pansplat.pipeline import Drawing
-from pansplat.predictor import Predictor, Progress
+from pansplat.training.sources import TripletSet, panogrf_folder, read_panogrf
 
 LOC360, INSTA360 = "360Loc", "Insta360"
 

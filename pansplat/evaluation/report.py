@@ -19,14 +19,14 @@ from rich.table import Table
 from torch import Tensor
 
 from pansplat import pipeline
-from pansplat.data.images import write_image
-from pansplat.data.pairs import Pair
-from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import cross_fade, psnr, ssim, ws_psnr
 from pansplat.evaluation.results import Column, Row, average_rows, make_folder, rich_table, write_json
 from pansplat.gaussians.scene import Scene
+from pansplat.images.image_files import write_image
+from pansplat.inputs.pairs import Pair
+from pansplat.inputs.views import Views
 from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor, Progress
 from pansplat.rendering import Rendering

@@ -12,8 +12,8 @@ from typing import Any
 
 from rich.table import Table
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError
+from pansplat.system.atomic import replacing
 
 
 @dataclass

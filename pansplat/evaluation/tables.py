@@ -14,10 +14,10 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from pansplat.atomic import replacing
 from pansplat.evaluation.protocol import ProtocolResult
 from pansplat.evaluation.results import Column, Row, markdown_table, rich_table
-from pansplat.files import SOFTWARE
+from pansplat.system.atomic import replacing
+from pansplat.system.files import SOFTWARE
 
 _METRICS = {  # titles and formats
     "gaussians": ("Gaussians", ",.0f"),

@@ -25,9 +25,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import find_scene_suffix, read_file, require_file
 from pansplat.gaussians.gltf import load_glb, save_glb
 from pansplat.gaussians.ply import COMMENT_PREFIX, find_entry, format_plain_ply, load_ply, read_ply, save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
@@ -40,6 +38,8 @@ from pansplat.gaussians.scene_files import (
     select_finite,
     sort_by_label,
 )
+from pansplat.system.atomic import replacing
+from pansplat.system.files import find_scene_suffix, read_file, require_file
 
 _MAX_FILE = 1 << 32  # bytes
 _MAX_ENTRY = 1 << 26  # bytes of the pansplat entry

@@ -23,9 +23,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.files import read_file
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.gaussians.scene_files import (
@@ -38,7 +36,9 @@ from pansplat.gaussians.scene_files import (
     sort_by_label,
 )
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.strict_json import convert, parse_json, read_field
+from pansplat.system.atomic import replacing
+from pansplat.system.files import read_file
+from pansplat.system.strict_json import convert, parse_json, read_field
 
 _Object = dict[str, Any]
 _Vector = tuple[float, float, float]

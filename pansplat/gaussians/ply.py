@@ -27,9 +27,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import SOFTWARE, require_file
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.gaussians.scene_files import (
@@ -40,6 +38,8 @@ from pansplat.gaussians.scene_files import (
     select_finite,
     sort_by_label,
 )
+from pansplat.system.atomic import replacing
+from pansplat.system.files import SOFTWARE, require_file
 
 OPACITY_EPSILON = 1e-6  # opacities are clamped to this distance from 0 and 1, where the logit is infinite
 SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarithm is finite

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float, Integer
 from torch import Tensor
 
-from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import interpolate_poses, multiply_quats, quats_from_rotations, rotations_from_quats
 from pansplat.geometry.world import USER_FRAME, WorldFrame
+from pansplat.system.descriptions import describe_count, describe_range, list_first
 
 Gains = tuple[tuple[float, ...], ...]
 """Factors of R, G and B for each view's photograph."""

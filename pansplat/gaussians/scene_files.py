@@ -21,7 +21,7 @@ from torch import Tensor
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.world import MAX_POSITION, WorldFrame, choose_unit, require_depth_range
-from pansplat.strict_json import convert, parse_json
+from pansplat.system.strict_json import convert, parse_json
 
 Y_UP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # from y down to y up, and back
 

@@ -35,7 +35,7 @@ from pansplat.model.weights import (
     require_shapes,
 )
 from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
-from pansplat.source_hash import hash_sources
+from pansplat.system.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
     "pansplat": (PanSplat, PanSplatConfig),

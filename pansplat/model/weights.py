@@ -26,12 +26,12 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.files import require_file
 from pansplat.geometry.cubemap import strip_lookup
 from pansplat.model.layers import Compat
-from pansplat.strict_json import convert, parse_json
+from pansplat.system.atomic import replacing
+from pansplat.system.files import require_file
+from pansplat.system.strict_json import convert, parse_json
 
 FORMAT = 1  # increased when tensor names or the meaning of the metadata change
 

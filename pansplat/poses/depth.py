@@ -61,7 +61,7 @@ def estimate_depth(image: Float[Array, "h w 3"], down: Float[Array, "3"] | None)
         image: RGB in [0, 1].
         down: gravity in the camera's frame; None if it is unknown: the camera is then taken to be upright.
     """
-    from pansplat.guided_sweep import load_default_sweep
+    from pansplat.sweep.guided_sweep import load_default_sweep
 
     turn = None if down is None else upright_rotation(np.eye(3), down)
     upright = image if turn is None else rotate_image(image, turn)

@@ -15,16 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
-from pansplat.console import with_progress_bar
-from pansplat.data.images import read_height, read_mask, read_panorama
-from pansplat.data.masks import scene_mask_of_files
-from pansplat.data.pairs import FAR, NEAR, find_mask
-from pansplat.data.placements import Tie, find_holds
-from pansplat.data.views import CAMERA_HEIGHT
-from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import require_file
-from pansplat.guided_sweep import load_default_sweep
+from pansplat.images.image_files import read_height, read_mask, read_panorama
+from pansplat.images.masks import scene_mask_of_files
+from pansplat.inputs.pairs import FAR, NEAR, find_mask
+from pansplat.inputs.placements import Tie, find_holds
+from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes, with_hints
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap, estimate_depth
@@ -53,8 +49,12 @@ from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_
 from pansplat.poses.ways import NO_WAYS, Ways
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
 from pansplat.predictor import Progress, part_of
-from pansplat.source_hash import hash_sources
-from pansplat.threads import one_thread, worker_threads
+from pansplat.sweep.guided_sweep import load_default_sweep
+from pansplat.system.console import with_progress_bar
+from pansplat.system.descriptions import describe_count, describe_range, list_first
+from pansplat.system.files import require_file
+from pansplat.system.source_hash import hash_sources
+from pansplat.system.threads import one_thread, worker_threads
 
 _HEIGHT = 1024  # pixels; larger panoramas are reduced
 _MIN_HEIGHT = 256

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from pansplat.data.images import read_crop
-from pansplat.data.panorama_metadata import gpano_number, parse_gpano, read_xmp
+from pansplat.images.image_files import read_crop
+from pansplat.images.panorama_metadata import gpano_number, parse_gpano, read_xmp
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
-from pansplat.data.folders import require_known_masks
-from pansplat.data.images import write_image
-from pansplat.data.panorama_metadata import read_xmp
-from pansplat.data.video import open_video
 from pansplat.errors import InputError
-from pansplat.files import make_portable_name, require_replaceable
+from pansplat.images.image_files import write_image
+from pansplat.images.panorama_metadata import read_xmp
+from pansplat.images.video import open_video
+from pansplat.inputs.folders import require_known_masks
 from pansplat.poses.axes import NO_PRIOR
 from pansplat.poses.features import Features, detect_features, match_features
 from pansplat.poses.two_view import estimate_relative_pose
 from pansplat.predictor import Progress
+from pansplat.system.files import make_portable_name, require_replaceable
 
 _CANDIDATES_PER_FRAME = 4  # frames that are decoded for each key frame; the sharpest of them is used
 _SMALL, _FEATURES, _MATCHES = 512, 2000, 300  # to measure parallax: height of the frames, pixels; the best of each

@@ -25,9 +25,9 @@ from numpy import ndarray as Array
 from torch import Tensor, nn
 
 from pansplat.errors import InputError
-from pansplat.model.aliked import Aliked
-from pansplat.model.lightglue import LightGlue
 from pansplat.model.weights import load_weights, require_shapes
+from pansplat.networks.aliked import Aliked
+from pansplat.networks.lightglue import LightGlue
 from pansplat.poses.features import FACE_ROTATIONS, are_distinct, render_face, sample_mask
 
 MODEL = "matcher"

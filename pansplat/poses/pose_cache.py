@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from pansplat.cache_folders import cache_folders, write_cache_file
-from pansplat.files import read_file
+from pansplat.system.cache_folders import cache_folders, write_cache_file
+from pansplat.system.files import read_file
 
 _TREE = "tree"  # name of the array that describes the value
 _FAULTS = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile)  # of a missing or damaged file

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from pansplat.data.folders import MATRIX_KEYS
-from pansplat.data.placements import is_by_hand
+from pansplat.inputs.folders import MATRIX_KEYS
+from pansplat.inputs.placements import is_by_hand
 from pansplat.poses.estimate import PoseEstimate, PoseGroup, Suggestions
 
 CONVENTION = "cam2world opencv"

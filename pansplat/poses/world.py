@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.threads import worker_threads
+from pansplat.system.threads import worker_threads
 from pansplat.tours.floor import find_storeys
 
 FLOOR_HEIGHT = 256  # pixels of the panoramas in which the floor is searched

@@ -25,11 +25,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pansplat.data.masks import mask_holes
-from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.geometry.pose import nearest_views
+from pansplat.images.masks import mask_holes
+from pansplat.inputs.views import Views
 from pansplat.predictor import Progress, part_of
 from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
@@ -38,7 +38,7 @@ from pansplat.refinement.parameters import CameraParameters, LearningRates, View
 from pansplat.rendering import rasterize
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.weights import compute_blending_weights
-from pansplat.source_hash import hash_sources
+from pansplat.system.source_hash import hash_sources
 
 _HEIGHT = 512  # largest of the images that are compared; colours are fitted at the photographs' own height
 # The same with a limit of Gaussians. These are larger than the pixels, and fitted at 512 rows they show as rows of dots

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.constants import FILTER_VARIANCE, NEAR
-from pansplat.descriptions import describe_count, describe_range
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import orthonormal_error
 from pansplat.rendering.image_planes import ImagePlane, Layout, Stitching, image_planes, stitch_faces
+from pansplat.system.descriptions import describe_count, describe_range
 
 Kernel = Literal["ray", "ewa"]
 Order = Literal["radial", "z"]

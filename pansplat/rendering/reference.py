@@ -29,7 +29,7 @@ from pansplat.rendering.projection import (
     select_drawable,
 )
 from pansplat.rendering.rasterize import Kernel, RasterInfo, RasterOptions, RasterSums
-from pansplat.threads import one_thread
+from pansplat.system.threads import one_thread
 
 TILE_SIZE = 8  # pixels
 _BOX_MARGIN = 0.01  # pixels added around each box, far more than rounding errors

@@ -10,19 +10,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.data.masks import mask_holes
-from pansplat.data.pairs import MAX_CONTEXT
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_working_world
+from pansplat.images.masks import mask_holes
+from pansplat.inputs.pairs import MAX_CONTEXT
 from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
-from pansplat.source_hash import hash_sources
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import SearchConfig, search_surfaces
 from pansplat.sweep.surface import PosedImages
+from pansplat.system.source_hash import hash_sources
 
 _MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
 

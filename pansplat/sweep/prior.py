@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 import torch
 
-from pansplat.data.views import CAMERA_HEIGHT
 from pansplat.geometry.equirect import rotate_equirect, row_weights
+from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights

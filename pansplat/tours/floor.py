@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pansplat.data.images import write_image
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
+from pansplat.images.image_files import write_image
 from pansplat.tours.graph import TourGraph, Views, make_graph
 from pansplat.tours.route import Route
 from pansplat.tours.surfaces import locate_surfaces

@@ -18,10 +18,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, shortest_path
 from torch import Tensor
 
-from pansplat.data.pairs import FAR, NEAR, Link, Pair, Panorama
-from pansplat.descriptions import describe_count, describe_range, list_first
 from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, Starts
 from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
+from pansplat.inputs.pairs import FAR, NEAR, Link, Pair, Panorama
+from pansplat.system.descriptions import describe_count, describe_range, list_first
 from pansplat.tours.layout import REACH, lay_out
 from pansplat.tours.walls import find_walls
 

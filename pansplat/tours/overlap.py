@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.images import read_panorama
 from pansplat.geometry.equirect import pad_equirect, row_weights
 from pansplat.geometry.warp import relative_pose, warp_panorama
+from pansplat.images.image_files import read_panorama
 from pansplat.tours.graph import TourGraph
 
 _HEIGHT = 48

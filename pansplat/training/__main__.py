@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from pansplat.console import own_warnings, parse_arguments, run_command
+from pansplat.system.console import own_warnings, parse_arguments, run_command
 
 if TYPE_CHECKING:
     from pansplat.training.config import TrainConfig
@@ -23,7 +23,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _train(config: TrainConfig) -> int:
-    from pansplat.files import require_output_folder
+    from pansplat.system.files import require_output_folder
     from pansplat.training.distributed import ProcessGroup
     from pansplat.training.trainer import Trainer
 

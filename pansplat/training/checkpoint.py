@@ -15,11 +15,11 @@ from typing import Annotated, Any
 import torch
 from msgspec import Meta, Struct
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError, InputWarning
 from pansplat.model.layers import Compat
 from pansplat.model.weights import UnsafeCheckpointError, WeightsFile, as_float32, read_checkpoint
-from pansplat.strict_json import convert, parse_json
+from pansplat.system.atomic import replacing
+from pansplat.system.strict_json import convert, parse_json
 
 _KIND, _FORMAT = "pansplat-training", 1
 _NAME = re.compile(r"step_(\d{8})\.pt")

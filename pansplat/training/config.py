@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from pansplat.data.augment import Augmentation
 from pansplat.errors import InputError
 from pansplat.model.layers import Compat, Precision
-from pansplat.options import Count, CountOrNone, Fraction, Minutes, Seed, check_numbers
-from pansplat.strict_json import convert, parse_json
+from pansplat.system.options import Count, CountOrNone, Fraction, Minutes, Seed, check_numbers
+from pansplat.system.strict_json import convert, parse_json
+from pansplat.training.augment import Augmentation
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
 DataKind = Literal["room", "panogrf", "360loc", "insta360", "pairs", "triplets"]

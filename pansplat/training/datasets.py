@@ -9,9 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from pansplat.data.folders import load_pairs
-from pansplat.data.sequences import BoundedSampler, read_insta360, read_loc360
-from pansplat.data.sources import (
+from pansplat.errors import InputError
+from pansplat.inputs.folders import load_pairs
+from pansplat.training.config import DataConfig
+from pansplat.training.room import RoomTriplets
+from pansplat.training.sequences import BoundedSampler, read_insta360, read_loc360
+from pansplat.training.sources import (
     ConcatSource,
     FixedFramePairs,
     PairSource,
@@ -21,9 +24,6 @@ from pansplat.data.sources import (
     read_game_maps,
     read_panogrf,
 )
-from pansplat.errors import InputError
-from pansplat.training.config import DataConfig
-from pansplat.training.room import RoomTriplets
 
 _T = TypeVar("_T")
 

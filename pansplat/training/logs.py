@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from pansplat.atomic import replacing
+from pansplat.system.atomic import replacing
 
 _SMOOTHING = 20  # the thick curve averages over a 20th of the steps
 

@@ -21,7 +21,7 @@ from torch.nn import functional
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Backbone, find_backbone, load_lpips
 from pansplat.geometry.equirect import pad_equirect
-from pansplat.options import Weight
+from pansplat.system.options import Weight
 
 DepthForm = Literal["depth", "inverse_depth"]
 Images = Float[Tensor, "batch 3 height width"]

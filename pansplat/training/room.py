@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from pansplat.bench.scenes import NUM_SURFACES, trace_room
-from pansplat.data.pairs import FAR, NEAR
-from pansplat.data.views import Sample, Views
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.inputs.pairs import FAR, NEAR
+from pansplat.inputs.views import Sample, Views
 
 _FREE = ((-2.0, -0.6, -1.7), (1.9, 0.6, 0.8))  # corners of a box half a metre from all surfaces, metres
 _STRETCH = (0.9, 1.4)  # of the room along each axis

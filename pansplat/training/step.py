@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from pansplat.data.views import Batch
+from pansplat.inputs.views import Batch
 from pansplat.model.base import Network
 from pansplat.model.heads import AuxiliaryHeads
 from pansplat.training.config import MemoryConfig

@@ -6,7 +6,7 @@ import signal
 import threading
 from contextlib import AbstractContextManager
 
-from pansplat.console import call_at_first_signal
+from pansplat.system.console import call_at_first_signal
 from pansplat.training.logs import ProgressDisplay
 
 

@@ -18,16 +18,16 @@ from typing import Any
 
 import torch
 
-from pansplat.atomic import replacing
-from pansplat.data.loader import Loader
-from pansplat.data.views import Batch
 from pansplat.errors import InputError
+from pansplat.inputs.views import Batch
 from pansplat.model.weights import pack_weights
-from pansplat.strict_json import convert, parse_json
+from pansplat.system.atomic import replacing
+from pansplat.system.strict_json import convert, parse_json
 from pansplat.training.checkpoint import load_latest, restore, restore_optimizer, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
 from pansplat.training.datasets import load_sources
 from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel
+from pansplat.training.loader import Loader
 from pansplat.training.logs import CsvTable, ProgressDisplay, TensorBoardLog, plot_run
 from pansplat.training.losses import choose_perceptual
 from pansplat.training.network import (

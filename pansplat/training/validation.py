@@ -10,14 +10,14 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from pansplat.data.images import write_image
-from pansplat.data.sources import SampleSource
-from pansplat.data.views import Sample, collate
 from pansplat.errors import InputError
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
+from pansplat.images.image_files import write_image
+from pansplat.inputs.views import Sample, collate
 from pansplat.model.base import Network
 from pansplat.model.heads import merge_tiles
 from pansplat.training.rendering import TargetRenderer
+from pansplat.training.sources import SampleSource
 
 MEASURES = ("psnr", "ws_psnr", "ssim", "depth_error")
 """Columns of validation.csv: dB, dB, 1, and the mean relative error of the finest depth (NaN without true depth)."""

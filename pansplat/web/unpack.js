@@ -54,7 +54,7 @@ async function readViews(reader) {
 }
 
 // Planes of bytes to texels (shaders/page.vert), and to the arrays of the worker: the inverse of
-// pansplat.web.data.pack_gaussians.
+// pansplat.export.page_data.pack_gaussians.
 function unpack(planes, view) {
   const { start, count } = scene.views[view], { terms, means } = scene;
   const plane = (k) => planes.subarray(k * count, (k + 1) * count);

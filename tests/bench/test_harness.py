@@ -23,7 +23,7 @@ from pansplat.bench.harness import (
     time_workload,
 )
 from pansplat.evaluation.results import Column, Row
-from pansplat.files import is_written
+from pansplat.system.files import is_written
 
 CPU = torch.device("cpu")
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark is Linux's")

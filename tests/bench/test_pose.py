@@ -10,10 +10,10 @@ from PIL import Image
 
 from pansplat.bench import pose as bench
 from pansplat.cli import run
-from pansplat.data.folders import load_pairs
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.evaluation.results import Row
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.solvers import rotation_exp
 from pansplat.poses.two_view import RelativePose

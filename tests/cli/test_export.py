@@ -15,10 +15,10 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import export as export_module
 from pansplat.cli import run
+from pansplat.export import page as page_module
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
-from pansplat.web import page as page_module
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
 

@@ -13,8 +13,8 @@ import pytest
 
 import pansplat
 from pansplat.cli import run
-from pansplat.console import own_warnings
 from pansplat.errors import InputError, InputWarning
+from pansplat.system.console import own_warnings
 
 
 def test_help_does_not_import_torch() -> None:

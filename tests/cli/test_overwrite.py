@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 
 from pansplat.cli import run
-from pansplat.data.images import write_depth, write_image
-from pansplat.data.video import write_video
 from pansplat.errors import InputError
 from pansplat.evaluation.results import write_json
-from pansplat.files import is_written, require_replaceable
+from pansplat.images.image_files import write_depth, write_image
+from pansplat.images.video import write_video
+from pansplat.system.files import is_written, require_replaceable
 
 OWN = b"of the user"
 SPHERE = ["--model", "sphere", "--refine", "0"]

@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 
 from pansplat.cli import run
-from pansplat.data.folders import load_pairs
-from pansplat.data.images import write_image
-from pansplat.data.photographs import list_photographs
-from pansplat.data.video import write_video
+from pansplat.images.image_files import write_image
+from pansplat.images.video import write_video
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.photographs import list_photographs
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")

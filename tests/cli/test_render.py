@@ -12,7 +12,7 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
-from pansplat.data.images import read_depth
+from pansplat.images.image_files import read_depth
 from pansplat.rendering import Rendering
 from pansplat.tours import find_tours
 

@@ -16,10 +16,10 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
-from pansplat.data.folders import UnposedPanoramasError, find_panorama_folders, load_pairs
-from pansplat.data.photographs import list_photographs
 from pansplat.errors import InputWarning
-from pansplat.web import page as page_module
+from pansplat.export import page as page_module
+from pansplat.inputs.folders import UnposedPanoramasError, find_panorama_folders, load_pairs
+from pansplat.inputs.photographs import list_photographs
 
 OPTIONS = ["--model", "sphere", "--refine", "0", "--predict-height", "64"]
 

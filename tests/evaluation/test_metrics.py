@@ -7,10 +7,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pansplat.data.folders import load_pairs
 from pansplat.evaluation.metrics import cross_fade, depth_errors, psnr, ssim, ws_psnr
 from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.geometry.pose import rotations_from_quats
+from pansplat.inputs.folders import load_pairs
 
 METRICS = {"psnr": psnr, "ws_psnr": ws_psnr, "ssim": ssim}
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.data.folders import load_pairs
-from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, PoseCheck, _describe_mistake, check_pair, check_views
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import invert_pose, rotations_from_quats
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.views import Views
 
 _FLIP = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
 _HEIGHT = 64

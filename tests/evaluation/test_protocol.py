@@ -8,7 +8,6 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.data.video import write_video
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
@@ -31,8 +30,9 @@ from pansplat.evaluation.tables import (
     rich_tables,
     write_report,
 )
-from pansplat.files import is_written
+from pansplat.images.video import write_video
 from pansplat.model.network import NetworkPredictor
+from pansplat.system.files import is_written
 
 HEIGHT = 32
 OPTIONS = ProtocolOptions(HEIGHT, pairs_per_sequence=3, gaps=(2, 4))

@@ -11,12 +11,12 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
-from pansplat.data.folders import load_pairs
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.evaluation.report import ERROR_SCALE, error_image, evaluate, results_table
 from pansplat.evaluation.results import Row
+from pansplat.inputs.folders import load_pairs
 
 HEIGHT = 16
 KEYS = [

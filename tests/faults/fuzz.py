@@ -32,16 +32,16 @@ from PIL import Image
 
 from pansplat.cache import _read_scene
 from pansplat.cli.render import read_poses
-from pansplat.data.folders import load_pairs
-from pansplat.data.images import read_depth, read_panorama, write_image
 from pansplat.errors import InputError
 from pansplat.gaussians.gltf import load_glb, save_glb
 from pansplat.gaussians.ply import load_ply
 from pansplat.gaussians.scene import Scene
+from pansplat.images.image_files import read_depth, read_panorama, write_image
+from pansplat.inputs.folders import load_pairs
 from pansplat.model.network import build_empty_network, load_predictor
 from pansplat.model.weights import WeightsFile, load_weights, read_checkpoint
 from pansplat.pipeline import render
-from pansplat.strict_json import read_json
+from pansplat.system.strict_json import read_json
 from pansplat.training.checkpoint import extract_weights, load_checkpoint
 
 Read = Callable[[Path], object]

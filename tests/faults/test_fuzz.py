@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import safetensors.torch
 
-from pansplat.data.reconstructions import _READERS
 from pansplat.gaussians.ply import load_ply
+from pansplat.inputs.reconstructions import _READERS
 
 
 @pytest.mark.slow

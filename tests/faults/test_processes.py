@@ -70,7 +70,7 @@ def test_a_signal_ends_a_command_quietly(
 
 _FORK_SERVER = """
 import io, json, os, signal, sys
-import torch, pansplat.cli, pansplat.pipeline, pansplat.console, rich.table, rich.progress  # before the forks
+import torch, pansplat.cli, pansplat.pipeline, pansplat.system.console, rich.table, rich.progress  # before the forks
 import pansplat.cli.info, pansplat.cli.predict, pansplat.evaluation.report
 from pansplat.cli import main
 

@@ -16,11 +16,11 @@ import torch
 from PIL import Image
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.files import SCENE_SUFFIXES
 from pansplat.gaussians import formats
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.ply import load_ply
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.system.files import SCENE_SUFFIXES
 
 CODED = (".compressed.ply", ".spz", ".splat", ".sog")
 # Largest error of positions (metres), rotations (1 - |cosine|), log scales, opacities, harmonics of degree 0 and above.

@@ -42,7 +42,7 @@ def test_a_tilted_panorama_is_turned_upright_for_the_network(render_room, monkey
             return [np.ones((32, 64), np.float32)]
 
     network = Network()
-    monkeypatch.setattr("pansplat.guided_sweep.load_default_sweep", lambda: type("Sweep", (), {"prior": network}))
+    monkeypatch.setattr("pansplat.sweep.guided_sweep.load_default_sweep", lambda: type("Sweep", (), {"prior": network}))
     image = (render_room(0, TILTED, CENTRE) / 255).astype(np.float32)
     found = estimate_depth(image, TILTED.T @ (0.0, 1, 0))
     assert np.allclose((TILTED @ found.rotation)[:, 1], (0, 1, 0))

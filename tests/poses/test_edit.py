@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import pansplat
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.files import write_poses
@@ -244,13 +244,6 @@ def test_suggestions_are_kept_from_the_cache_to_the_file(folder: Path):
             (folder / "a.png", folder / "f.png"): (Suggestion(Place(1.0, 2.0, 0.5), -1.5),)
         }
         editor.place({folder / "e.png": np.eye(4)}, 0)
-
-
-def test_a_tour_of_another_program_is_not_changed(folder: Path):
-    scenes = {name: {"panorama": f"{name}.png"} for name in NAMES}
-    (folder / "tour.json").write_text(json.dumps({"scenes": scenes}))
-    with pytest.raises(InputError, match="got a tour of another program"):
-        _edit(folder)
 
 
 def test_a_new_estimate_keeps_the_poses_by_hand_and_adds_others_beside_them(folder: Path):

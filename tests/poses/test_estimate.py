@@ -13,7 +13,7 @@ import torch
 
 import pansplat
 from pansplat.cli import run
-from pansplat.data.poses import read_trajectory
+from pansplat.inputs.poses import read_trajectory
 from pansplat.poses.axes import SceneAxes
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pansplat.cli import run
-from pansplat.data.video import write_video
+from pansplat.images.video import write_video
 from pansplat.poses.estimate import PoseEstimate, estimate_poses
 from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
 

@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 import torch
 
-from pansplat.data.views import Views
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.inputs.views import Views
 from pansplat.rendering import rasterize
 
 HEIGHT = 32

@@ -59,7 +59,7 @@ def test_gradients_that_are_not_finite_do_not_move_parameters() -> None:
 def test_a_refinement_does_not_import_the_compiler() -> None:
     program = """
 import sys, torch
-from pansplat.data.views import Views
+from pansplat.inputs.views import Views
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.pipeline import refine
 poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)

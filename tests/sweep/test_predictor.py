@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 import pansplat
-from pansplat.data.pairs import Pair
 from pansplat.errors import InputError
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
+from pansplat.inputs.pairs import Pair
 from pansplat.sweep import Sweep, SweepConfig
 from pansplat.sweep.lift import LiftConfig
 from pansplat.sweep.search import SearchConfig

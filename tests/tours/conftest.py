@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.data.pairs import Link, Pair, Panorama
+from pansplat.inputs.pairs import Link, Pair, Panorama
 from pansplat.tours import TourGraph, find_tours
 
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 import pansplat.tours as tours
-from pansplat.data.pairs import Panorama
-from pansplat.data.placements import Placement
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.placements import Placement
 from pansplat.tours import TourGraph, draw_floor_plan, find_floor_outline
 
 

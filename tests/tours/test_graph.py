@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import pansplat.tours as tours
-from pansplat.data.pairs import Pair, Panorama
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
+from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.tours import find_tours
 
 

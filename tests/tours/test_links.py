@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from pansplat.data.pairs import Link
+from pansplat.inputs.pairs import Link
 from pansplat.tours import TourGraph, find_link_ring, find_way_along_link
 
 

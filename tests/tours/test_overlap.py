@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import torch
 
-from pansplat.data.images import write_image
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.images.image_files import write_image
 from pansplat.tours import connect
 
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.cleanup import crop_to_rooms
 from pansplat.errors import InputError
-from pansplat.files import is_written
+from pansplat.export.cleanup import crop_to_rooms
+from pansplat.export.plan_files import _Drawing, describe_plan, write_picture, write_plan
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.system.files import is_written
 from pansplat.tours import make_graph
 from pansplat.tours.plan import Plan, make_plan
-from pansplat.tours.plan_files import _Drawing, describe_plan, write_picture, write_plan
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.data.folders import load_pairs
-from pansplat.data.pairs import Panorama
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.pairs import Panorama
 from pansplat.tours import TourGraph, find_tours, plan_route
 from pansplat.tours.floor import assign_storeys
 

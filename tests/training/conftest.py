@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.inputs.views import Batch, Sample, Views, collate
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
 from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
 from pansplat.model.heads import AdapterConfig, HeadsConfig

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from pansplat.data.views import collate
+from pansplat.inputs.views import collate
 from pansplat.model.pansplat import PanSplat
 from pansplat.training import network as network_module
 from pansplat.training import trainer as trainer_module

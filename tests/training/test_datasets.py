@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from pansplat.data.sources import PairSource, TripletSource
 from pansplat.errors import InputError
 from pansplat.training.config import DataConfig
 from pansplat.training.datasets import RESERVED, is_reserved, load_sources
+from pansplat.training.sources import PairSource, TripletSource
 
 _FAMILIES = (
     *("oa_minia", "oa_koth1", "mictf1beta", "hydronex2", "sleekgrinder", "pul1duel-oa", "oacmpdm1", "oa_shouse"),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from pansplat.data.views import Batch
+from pansplat.inputs.views import Batch
 from pansplat.model.feature_pyramid import TransformerConfig
 from pansplat.model.heads import AdapterConfig, AuxiliaryHeads
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig

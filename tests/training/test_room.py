@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from pansplat.data.views import Views
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_panorama
+from pansplat.inputs.views import Views
 from pansplat.training.config import DataConfig
 from pansplat.training.datasets import load_sources
 from pansplat.training.room import RoomTriplets

@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.data.views import Sample
 from pansplat.errors import InputError
+from pansplat.inputs.views import Sample
 from pansplat.model.weights import load_weights
 from pansplat.training import trainer
 from pansplat.training.config import OptimizerConfig, TrainConfig, ValidationConfig

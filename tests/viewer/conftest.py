@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.data.images import write_image
-from pansplat.data.pairs import Link, Pair, Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import rotations_from_quats
+from pansplat.images.image_files import write_image
+from pansplat.inputs.pairs import Link, Pair, Panorama
 from pansplat.rendering import Rendering, rasterize
 from pansplat.tours import FloorOutline, TourGraph, merge_scenes
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer

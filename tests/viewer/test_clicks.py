@@ -17,13 +17,13 @@ import torch
 from imgui_bundle import imgui
 from PIL import Image
 
-from pansplat.data.folders import load_pairs
-from pansplat.data.images import write_image
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.images.image_files import write_image
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
@@ -88,7 +88,7 @@ class User:
     def __init__(self, viewer: Viewer, target: moderngl.Framebuffer, clock: list[float], load: Callable) -> None:
         self.viewer, self.target, self.clock = viewer, target, clock
         self.load = self.first_load = load
-        self.find = lambda path, progress: [SceneEntry("opened")]
+        self.find = lambda path, progress, show: [SceneEntry("opened")]
         self.state, self.panels = viewer.state, viewer.panels
 
     def draw_frames(self, count: int, seconds: float = 1 / 30) -> None:
@@ -249,7 +249,7 @@ def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp
 @pytest.fixture
 def user(session, ctx) -> User:
     """The session with scene, state and camera as at the start."""
-    session.load, session.find = session.first_load, lambda path, progress: [SceneEntry("opened")]
+    session.load, session.find = session.first_load, lambda path, progress, show: [SceneEntry("opened")]
     if session.viewer.library.names != NAMES or session.viewer.library.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
@@ -457,7 +457,7 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
 def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
     opened = []
 
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+    def find(path: Path, progress: Progress, show: object) -> list[SceneEntry]:
         opened.append(path.name)
         return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
 
@@ -985,7 +985,7 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
     content = {"convention": "cam2world opencv", "worlds": [{"unit": 1.0}], "poses": poses, "estimate": estimate}
     (tmp_path / "poses.json").write_text(json.dumps(content))
 
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+    def find(path: Path, progress: Progress, show: object) -> list[SceneEntry]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_pairs(path))]
@@ -1081,6 +1081,9 @@ def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(plac
     user.click_at(*at)  # on the ghost
     assert placing.shown.suggestion == 0
     user.click("Save##pose")
+    assert user.viewer.placing.is_doubted, "noise has nothing in common"
+    user.draw_frames(1)
+    user.click("Save, although it fits poorly##pose")
     entry = json.loads((tmp_path / "poses.json").read_text())["poses"]["d.png"]
     assert entry["placed"] == "by hand" and entry["cam2world"][0][3] == pytest.approx(1.0)
     user.draw_frames(2)

@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.data.pairs import Pair, Panorama
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.inputs.pairs import Pair, Panorama
 
 
 def make_scene(num_views: int = 3, per_view: int = 700, degree: int = 1, seed: int = 0) -> Scene:

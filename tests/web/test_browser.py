@@ -25,16 +25,16 @@ from jaxtyping import Float
 from PIL import Image
 
 from pansplat import pipeline
-from pansplat.data.images import read_panorama
-from pansplat.data.pairs import Link, Note, Pair, Panorama
+from pansplat.export import page as page_module
+from pansplat.export.page import PageFiles, write_page
+from pansplat.export.page_server import PageServer
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import path_poses
+from pansplat.images.image_files import read_panorama
+from pansplat.inputs.pairs import Link, Note, Pair, Panorama
 from pansplat.tours import EDGE_HYSTERESIS, TourGraph, find_fronts, find_rooms, make_graph, select_views
 from pansplat.tours.layout import REACH
-from pansplat.web import PageFiles, write_page
-from pansplat.web import page as page_module
-from pansplat.web.serve import PageServer
 
 SIZE = (320, 240)
 LIMIT = 180  # seconds, after which a state that the page does not reach is an error

@@ -19,6 +19,8 @@ import torch
 from pansplat import pipeline
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.errors import InputError, InputWarning
+from pansplat.export import page as page_module
+from pansplat.export.page import write_page
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -26,8 +28,6 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.refinement.budget import merge_to
 from pansplat.tours import find_camera_height, find_rooms, make_graph, select_views
 from pansplat.tours.plan import make_plan
-from pansplat.web import page as page_module
-from pansplat.web import write_page
 
 
 @pytest.fixture(autouse=True)

@@ -17,14 +17,14 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from pansplat.data.cube_images import equirect_from_faces
-from pansplat.data.images import read_panorama
-from pansplat.data.pairs import Pair, Panorama
+from pansplat.export import page as page_module
+from pansplat.export import page_photographs as module
+from pansplat.export.page import write_page
+from pansplat.export.page_photographs import PackedPhotograph, pack_photographs, read_photograph
 from pansplat.gaussians.scene import Scene
-from pansplat.web import page as page_module
-from pansplat.web import photographs as module
-from pansplat.web import write_page
-from pansplat.web.photographs import PackedPhotograph, pack_photographs, read_photograph
+from pansplat.images.cube_images import equirect_from_faces
+from pansplat.images.image_files import read_panorama
+from pansplat.inputs.pairs import Pair, Panorama
 
 PURPLE = (200, 0, 200)  # of what masks hide; nothing else has so little green
 

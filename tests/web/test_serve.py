@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
+from pansplat.export import page as page_module
+from pansplat.export import page_server as serve_module
+from pansplat.export.page import write_page
+from pansplat.export.page_server import PageServer, make_certificate
 from pansplat.gaussians.scene import Scene
 from pansplat.pipeline import save
-from pansplat.web import page as page_module
-from pansplat.web import serve as serve_module
-from pansplat.web import write_page
-from pansplat.web.serve import PageServer, make_certificate
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.cubemap import FACES
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
-from pansplat.options import EYE_DISTANCE
 from pansplat.rendering.image_planes import image_planes
+from pansplat.system.options import EYE_DISTANCE
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer, create_renderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.programs import Programs, set_uniforms

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from pansplat.data.blur_masks import name_blur_mask
-from pansplat.data.images import read_hidden, write_image
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import directions_from_uv, pixel_directions
+from pansplat.images.blur_masks import name_blur_mask
+from pansplat.images.image_files import read_hidden, write_image
+from pansplat.inputs.pairs import Panorama
 from pansplat_viewer.scene.background import Report
 from pansplat_viewer.scene.picking import compute_pixel_ray
 from pansplat_viewer.scene.settings import DrawSettings
@@ -38,7 +38,7 @@ _STRAIGHT = 1.0  # pixels, of an outline
 
 def remove_floaters(scene: Scene, report: Report) -> tuple[Scene | None, str]:
     """The scene without floaters, None if there are none; and what was done."""
-    from pansplat.cleanup import Cleaning, clean_up
+    from pansplat.export.cleanup import Cleaning, clean_up
 
     cleaned, (change,) = clean_up(scene, Cleaning(floaters=False), progress=report)
     return cleaned if change.after < change.before else None, str(change)
@@ -46,7 +46,7 @@ def remove_floaters(scene: Scene, report: Report) -> tuple[Scene | None, str]:
 
 def save_cleaned(scene: Scene, settings: DrawSettings, path: Path, report: Report) -> str:
     """Write a scene without what the box and the least opacity of the settings hide; returns what was done."""
-    from pansplat.cleanup import Cleaning, clean_up
+    from pansplat.export.cleanup import Cleaning, clean_up
     from pansplat.gaussians.formats import save_scene
 
     cleaning = Cleaning(box=settings.box, min_opacity=settings.opacity_threshold)

@@ -24,9 +24,9 @@ from msgspec import Meta, Struct
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.strict_json import read_json
+from pansplat.system.atomic import replacing
+from pansplat.system.strict_json import read_json
 from pansplat.tours import TourGraph
 from pansplat_viewer.scene.camera import MAX_FOV_DEGREES, MIN_FOV_DEGREES, Camera, move_to_pose
 

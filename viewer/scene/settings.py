@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 from pansplat.constants import NEAR
 from pansplat.errors import InputError
-from pansplat.options import EYE_DISTANCE
+from pansplat.system.options import EYE_DISTANCE
 
 Preset = Literal["exact", "3dgs"]
 Mode = Literal["joint", "view", "deferred"]

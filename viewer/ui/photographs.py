@@ -10,9 +10,9 @@ import moderngl
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pansplat.data.images import read_height, read_panorama
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
+from pansplat.images.image_files import read_height, read_panorama
+from pansplat.inputs.pairs import Panorama
 
 MAX_HEIGHT = 2048  # pixels; sharper than the image at fields of view above 65 degrees on 720 rows
 _MAX_TEXTURES = 4  # 25 MB each

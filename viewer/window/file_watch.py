@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pansplat.data.pairs import list_panorama_files
+from pansplat.inputs.pairs import list_panorama_files
 
 _SECONDS = 2.0  # between looks at the files
 _FILES = 500  # that are looked at together, in about a millisecond; a tour of tiles has thousands

@@ -12,9 +12,9 @@ from typing import Literal
 import platformdirs
 from msgspec import Struct
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.strict_json import read_json
+from pansplat.system.atomic import replacing
+from pansplat.system.strict_json import read_json
 
 Theme = Literal["dark", "light"]
 

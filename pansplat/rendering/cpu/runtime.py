@@ -28,7 +28,7 @@ from pansplat.rendering.cpu.numba_api import (
     set_source_stamp,
     share_literal_versions,
 )
-from pansplat.source_hash import hash_sources
+from pansplat.system.source_hash import hash_sources
 
 _PACKAGE = __name__.rpartition(".")[0]
 _INLINED = _PACKAGE, "pansplat.constants"  # modules whose functions and constants become part of kernels

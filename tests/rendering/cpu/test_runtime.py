@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat import source_hash
 from pansplat.rendering.cpu import runtime
 from pansplat.rendering.cpu.runtime import (
     Workspace,
@@ -23,6 +22,7 @@ from pansplat.rendering.cpu.runtime import (
     pooled_empty,
     release_idle_memory,
 )
+from pansplat.system import source_hash
 
 
 def _add_indices(x):

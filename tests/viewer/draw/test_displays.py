@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.data.images import write_image
+from pansplat.images.image_files import write_image
 from pansplat.rendering import rasterize
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.displays import color_by_property

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.data.folders import load_pairs
-from pansplat.data.images import read_blur_mask, write_image
-from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
+from pansplat.images.image_files import read_blur_mask, write_image
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.pairs import Panorama
 from pansplat_viewer.scene.cleaning import MaskPainter, measure_bounds
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.data.pairs import Link
+from pansplat.inputs.pairs import Link
 from pansplat.tours import FADE_SECONDS, plan_route
 from pansplat_viewer import run
 from pansplat_viewer.capture import Film, TourFrames, _find_nearest_frames, write_tour

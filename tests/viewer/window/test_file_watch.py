@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pansplat.data.folders import load_pairs
+from pansplat.inputs.folders import load_pairs
 from pansplat_viewer.scene.loader import SceneEntry
 from pansplat_viewer.window.file_watch import FileWatch
 

@@ -12,9 +12,9 @@ from msgspec import Meta
 from tyro.conf import Positional, subcommand
 
 from pansplat.cli.inputs import Out
-from pansplat.console import own_warnings, parse_arguments, run_command
-from pansplat.files import require_output_folder
-from pansplat.options import Count, Seed, Threads, check_numbers
+from pansplat.system.console import own_warnings, parse_arguments, run_command
+from pansplat.system.files import require_output_folder
+from pansplat.system.options import Count, Seed, Threads, check_numbers
 from pansplat_homes.depth import DepthTrainConfig
 from pansplat_homes.matcher import ConvertMatcher
 from pansplat_homes.sharpening import SharpeningTrainConfig

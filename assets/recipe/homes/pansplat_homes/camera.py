@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.images import srgb_from_linear
+from pansplat.images.image_files import srgb_from_linear
 
 Array = NDArray[Any]  # float32
 Mask = NDArray[np.bool_]

@@ -23,16 +23,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from pansplat.data.augment import mirror_views, roll_views
-from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.files import require_output_folder
 from pansplat.geometry.equirect import row_weights
-from pansplat.guided_sweep import save_depth_network
-from pansplat.model.depth_network import DepthEstimate
-from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
+from pansplat.inputs.views import Views
 from pansplat.model.layers import to_channels_last
 from pansplat.model.weights import load_weights
+from pansplat.networks.depth_network import DepthEstimate
+from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
+from pansplat.sweep.guided_sweep import save_depth_network
+from pansplat.system.files import require_output_folder
+from pansplat.training.augment import mirror_views, roll_views
 from pansplat.training.checkpoint import (
     list_checkpoints,
     load_checkpoint,

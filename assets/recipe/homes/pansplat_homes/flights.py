@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.atomic import replacing
-from pansplat.data.images import write_depth, write_image
+from pansplat.images.image_files import write_depth, write_image
+from pansplat.system.atomic import replacing
 from pansplat_homes.camera import CameraEffects, photograph
 from pansplat_homes.homes import Furnishing, Home, build_home, make_pose
 from pansplat_homes.plans import RoomKind

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.model.efficientnet import EfficientNetLite0
+from pansplat.networks.efficientnet import EfficientNetLite0
 
 
 def load_imagenet(encoder: EfficientNetLite0, weights: Mapping[str, Tensor]) -> None:

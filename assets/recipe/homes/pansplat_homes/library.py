@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.strict_json import parse_json
+from pansplat.system.atomic import replacing
+from pansplat.system.strict_json import parse_json
 from pansplat_homes.meshes import Mesh, MeshMaterial, Texture, make_mesh, read_obj, select_triangles, simplify
 
 _VERSION = 1  # of the cache

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pansplat.atomic import replacing
+from pansplat.system.atomic import replacing
 from pansplat_homes.camera import CameraEffects, photograph
 from pansplat_homes.homes import build_home
 from pansplat_homes.library import FurnitureLibrary

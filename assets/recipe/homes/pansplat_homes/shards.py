@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy.typing import NDArray
 
-from pansplat.atomic import replacing
-from pansplat.data.images import linear_from_srgb
 from pansplat.errors import InputError
-from pansplat.strict_json import read_json
+from pansplat.images.image_files import linear_from_srgb
+from pansplat.system.atomic import replacing
+from pansplat.system.strict_json import read_json
 from pansplat_homes.library import FurnitureLibrary, load_furniture
 
 TOURS_PER_SHARD = 16

@@ -15,12 +15,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from pansplat.data.views import Views
 from pansplat.geometry.equirect import resize_equirect, row_weights
-from pansplat.guided_sweep import default_weights, load_guided_sweep, load_sharpening, save_sharpening
-from pansplat.model.depth_network import DepthEstimate
-from pansplat.model.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.inputs.views import Views
 from pansplat.model.layers import to_channels_last
+from pansplat.networks.depth_network import DepthEstimate
+from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.sweep.guided_sweep import default_weights, load_guided_sweep, load_sharpening, save_sharpening
 from pansplat_homes.depth import MAX_DEPTH, DepthTrainConfig, DepthTrainer, Sample, run_trainer
 from pansplat_homes.panes import close_panes
 

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pansplat.atomic import replacing
-from pansplat.data.images import srgb_from_linear, write_depth, write_image
-from pansplat.data.pairs import FAR, NEAR
-from pansplat.data.views import Sample, Views
+from pansplat.images.image_files import srgb_from_linear, write_depth, write_image
+from pansplat.inputs.pairs import FAR, NEAR
+from pansplat.inputs.views import Sample, Views
+from pansplat.system.atomic import replacing
 from pansplat_homes.homes import Home, build_home
 from pansplat_homes.plans import OUTSIDE
 from pansplat_homes.scene import GeneratedScene

@@ -5,8 +5,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pansplat.data.images import linear_from_srgb, srgb_from_linear
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.images.image_files import linear_from_srgb, srgb_from_linear
 from pansplat_homes.camera import NO_EFFECTS, CameraEffects, Photographs, photograph
 
 HEIGHT = 64

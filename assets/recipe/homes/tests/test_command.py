@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pansplat.data.folders import load_pairs
+from pansplat.inputs.folders import load_pairs
 from pansplat_homes.__main__ import run
 
 COMMANDS = ("homes", "photographs", "flights", "triplets", "maps", "train-depth", "train-sharpening", "convert-matcher")

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.model.depth_network import DepthEstimate, DepthNetworkConfig
-from pansplat.model.depth_refinement import RefinementConfig
+from pansplat.inputs.views import Views
 from pansplat.model.weights import pack_weights, save_weights
+from pansplat.networks.depth_network import DepthEstimate, DepthNetworkConfig
+from pansplat.networks.depth_refinement import RefinementConfig
 from pansplat.training.checkpoint import load_latest
 from pansplat.training.logs import read_table
 from pansplat_homes import depth as training
@@ -164,7 +164,7 @@ def test_a_time_limit_or_a_signal_ends_the_run_after_its_step_with_a_checkpoint(
 
 @pytest.mark.slow
 def test_run_writes_logs_and_a_model(config):
-    from pansplat.guided_sweep import load_guided_sweep
+    from pansplat.sweep.guided_sweep import load_guided_sweep
 
     DepthTrainer(config, silent=True).train()
     assert [row["step"] for row in read_table(config.out / "log.csv")] == [str(n) for n in range(6)]

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pansplat.data.folders import load_pairs
+from pansplat.inputs.folders import load_pairs
 from pansplat_homes.flights import NAMES, write_flight
 
 HEIGHT = 32

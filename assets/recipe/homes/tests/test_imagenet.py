@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pansplat.model.efficientnet import EfficientNetLite0
+from pansplat.networks.efficientnet import EfficientNetLite0
 from pansplat_homes.imagenet import load_imagenet
 
 _NAMES = {

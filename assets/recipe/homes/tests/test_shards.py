@@ -5,8 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pansplat.data.images import write_image
 from pansplat.errors import InputError
+from pansplat.images.image_files import write_image
 from pansplat_homes import shards
 from pansplat_homes.shards import ShardReader, TourSettings, pack_triplets, render_tour, write_shards
 

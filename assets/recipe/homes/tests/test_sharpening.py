@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.guided_sweep import load_sharpening
-from pansplat.model.depth_network import DepthEstimate
-from pansplat.model.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.networks.depth_network import DepthEstimate
+from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.sweep.guided_sweep import load_sharpening
 from pansplat.training.logs import read_table
 from pansplat_homes import shards
 from pansplat_homes.shards import Tour

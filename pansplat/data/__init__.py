@@ -1,1 +1,0 @@
-"""Reading posed panoramas and training samples from files; writing images and videos."""

@@ -1,0 +1,1 @@
+"""Files made of scenes and tours: web pages, floor plans, meshes, training sets, and the clean-up before."""

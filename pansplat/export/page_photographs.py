@@ -1,0 +1,192 @@
+"""Photographs of a page: cube tiles of two or three sizes, which the page shows where a camera stands at a panorama.
+
+What masks hide is replaced before anything is encoded: blur masks by the reading of every panorama, scene masks by what
+the Gaussians show there. The tiles are encoded from pixels, so that no metadata of a file is in them.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+from torch import Tensor
+from torch.nn import functional
+
+from pansplat import pipeline
+from pansplat.export.training_set import cut_faces
+from pansplat.gaussians.scene import Scene
+from pansplat.images.masks import mask_holes
+from pansplat.inputs.pairs import Pair
+from pansplat.predictor import Progress
+from pansplat.system.files import SOFTWARE
+from pansplat.tours import TourGraph, make_graph, select_views
+
+MIN_HEIGHT = 1024  # of a photograph in a page, pixels, unless it is smaller
+MAX_HEIGHT = 4096  # of a photograph in a folder
+_FACE = 0.65  # size of a face, of the photograph's height; its centre is as dense
+_STEP = 16  # divides the size of a face, pixels
+_PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels
+_TILE = 672  # largest size of a tile
+# Of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the gradient.
+_QUALITY, _FOLDER_QUALITY, _PREVIEW_QUALITY, _LOWER_QUALITIES = 82, 90, 75, (75, 65)
+_SHRINK = 0.8  # of a height that is too large for the page
+_HIDDEN_ROWS = 512  # of the image of the Gaussians in what masks hide
+_GUARD, _FEATHER = 3, 1 / 128  # around it: pixels of which nothing is shown, and of the height, which fade
+
+
+@dataclass(frozen=True, eq=False)
+class PackedPhotograph:
+    """A photograph as files of JPEG.
+
+    Attributes:
+        height: of the panorama that it was made from, pixels.
+        levels: size of a face and of a tile of each level, the smallest first, pixels.
+        tiles: of each level and face, row by row.
+        rotation: from the axes of the panorama to the world.
+    """
+
+    height: int
+    levels: tuple[tuple[int, int], ...]
+    tiles: tuple[bytes, ...]
+    rotation: Float[np.ndarray, "3 3"]
+
+    @property
+    def name(self) -> str:
+        """Hexadecimal digits that change with the content."""
+        return hashlib.blake2b(b"".join(self.tiles), digest_size=8).hexdigest()
+
+    @property
+    def num_bytes(self) -> int:
+        """Of all tiles."""
+        return sum(map(len, self.tiles))
+
+    def describe(self) -> dict[str, Any]:
+        """What photographs.js reads."""
+        return {"name": self.name, "levels": self.levels, "rotation": self.rotation.tolist()}
+
+    def make_element(self) -> str:
+        """The elements of a page in one file that hold all tiles."""
+        texts = " ".join(base64.b64encode(tile).decode() for tile in self.tiles)
+        return f'<script type="text/plain">{texts}</script><script>addTile("{self.name}")</script>'
+
+    def make_scripts(self) -> dict[str, str]:
+        """A script for each tile by its file name: a page from disk may not read the pixels of image files."""
+        name = self.name
+        return {
+            f"{name}_{n}.js": f'addTile("{name}", {n}, "{base64.b64encode(tile).decode()}"); // {SOFTWARE}\n'
+            for n, tile in enumerate(self.tiles)
+        }
+
+
+def list_photographs(source: Pair | TourGraph, views: Sequence[int]) -> list[Pair]:
+    """A pair of one panorama for each of some views of a scene that was predicted from a pair or tour."""
+    if isinstance(source, TourGraph):
+        return [source.make_pair([view]) for view in views]
+    return [dataclasses.replace(source, context=(source.context[view],)) for view in views]
+
+
+def pack_photographs(
+    scene: Scene, photographs: Sequence[Pair], num_bytes: float, height: int | None, progress: Progress
+) -> list[PackedPhotograph]:
+    """The photographs of a scene's views, within a number of bytes if that is possible.
+
+    They keep their height if they fit. Else the height falls to `MIN_HEIGHT`, then the quality.
+
+    Args:
+        photographs: of each view, see `list_photographs`.
+        height: largest height, pixels, whatever their size; by default what fits.
+    """
+    rows = min(height or MAX_HEIGHT, max(photograph.image_height for photograph in photographs))
+    tries = [(rows, _QUALITY if num_bytes < math.inf else _FOLDER_QUALITY)]
+    if height is None and num_bytes < math.inf:
+        while (rows := max(round(_SHRINK * rows), MIN_HEIGHT)) < tries[-1][0]:
+            tries.append((rows, _QUALITY))
+        tries += [(tries[-1][0], quality) for quality in _LOWER_QUALITIES]
+    packed: list[PackedPhotograph] = []
+    for rows, quality in tries:
+        packed.clear()
+        is_last = (rows, quality) == tries[-1]
+        for view, photograph in enumerate(photographs):
+            progress("packing photographs", view / len(photographs))
+            image = read_photograph(scene, view, photograph, rows)
+            packed.append(_pack(image, scene.cam2world[view, :3, :3].double().numpy(), quality))
+            expected = sum(each.num_bytes for each in packed) * len(photographs) / len(packed)
+            if expected > (1.5 if len(packed) < len(photographs) else 1) * num_bytes and not is_last:
+                break
+        else:
+            break
+    return packed
+
+
+@torch.no_grad()
+def read_photograph(scene: Scene, view: int, photograph: Pair, height: int) -> Float[Tensor, "3 height width"]:
+    """A photograph of at most a height, with the exposure of the Gaussians, and without what its masks hide."""
+    views = photograph.load_context(min(height, photograph.image_height))
+    image, mask = views.images[0], views.masks[0] & mask_holes(views.images)[0]
+    del views  # of large photographs gigabytes
+    if scene.joint and scene.gains:  # the Gaussians of single views have the exposure of their photographs
+        image = image / torch.tensor(scene.gains[view]).to(image)[:, None, None]
+    if mask.all():
+        return image.clamp(0, 1)
+    rows = min(scene.height, _HIDDEN_ROWS)
+    drawn = pipeline.render(*_select_shown(scene, view), size=(rows, 2 * rows)).color.clamp(0, 1)
+    drawn = functional.interpolate(drawn[None].to(image), image.shape[1:], mode="bilinear")[0]
+    shown = torch.from_numpy(_fade_from_hidden(mask.numpy()))
+    return torch.where(shown > 0, torch.lerp(drawn, image.clamp(0, 1), shown), drawn)
+
+
+def _select_shown(scene: Scene, view: int) -> tuple[Scene, Float[Tensor, "4 4"]]:
+    """What a page draws at a panorama, and its pose (4, 4)."""
+    pose = scene.cam2world[view]
+    if not scene.overlaps:
+        return scene, pose
+    tour = make_graph(scene)
+    edge, _ = tour.find_nearest_edge(pose[:3, 3].numpy())
+    return select_views(scene, tour.choose_scene_views()[edge]), pose
+
+
+def _fade_from_hidden(mask: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Weights of a photograph: 0 where it is hidden and next to it, from where it fades in."""
+    feather = max(round(_FEATHER * len(mask)), 1)
+    margin = min(feather + _GUARD, mask.shape[1])
+    padded = np.pad(mask.astype(np.uint8), ((0, 0), (margin, margin)), mode="wrap")
+    distances = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[:, margin:-margin]
+    return ((distances - _GUARD) / feather).clip(0, 1)
+
+
+def _pack(image: Float[Tensor, "3 height width"], rotation: np.ndarray, quality: int) -> PackedPhotograph:
+    """The tiles of all levels."""
+    height = image.shape[1]
+    size = max(round(_FACE * height / _STEP) * _STEP, _STEP)
+    sizes = [smaller for smaller in (_PREVIEW, _MIDDLE) if 1.3 * smaller < size]
+    levels = tuple((each, -(-each // -(-each // _TILE))) for each in (*sizes, size))
+    tiles: list[list[bytes]] = [[] for _ in levels]
+    for face in cut_faces(image, size):
+        pixels = (255 * face + 0.5).astype(np.uint8)
+        for level, (smaller, tile) in enumerate(levels):
+            reduced = cv2.resize(pixels, (smaller, smaller), interpolation=cv2.INTER_AREA)
+            tiles[level] += _encode(reduced, tile, quality if level == len(levels) - 1 else _PREVIEW_QUALITY)
+    return PackedPhotograph(height, levels, tuple(each for level in tiles for each in level), rotation)
+
+
+def _encode(pixels: UInt8[np.ndarray, "size size 3"], tile: int, quality: int) -> list[bytes]:
+    """The tiles of a face."""
+    encoded = []
+    for top in range(0, len(pixels), tile):
+        for left in range(0, len(pixels), tile):
+            with io.BytesIO() as file:
+                part = np.ascontiguousarray(pixels[top : top + tile, left : left + tile])
+                Image.fromarray(part).save(file, "JPEG", quality=quality, optimize=True)
+                encoded.append(file.getvalue())
+    return encoded

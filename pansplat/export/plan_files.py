@@ -1,0 +1,287 @@
+"""Floor plans of straight walls as drawings: SVG and PNG of one figure, and DXF for CAD programs.
+
+The longest wall is horizontal. Storeys are next to each other, the lowest on the left. All are to scale: figures are
+1:50 on paper, a DXF is in metres.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import ezdxf
+import numpy as np
+import shapely
+from ezdxf import units
+from ezdxf.enums import TextEntityAlignment
+from jaxtyping import Float
+from shapely.geometry import Polygon
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+from pansplat.system.atomic import replacing
+from pansplat.system.files import SOFTWARE
+from pansplat.tours.floor import assign_storeys, write_floor_plan
+from pansplat.tours.graph import make_graph
+from pansplat.tours.plan import Plan, Room, make_plan
+
+SUFFIXES = (".svg", ".png", ".dxf")
+
+_PAPER = 0.02  # metres of paper for a metre: 1:50
+_INCH = 0.0254
+_DOTS_PER_INCH = 150
+_MARGIN, _GAP, _LINE = 0.8, 1.5, 0.35  # around a storey, between two, and between lines of notes, metres
+_TEXT, _SMALL_TEXT = 0.22, 0.13  # heights, metres
+_LETTER = 0.72  # width of a letter, of its height
+_MEASURED = 0.6  # metres, the shortest wall whose length is written
+_UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below
+_CAP_HEIGHT = 0.73  # of a letter, of the font's size
+_POINT = _INCH / 72
+_LAYERS = {"WALLS": 7, "DOORS": 30, "ROOMS": 5, "LENGTHS": 8, "PANORAMAS": 4, "NOTES": 7}  # names and colours
+
+
+@dataclass(frozen=True)
+class _Text:
+    """A text around a place or, if it starts there, on its right; sizes in metres, the angle in degrees."""
+
+    layer: str
+    place: tuple[float, float]
+    text: str
+    size: float
+    is_centred: bool = True
+    angle: float = 0.0
+
+
+def write_plan(scene: Scene, path: str | Path) -> Plan:
+    """Write the floor plan of a scene with straight walls, and return it.
+
+    Args:
+        scene: with input cameras, not fused.
+        path: a .svg, .png or .dxf.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"cannot write {path}: needed a name ending in {', '.join(SUFFIXES)}; rename it")
+    if scene.joint:
+        raise InputError(
+            f"cannot write {path}: needed all that each panorama shows, got a scene with each surface once; give the "
+            "folder of the panoramas, or a scene that was exported with --layers"
+        )
+    plan = _find_rooms(scene)
+    if plan is None:
+        raise InputError(
+            f"cannot write {path}: needed a floor, and walls around at least one of the {len(scene.cam2world)} input "
+            "cameras, got none; export a folder of upright panoramas of rooms"
+        )
+    drawing = _Drawing(plan)
+    with replacing(path) as partial:
+        partial.write_bytes(_draw_dxf(drawing) if suffix == ".dxf" else _draw_figure(drawing, suffix[1:]))
+    return plan
+
+
+def write_picture(scene: Scene, path: str | Path) -> Plan | None:
+    """Write the floor plan as an image: the drawing of `write_plan`, or only the floors where no walls are known.
+
+    Args:
+        scene: with input cameras.
+        path: a .png.
+
+    Returns:
+        The plan; None if only the floors are shown, as in a scene with each surface once.
+    """
+    if not scene.joint and _find_rooms(scene) is not None:
+        return write_plan(scene, path)
+    write_floor_plan(scene, path)
+    return None
+
+
+def _find_rooms(scene: Scene) -> Plan | None:
+    """The plan of a scene; None if it has no rooms."""
+    tour = make_graph(scene)
+    plan = make_plan(scene, tour) if len(tour) else None
+    return plan if plan is not None and plan.rooms else None
+
+
+def describe_plan(plan: Plan) -> list[str]:
+    """Lines on the size of a plan and its uncertainty."""
+    area = sum(room.area for room in plan.rooms)
+    spread = "" if plan.scale_error is None else f", which differ by {100 * plan.scale_error:.1f} %"
+    count = f"median of {plan.num_heights} panorama{'s' if plan.num_heights > 1 else ''}"
+    lines = [
+        f"{len(plan.rooms)} room{'s' if len(plan.rooms) > 1 else ''}, {area:.1f} m² between the walls",
+        f"scale: cameras {plan.camera_height:.2f} m over the floor ({count}{spread})",
+    ]
+    inside = {node for room in plan.rooms for node in room.panoramas}
+    if outside := [panorama.name for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
+        lines.append(f"no closed walls around {', '.join(outside)}")
+    if plan.wall_error is None:
+        return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
+    walls = f"{plan.num_walls} wall{'s' if plan.num_walls > 1 else ''}"
+    return [*lines, f"walls: ± {100 * plan.wall_error:.1f} cm, by the panoramas that show the same {walls}"]
+
+
+def _describe_area(plan: Plan, number: int) -> str:
+    room = plan.rooms[number]
+    return f"{room.area:.1f} m² ± {plan.area_error(room):.1f}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawing:
+    """A plan on a sheet: where its rooms, doors, panoramas and texts are, metres to the right and up."""
+
+    plan: Plan
+
+    @cached_property
+    def _turn(self) -> Float[np.ndarray, "2 2"]:
+        """The rotation, applied from the right, after which the longest wall is horizontal."""
+        cosine, sine = math.cos(self.plan.turn), math.sin(self.plan.turn)
+        return np.array(((cosine, sine), (-sine, cosine)))
+
+    @cached_property
+    def storeys(self) -> list[int]:
+        """The storey of each panorama."""
+        return assign_storeys(self.plan.tour)
+
+    @cached_property
+    def _centers(self) -> Float[np.ndarray, "node 2"]:
+        return self.plan.tour.positions @ self.plan.tour.level_axes[:, (0, 2)] @ self._turn
+
+    @cached_property
+    def _layout(self) -> tuple[Float[np.ndarray, "storey 2"], tuple[float, float]]:
+        """What each storey is moved by, so that all are in one row from (0, 0) on, and the size of the row."""
+        moves, right, height = [], 0.0, 0.0
+        for storey in range(max(self.storeys) + 1):
+            outlines = [room.outline @ self._turn for room in self.plan.rooms if room.storey == storey]
+            places = np.concatenate([self._centers[np.array(self.storeys) == storey], *outlines])
+            low, size = places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN
+            moves.append((right - low[0], -low[1]))
+            right, height = right + float(size[0]) + _GAP, max(height, float(size[1]))
+        return np.array(moves), (right - _GAP, height)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of all storeys."""
+        return self._layout[1]
+
+    def outline(self, room: Room) -> Float[np.ndarray, "corner 2"]:
+        """The corners of a room."""
+        return room.outline @ self._turn + self._layout[0][room.storey]
+
+    @cached_property
+    def doors(self) -> list[Float[np.ndarray, "2 2"]]:
+        """The ends of all doors."""
+        moves = [self._layout[0][self.plan.rooms[door.rooms[0]].storey] for door in self.plan.doors]
+        return [door.ends @ self._turn + move for door, move in zip(self.plan.doors, moves, strict=True)]
+
+    @cached_property
+    def panoramas(self) -> Float[np.ndarray, "node 2"]:
+        """The places of all panoramas."""
+        return self._centers + self._layout[0][self.storeys]
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """Lines below the plan."""
+        return describe_plan(self.plan)
+
+    def list_texts(self) -> Iterator[_Text]:
+        """Names and areas of rooms, lengths of walls, and the names of panoramas outside of rooms."""
+        for number, room in enumerate(self.plan.rooms):
+            corners = self.outline(room)
+            circle = shapely.maximum_inscribed_circle(Polygon(corners))
+            (x, y), width = circle.coords[0], 2 * circle.length
+            name = room.name if room.is_placed else f"{room.name} (not placed)"
+            for row, text in ((0.7, name), (-0.7, _describe_area(self.plan, number))):
+                size = min(_TEXT, 0.9 * width / (_LETTER * max(len(text), 1)))
+                yield _Text("ROOMS", (x, y + row * size), text, size)
+            for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+                length = float(np.linalg.norm(end - start))
+                if length >= _MEASURED:
+                    x, y = (start + end) / 2 + 1.2 * _SMALL_TEXT * np.array((start - end)[::-1]) * (1, -1) / length
+                    angle = math.degrees(
+                        math.remainder(math.atan2(*(end - start)[::-1]) - _UPWARDS, math.pi) + _UPWARDS
+                    )
+                    yield _Text("LENGTHS", (x, y), f"{length:.2f}", _SMALL_TEXT, angle=angle)
+        inside = {node for room in self.plan.rooms for node in room.panoramas}
+        for node, (x, y) in enumerate(self.panoramas.tolist()):
+            if node not in inside:
+                name = self.plan.tour.panoramas[node].name
+                yield _Text("PANORAMAS", (x + 0.12, y), name, _SMALL_TEXT, is_centred=False)
+
+
+def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
+    """The plan as a file of a figure, 1:50 on paper: "svg", whose texts are texts, or "png"."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    notes = [*drawing.notes, "1:50 on paper; the bar is 1 m"]
+    width, height = drawing.size
+    width = max(width, 0.15 * _LETTER * max(map(len, notes)) + _MARGIN)
+    below = _LINE * len(notes) + _MARGIN
+    figure = Figure(figsize=(width * _PAPER / _INCH, (height + below) * _PAPER / _INCH))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(-below, height))
+    axes.set_axis_off()
+
+    def points(metres: float) -> float:
+        return metres * _PAPER / _POINT
+
+    for room in drawing.plan.rooms:
+        dashes = "solid" if room.is_placed else "dashed"
+        style = {"facecolor": "#f2f0ea", "edgecolor": "#222", "linestyle": dashes, "linewidth": points(0.07)}
+        axes.fill(*drawing.outline(room).T, gid="room", joinstyle="miter", **style)
+    for ends in drawing.doors:
+        axes.plot(*ends.T, color="#f2f0ea", linewidth=points(0.09), solid_capstyle="butt")
+        axes.plot(*ends.T, color="#c26a1b", linewidth=points(0.035), solid_capstyle="butt")
+    axes.plot(*drawing.panoramas.T, "o", color="#2b7bb9", markersize=points(0.12), markeredgewidth=0)
+    rows = [_Text("NOTES", (_MARGIN / 2, -_LINE * (n + 1)), note, 0.15, False) for n, note in enumerate(notes)]
+    for text in [*drawing.list_texts(), *rows]:
+        axes.text(
+            *text.place,
+            text.text.encode(errors="backslashreplace").decode(),
+            fontsize=points(text.size) / _CAP_HEIGHT,
+            rotation=text.angle,
+            rotation_mode="anchor",
+            ha="center" if text.is_centred else "left",
+            va="center",
+            color={"LENGTHS": "#777", "PANORAMAS": "#2b7bb9"}.get(text.layer, "#222"),
+            parse_math=False,
+        )
+    bar = -_LINE * len(notes) - 0.4
+    axes.plot((_MARGIN / 2, _MARGIN / 2 + 1), (bar, bar), color="#222", linewidth=points(0.05))
+    file = io.BytesIO()
+    stated = {"Creator": SOFTWARE, "Date": None} if kind == "svg" else {"Software": SOFTWARE}
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "pansplat"}):
+        figure.savefig(file, format=kind, dpi=_DOTS_PER_INCH, metadata=stated)
+    return file.getvalue()
+
+
+def _draw_dxf(drawing: _Drawing) -> bytes:
+    """The plan as a DXF of AutoCAD 2010, in metres."""
+    document = ezdxf.new("R2010", setup=True)
+    document.units = units.M
+    for name, color in _LAYERS.items():
+        document.layers.add(name, color=color)
+    space = document.modelspace()
+    for room in drawing.plan.rooms:
+        space.add_lwpolyline(drawing.outline(room).tolist(), close=True, dxfattribs={"layer": "WALLS"})
+    for ends in drawing.doors:
+        space.add_line(*ends.tolist(), dxfattribs={"layer": "DOORS"})
+    for place in drawing.panoramas.tolist():
+        space.add_circle(place, 0.06, dxfattribs={"layer": "PANORAMAS"})
+    notes = [
+        _Text("NOTES", (_MARGIN / 2, -_LINE * (row + 1)), note, 0.15, is_centred=False)
+        for row, note in enumerate(drawing.notes)
+    ]
+    for text in [*drawing.list_texts(), *notes]:
+        content = text.text.encode(errors="backslashreplace").decode().replace("\n", " ")
+        align = TextEntityAlignment.MIDDLE_CENTER if text.is_centred else TextEntityAlignment.MIDDLE_LEFT
+        entity = space.add_text(content, height=text.size, rotation=text.angle, dxfattribs={"layer": text.layer})
+        entity.set_placement(text.place, align=align)
+    stream = io.StringIO()
+    stream.write(f"999\n{SOFTWARE}\n")
+    document.write(stream)
+    return stream.getvalue().encode()

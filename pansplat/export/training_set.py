@@ -1,0 +1,134 @@
+"""Writing a folder from which gsplat, nerfstudio and brush train: cube faces, a model of COLMAP, transforms.json."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray as Array
+from torch import Tensor
+
+from pansplat.geometry.cubemap import FACES, face_poses, face_rotations
+from pansplat.geometry.equirect import pad_equirect, uv_from_directions
+from pansplat.images.image_files import read_height, read_mask, read_panorama, write_image
+from pansplat.images.masks import scene_mask_of_files
+from pansplat.images.rig_images import Lens
+from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.reconstructions.colmap import write_colmap
+from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
+
+POINTS = "points.ply"
+
+_MAX_HEIGHT = 8192  # of a panorama, pixels
+_MASK_HEIGHT = 512
+_LOSSLESS = (".png", ".exr", ".tif", ".tiff")  # pictures whose faces are PNG; those of others are JPG
+_MARGIN = 2  # pixels, of the cubic filter
+_BAND = 256  # rows of a face that are sampled together
+
+
+@dataclass(frozen=True, eq=False)
+class PosedPanorama:
+    """A panorama to write.
+
+    Attributes:
+        panorama: its picture and mask; its pose is not used.
+        cam2world: OpenCV axes, metres, a world with y down.
+        siblings: panoramas in which static content is detected, see `pansplat.inputs.pairs.Pair`.
+    """
+
+    panorama: Panorama
+    cam2world: Float[Tensor, "4 4"]
+    siblings: tuple[Path, ...] = ()
+
+
+def write_dataset(
+    folder: Path,
+    views: Sequence[PosedPanorama],
+    points: Float[Array, "point 3"],
+    colors: UInt8[Array, "point 3"],
+    progress: Callable[[str, float], None],
+) -> int:
+    """Write cube faces with poses, and points: images/, masks/ (if some are not white), sparse/0/, transforms.json.
+
+    The pictures are made anew, one at a time, and carry no metadata of the photographs. transforms.json names
+    `POINTS`, which the caller writes, in the world of `pansplat.inputs.reconstructions.nerfstudio.Z_UP`.
+
+    Args:
+        folder: an empty one.
+        views: the panoramas.
+        points, colors: positions, metres, and 8-bit sRGB.
+        progress: called with a description and the completed fraction.
+
+    Returns:
+        The number of pictures.
+    """
+    sparse = folder / "sparse" / "0"
+    for sub in (folder / "images", sparse):
+        sub.mkdir(parents=True)
+    masks = [_find_mask(view) for view in views]
+    has_masks = not all(bool(mask.all()) for mask in masks)
+    if has_masks:
+        (folder / "masks").mkdir()
+    rigs, shots = [], []
+    for number, (view, mask) in enumerate(zip(views, masks, strict=True)):
+        progress("writing cube faces", number / len(views))
+        image = view.panorama.image
+        height = min(read_height(image), _MAX_HEIGHT)
+        size = 2 * math.ceil(height / math.pi)
+        lens = Lens(size / 2, size / 2, size / 2, size / 2, size, size)
+        faces = cut_faces(read_panorama(image, height)[0], size)
+        shown = cut_faces(mask.float().expand(3, -1, -1), size)
+        plain = re.sub(r"[^\w.-]+", "_", view.panorama.name)  # COLMAP reads no spaces
+        stem = f"{number:04d}_{plain}"
+        suffix = ".png" if image.suffix.lower() in _LOSSLESS else ".jpg"
+        rig = []
+        for face, pose in enumerate(face_poses(view.cam2world.double())):
+            name = f"{stem}_{FACES[face]}{suffix}"
+            write_image(folder / "images" / name, next(faces), panorama=False)
+            if has_masks:
+                white = np.where(next(shown) >= 0.5, np.uint8(255), np.uint8(0))
+                write_image(folder / "masks" / f"{name}.png", white, panorama=False)
+            rig.append((name, pose, lens))
+            shots.append((f"images/{name}", pose, lens, f"masks/{name}.png" if has_masks else None))
+        rigs.append(rig)
+    write_colmap(sparse, rigs, points, colors)
+    write_nerfstudio(folder / "transforms.json", shots, POINTS if len(points) else None)
+    (folder / "scale.txt").write_text("1\n", "utf-8")  # metres per unit
+    return len(shots)
+
+
+def _find_mask(view: PosedPanorama) -> Bool[Tensor, "height width"]:
+    """Where the panorama shows the scene, as predictions see it."""
+    panorama = view.panorama
+    opaque = read_panorama(panorama.image, _MASK_HEIGHT)[1]
+    if panorama.mask is not None:
+        return opaque & read_mask(panorama.mask, _MASK_HEIGHT)
+    return opaque & scene_mask_of_files(view.siblings, _MASK_HEIGHT)
+
+
+def cut_faces(image: Float[Tensor, "3 height width"], size: int) -> Iterator[Float[Array, "size size 3"]]:
+    """Yield the six cube faces of a panorama, by bicubic samples, in [0, 1]."""
+    height, width = image.shape[1:]
+    padded = np.empty((height + 2 * _MARGIN, width + 2 * _MARGIN, 3), np.float32)
+    for channel in range(3):
+        padded[..., channel] = pad_equirect(image[channel : channel + 1], _MARGIN)[0]
+    del image  # gigabytes
+    position = (torch.arange(size, dtype=torch.float64) + 0.5) / size * 2 - 1
+    for rotation in face_rotations():
+        face = np.empty((size, size, 3), np.float32)
+        for first in range(0, size, _BAND):
+            y, x = torch.meshgrid(position[first : first + _BAND], position, indexing="ij")
+            uv = uv_from_directions(torch.stack((x, y, torch.ones_like(x)), dim=-1) @ rotation.T).numpy()
+            columns, rows = (
+                (uv[..., axis] * count - 0.5 + _MARGIN).astype(np.float32) for axis, count in ((0, width), (1, height))
+            )
+            band = cv2.remap(padded, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            face[first : first + _BAND] = band.clip(0, 1)
+        yield face

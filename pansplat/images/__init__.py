@@ -1,0 +1,1 @@
+"""Files of pictures: panoramas, faces of cubes, cameras of rigs, masks, videos and their metadata."""

@@ -1,0 +1,237 @@
+"""Reading frames of video files by number, and writing MP4 and WebM files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pansplat.errors import InputError
+from pansplat.images.panorama_metadata import Projection, Stereo, mark_spherical_video
+from pansplat.system.atomic import replacing
+from pansplat.system.files import SOFTWARE, require_file
+
+_MAX_SKIP = 48  # frames between two reads; a larger gap is skipped by seeking
+_ENCODERS = {
+    ".mp4": ("libx264", "libopenh264", "mpeg4"),  # H.264 first: every browser and player supports it
+    ".webm": ("libvpx-vp9", "libsvtav1", "libaom-av1"),  # VP9 first: it is faster to encode
+}
+VIDEO_SUFFIXES = tuple(_ENCODERS)
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFile:
+    """A video file with the times of its frames. `read` decodes frames.
+
+    Attributes:
+        path: the file.
+        stamps: presentation time of each frame in units of `time_base`, ascending.
+        time_base: seconds.
+        width, height: pixels.
+    """
+
+    path: Path
+    stamps: tuple[int, ...]
+    time_base: Fraction
+    width: int
+    height: int
+
+    @property
+    def seconds(self) -> list[float]:
+        """Time of each frame since the first frame."""
+        return [float((stamp - self.stamps[0]) * self.time_base) for stamp in self.stamps]
+
+    def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
+        """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order."""
+        numbers = sorted(set(frames))
+        if numbers and not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
+            raise InputError(
+                f"{self.path}: needed frames 0 to {len(self.stamps) - 1}, got {numbers[0]} to {numbers[-1]}."
+            )
+        found: dict[int, NDArray[np.uint8]] = {}
+        with _open_container(self.path) as container:
+            container.streams.video[0].thread_type = "AUTO"
+            for group in _group_near_frames(numbers):
+                found |= self._decode(container, group, self.stamps[group[0]])
+                missing = [frame for frame in group if frame not in found]
+                if missing:  # key frames of some files are wrong: decode from the start
+                    found |= self._decode(container, missing, self.stamps[0])
+        missing = [frame for frame in numbers if frame not in found]
+        if missing:
+            raise InputError(
+                f"{self.path}: needed {len(numbers)} frames, got none for {missing[:5]}: the file is damaged there; "
+                "copy or encode it again."
+            )
+        return found
+
+    def _decode(self, container: Any, frames: Sequence[int], seek_to: int) -> dict[int, NDArray[np.uint8]]:
+        """Pixels of the frames that are found from the key frame at or before the time `seek_to` on."""
+        from av.error import FFmpegError
+
+        numbers = {self.stamps[frame]: frame for frame in frames}
+        last = max(numbers)
+        found = {}
+        stream = container.streams.video[0]
+        try:
+            container.seek(seek_to, stream=stream)
+            for frame in container.decode(stream):
+                if frame.pts in numbers:
+                    found[numbers[frame.pts]] = frame.to_ndarray(format="rgb24")
+                if len(found) == len(numbers) or (frame.pts is not None and frame.pts > last):
+                    break
+        except FFmpegError as error:
+            raise InputError(f"{self.path}: needed readable frames, got '{error}'; copy or encode it again.") from error
+        return found
+
+
+def open_video(path: Path | str) -> VideoFile:
+    """A video file with the times of its frames, which are read from packets without decoding."""
+    path = Path(path)
+    with _open_container(path) as container:
+        from av.error import FFmpegError
+
+        if not container.streams.video:
+            raise InputError(f"{path}: needed a video, got a file without a video stream; give another file.")
+        stream = container.streams.video[0]
+        try:
+            packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
+        except FFmpegError as error:
+            raise InputError(f"{path}: needed a complete video, got '{error}'; copy it again.") from error
+        stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
+        if not stamps or len(stamps) != len(packets):
+            raise InputError(
+                f"{path}: needed a time for each frame, got {len(stamps)} times for {len(packets)} frames; write it "
+                "again as .mp4 (ffmpeg -i FILE -c:v libx264 -crf 12 video.mp4)."
+            )
+        return VideoFile(path, tuple(stamps), stream.time_base, stream.width, stream.height)
+
+
+def _open_container(path: Path) -> Any:
+    import av
+    from av.error import FFmpegError
+
+    require_file(path, "a readable video file")
+    try:
+        return av.open(str(path))
+    except (OSError, FFmpegError) as error:
+        raise InputError(f"{path}: needed a readable video file, got '{error}'; check it.") from error
+
+
+def _group_near_frames(frames: Sequence[int]) -> Iterator[list[int]]:
+    """Split sorted frame numbers where consecutive ones are more than `_MAX_SKIP` apart."""
+    group: list[int] = []
+    for frame in frames:
+        if group and frame - group[-1] > _MAX_SKIP:
+            yield group
+            group = []
+        group.append(frame)
+    if group:
+        yield group
+
+
+def write_video(
+    path: Path | str,
+    frames: Iterable[NDArray[np.uint8]],
+    fps: float,
+    *,
+    quality: int = 18,
+    panorama: bool | Projection = False,
+    stereo: Stereo = "mono",
+) -> int:
+    """Write an MP4 or WebM file atomically and return the number of frames. H.264 or VP9 if PyAV supports it.
+
+    The format supports even sizes only: frames of odd width or height lose their last column or row.
+
+    Args:
+        path: file to write, ending in .mp4 or .webm.
+        frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
+        fps: frames per second.
+        quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
+        panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
+            players then show an .mp4 as 360 degrees. A .webm has no such mark.
+        stereo: arrangement of the eyes in a panorama's frame.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        allowed = " or ".join(VIDEO_SUFFIXES)
+        raise InputError(f"cannot write {path}: needed a name ending in {allowed}, got '{path.suffix}'; rename it.")
+    if not 0 < fps < float("inf"):
+        raise InputError(f"`fps` must be positive, got {fps}; choose one, such as 30.")
+    import av
+
+    with replacing(path) as temporary:
+        count = 0
+        options = {"movflags": "+faststart"} if path.suffix.lower() == ".mp4" else {}
+        with av.open(str(temporary), "w", options=options) as container:
+            container.metadata["comment"] = SOFTWARE  # at the start of a .webm
+            stream: Any = None
+            for count, frame in enumerate(frames, start=1):
+                pixels = _check_frame(path, frame, count, None if stream is None else (stream.height, stream.width))
+                if stream is None:
+                    encoder = video_encoder(path.suffix.lower())
+                    stream = _add_stream(container, encoder, pixels.shape[1], pixels.shape[0], fps, quality)
+                video_frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+                for packet in stream.encode(video_frame.reformat(format="yuv420p", dst_colorspace="ITU709")):
+                    container.mux(packet)
+            if stream is None:
+                raise InputError(f"cannot write {path}: needed at least one frame, got none; nothing was written.")
+            for packet in stream.encode():
+                container.mux(packet)
+        if path.suffix.lower() == ".mp4":
+            if panorama:
+                mark_spherical_video(temporary, "equirect" if panorama is True else panorama, stereo)
+            with open(temporary, "ab") as file:  # a box that players skip
+                file.write((8 + len(SOFTWARE)).to_bytes(4, "big") + b"free" + SOFTWARE.encode())
+    return count
+
+
+def video_encoder(suffix: str = ".mp4") -> str:
+    """Name of the encoder that `write_video` uses for files of a suffix."""
+    import av
+    import av.codec
+
+    for name in _ENCODERS[suffix]:
+        if name in av.codecs_available:
+            try:
+                av.codec.Codec(name, "w")
+                return name
+            except ValueError:  # available for decoding only
+                continue
+    raise InputError(f"needed PyAV with one of the encoders {_ENCODERS[suffix]}, got none of them; reinstall `av`.")
+
+
+def _add_stream(container: Any, encoder: str, width: int, height: int, fps: float, quality: int) -> Any:
+    stream = container.add_stream(encoder, rate=Fraction(fps).limit_denominator(1001))
+    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    if encoder == "libx264":
+        stream.options = {"crf": str(quality), "preset": "medium"}
+    elif encoder == "libvpx-vp9":
+        stream.options = {"crf": str(quality + 6), "b": "0", "row-mt": "1", "cpu-used": "4"}  # crf is 0 to 63
+    elif encoder == "libsvtav1":
+        stream.options = {"crf": str(quality + 10), "preset": "8"}  # crf is 0 to 63
+    else:
+        stream.bit_rate = int(width * height * fps * 0.2)
+    # BT.709, limited range. Without these tags players guess the colour space from the size, and colours shift.
+    context = stream.codec_context
+    context.color_primaries, context.color_trc, context.colorspace, context.color_range = 1, 1, 1, 1
+    return stream
+
+
+def _check_frame(path: Path, frame: Any, number: int, size: tuple[int, int] | None) -> NDArray[np.uint8]:
+    """The frame cropped to an even size."""
+    pixels = np.asarray(frame)
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or min(pixels.shape) < 2:
+        raise InputError(
+            f"cannot write {path}: needed frames (H W 3) of uint8, got {pixels.dtype} {pixels.shape} as frame {number}."
+        )
+    pixels = np.ascontiguousarray(pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2])
+    if size is not None and pixels.shape[:2] != size:
+        raise InputError(
+            f"cannot write {path}: needed frames of one size {size}, got {pixels.shape[:2]} as frame {number}."
+        )
+    return pixels

@@ -1,0 +1,177 @@
+"""Panoramas without poses: the pictures of a folder, and the links and titles of its links.json."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections import Counter
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pansplat.errors import InputError, InputWarning
+from pansplat.geometry.path import wrap_angle
+from pansplat.images.cube_faces import find_layout, group_faces
+from pansplat.images.cube_images import CubeImage, write_cube
+from pansplat.images.image_files import is_two_to_one, read_size, require_complete, require_two_to_one
+from pansplat.inputs.pairs import Link, Panorama, find_mask, list_panorama_files
+from pansplat.inputs.web_tours.entries import Number, plain_text, read_direction, resolve_links
+from pansplat.system.files import is_written
+from pansplat.system.strict_json import convert, read_field, read_json
+
+LINKS = "links.json"
+
+
+def read_photograph(image: Path) -> Panorama:
+    """A 2:1 picture, or one that holds six cube faces, as a panorama at the origin of a world of its own."""
+    return _make_panorama(image.stem, _read_picture(image), image.parent)
+
+
+def list_photographs(folder: Path) -> list[Panorama]:
+    """The panoramas among the pictures of a folder, sorted by name, with the links of links.json.
+
+    Pictures that pansplat rendered count only if there are no other panoramas. Warns about pictures that are left out.
+    """
+    every = list_panorama_files(folder)
+    rendered = [image for image in every if is_written(image)]
+    panoramas, problems = _read_pictures([image for image in every if image not in rendered], folder)
+    if panoramas:
+        problems += [f"{image}: it was rendered by pansplat." for image in rendered]
+    elif rendered:
+        panoramas, problems = _read_pictures(every, folder)
+    if problems and not panoramas:
+        raise InputError("; ".join(problem.rstrip(".") for problem in problems[:3]) + ".")
+    _warn_left_out(problems)
+    return add_links(panoramas, folder)
+
+
+def list_further_photographs(
+    folders: Sequence[Path], known: Collection[Path], names: Collection[str], stated: Collection[str] = ()
+) -> list[Panorama]:
+    """The panoramas of folders other than the known files, without links.
+
+    Pictures that pansplat rendered count only if they are stated. Warns about pictures that are no panoramas.
+
+    Args:
+        folders: each once.
+        known: files that are no further ones.
+        names: that are taken; a panorama of such a name gets the folder's name before its own.
+        stated: names of files that are photographs.
+    """
+    taken = set(names)
+    further: list[Panorama] = []
+    for folder in folders:
+        panoramas, problems = _read_pictures(_list_others(folder, known, stated), folder)
+        _warn_left_out(problems)
+        for panorama in panoramas:
+            name = panorama.name if panorama.name not in taken else f"{folder.resolve().name}_{panorama.name}"
+            taken.add(name)
+            further.append(dataclasses.replace(panorama, name=name))
+    return further
+
+
+def list_unread_panoramas(folder: Path, known: Collection[Path]) -> list[Path]:
+    """The 2:1 pictures of a folder other than the known files, which pansplat has not rendered; no pixels are read."""
+    return [image for image in _list_others(folder, known) if is_two_to_one(image)]
+
+
+def _list_others(folder: Path, known: Collection[Path], stated: Collection[str] = ()) -> list[Path]:
+    """The pictures of a folder other than the known files, which are stated, or which pansplat has not rendered."""
+    read = {_identify(file) for file in known}
+    others = [image for image in list_panorama_files(folder) if _identify(image) not in read]
+    return [image for image in others if image.name in stated or not is_written(image)]
+
+
+def _identify(file: Path) -> object:
+    """What a file has in common under all of its names: on Windows and macOS in other capitals, too."""
+    try:
+        status = file.stat()
+    except OSError:
+        return file.resolve()
+    return (status.st_dev, status.st_ino) if status.st_ino else file.resolve()  # 0 on some network drives
+
+
+def _warn_left_out(problems: Sequence[str]) -> None:
+    for problem in problems:
+        warnings.warn(f"left out: {problem}", category=InputWarning, stacklevel=4)
+
+
+def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama], list[str]]:
+    """The panoramas among pictures, and what is wrong with the others."""
+    cubes, rest = group_faces(images)
+    pictures: dict[str, Path | CubeImage] = dict(cubes)
+    repeated = Counter(image.stem for image in rest)
+    problems = []
+    for image in rest:
+        name = image.stem if repeated[image.stem] == 1 and image.stem not in cubes else image.name.replace(".", "_")
+        try:
+            pictures[name] = _read_picture(image)
+        except InputError as error:
+            problems.append(str(error))
+    return [_make_panorama(name, pictures[name], folder) for name in sorted(pictures)], problems
+
+
+def _read_picture(image: Path) -> Path | CubeImage:
+    width, height = read_size(image)
+    if width == 2 * height:
+        require_complete(image)
+        return image
+    layout = find_layout(image)
+    if layout is None:
+        require_two_to_one(image, width, height)
+    return layout
+
+
+def _make_panorama(name: str, picture: Path | CubeImage, folder: Path) -> Panorama:
+    image = picture if isinstance(picture, Path) else write_cube(picture, folder, name)
+    return Panorama(name, image, torch.eye(4, dtype=torch.float64), find_mask(image, folder))
+
+
+def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
+    """The panoramas with the links, titles and start views of the folder's links.json, if it has one.
+
+    Warns about entries and links that cannot be used, or about a file that cannot be read.
+    """
+    source = folder / LINKS
+    if not source.is_file():
+        return list(panoramas)
+    try:
+        content = read_json(source, dict[str, Any])
+    except InputError as error:
+        warnings.warn(f"links are left out: {error}", category=InputWarning, stacklevel=3)
+        return list(panoramas)
+    names = {key: panorama.name for panorama in panoramas for key in (panorama.name, panorama.image.name)}
+    entries: dict[str, Any] = {}
+    for key, entry in content.items():
+        if key in names:
+            entries[names[key]] = entry
+        else:
+            warnings.warn(
+                f"{source}: {key[:60]!r} is left out: it is no panorama of the folder.", InputWarning, stacklevel=3
+            )
+    result = []
+    for panorama in panoramas:
+        try:
+            result.append(_add_entry(panorama, entries.get(panorama.name, []), names, source))
+        except InputError as error:
+            warnings.warn(f"links of {panorama.name} are left out: {error}", category=InputWarning, stacklevel=3)
+            result.append(panorama)
+    return result
+
+
+def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Path) -> Panorama:
+    """The panorama with the content of its entry: a list of links, or {"title", "start", "links"}."""
+    content = convert({"links": entry} if isinstance(entry, list) else entry, dict[str, Any], source)
+    links = [
+        Link(str(link.get("to")), *read_direction({"yaw": None, **link}, source), plain_text(link.get("text")))
+        for link in read_field(content, "links", list[dict[str, Any]], source, [])
+    ]
+    start = read_field(content, "start", tuple[Number, Number], source)
+    return dataclasses.replace(
+        panorama,
+        title=plain_text(content.get("title")) or panorama.title,
+        links=resolve_links(links, names, panorama.name, source),
+        start=start and (wrap_angle(start[0]), start[1]),
+    )

@@ -1,0 +1,168 @@
+"""Exports of the Marzipano Tool: data.js, and tiles/SCENE/LEVEL/FACE/ROW/COLUMN.jpg.
+
+Angles are radians: yaw to the right of the front face's centre, pitch below the horizon. The reference states the
+opposite sign of pitch; the code and all exports have this one. A level's number is its place in the list. The first,
+smallest level has number 0 and is in preview.jpg, a column of the faces b d f l r u.
+
+Source: https://www.marzipano.net/docs.html; https://www.marzipano.net/reference/CubeGeometry.html;
+https://github.com/google/marzipano: src/geometries/Cube.js (faces), src/sources/ImageUrl.js (tiles),
+src/views/Rectilinear.js (angles), demos/sample-tour/index.js.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pansplat.errors import InputError, InputWarning
+from pansplat.images.cube_faces import find_gap, strip_level
+from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
+from pansplat.images.image_files import read_size, require_complete
+from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.web_tours.entries import (
+    Entry,
+    Pixels,
+    locate,
+    optional,
+    plain_text,
+    read_direction,
+    read_entries,
+    read_note,
+    read_text,
+    require_tiles,
+)
+from pansplat.inputs.web_tours.javascript import parse_literal
+from pansplat.system.strict_json import convert
+
+_DATA = "data.js"
+_FILES = "app-files"  # folder in the archive of the Tool
+_FACES = "frblud"
+_PREVIEW = "bdflru"
+_ASSIGNMENT = re.compile(r"(?<![\w$])[A-Za-z_$][\w$]*\s*=\s*(?=\{)")
+_SHOWN = 30
+_UNNAMED = "Project Title"  # of a project whose author gave no name
+
+
+def find_marzipano(folder: Path) -> Path | None:
+    """The data.js of an export, in the folder or in its app-files/."""
+    found = (folder / _DATA, folder / _FILES / _DATA)
+    return next((path for path in found if path.is_file()), None)
+
+
+def read_marzipano(source: Path) -> tuple[str, list[Entry]]:
+    """The title of an export, and its scenes that have a complete level."""
+    content = _read_data(source)
+    entries = read_entries(source, _list_scenes(content["scenes"]), lambda key, scene: _read_scene(key, scene, source))
+    title = plain_text(content.get("name"))
+    return "" if title == _UNNAMED else title, entries
+
+
+def _read_data(source: Path) -> dict[str, Any]:
+    text = read_text(source)
+    if text.lstrip().startswith("<"):
+        raise InputError(f"{source}: needed `var APP_DATA = {{...}}`, got an HTML page; export or download it again.")
+    position = 0
+    while (found := _ASSIGNMENT.search(text, position)) is not None:
+        content, position = parse_literal(text, found.end(), source)
+        if isinstance(content.get("scenes"), list):
+            return content
+    raise InputError(
+        f"{source}: needed `var APP_DATA = {{...}}` with a list of scenes, got other text "
+        f"({text.strip()[:_SHOWN]!r}); give the folder of an export of the Marzipano Tool."
+    )
+
+
+def _list_scenes(scenes: list[Any]) -> Iterator[tuple[str, Any]]:
+    for place, scene in enumerate(scenes, start=1):
+        key = scene.get("id") if isinstance(scene, dict) else None
+        yield (plain_text(key) or f"number {place}", scene)
+
+
+def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
+    if not plain_text(scene.get("id")):
+        raise InputError('needed an "id", the name of the folder of its tiles, got none')
+    levels = _find_levels(key, scene, source)
+    view = scene.get("initialViewParameters")
+    start = optional(f"{source}: the start view of {key}", lambda: read_direction(view)) if view else None
+    links = [
+        optional(f"{source}: a link of {key}", lambda spot=spot: _read_link(spot))
+        for spot in _objects(scene.get("linkHotspots"))
+    ]
+    notes = [
+        optional(f"{source}: a hot spot of {key}", lambda spot=spot: _read_note(spot))
+        for spot in _objects(scene.get("infoHotspots"))
+    ]
+    picture, title = CubeImage(source.parent, levels), plain_text(scene.get("name"))
+    return Entry(key, picture, title, tuple(filter(None, links)), tuple(filter(None, notes)), start)
+
+
+def _read_link(spot: Mapping[str, Any]) -> Link:
+    return Link(plain_text(spot.get("target")), *read_direction(spot), plain_text(spot.get("text")))
+
+
+def _read_note(spot: Mapping[str, Any]) -> Note:
+    return read_note(read_direction(spot), [spot.get("title"), spot.get("text")])
+
+
+def _objects(value: Any) -> list[dict[str, Any]]:
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[CubeLevel, ...]:
+    """The complete levels of a scene; the preview if there is none.
+
+    The numbers of the folders are those of the list, or one more in exports without a level of preview.
+    """
+    folder = source.parent
+    base = locate(folder, "tiles", plain_text(scene.get("id")))
+    stated = [
+        tuple(convert(level.get(key), Pixels, key, strict=False) for key in ("size", "tileSize"))
+        for level in _objects(scene.get("levels"))
+    ]
+    for pixels, tile in stated:
+        require_tiles(min(pixels, MAX_SIZE), tile)
+    attempts = [_find_complete(base, stated, first, folder) for first in (0, 1)]
+    best, gap = max(attempts, key=lambda attempt: len(attempt[0]))
+    preview = f"{base}/preview.jpg"
+    if not best and (folder / preview).is_file():
+        width, height = read_size(folder / preview)
+        require_complete(folder / preview)
+        best = [strip_level(preview, width, _PREVIEW)] if height == 6 * width else []
+    gap = gap or f"{base} is missing"
+    if not best:
+        raise InputError(f"needed all tiles of a level, but {gap}; copy or export the tour again")
+    largest = min(max(pixels for pixels, _ in stated), MAX_SIZE) if stated else 0
+    if best[-1].size < largest:
+        warnings.warn(
+            f"{source}: scene {key!r} is read at {best[-1].size} instead of {largest} pixels a face: {gap}.",
+            category=InputWarning,
+            stacklevel=4,
+        )
+    return tuple(best)
+
+
+def _find_complete(
+    base: str, stated: Sequence[tuple[int, int]], first: int, folder: Path
+) -> tuple[list[CubeLevel], str | None]:
+    """The complete levels, the smallest first, and a gap of the others, if the levels count from `first`."""
+    complete: list[CubeLevel] = []
+    found = None
+    for place, (pixels, tile) in enumerate(stated, start=first):
+        level = CubeLevel(pixels, tile, tuple(f"{base}/{place}/{face}/{ROW}/{COLUMN}.jpg" for face in _FACES))
+        if pixels > MAX_SIZE or _has_more_tiles(level, folder):
+            continue
+        gap = find_gap(level, folder)
+        if gap is None:
+            complete.append(level)
+        elif place:
+            found = gap
+    return sorted(complete, key=lambda level: level.size), found
+
+
+def _has_more_tiles(level: CubeLevel, folder: Path) -> bool:
+    """Whether the folder holds a larger level than the stated one."""
+    count = -(-level.size // level.tile)
+    return (folder / level.faces[0].replace(ROW, "0").replace(COLUMN, str(count))).is_file()

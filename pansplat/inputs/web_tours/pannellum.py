@@ -1,0 +1,285 @@
+"""Tours of Pannellum: a configuration in JSON, or as an object literal in HTML or JavaScript.
+
+Angles are degrees: yaw to the right of the centre, pitch above the horizon. Faces are in the order front, right, back,
+left, up, down, and have the letters f r b l u d. Levels of tiles count from 1, the smallest; each is twice as large as
+the one before.
+
+Source: https://pannellum.org/documentation/reference/; https://github.com/mpetroff/pannellum:
+doc/json-config-parameters.md, utils/multires/generate.py (levels and tiles), src/js/libpannellum.js (faces).
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any
+
+from msgspec import Meta
+
+from pansplat.errors import InputError, InputWarning
+from pansplat.images.cube_faces import find_gap, find_layout, require_faces
+from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
+from pansplat.images.image_files import read_size, require_complete
+from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.web_tours.entries import (
+    MAX_BYTES,
+    Entry,
+    Number,
+    Pixels,
+    locate,
+    optional,
+    plain_text,
+    read_direction,
+    read_entries,
+    read_note,
+    read_text,
+    require_tiles,
+)
+from pansplat.inputs.web_tours.javascript import parse_literal, skip_space
+from pansplat.system.strict_json import convert
+
+SUFFIXES = (".json", ".html", ".htm", ".js")
+_NAMES = ("tour.json", "pannellum.json", "config.json")  # looked at first
+_OTHERS = ("poses.json", "pairs.json", "links.json", "camera_pose.json")  # files of this package
+_PICTURES = ("panorama", "cubeMap", "multiRes")
+_FACES = "frblud"
+_MAX_LEVEL = 20
+_CALL = re.compile(r"pannellum\s*\.\s*viewer\s*\(")
+_EMBEDDED = re.compile(r"pannellum\.html?([?#][^\"'\s]*)")
+_STATED = re.compile(r"[?#&]config=([^?#&]+)")
+_SETTING = re.compile(r"(?<![\w$.])([A-Za-z_$][\w$]*)\s*=\s*(?=\{)")
+_MAX_FRAMES = 100  # of a page
+_NAME = re.compile(r"[A-Za-z_$][\w$]*")
+
+
+def find_pannellum(folder: Path) -> Path | None:
+    """A file of the folder that holds a configuration; a tour.json also if it holds none.
+
+    Raises:
+        OSError: the folder cannot be listed.
+    """
+    files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES and path.name not in _OTHERS]
+    rank = {name: place for place, name in enumerate(_NAMES)}
+    files.sort(key=lambda path: (rank.get(path.name, len(rank)), SUFFIXES.index(path.suffix.lower())))
+    for path in files:
+        if not path.is_file() or path.stat().st_size > MAX_BYTES:
+            continue
+        try:
+            if path.name == _NAMES[0] or _find_configuration(path) is not None:
+                return path
+        except InputError:
+            continue
+    return None
+
+
+def read_pannellum(source: Path) -> tuple[str, list[Entry]]:
+    """The title of a tour and its scenes, or its only panorama; the first scene of the tour is the first."""
+    content = _find_configuration(source)
+    if content is None:
+        got = "an HTML page" if read_text(source).lstrip().startswith("<") else "other text"
+        raise InputError(
+            f'{source}: needed a tour of Pannellum or of the Marzipano Tool, got {got} without "scenes", "panorama", '
+            '"cubeMap" or "multiRes"; give the folder of the tour, or download it again.'
+        )
+    stated = content.get("default")
+    common: dict[str, Any] = stated if isinstance(stated, dict) else {}
+    scenes = content.get("scenes")
+    if isinstance(scenes, dict):
+        outside = {key: value for key, value in content.items() if key not in ("default", "scenes", "title")}
+        first = str(common.get("firstScene", content.get("firstScene", "")))
+        merged = {
+            key: {**outside, **common, **scene} if isinstance(scene, dict) else scene for key, scene in scenes.items()
+        }
+        ordered = sorted(merged.items(), key=lambda item: item[0] != first)
+    else:
+        ordered = [(source.resolve().parent.name if source.stem in ("index", "tour") else source.stem, content)]
+    entries = read_entries(source, iter(ordered), lambda key, scene: _read_scene(key, scene, source))
+    return plain_text(common.get("title", content.get("title") if isinstance(scenes, dict) else "")), entries
+
+
+def _find_configuration(source: Path) -> dict[str, Any] | None:
+    """The configuration in a file, or in the JSON file that an embedded viewer names; None if there is none."""
+    text = read_text(source)
+    if source.suffix.lower() == ".json":
+        start = len(text) - len(text.lstrip())
+        if not text[start:].startswith("{") or not any(
+            f'"{key}"' in text or key in text for key in ("scenes", *_PICTURES)
+        ):
+            return None
+        return _accept(parse_literal(text, start, source)[0])
+    for literal in _list_arguments(text, source):
+        if _accept(literal) is not None:
+            return literal
+    names = (name for found in _EMBEDDED.finditer(text) for name in _STATED.findall(found[1]))
+    for name in islice(names, _MAX_FRAMES):
+        file = source.parent / locate(source.parent, name)
+        if file.suffix.lower() == ".json" and file.is_file() and file.parent == source.parent:
+            return _find_configuration(file)
+    return None
+
+
+def _list_arguments(text: str, source: Path) -> Iterator[Any]:
+    """The second arguments of the calls of a page, each a literal or a variable that was set to one.
+
+    The time is proportional to the length of the text: calls in arguments of others are no calls, a variable is read
+    once, and no more once those that were read add up to twice the text.
+    """
+    settings: dict[str, int] = {}  # positions of values, found at the first variable
+    position, left = 0, 2 * len(text)
+    while (call := _CALL.search(text, position)) is not None:
+        value, position = parse_literal(text, call.end(), source)
+        if not text.startswith(",", position):
+            continue
+        start = skip_space(text, position + 1)
+        value, position = parse_literal(text, start, source)
+        name = _NAME.match(text, start)
+        if value is None and name is not None and left > 0:
+            for found in () if settings else _SETTING.finditer(text):
+                settings.setdefault(found[1], found.end())
+            begin = settings.get(name.group(), len(text))
+            settings[name.group()] = len(text)
+            if begin < len(text):
+                value, end = parse_literal(text, begin, source)
+                left -= end - begin
+        yield value
+
+
+def _accept(content: Any) -> dict[str, Any] | None:
+    if not isinstance(content, dict):
+        return None
+    scenes = content.get("scenes")
+    is_tour = isinstance(scenes, dict) and any(isinstance(scene, dict) for scene in scenes.values())
+    return content if is_tour or any(content.get(key) for key in _PICTURES) else None
+
+
+def _spots(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
+    spots = scene.get("hotSpots")
+    return [spot for spot in spots if isinstance(spot, dict)] if isinstance(spots, list) else []
+
+
+def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
+    kind = scene.get("type", "equirectangular")
+    readers = {"equirectangular": _read_equirect, "cubemap": _read_cube_map, "multires": _read_tiles}
+    if not isinstance(kind, str) or kind not in readers:
+        raise InputError(f"needed the type {', '.join(readers)}, got {str(kind)[:40]!r}")
+    if scene.get("dynamic"):
+        raise InputError("needed a picture, got a video")
+    picture = readers[kind](scene, source.parent)
+    has_start = "yaw" in scene or "pitch" in scene
+    start = optional(f"{source}: the start view of {key}", lambda: _read_direction(scene)) if has_start else None
+    links = [
+        optional(f"{source}: a link of {key}", lambda spot=spot: _read_link(spot))
+        for spot in _spots(scene)
+        if spot.get("sceneId")
+    ]
+    notes = [
+        optional(f"{source}: a hot spot of {key}", lambda spot=spot: _read_note(spot))
+        for spot in _spots(scene)
+        if not spot.get("sceneId")
+    ]
+    title = plain_text(scene.get("title"))
+    return Entry(key, picture, title, tuple(filter(None, links)), tuple(filter(None, notes)), start)
+
+
+def _read_link(spot: Mapping[str, Any]) -> Link:
+    return Link(str(spot["sceneId"]), *_read_direction(spot), plain_text(spot.get("text")))
+
+
+def _read_note(spot: Mapping[str, Any]) -> Note:
+    text = spot.get("text")
+    picture = [f"[{str(spot['image']).rpartition('/')[2]}]"] if spot.get("image") else []
+    shown = [html.escape(each) for each in (text, *picture) if isinstance(each, str)]  # Pannellum shows no HTML
+    return read_note(_read_direction(spot), shown, [spot.get(name) for name in ("URL", "image", "video")])
+
+
+def _read_direction(content: Mapping[str, Any]) -> tuple[float, float]:
+    yaw, pitch = read_direction(content, unit=math.radians(1))
+    return yaw, -pitch
+
+
+def _base(scene: Mapping[str, Any]) -> list[Any]:
+    return [scene["basePath"]] if scene.get("basePath") else []
+
+
+def _read_equirect(scene: Mapping[str, Any], folder: Path) -> Path | CubeImage:
+    image = folder / locate(folder, *_base(scene), scene.get("panorama"))
+    spans = [
+        convert(scene.get(name, whole), Number, name, strict=False) for name, whole in (("haov", 360), ("vaov", 180))
+    ]
+    if spans != [360, 180]:
+        raise InputError(f"needed a picture of 360 x 180 degrees, got {spans[0]:g} x {spans[1]:g} (haov, vaov)")
+    width, height = read_size(image)
+    if width == 2 * height:
+        require_complete(image)
+        return image
+    layout = find_layout(image)
+    if layout is None:
+        raise InputError(f"{image}: needed a 2:1 equirectangular panorama, got {width}x{height} (width x height)")
+    return layout
+
+
+def _read_cube_map(scene: Mapping[str, Any], folder: Path) -> CubeImage:
+    files = scene.get("cubeMap")
+    if not isinstance(files, list) or len(files) != 6:
+        raise InputError('needed six files as "cubeMap", got another value')
+    faces = tuple(locate(folder, *_base(scene), file) for file in files)
+    pixels = require_faces([folder / face for face in faces])
+    return CubeImage(folder, (CubeLevel(pixels, pixels, faces),))
+
+
+def _read_tiles(scene: Mapping[str, Any], folder: Path) -> CubeImage:
+    stated = scene.get("multiRes")
+    if not isinstance(stated, dict):
+        raise InputError('needed an object as "multiRes", got another value')
+    base = _base(scene) + ([stated["basePath"]] if stated.get("basePath") else [])
+    suffix = f".{stated.get('extension') or 'jpg'}"
+    kinds = {"tileResolution": Pixels, "cubeResolution": Pixels, "maxLevel": Annotated[int, Meta(ge=1, le=_MAX_LEVEL)]}
+    tile, full, highest = (convert(stated.get(name), kind, name, strict=False) for name, kind in kinds.items())
+    require_tiles(min(full, MAX_SIZE), tile)
+    levels: list[CubeLevel] = []
+    gaps: list[str] = []
+    for number in range(1, highest + 1):
+        pixels = full >> (highest - number)
+        faces = _fill(folder, base, stated.get("path"), suffix, {"%l": str(number), "%y": ROW, "%x": COLUMN})
+        if not 0 < pixels <= MAX_SIZE:
+            continue
+        level = CubeLevel(pixels, tile, faces)
+        gap = find_gap(level, folder)
+        if gap is None:
+            levels.append(level)
+        else:
+            gaps.append(gap)
+    if stated.get("fallbackPath") and not levels:
+        faces = _fill(folder, base, stated["fallbackPath"], suffix, {})
+        if all((folder / face).is_file() for face in faces):
+            pixels = require_faces([folder / face for face in faces])
+            levels.append(CubeLevel(pixels, pixels, faces))
+    if not levels:
+        raise InputError(
+            f"needed all tiles of a level, but {gaps[-1] if gaps else 'there is none'}; copy the tour again"
+        )
+    if gaps and levels[-1].size < min(full, MAX_SIZE):
+        warnings.warn(
+            f"{folder}/{gaps[-1]}; the panorama is read at {levels[-1].size} pixels a face, not {full}.",
+            category=InputWarning,
+            stacklevel=4,
+        )
+    return CubeImage(folder, tuple(levels))
+
+
+def _fill(folder: Path, base: list[Any], pattern: Any, suffix: str, values: Mapping[str, str]) -> tuple[str, ...]:
+    """The paths of the six faces from a format string of tiles."""
+    if not isinstance(pattern, str) or "%s" not in pattern:
+        raise InputError(f"needed a path with %s for the face, got {str(pattern)[:40]!r}")
+    faces = []
+    for face in _FACES:
+        path = pattern.replace("%s", face)
+        for sign, value in values.items():
+            path = path.replace(sign, value)
+        faces.append(locate(folder, *base, path, suffix=suffix))
+    return tuple(faces)

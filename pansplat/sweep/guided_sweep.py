@@ -1,0 +1,204 @@
+"""The default predictor: a sweep with a prior of depth from a small trained network."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from importlib.resources import files
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import interpolate
+
+from pansplat.errors import InputError
+from pansplat.model.layers import to_channels_last
+from pansplat.model.weights import (
+    build_on_meta,
+    config_from_dict,
+    load_weights,
+    pack_weights,
+    require_shapes,
+    save_weights,
+)
+from pansplat.networks.depth_network import DepthEstimate
+from pansplat.networks.depth_refinement import DepthRefinement, Observations, RefinementConfig
+from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.sweep import Sweep
+from pansplat.sweep.predictor import SweepConfig
+from pansplat.sweep.prior import DepthPrior
+from pansplat.sweep.search import SearchConfig
+from pansplat.sweep.surface import resize_sphere
+from pansplat.system.source_hash import hash_sources
+
+MODEL = "depth"  # name of the network in a weights file
+SHARPENING = "depth_sharpening"  # name of the sharpening network
+_SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
+
+
+class GuidedSweep(Sweep):
+    """A sweep guided by a depth network.
+
+    Args:
+        network: in eval mode.
+        sharpening: of a single view's depth; in eval mode.
+        weights_hash: changes with the weights.
+        name: in messages and scene files.
+    """
+
+    def __init__(
+        self, network: DepthRefinement, sharpening: DepthSharpening, weights_hash: str, name: str = "default"
+    ) -> None:
+        config = SweepConfig(search=SearchConfig(finest_height=_SEARCH_HEIGHT))
+        super().__init__(config, NetworkPrior(network, sharpening, weights_hash + hash_sources(__name__)))
+        self.name, self.network = name, network
+
+
+def load_guided_sweep(path: Path, name: str = "default") -> GuidedSweep:
+    """The guided sweep of a weights file that `save_depth_network` wrote, with the package's sharpening network."""
+    network = _load_network(path, MODEL, RefinementConfig, DepthRefinement)
+    sharpening = load_sharpening(_shipped("sharpening.safetensors"))
+    return GuidedSweep(network, sharpening, _hash_files(path, _shipped("sharpening.safetensors")), name)
+
+
+@lru_cache(maxsize=1)
+def load_default_sweep() -> GuidedSweep:
+    """The guided sweep of the weights that the package ships; it is loaded once."""
+    return load_guided_sweep(default_weights())
+
+
+def load_sharpening(path: Path) -> DepthSharpening:
+    """The sharpening network of a weights file that `save_sharpening` wrote, in eval mode."""
+    return _load_network(path, SHARPENING, SharpeningConfig, DepthSharpening)
+
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def _load_network(path: Path, model: str, config_type: type, network_type: Callable[..., Network]) -> Network:
+    """A network in eval mode; all names and shapes of the weights must fit."""
+    weights = load_weights(path)
+    if weights.model != model:
+        raise InputError(f"{path}: needed weights of a {model} network, got weights of {weights.model!r}")
+    config = config_from_dict(config_type, weights.config, f"{path}: config")
+    expected = build_on_meta(lambda: network_type(config), model, path).state_dict()
+    require_shapes(weights.tensors, expected, path)
+    network = network_type(config)
+    network.load_state_dict(weights.tensors)
+    return network.eval()
+
+
+def save_depth_network(path: Path, network: DepthRefinement, state: dict[str, Tensor]) -> None:
+    """Write a network's weights: kernels in float16, the rest in float32.
+
+    Args:
+        state: the weights, such as their moving average.
+    """
+    _save(path, MODEL, network.config, state)
+
+
+def save_sharpening(path: Path, network: DepthSharpening, state: dict[str, Tensor]) -> None:
+    """The same for the sharpening network."""
+    _save(path, SHARPENING, network.config, state)
+
+
+def _save(path: Path, model: str, config: object, state: dict[str, Tensor]) -> None:
+    half = {name: t.half() if t.is_floating_point() and t.ndim > 1 else t for name, t in state.items()}
+    save_weights(path, pack_weights(model, config, half, compat="fixed"))
+
+
+def default_weights() -> Path:
+    """The weights of the depth network that the package ships."""
+    return _shipped("model.safetensors")
+
+
+def _shipped(name: str) -> Path:
+    return Path(str(files("pansplat.default_model").joinpath(name)))
+
+
+def _hash_files(*paths: Path) -> str:
+    digest = hashlib.blake2b(digest_size=8)
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+class NetworkPrior:
+    """A `PriorModel` of a depth network.
+
+    Args:
+        network: in eval mode.
+        sharpening: in eval mode.
+        fingerprint: changes with the weights.
+        height: height of the panoramas that the depth network sees, pixels.
+    """
+
+    def __init__(
+        self, network: DepthRefinement, sharpening: DepthSharpening, fingerprint: str, height: int = 128
+    ) -> None:
+        self.network, self.sharpening, self.fingerprint, self.height = network, sharpening, fingerprint, height
+
+    @torch.no_grad()
+    def observe(self, images: Sequence[np.ndarray]) -> NetworkObservation:
+        """Observe upright panoramas (h, w, 3), RGB in [0, 1]."""
+        maps = torch.stack([torch.from_numpy(image).permute(2, 0, 1) for image in images]).float()
+        small = interpolate(maps, (self.height, 2 * self.height), mode="area")
+        estimate, observed = self.network.observe(to_channels_last(small))
+        return NetworkObservation(self.network, estimate, observed, partial(self._sharpen, maps, estimate))
+
+    @torch.no_grad()
+    def _sharpen(self, maps: Float[Tensor, "view 3 h w"], estimate: DepthEstimate) -> list[np.ndarray]:
+        """Sharpened log-depth of the panoramas, in camera heights; one after another, in bounded memory."""
+        height = self.sharpening.config.height
+        large = [torch.from_numpy(resize_sphere(_as_image(m), height)).permute(2, 0, 1)[None] for m in maps]
+        sharp = [
+            self.sharpening(to_channels_last(image), DepthEstimate(*(map[n : n + 1] for map in estimate)))[0]
+            for n, image in enumerate(large)
+        ]
+        return [log_depth[0].float().numpy() for log_depth in sharp]
+
+
+class NetworkObservation:
+    """`ObservedViews` of a depth network."""
+
+    def __init__(
+        self,
+        network: DepthRefinement,
+        estimate: DepthEstimate,
+        observed: Observations,
+        sharpen: Callable[[], list[np.ndarray]],
+    ) -> None:
+        self.network, self._observed, self.sharpen = network, observed, sharpen
+        self.priors = _as_priors(estimate)
+
+    @torch.no_grad()
+    def refine(
+        self,
+        estimates: Sequence[DepthPrior],
+        cam2world: np.ndarray,
+        neighbours: Sequence[Sequence[int]],
+        iterations: int,
+    ) -> list[DepthPrior]:
+        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of each view with its neighbours."""
+        log_depth = torch.from_numpy(np.stack([estimate.log_depth for estimate in estimates])).float()
+        log_scale = torch.from_numpy(np.stack([estimate.scale for estimate in estimates])).float().log()
+        estimate = DepthEstimate(log_depth, log_scale)
+        pairs = [(view, other) for view, others in enumerate(neighbours) for other in others]
+        for _ in range(iterations):
+            estimate = self.network.refine(self._observed, estimate, torch.from_numpy(cam2world), pairs)
+        return _as_priors(estimate)
+
+
+def _as_image(maps: Float[Tensor, "c h w"]) -> np.ndarray:
+    return np.ascontiguousarray(maps.permute(1, 2, 0).numpy())
+
+
+def _as_priors(estimate: DepthEstimate) -> list[DepthPrior]:
+    return [
+        DepthPrior(log_depth.float().numpy(), log_scale.exp().float().numpy())
+        for log_depth, log_scale in zip(estimate.log_depth, estimate.log_scale, strict=True)
+    ]

@@ -1,0 +1,162 @@
+"""Infinite batches of samples, read by worker processes.
+
+Batch n is determined by the seed and n, for any number of workers: each epoch is a permutation of the source, and the
+random numbers of a sample are seeded by (seed, epoch, index). A run can therefore be resumed at any step.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import signal
+import sys
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from multiprocessing.context import BaseContext
+
+import numpy as np
+from torch.utils.data import DataLoader, Dataset
+
+from pansplat.errors import InputError
+from pansplat.inputs.views import Batch, Sample, collate
+from pansplat.training.augment import Augmentation, augment
+from pansplat.training.sources import SampleSource
+
+_MAX_FAILURES = 32  # consecutive unreadable samples before an error
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A sample that could not be read; `message` names the file and the reason."""
+
+    index: int
+    message: str
+
+
+class Loader:
+    """Batches of a source.
+
+    Args:
+        source: the samples; sent to the workers once.
+        height: height of the panoramas, pixels.
+        batch_size: samples per batch and process.
+        seed: seed of the order and of the samples' random numbers.
+        workers: processes that read; 0 to read in this process.
+        augmentation: None for no augmentation.
+        rank, world_size: index of this process, and number of processes in distributed training.
+
+    Attributes:
+        skipped: by message, the number of times that an unreadable sample was skipped. The first time it warns.
+    """
+
+    def __init__(
+        self,
+        source: SampleSource,
+        *,
+        height: int,
+        batch_size: int,
+        seed: int = 0,
+        workers: int = 0,
+        augmentation: Augmentation | None = None,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        if len(source) == 0:
+            raise InputError("needed at least one sample, got an empty source; give other data.")
+        if batch_size < 1 or workers < 0 or not 0 <= rank < world_size:
+            raise InputError(
+                f"needed batch_size >= 1, workers >= 0 and 0 <= rank < world_size, got {batch_size}, {workers}, {rank} "
+                f"and {world_size}."
+            )
+        self.reader = _Reader(source, height, seed, augmentation)
+        self.batch_size, self.workers, self.rank, self.world_size = batch_size, workers, rank, world_size
+        self.skipped: Counter[str] = Counter()
+
+    def batches(self, step: int = 0) -> Iterator[Batch]:
+        """Infinite batches, starting at a step."""
+        loader = DataLoader(
+            self.reader,
+            batch_sampler=self._positions(step),
+            num_workers=self.workers,
+            collate_fn=_identity,
+            worker_init_fn=_ignore_interrupts,
+            multiprocessing_context=_worker_context() if self.workers else None,
+        )
+        for read in loader:
+            self._count(itertools.chain.from_iterable(skipped for _, skipped in read))
+            samples = [sample for sample, _ in read if sample is not None]
+            if len(samples) < len(read):
+                raise InputError(self._describe_failures([skipped for _, skipped in read]))
+            yield collate(samples)
+
+    def _positions(self, step: int) -> Iterable[list[int]]:
+        for number in itertools.count(step):
+            first = (number * self.world_size + self.rank) * self.batch_size
+            yield list(range(first, first + self.batch_size))
+
+    def _count(self, skipped: Iterable[Skipped]) -> None:
+        for failure in skipped:
+            self.skipped[failure.message] += 1
+            if self.skipped[failure.message] == 1:
+                warnings.warn(
+                    f"skipped sample {failure.index} ({len(self.skipped)} unreadable so far): {failure.message}",
+                    stacklevel=3,
+                )
+
+    def _describe_failures(self, failures: list[list[Skipped]]) -> str:
+        worst = max(failures, key=len)
+        examples = "\n  ".join(dict.fromkeys(failure.message for failure in worst[:3]))
+        return (
+            f"needed readable samples, got {len(worst)} consecutive unreadable ones (of {len(self.reader.source)}); "
+            f"check the first of them:\n  {examples}"
+        )
+
+
+def _ignore_interrupts(_: int) -> None:
+    """Ignore Ctrl-C in a worker: a terminal sends it to all processes, but the current step needs the workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
+    """The sample at a position of the infinite sequence of epochs, and the samples that were skipped for it."""
+
+    def __init__(self, source: SampleSource, height: int, seed: int, augmentation: Augmentation | None) -> None:
+        self.source, self.height, self.seed, self.augmentation = source, height, seed, augmentation
+
+    def __getitem__(self, position: int) -> tuple[Sample | None, list[Skipped]]:
+        count = len(self.source)
+        epoch, place = divmod(position, count)
+        order = _permutation(self.seed, epoch, count)
+        skipped: list[Skipped] = []
+        for k in range(min(count, _MAX_FAILURES)):  # the next sample of the epoch replaces an unreadable one
+            index = int(order[(place + k) % count])
+            try:
+                return self._read(epoch, index, place), skipped
+            except (InputError, OSError) as error:
+                skipped.append(Skipped(index, str(error)))
+        return None, skipped
+
+    def _read(self, epoch: int, index: int, place: int) -> Sample:
+        """The sample at an index. The seed includes `place`, so that two reads of a sample in one epoch differ."""
+        seeds = np.random.SeedSequence((self.seed, epoch, index, place)).spawn(2)
+        sample = self.source.sample(index, self.height, int(seeds[0].generate_state(1)[0]))
+        if self.augmentation is None:
+            return sample
+        return augment(sample, self.augmentation, np.random.default_rng(seeds[1]))
+
+
+@lru_cache(maxsize=4)
+def _permutation(seed: int, epoch: int, count: int) -> np.ndarray:
+    return np.random.default_rng((seed, epoch)).permutation(count)
+
+
+def _identity(read: list[tuple[Sample | None, list[Skipped]]]) -> list[tuple[Sample | None, list[Skipped]]]:
+    return read
+
+
+def _worker_context() -> BaseContext:
+    """Start fresh processes: a fork could inherit locks that threads of this process hold."""
+    return multiprocessing.get_context("spawn" if sys.platform == "win32" else "forkserver")

@@ -1,0 +1,30 @@
+"""The warm-up compiles all CPU kernels."""
+
+import subprocess
+import sys
+
+import pytest
+
+_CHECK = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from numba.core.caching import NullCache
+from numba.core.dispatcher import Dispatcher
+from pansplat.cli import warm_up
+warm_up.ProcessPoolExecutor = lambda count, context: ThreadPoolExecutor(1)  # so that this process holds the kernels
+warm_up.main()
+packages = "pansplat.rendering.cpu", "pansplat.sweep", "pansplat.refinement"
+modules = [m for name, m in sys.modules.items() if name.startswith(packages)]
+kernels = {k for m in modules for k in vars(m).values() if isinstance(k, Dispatcher)}
+called_by_kernels = {name for kernel in kernels for name in kernel.py_func.__code__.co_names}
+for kernel in kernels:
+    if kernel.__name__ not in called_by_kernels and not isinstance(kernel._cache, NullCache):
+        assert kernel.signatures, kernel
+"""
+
+
+@pytest.mark.slow
+def test_the_command_compiles_every_kernel_of_the_rasteriser_and_the_sweep_and_states_the_time() -> None:
+    done = subprocess.run([sys.executable, "-c", _CHECK], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("CPU kernels are compiled")

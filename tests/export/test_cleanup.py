@@ -1,0 +1,124 @@
+"""Floaters go, and surfaces and thin things stay; rooms are found by their names; changes are stated in dB."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.export.cleanup import Change, Cleaning, clean_up, compare_pictures, find_floaters
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.refinement import fuse_views
+
+_COUNT = 12000  # Gaussians of a camera
+
+
+def _make(means: torch.Tensor, scale: float, view: int) -> Gaussians:
+    count = len(means)
+    return Gaussians(
+        means.float(),
+        torch.full((count, 3), scale),
+        torch.tensor((1.0, 0, 0, 0)).expand(count, 4),
+        torch.full((count,), 0.95),
+        torch.sin(3 * means.float())[:, None],
+        torch.zeros(count, dtype=torch.int64),
+        torch.full((count,), view),
+    )
+
+
+def _make_room() -> tuple[Scene, torch.Tensor]:
+    """A room of 6 x 3 x 4 m with a lamp on a wire, seen by two cameras; and which Gaussians are those of the wire."""
+    low, high = torch.tensor((-3.0, -1.5, -2.0)).double(), torch.tensor((3.0, 1.5, 2.0)).double()
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[:, 0, 3] = torch.tensor((-0.8, 0.8))
+    rays = fibonacci_directions(_COUNT).double() + 1e-9
+    wire = torch.tensor((0.1, -1.5, 1.0)).double() + torch.arange(40)[:, None] * torch.tensor((0.0, 0.02, 0.0)).double()
+    parts, is_wire = [], []
+    for view, pose in enumerate(poses):
+        center = pose[:3, 3]
+        distance = (torch.where(rays > 0, high - center, low - center) / rays).amin(dim=1, keepdim=True)
+        parts += [_make(center + distance * rays, 0.05, view), _make(wire, 0.01, view)]
+        is_wire += [torch.zeros(_COUNT, dtype=torch.bool), torch.ones(40, dtype=torch.bool)]
+    scene = Scene(Gaussians.cat(parts), poses, 0.3, 8.0, ("left", "right"), "synthetic", 64)
+    return scene, torch.cat(is_wire)
+
+
+def _add_floaters(scene: Scene) -> tuple[Scene, torch.Tensor]:
+    """The scene with eleven Gaussians in its free space: single ones, two together, and one 30 m behind a wall."""
+    places = torch.tensor(
+        (
+            *((0.0, 0.0, 0.5), (-1.5, 0.3, -0.6), (1.9, -0.4, 0.9), (0.3, 0.8, -1.0), (-2.2, -0.7, 0.4)),
+            *((-0.6, -0.5, -1.2), (1.4, 0.6, 0.2), (0.9, 0.5, 1.2)),
+            *((-1.8, 0.5, 1.0), (-1.79, 0.51, 1.0), (30.0, 0.0, 0.0)),
+        )
+    )
+    views = torch.arange(len(places)) % 2
+    added = replace(_make(places, 0.03, 0), views=views)
+    dirty = replace(scene, gaussians=Gaussians.cat([scene.gaussians, added]))
+    return dirty, torch.arange(len(dirty.gaussians)) >= len(scene.gaussians)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_floaters_go_and_everything_else_stays(joint: bool) -> None:
+    scene, is_wire = _make_room()
+    assert not find_floaters(scene).any()
+    scene = fuse_views(scene) if joint else scene
+    dirty, is_added = _add_floaters(scene)
+    found = find_floaters(dirty)
+    assert torch.equal(found.nonzero()[:, 0], is_added.nonzero()[:-1, 0]), "the one behind the wall is kept"
+    assert joint or not found[: len(is_wire)][is_wire].any()
+    cleaned, (change,) = clean_up(dirty, Cleaning(floaters=False))
+    assert change == Change("floaters", len(dirty.gaussians), len(dirty.gaussians) - 10, (2, 2), change.psnr)
+    assert change.psnr is not None and 15 < change.psnr < 55
+    assert compare_pictures(scene, cleaned) > 60
+
+
+def test_the_unit_of_the_world_and_values_that_are_not_finite_have_no_influence() -> None:
+    dirty, _ = _add_floaters(_make_room()[0])
+    expected = find_floaters(dirty)
+    assert torch.equal(find_floaters(dirty.scaled(1000.0)), expected)
+    means = dirty.gaussians.means.clone()
+    means[5, 1] = math.nan
+    broken = replace(dirty, gaussians=replace(dirty.gaussians, means=means))
+    assert torch.equal(find_floaters(broken), expected)
+
+
+def test_without_cameras_isolated_gaussians_float() -> None:
+    dirty, is_added = _add_floaters(_make_room()[0])
+    foreign = replace(dirty, cam2world=dirty.cam2world[:0], names=())
+    assert torch.equal(find_floaters(foreign), is_added)
+    few = replace(foreign, gaussians=foreign.gaussians.select(torch.arange(9)))
+    assert not find_floaters(few).any()
+
+
+def test_an_opacity_cut_states_its_error() -> None:
+    scene, _ = _make_room()
+    opacities = torch.where(torch.arange(len(scene.gaussians)) % 4 > 0, 0.9, 0.2)
+    scene = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
+    cleaned, (change,) = clean_up(scene, Cleaning(min_opacity=0.5))
+    assert len(cleaned.gaussians) == change.after == int((opacities > 0.5).sum()) and change.cameras == (2, 2)
+    assert change.psnr is not None and 10 < change.psnr < 60
+    assert f"{change.before - change.after:,} of {change.before:,} Gaussians left out" in str(change)
+    assert f"agree to {change.psnr:.1f} dB" in str(change)
+    _, (none,) = clean_up(scene, Cleaning(min_opacity=0.1))
+    assert none.psnr == math.inf and "did not change" in str(none)
+    assert clean_up(scene, Cleaning()) == (scene, [])
+
+
+def test_a_crop_counts_the_cameras_that_go() -> None:
+    scene, _ = _make_room()
+    cleaned, (change,) = clean_up(scene, Cleaning(box=(-3, -2, -3, 0, 2, 3)))
+    assert change.cameras == (2, 1) and cleaned.names == ("left",)
+    assert "and 1 of 2 cameras; the picture at the 1 camera before and after agree" in str(change)
+
+
+def test_unknown_rooms_and_scenes_without_cameras_are_refused() -> None:
+    scene, _ = _make_room()
+    with pytest.raises(
+        InputError, match=r"needed the name of a room or panorama, got 'attic'; choose from .*left.*right"
+    ):
+        clean_up(scene, Cleaning(rooms=("attic",)))
+    with pytest.raises(InputError, match="rooms need a scene with input cameras"):
+        clean_up(replace(scene, cam2world=scene.cam2world[:0], names=()), Cleaning(rooms=("left",)))

@@ -1,0 +1,674 @@
+"""What a blur mask hides has no influence on anything that is read, and masks that cannot be used are refused."""
+
+import json
+import re
+import shutil
+import unicodedata
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pansplat import pipeline
+from pansplat.batch import _hash_pair
+from pansplat.cli.pose import Pose
+from pansplat.errors import InputError, InputWarning
+from pansplat.export.training_set import PosedPanorama, write_dataset
+from pansplat.geometry.cubemap import face_poses
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.images.blur_masks import blur_hidden, find_blur_mask, resize_hidden, widen_hidden
+from pansplat.images.cube_images import CubeImage, CubeLevel, write_cube
+from pansplat.images.image_files import read_blur_mask, read_hidden, read_panorama, read_thumbnail, write_image
+from pansplat.images.rig_images import Lens
+from pansplat.images.video import write_video
+from pansplat.inputs.folders import UnposedPanoramasError, load_pairs
+from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.reconstructions.colmap import write_colmap
+from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
+from pansplat.poses.files import _hash_inputs
+from pansplat.training.sequences import LOCATIONS, read_loc360, read_video_folder
+
+HEIGHT = 64
+HIDDEN = np.zeros((HEIGHT, 2 * HEIGHT), bool)
+HIDDEN[20:44, :10] = HIDDEN[20:44, 118:] = True  # across the seam
+HIDDEN[58:, 40:60] = True
+WIDE = widen_hidden(HIDDEN)  # what is blurred
+
+
+def _make_photograph(person: int = 0) -> np.ndarray:
+    """A room that does not change and, where it is hidden, another person for each number."""
+    pixels = np.random.default_rng(7).integers(60, 200, (HEIGHT, 2 * HEIGHT, 3), dtype=np.uint8)
+    pixels[HIDDEN] = np.random.default_rng(person).integers(0, 255, (int(HIDDEN.sum()), 3), dtype=np.uint8)
+    return pixels
+
+
+def _write(path: Path, person: int, mask: np.ndarray | None = HIDDEN) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(_make_photograph(person)).save(path)
+    if mask is not None:
+        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path.with_name(f"{path.stem}_blur.png"))
+    return path
+
+
+def _write_pair(folder: Path, person: int) -> Path:
+    poses = {}
+    for number, name in enumerate(("left.png", "right.png")):
+        _write(folder / name, person + number)
+        pose = np.eye(4)
+        pose[0, 3] = 0.5 * number
+        poses[name] = {"cam2world": pose.tolist()}
+    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    return folder
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+@pytest.mark.parametrize("height", [1, 2, 3, 50, HEIGHT])
+def test_hidden_pixels_have_no_influence_and_others_do_not_change(kind: type, height: int) -> None:
+    random = np.random.default_rng(0)
+    hidden = random.random((height, 2 * height)) < 0.7
+    hidden[0, 0], hidden[-1, -1] = True, False
+    scale = 1 if kind is np.uint8 else 255
+    first, second = ((random.integers(0, 255, (height, 2 * height, 3)) / scale).astype(kind) for _ in range(2))
+    second[~hidden] = first[~hidden]
+    blurred = blur_hidden(first, hidden)
+    assert blurred.dtype == kind and np.array_equal(blurred, blur_hidden(second, hidden))
+    assert np.array_equal(blurred[~hidden], first[~hidden])
+    assert blurred.min() >= 0 and blurred.max() <= 255 / scale
+
+
+def test_the_blur_is_the_colour_around_it_across_the_seam() -> None:
+    color = np.full((64, 128, 3), (10, 120, 230), np.uint8)
+    color[:, 40:90] = 0
+    hidden = np.zeros((64, 128), bool)
+    hidden[20:40, :20] = hidden[20:40, 110:] = True
+    assert np.abs(blur_hidden(color, hidden)[hidden].astype(int) - (10, 120, 230)).max() <= 1
+    rolled = blur_hidden(np.roll(color, 64, axis=1), np.roll(hidden, 64, axis=1))
+    assert np.array_equal(np.roll(rolled, 64, axis=1), blur_hidden(color, hidden))
+
+
+@pytest.mark.parametrize("height", [16, 64, 100])
+def test_a_mask_of_another_size_hides_every_pixel_that_it_touches(height: int) -> None:
+    resized = resize_hidden(HIDDEN, height, 2 * height)
+    assert resized.shape == (height, 2 * height)
+    rows, columns = np.nonzero(HIDDEN)
+    for offset in (0.01, 0.5, 0.99):
+        y, x = ((np.stack((rows, columns)) + offset) * height / HEIGHT).astype(int)
+        assert resized[y, x].all()
+    assert resized.mean() < 2 * HIDDEN.mean() + 0.05
+
+
+def test_white_that_is_transparent_hides_nothing(tmp_path: Path) -> None:
+    pixels = np.full((8, 16, 4), 255, np.uint8)
+    pixels[2:, :, 3] = 0
+    Image.fromarray(pixels).save(tmp_path / "a_blur.png")
+    hidden = read_blur_mask(tmp_path / "a_blur.png", 8)
+    assert hidden[:2].all() and not hidden[2:].any()
+
+
+def test_a_margin_is_hidden_across_the_seam() -> None:
+    hidden = np.zeros((256, 512), bool)
+    hidden[100, 511] = True
+    rows, columns = np.nonzero(widen_hidden(hidden))
+    assert {*rows.tolist()} == {98, 99, 100, 101, 102} and {*columns.tolist()} == {509, 510, 511, 0, 1}
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr"])
+def test_every_read_of_a_photograph_is_blurred(tmp_path: Path, suffix: str) -> None:
+    reads = []
+    for person in (1, 2):
+        path = tmp_path / f"{person}" / f"a{suffix}"
+        path.parent.mkdir()
+        # JPEG mixes pixels within blocks of 16: these are hidden as a whole.
+        mask = resize_hidden(HIDDEN, 4, 8).repeat(16, axis=0).repeat(16, axis=1)
+        if suffix == ".jpg":
+            Image.fromarray(_make_photograph(person)).save(path, quality=90)
+        else:
+            write_image(path, _make_photograph(person))
+        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path.with_name("a_blur.png"))
+        image, opaque = read_panorama(path, HEIGHT)
+        assert opaque.all()
+        reads.append((image, read_panorama(path, 32)[0], read_thumbnail(path, 16)))
+    for first, second in zip(*reads, strict=True):
+        assert torch.equal(first, second)
+
+
+def test_black_masks_change_nothing_and_a_mask_of_most_is_noted(tmp_path: Path) -> None:
+    plain = read_panorama(_write(tmp_path / "plain.png", 1, None), HEIGHT)[0]
+    assert torch.equal(read_panorama(_write(tmp_path / "a.png", 1, np.zeros_like(HIDDEN)), HEIGHT)[0], plain)
+    with pytest.warns(InputWarning, match=r"b_blur\.png: 9\d% of the photograph is blurred; white is blurred"):
+        read_panorama(_write(tmp_path / "b.png", 1, ~HIDDEN), HEIGHT)
+
+
+def test_cube_faces_of_a_panorama_are_blurred(tmp_path: Path, color_face: Callable[[str, int], np.ndarray]) -> None:
+    for face in "frblud":
+        Image.fromarray(color_face(face, 32)).save(tmp_path / f"hall_{face}.png")
+    (pair,) = load_pairs(tmp_path)
+    plain = pair.load_context(HEIGHT)
+    assert pair.context[0].name == "hall" and find_blur_mask(pair.context[0].image) is None
+    Image.fromarray(np.where(HIDDEN, 255, 0).astype(np.uint8)).save(tmp_path / "hall_blur.png")
+    (pair,) = load_pairs(tmp_path)
+    assert find_blur_mask(pair.context[0].image) == tmp_path / "hall_blur.png"
+    views = pair.load_context(HEIGHT)
+    hidden = torch.from_numpy(WIDE)
+    assert torch.equal(views.images[0][:, ~hidden], plain.images[0][:, ~hidden])
+    assert (views.images - plain.images).abs()[0][:, hidden].max() > 0.1
+
+
+def test_scenes_and_training_sets_of_different_hidden_people_are_equal(
+    tmp_path: Path, sphere_predictor: Callable[[], object]
+) -> None:
+    scenes, sets = [], []
+    for person in (1, 5):
+        (pair,) = load_pairs(_write_pair(tmp_path / f"{person}", person))
+        scenes.append(pipeline.predict(pair, sphere_predictor(), height=HEIGHT).gaussians)  # type: ignore[arg-type]
+        folder = tmp_path / f"set{person}"
+        folder.mkdir()
+        posed = [PosedPanorama(view, view.cam2world, pair.siblings) for view in pair.context]
+        write_dataset(folder, posed, np.zeros((1, 3)), np.zeros((1, 3), np.uint8), lambda what, done: None)
+        sets.append({file.name: file.read_bytes() for file in sorted(folder.rglob("*.png"))})
+    assert torch.equal(scenes[0].harmonics, scenes[1].harmonics) and torch.equal(scenes[0].means, scenes[1].means)
+    assert len(sets[0]) == 12 and sets[0] == sets[1], "the faces"
+
+
+def test_caches_depend_on_the_mask(tmp_path: Path, sphere_predictor: Callable[[], object]) -> None:
+    folder = _write_pair(tmp_path / "pair", 1)
+    (pair,) = load_pairs(folder)
+    predictor = sphere_predictor()
+
+    def list_keys() -> list[object]:
+        pipeline.predict(pair, predictor, height=HEIGHT)  # type: ignore[arg-type]
+        return [_hash_pair(pair), _hash_inputs(pair.context, 1.5), predictor.calls]  # type: ignore[attr-defined]
+
+    first = list_keys()
+    assert list_keys() == first
+    _write(folder / "left.png", 1, np.roll(HIDDEN, 4, axis=0))
+    second = list_keys()
+    assert all(a != b for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "message"),
+    [
+        (
+            "lefd_blur.png",
+            (128, 64),
+            r"lefd_blur\.png: needed the name of a panorama .* got 'lefd_\S*' \(did you mean left_",
+        ),
+        ("left_blur.png", (64, 64), r"left_blur\.png: needed a mask of the proportions .* 128x64, got 64x64"),
+        (
+            "left_blur.jpg",
+            (128, 64),
+            r"left_blur\.jpg: needed the name .* got 'left_blur\.jpg' \(did you mean left_blur\.png",
+        ),
+    ],
+)
+def test_a_mask_that_hides_nothing_by_mistake_is_refused(
+    tmp_path: Path, name: str, size: tuple[int, int], message: str
+) -> None:
+    folder = _write_pair(tmp_path / "pair", 1)
+    for mask in folder.glob("*_blur.png"):
+        mask.unlink()
+    Image.new("L", size).save(folder / name)
+    with warnings.catch_warnings(), pytest.raises(InputError, match=message):
+        warnings.filterwarnings("ignore", message=r".*has no pose of left_blur\.jpg")
+        load_pairs(folder)
+    (folder / "poses.json").unlink()
+    with pytest.raises(InputError, match=message):
+        load_pairs(folder)
+    if "lefd" not in name:
+        with pytest.raises(InputError, match=message):
+            load_pairs(folder / "left.png")
+
+
+def test_damaged_and_white_masks_are_refused(tmp_path: Path) -> None:
+    folder = _write_pair(tmp_path / "pair", 1)
+    mask = folder / "left_blur.png"
+    Image.new("L", (128, 64), 255).save(mask)
+    with pytest.raises(InputError, match=r"left_blur\.png: needed a blur mask with black .* got white only"):
+        load_pairs(folder)[0].load_context(HEIGHT)
+    mask.write_bytes(mask.read_bytes()[:60])
+    with pytest.raises(InputError, match=r"left_blur\.png: needed .* got damaged or truncated data"):
+        load_pairs(folder)
+    with pytest.raises(InputError, match=r"left_blur\.png: needed .* got damaged or truncated data"):
+        read_panorama(folder / "left.png", HEIGHT)
+
+
+def test_a_mask_is_no_panorama(tmp_path: Path) -> None:
+    _write(tmp_path / "a.png", 1)
+    (pair,) = load_pairs(tmp_path)
+    assert [view.name for view in pair.context] == ["a"]
+
+
+def _draw_mask(path: Path, hidden: np.ndarray = HIDDEN, kind: str = "blur") -> Path:
+    """A mask file: white hides in blur masks, black in the others."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    white = hidden if kind == "blur" else ~hidden
+    Image.fromarray(np.where(white, 255, 0).astype(np.uint8)).save(path, path.suffix[1:].lower().replace("jpg", "jpeg"))
+    return path
+
+
+@pytest.mark.parametrize(
+    "name", ["left_blur.PNG", "left_Blur.png", "LEFT_BLUR.PNG", "left_blur.png.png", "left_mask.PNG", "Left_Mask.png"]
+)
+@pytest.mark.parametrize("is_posed", [True, False])
+def test_a_mask_is_a_mask_in_any_case(tmp_path: Path, name: str, is_posed: bool) -> None:
+    kind = "blur" if "blur" in name.lower() else "mask"
+    for part in ("plain", "other"):
+        folder = _write_pair(tmp_path / part, 1)
+        for mask in folder.glob("*_blur.png"):
+            mask.unlink()
+    _draw_mask(tmp_path / "plain" / f"left_{kind}.png", kind=kind)
+    _draw_mask(tmp_path / "other" / name, kind=kind)
+    reads = []
+    for part in ("plain", "other"):
+        if is_posed:
+            panoramas = load_pairs(tmp_path / part)[0].context
+        else:
+            (tmp_path / part / "poses.json").unlink()
+            with pytest.raises(UnposedPanoramasError) as caught:
+                load_pairs(tmp_path / part)
+            panoramas = tuple(caught.value.panoramas)
+        assert [view.name for view in panoramas] == ["left", "right"]
+        pair = load_pairs(tmp_path / part / "left.png")[0]
+        views = [Pair("", tmp_path, (view,), (), 1, 2).load_context(HEIGHT) for view in panoramas]
+        views.append(pair.load_context(HEIGHT))
+        reads.append([tensor for view in views for tensor in (view.images, view.masks)])
+    for plain, other in zip(*reads, strict=True):
+        assert torch.equal(plain, other)
+    assert not torch.equal(reads[0][0][0], torch.from_numpy(_make_photograph(1)).permute(2, 0, 1) / 255) or (
+        not reads[0][1].all()
+    ), "the mask is applied"
+
+
+@pytest.mark.parametrize("name", ["mask.PNG", "Mask.png"])
+def test_the_mask_of_a_folder_is_one_in_any_case(tmp_path: Path, name: str, write_trajectory: Callable) -> None:
+    folders = [_write_pair(tmp_path / "pair", 1), write_trajectory(tmp_path / "walk")]
+    for folder in folders:
+        _draw_mask(folder / name, kind="mask")
+        assert torch.equal(load_pairs(folder)[0].load_context(HEIGHT).masks[0], torch.from_numpy(~HIDDEN)), folder
+
+
+@pytest.fixture
+def write_trajectory() -> Callable[[Path], Path]:
+    """Write two frames in images/ with the poses of a trajectory."""
+
+    def write(folder: Path) -> Path:
+        for number in (0, 1):
+            _write(folder / "images" / f"{number}.png", number, None)
+        (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
+        (folder / "scale.txt").write_text("1")
+        return folder
+
+    return write
+
+
+NEAR_LEFT = r"did you mean (\S*/)?left_"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "lefd_Blur.PNG",
+            rf"lefd_Blur\.PNG: needed the name of a panorama before _blur.* got 'lefd_\S*' \({NEAR_LEFT}blur",
+        ),
+        ("lefd_blur.jpg", rf"lefd_blur\.jpg: needed the name of a panorama .* got 'lefd_\S*' \({NEAR_LEFT}blur\.png"),
+        ("lefd_mask.png", rf"lefd_mask\.png: needed the name of a panorama .* got 'lefd_\S*' \({NEAR_LEFT}mask\.png"),
+        ("left.png_mask.png", rf"needed the name of a panorama .* got 'left\.png_mask\.png' \({NEAR_LEFT}mask\.png"),
+        (
+            "left_Mask.JPG",
+            r"left_Mask\.JPG: needed the name .* got 'left_Mask\.JPG' \(did you mean left_mask\.png\?\); rename, conv",
+        ),
+        (
+            "mask.jpg",
+            r"mask\.jpg: needed the name of a panorama before _mask\.png, got 'mask\.jpg'; rename, convert or",
+        ),
+        ("blur.png", r"/blur\.png: needed the name of a panorama before _blur"),
+        (
+            "masks/left_blur.png",
+            rf"masks/left_blur\.png: needed the name .* got 'left_blur\.png' \({NEAR_LEFT}blur\.png",
+        ),
+        ("deep/er/lefd_mask.png", r"deep/er/lefd_mask\.png: needed the name of a panorama"),
+        ("left_Blur.png", r"left\.png: needed one mask _blur, got left_Blur\.png, left_blur\.png; keep the right one"),
+    ],
+)
+@pytest.mark.parametrize("is_posed", [True, False])
+def test_a_mask_that_is_not_applied_is_refused(tmp_path: Path, name: str, message: str, is_posed: bool) -> None:
+    folder = _write_pair(tmp_path / "pair", 1)
+    if not is_posed:
+        (folder / "poses.json").unlink()
+    _draw_mask(folder / name, kind="blur" if "blur" in name.lower() else "mask")
+    with pytest.raises(InputError, match=message):
+        load_pairs(folder)
+
+
+def test_masks_that_poses_state_have_any_name(tmp_path: Path) -> None:
+    folder = _write_pair(tmp_path / "pair", 1)
+    content = json.loads((folder / "poses.json").read_text())
+    for number, name in enumerate(("masks/of_all_mask.png", "tripod_mask.jpg")):
+        _draw_mask(folder / name, kind="mask")
+        content["poses"][("left.png", "right.png")[number]]["mask"] = name
+    (folder / "poses.json").write_text(json.dumps(content))
+    assert not load_pairs(folder)[0].load_context(HEIGHT).masks.all()
+
+
+@pytest.mark.parametrize("source", ["file", "poses.json", "pose", "pose folder"])
+def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
+    folder = _write_pair(tmp_path / "pair", 1)
+    mask = _draw_mask(folder / "lefd_Blur.jpg") if source == "pose folder" else folder / "left_blur.png"
+    message = rf"{mask.name}: needed (a panorama, got the mask of another|the name of a panorama)"
+    if source == "poses.json":  # written by older versions
+        content = json.loads((folder / "poses.json").read_text())
+        content["poses"][mask.name] = content["poses"]["left.png"]
+        (folder / "poses.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=message):
+        if source == "file":
+            load_pairs(mask)
+        elif source == "poses.json":
+            load_pairs(folder)
+        else:
+            Pose((folder,) if source == "pose folder" else (folder / "left.png", mask, folder / "right.png")).run()
+
+
+@pytest.mark.parametrize("command", ["pose", "training"])
+@pytest.mark.parametrize("name", ["walk_blur.png", "Walk_Mask.PNG"])
+def test_a_mask_of_a_video_is_refused(tmp_path: Path, command: str, name: str) -> None:
+    frame = np.zeros((64, 128, 3), np.uint8)
+    write_video(tmp_path / "walk.mp4", iter([frame, frame]), 30)
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
+    _draw_mask(tmp_path / name)
+    with pytest.raises(InputError, match=rf"{name}: needed the name of a panorama before .* got '{name}'"):
+        if command == "pose":
+            Pose((tmp_path / "walk.mp4",), tmp_path / "frames").run()
+        else:
+            read_video_folder(tmp_path)
+
+
+def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:
+    folders = [tmp_path / location / "mapping" / "daytime_360_0" for location in LOCATIONS["test"]]
+    for folder in folders:
+        _write(folder / "image" / "frame_0.png", 0, None)
+        (folder / "camera_pose.json").write_text(json.dumps({"frame_0.png": np.eye(4).tolist()}))
+    assert read_loc360(tmp_path, "test")
+    _draw_mask(folders[-1] / "image" / "frame_1_blur.png")
+    with pytest.raises(InputError, match=r"frame_1_blur\.png: needed the name .* \(did you mean frame_0_blur"):
+        read_loc360(tmp_path, "test")
+
+
+SIDE = 48  # pixels along a face
+COVER = np.zeros((SIDE, SIDE), bool)  # what a mask of the front face covers
+COVER[16:36, 14:34] = True
+FACES = {"f": "front", "r": "right", "b": "back", "l": "left", "u": "up", "d": "down"}
+
+
+def _write_faces(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
+    """Six faces of hall; another person for each number is on the front face, where `COVER` is white."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for face in FACES:
+        pixels = color_face(face, SIDE)
+        if face == "f":
+            pixels[COVER] = np.random.default_rng(person).integers(0, 255, (int(COVER.sum()), 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"hall_{face}.png")
+    return folder
+
+
+def _write_strip(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
+    _write_faces(folder / "faces", color_face, person)
+    faces = [np.asarray(Image.open(folder / "faces" / f"hall_{face}.png")) for face in "frblud"]
+    shutil.rmtree(folder / "faces")
+    Image.fromarray(np.concatenate(faces, axis=1)).save(folder / "hall.png")
+    return folder
+
+
+def _write_set(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
+    """The faces with poses, as COLMAP and nerfstudio have them, in two places."""
+    (folder / "images").mkdir(parents=True)
+    lens = Lens(SIDE / 2, SIDE / 2, SIDE / 2, SIDE / 2, SIDE, SIDE)
+    rigs = []
+    for place in (0, 1):
+        _write_faces(folder / "faces", color_face, person if place == 0 else 0)
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 3] = place
+        rig = []
+        for face, turned in zip(FACES, face_poses(pose), strict=True):
+            name = f"000{place}_a_{FACES[face]}.png"
+            (folder / "faces" / f"hall_{face}.png").rename(folder / "images" / name)
+            rig.append((name, turned, lens))
+        rigs.append(rig)
+    (folder / "faces").rmdir()
+    (folder / "sparse" / "0").mkdir(parents=True)
+    write_colmap(folder / "sparse" / "0", rigs, np.empty((0, 3)), np.empty((0, 3), np.uint8))
+    shots = [(f"images/{name}", pose, shot_lens, None) for rig in rigs for name, pose, shot_lens in rig]
+    write_nerfstudio(folder / "transforms.json", shots, None)
+    (folder / "scale.txt").write_text("1\n")
+    return folder
+
+
+def _write_colmap(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
+    (_write_set(folder, color_face, person) / "transforms.json").unlink()
+    return folder
+
+
+def _write_uneven(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
+    """A rig that is no cube: without the face at the back."""
+    file = _write_set(folder, color_face, person) / "transforms.json"
+    content = json.loads(file.read_text())
+    content["frames"] = [frame for frame in content["frames"] if "_back" not in frame["file_path"]]
+    file.write_text(json.dumps(content))
+    return folder
+
+
+ASSEMBLED = {
+    "faces": (_write_faces, "hall_f_blur.png"),
+    "strip": (_write_strip, "hall_Blur.PNG"),
+    "nerfstudio": (_write_set, "images/0000_a_front_blur.png"),
+    "colmap": (_write_colmap, "images/0000_A_front_BLUR.png"),
+    "uneven": (_write_uneven, "images/0000_a_front_blur.png"),
+}
+
+
+def _cover(kind: str) -> np.ndarray:
+    """What the mask of a picture covers."""
+    return np.pad(COVER, ((0, 0), (0, 5 * SIDE))) if kind == "strip" else COVER
+
+
+def _load_first(folder: Path) -> Panorama:
+    return load_pairs(folder)[0].context[0]
+
+
+@pytest.mark.filterwarnings("ignore:.*in no picture")
+@pytest.mark.parametrize("kind", ASSEMBLED)
+@pytest.mark.parametrize(("height", "scale"), [(32, 2), (200, 1)])
+def test_a_mask_of_a_picture_hides_it_in_its_panorama(
+    tmp_path: Path, kind: str, height: int, scale: int, color_face: Callable[[str, int], np.ndarray]
+) -> None:
+    write, name = ASSEMBLED[kind]
+    reads = []
+    for person in (1, 2):
+        folder = write(tmp_path / f"{person}", color_face, person)
+        before = read_panorama(_load_first(folder).image, height)[0]
+        _draw_mask(folder / name, _cover(kind).repeat(scale, axis=0).repeat(scale, axis=1))
+        panorama = _load_first(folder)
+        image, shown = read_panorama(panorama.image, height)
+        reads.append((image, shown, read_thumbnail(panorama.image, 16)))
+        rays = pixel_directions(height, 2 * height)
+        x, y = ((rays[..., axis] / rays[..., 2] + 1) * SIDE / 2 for axis in (0, 1))
+        inside = (rays[..., 2] > 0) & (x > 14) & (x < 34) & (y > 16) & (y < 36)
+        far = (rays[..., 2] < 0) | (x < 4) | (x > 44) | (y < 4) | (y > 46)
+        assert torch.equal(image[:, far], before[:, far])
+        assert (image - before)[:, inside].abs().mean() > 0.1
+    for first, second in zip(*reads, strict=True):
+        assert torch.equal(first, second), "what is hidden has no influence"
+
+
+@pytest.mark.filterwarnings("ignore:.*in no picture")
+@pytest.mark.parametrize("kind", ASSEMBLED)
+def test_a_scene_mask_of_a_picture_masks_its_panorama(
+    tmp_path: Path, kind: str, color_face: Callable[[str, int], np.ndarray]
+) -> None:
+    write, name = ASSEMBLED[kind]
+    folder = write(tmp_path / "a", color_face, 1)
+    before = load_pairs(folder)[0].load_context(64).masks[0]
+    _draw_mask(folder / re.sub("blur", "mask", name, flags=re.IGNORECASE), _cover(kind), kind="mask")
+    after = load_pairs(folder)[0].load_context(64).masks[0]
+    rays = pixel_directions(64, 128)
+    x, y = ((rays[..., axis] / rays[..., 2] + 1) * SIDE / 2 for axis in (0, 1))
+    covered = (rays[..., 2] > 0) & (x > 15) & (x < 33) & (y > 17) & (y < 35)
+    far = (rays[..., 2] < 0) | (x < 12) | (x > 36) | (y < 14) | (y > 38)
+    assert not after[covered].any() and torch.equal(after[far], before[far]) and before[covered].all()
+
+
+def test_a_mask_of_a_tile_hides_it_at_all_levels(tmp_path: Path, write_tiles: Callable) -> None:
+    levels = []
+    for size in (32, 64):
+        write_tiles(size, 32, lambda face, row, column, size=size: tmp_path / f"{size}/{face}_{row}_{column}.png")
+        faces = tuple(f"{size}/{face}_{{row}}_{{column}}.png" for face in "frblud")
+        levels.append(CubeLevel(size, 32, faces))
+    image = write_cube(CubeImage(tmp_path, tuple(levels)), tmp_path, "hall")
+    before = [read_panorama(image, height)[0] for height in (24, 96)]
+    _draw_mask(tmp_path / "64" / "f_0_1_blur.png", np.ones((32, 32), bool))
+    for height, plain in zip((24, 96), before, strict=True):
+        changed = (read_panorama(image, height)[0] != plain).any(dim=0)
+        assert changed[3 * height // 8 + 1, height + 2 : 9 * height // 8].all() and not changed[:, : height // 2].any()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "size", "message"),
+    [
+        (
+            "faces",
+            "hall_f_blur.png",
+            (64, 32),
+            r"hall_f_blur\.png: needed a mask of the proportions .* 48x48, got 64x32",
+        ),
+        ("strip", "hall_blur.png", (64, 64), r"hall_blur\.png: needed a mask of the proportions .* 288x48, got 64x64"),
+        ("faces", "hall_blur.png", (64, 64), r"hall_blur\.png: needed a mask of the proportions .* 192x96, got 64x64"),
+        (
+            "faces",
+            "hall_g_blur.png",
+            (48, 48),
+            r"hall_g_blur\.png: needed the name .* \(did you mean hall_[frblud]_blur",
+        ),
+        ("colmap", "images/0000_a_blur.png", (64, 32), r"0000_a_blur.png: needed .*did you mean \S*/set/0000_a_blur"),
+        ("nerfstudio", "images/0000_a_frond_blur.png", (48, 48), r"frond_blur.* \(did you mean 0000_a_front_blur"),
+        ("colmap", "masks/0000_a_frond.png.png", (48, 48), r"frond\.png\.png: needed the name of a picture"),
+        ("nerfstudio", "masks/0000_a_front_blur.png", (48, 48), r"masks/0000_a_front_blur\.png: needed the name"),
+    ],
+)
+def test_a_mask_that_no_panorama_of_pictures_applies_is_refused(
+    tmp_path: Path, kind: str, name: str, size: tuple[int, int], message: str, color_face: Callable
+) -> None:
+    folder = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1)
+    (folder / name).parent.mkdir(exist_ok=True)
+    Image.new("L", size).save(folder / name)
+    with pytest.raises(InputError, match=message):
+        load_pairs(folder)
+
+
+@pytest.mark.parametrize("name", ["0000_a_front.png.png", "0000_A_front.PNG.png", "0000_a_front.png"])
+@pytest.mark.parametrize("kind", ["nerfstudio", "colmap"])
+def test_the_folder_masks_is_applied(tmp_path: Path, kind: str, name: str, color_face: Callable) -> None:
+    folder = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1)
+    _draw_mask(folder / "masks" / name, COVER, kind="mask")
+    with pytest.warns(InputWarning, match="in no picture"):
+        assert not load_pairs(folder)[0].load_context(64).masks[0, 34, 64]
+
+
+def test_a_stated_mask_that_is_missing_is_refused(tmp_path: Path, color_face: Callable) -> None:
+    file = _write_set(tmp_path / "set", color_face, 1) / "transforms.json"
+    content = json.loads(file.read_text())
+    content["frames"][3]["mask_path"] = "masks/a.png"
+    file.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"frame 3: needed the mask masks/a\.png, got no such file"):
+        load_pairs(file.parent)
+
+
+def test_a_mask_beside_a_rig_is_that_of_its_panorama(tmp_path: Path, color_face: Callable) -> None:
+    folder = _write_set(tmp_path / "set", color_face, 1)
+    _draw_mask(folder / "0000_a_mask.png", kind="mask")
+    _draw_mask(folder / "0001_A_Blur.PNG")
+    panoramas = load_pairs(folder)[0].context
+    assert panoramas[0].mask == folder / "0000_a_mask.png" and panoramas[1].mask is None
+    assert find_blur_mask(panoramas[1].image) == folder / "0001_A_Blur.PNG"
+
+
+def _link(path: Path, target: Path) -> None:
+    try:
+        path.symlink_to(target)
+    except OSError:
+        pytest.skip("no links here")
+
+
+def test_masks_beside_a_link_are_applied_and_those_beside_its_file_are_refused(
+    tmp_path: Path, color_face: Callable
+) -> None:
+    folder = _write_set(tmp_path / "set", color_face, 1)
+    file = folder / "images" / "0000_a_front.png"
+    (tmp_path / "store").mkdir()
+    moved = file.rename(tmp_path / "store" / file.name)
+    _link(file, moved)
+    mask = _draw_mask(folder / "images" / "0000_a_front_blur.png", COVER)
+    assert read_hidden(_load_first(folder).image, 64).any()
+    mask.rename(moved.with_name(mask.name))
+    with pytest.raises(InputError, match=r"store/0000_a_front_blur\.png: needed the name of a panorama"):
+        load_pairs(folder)
+
+
+@pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
+def test_a_name_has_its_mask_in_both_forms_of_unicode(tmp_path: Path, forms: tuple[str, str]) -> None:
+    """Copies from macOS have accents as characters of their own."""
+    picture, name = (unicodedata.normalize(form, "K\u00fcche") for form in forms)  # type: ignore[arg-type]
+    _write(tmp_path / f"{picture}.png", 1, None)
+    mask = _draw_mask(tmp_path / f"{name}_blur.png")
+    found = find_blur_mask(_load_first(tmp_path).image)
+    assert found is not None and found.samefile(mask)
+
+
+def test_scenes_and_caches_depend_on_masks_of_pictures(
+    tmp_path: Path, color_face: Callable, sphere_predictor: Callable[[], object]
+) -> None:
+    scenes = []
+    for person in (1, 2):
+        folder = _write_set(tmp_path / f"{person}", color_face, person)
+        (pair,) = load_pairs(folder)
+        before = _hash_pair(pair), _hash_inputs(pair.context, 1.5)
+        _draw_mask(folder / "images" / "0000_a_front_blur.png", COVER)
+        (pair,) = load_pairs(folder)
+        after = _hash_pair(pair), _hash_inputs(pair.context, 1.5)
+        assert before[0] != after[0] and before[1] != after[1]
+        scenes.append(pipeline.predict(pair, sphere_predictor(), height=HEIGHT).gaussians)  # type: ignore[arg-type]
+        new = tmp_path / f"new{person}"
+        new.mkdir()
+        posed = [PosedPanorama(view, view.cam2world, pair.siblings) for view in pair.context]
+        write_dataset(new, posed, np.zeros((1, 3)), np.zeros((1, 3), np.uint8), lambda what, done: None)
+    assert torch.equal(scenes[0].harmonics, scenes[1].harmonics) and torch.equal(scenes[0].means, scenes[1].means)
+    sets = [{file.name: file.read_bytes() for file in (tmp_path / f"new{n}").rglob("*.*")} for n in (1, 2)]
+    assert sets[0] == sets[1] and len(sets[0]) > 12
+
+
+def test_a_web_tour_names_the_picture_of_its_masks(tmp_path: Path) -> None:
+    """The name of a panorama of a tour is that of its scene, its mask has the name of its picture."""
+    _write(tmp_path / "panos" / "IMG_1.png", 1, None)
+    tour = {"scenes": {"kitchen": {"type": "equirectangular", "panorama": "panos/IMG_1.png"}}}
+    (tmp_path / "tour.json").write_text(json.dumps(tour))
+    _draw_mask(tmp_path / "kitchen_blur.png")
+    with pytest.raises(InputError, match=r"kitchen_blur\.png: needed the name .*did you mean \S*IMG_1_blur\.png"):
+        load_pairs(tmp_path)
+    (tmp_path / "kitchen_blur.png").rename(tmp_path / "panos" / "IMG_1_Blur.PNG")
+    assert find_blur_mask(_load_first(tmp_path).image) == tmp_path / "panos" / "IMG_1_Blur.PNG"
+
+
+def test_only_one_module_decodes_pictures_of_users() -> None:
+    root = Path(__file__).parents[2]
+    decoders = re.compile(r"\bImage\.open\(|\bimread\(|\bimdecode\(")
+    found = {
+        file.relative_to(root).as_posix()
+        for part in ("pansplat", "viewer")
+        for file in (root / part).rglob("*.py")
+        if decoders.search(file.read_text(encoding="utf-8"))
+    }
+    assert found == {"pansplat/images/image_files.py", "pansplat/images/panorama_metadata.py"}

@@ -1,0 +1,492 @@
+"""Every folder format gives the same cameras, and invalid folders are refused with the reason."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.images.image_files import write_image
+from pansplat.inputs.folders import UnposedPanoramasError, find_panorama_folders, load_pairs
+from pansplat.inputs.pairs import Link
+
+OPENCV = "cam2world opencv"
+
+
+def _pose(x: float, z: float = 0.0) -> list[list[float]]:
+    return [[0, 0, 1, x], [0, 1, 0, 0], [-1, 0, 0, z], [0, 0, 0, 1]]
+
+
+def _write_panorama(path: Path, value: float = 0.5) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, torch.full((3, 16, 32), value))
+
+
+def _write_depth(path: Path, millimetres: int) -> None:
+    cv2.imwrite(str(path), np.full((16, 32), millimetres, np.uint16))
+
+
+def _folder(folder: Path, names: Sequence[str] = ("left.png", "right.png"), **content: object) -> Path:
+    """A pair folder whose i-th camera is at x = i; `content` goes into poses.json, None removes an entry."""
+    for i, name in enumerate(names):
+        _write_panorama(folder / name, 0.1 * (i + 1))
+    poses = {"convention": OPENCV, "poses": {name: _pose(i) for i, name in enumerate(names)}} | content
+    (folder / "poses.json").write_text(json.dumps({k: v for k, v in poses.items() if v is not None}))
+    return folder
+
+
+def _centres(pair) -> list[float]:
+    return [float(panorama.cam2world[0, 3]) for panorama in pair.context]
+
+
+def test_two_images_with_poses_are_a_pair(tmp_path: Path) -> None:
+    (pair,) = load_pairs(_folder(tmp_path / "room"))
+    assert pair.name == "room"
+    assert [panorama.name for panorama in pair.context] == ["left", "right"]
+    assert (pair.targets, pair.near, pair.far) == ((), 0.45, 10.0)
+    views = pair.load_context(8)
+    assert views.images.shape == (2, 3, 8, 16)
+    assert views.images.mean(dim=(1, 2, 3)).tolist() == pytest.approx([0.1, 0.2], abs=3e-3)
+    assert views.cam2world.dtype == torch.float64
+    assert views.cam2world.tolist() == [_pose(0), _pose(1)]
+    assert views.masks.all()
+    assert views.names == ("left", "right")
+    assert views.depths is None
+    assert pair.load_targets(8).images.shape == (0, 3, 8, 16)
+
+
+def test_the_path_may_be_the_pose_file_and_pixels_are_decoded_only_by_load_context(tmp_path: Path, monkeypatch) -> None:
+    folder = _folder(tmp_path / "room")
+    monkeypatch.setattr("pansplat.images.image_files._decode", None)
+    assert load_pairs(folder / "poses.json")[0].name == load_pairs(str(folder))[0].name == "room"
+
+
+def test_a_damaged_picture_of_three_is_left_out_with_its_pairs(tmp_path: Path) -> None:
+    names = ("left.png", "middle.png", "right.png")
+    folder = _folder(tmp_path / "room", names)
+    (folder / "middle.png").write_bytes((folder / "middle.png").read_bytes()[:-30])
+    groups = [{"context": list(names[:2])}, {"context": ["left.png", "right.png"], "target": "middle.png"}]
+    for pairs in (None, groups):
+        if pairs is not None:
+            (folder / "pairs.json").write_text(json.dumps({"pairs": pairs}))
+        with pytest.warns(UserWarning, match=r"left out: .*middle\.png: needed a complete image"):
+            (pair,) = load_pairs(folder)
+        assert [view.name for view in pair.context] == ["left", "right"] and not pair.targets
+    write_image(folder / "middle.png", torch.full((3, 16, 24), 0.5))
+    with pytest.warns(UserWarning, match=r"left out: .*middle\.png: needed a 2:1"):
+        assert len(load_pairs(folder)) == 1
+    (folder / "left.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"left\.png: needed an image, got a file of 0 bytes"):
+        load_pairs(folder)
+
+
+def test_a_pair_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
+    names = ("left.png", "middle.png", "right.png")
+    entries = {n: {"cam2world": _pose(i), "depth": f"{n[:-4]}_depth.png"} for i, n in enumerate(names)}
+    entries["left.png"]["mask"] = "own.png"
+    folder = _folder(tmp_path / "room", names, poses=entries, near=0.2, far=30)
+    for i, name in enumerate(names):
+        _write_depth(folder / f"{name[:-4]}_depth.png", 1000 * (i + 1))
+    mask = torch.ones(3, 16, 32)
+    mask[:, 8:] = 0
+    write_image(folder / "own.png", mask)
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": [names[0], names[2]], "target": [names[1]]}]}))
+    (pair,) = load_pairs(folder)
+    views, targets = pair.load_context(16), pair.load_targets(16)
+    assert (views.near, views.far) == (0.2, 30.0)
+    assert views.depths is not None
+    assert views.depths[:, 0, 0].tolist() == [1.0, 3.0]
+    assert targets.names == ("middle",)
+    assert not views.masks[0, 8:].any()
+    assert views.masks[0, :8].all()
+    assert views.masks[1].all()
+
+
+def test_mask_files_are_found_by_name_and_must_show_some_scene(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    whole, own = torch.ones(3, 16, 32), torch.ones(3, 16, 32)
+    whole[:, :, :4], own[:, :, 20:] = 0, 0
+    write_image(folder / "mask.png", whole)
+    write_image(folder / "left_mask.png", own)
+    masks = load_pairs(folder)[0].load_context(16).masks
+    assert torch.equal(masks[0], own[0] > 0)
+    assert torch.equal(masks[1], whole[0] > 0)
+    write_image(folder / "right_mask.png", torch.zeros(3, 16, 32))
+    with pytest.raises(InputError, match=r"right_mask\.png: needed some pixels that show the scene.*invert the mask"):
+        load_pairs(folder)[0].load_context(16)
+
+
+@pytest.mark.parametrize(("file", "key"), [("cam2world opencv", "cam2world"), ("world2cam OpenGL", "world2cam")])
+def test_the_convention_argument_overrides_the_file(tmp_path: Path, file: str, key: str) -> None:
+    poses = {name: {key: _pose(i)} for i, name in enumerate(("left.png", "right.png"))}
+    folder = _folder(tmp_path / "room", convention=file, poses=poses)
+    given = load_pairs(folder, convention="world2cam opencv")[0].context[1].cam2world
+    assert torch.allclose(given, torch.linalg.inv(torch.tensor(_pose(1), dtype=torch.float64)))
+
+
+def test_near_and_far_arguments_override_the_file(tmp_path: Path) -> None:
+    (pair,) = load_pairs(_folder(tmp_path / "room", near=1, far=2), near=0.3, far=4)
+    assert (pair.near, pair.far) == (0.3, 4)
+
+
+def test_pairs_of_nested_folders_have_unique_names(tmp_path: Path) -> None:
+    for name in ("b", "a", "c"):
+        _folder(tmp_path / name / "room")
+    pairs = load_pairs(tmp_path)
+    assert [pair.folder.parent.name for pair in pairs] == ["a", "b", "c"]
+    assert len({pair.name for pair in pairs}) == 3
+
+
+def test_without_pairs_file_panoramas_are_paired_along_the_spanning_tree(tmp_path: Path) -> None:
+    names = [f"{i}.png" for i in range(4)]
+    poses = {name: _pose(x) for name, x in zip(names, (0.0, 10.0, 1.0, 12.0), strict=True)}
+    pairs = load_pairs(_folder(tmp_path / "flat", names, poses=poses))
+    assert [pair.name for pair in pairs] == ["0-2", "1-2", "1-3"]
+
+
+def test_triplets_come_first_and_contexts_are_unique(tmp_path: Path) -> None:
+    names = ("a.png", "b.png", "c.png")
+    folder = _folder(tmp_path / "flat", names)
+    pairs = [{"context": ["a.png", "b.png"]}, {"context": ["a.png", "c.png"]}]
+    triplets = [{"context": ["a.png", "c.png"], "target": "b.png"}]
+    (folder / "pairs.json").write_text(json.dumps({"pairs": pairs, "triplets": triplets}))
+    loaded = load_pairs(folder)
+    assert [(pair.name, [t.name for t in pair.targets]) for pair in loaded] == [("a-c", ["b"]), ("a-b", [])]
+
+
+def test_coincident_cameras_warn(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room", poses={"left.png": _pose(1), "right.png": _pose(1)})
+    (pair,) = load_pairs(folder)
+    with pytest.warns(UserWarning, match="room: cameras of the context views coincide"):
+        assert pair.load_context(8).images.shape == (2, 3, 8, 16)
+
+
+def _matterport3d(scene: Path) -> Path:
+    for i in range(3):
+        view = scene / f"{i:02d}"
+        _write_panorama(view / "rgb.png")
+        _write_depth(view / "depth.png", 2500)
+        np.savetxt(view / "rot.txt", np.eye(3))
+        np.savetxt(view / "tran.txt", [0, 0.5, 0.5 * (i - 1)])
+    return scene
+
+
+def test_panogrf_scenes_are_found_from_every_level_of_folders(tmp_path: Path) -> None:
+    top = tmp_path / "mp3d"
+    scene = _matterport3d(top / "png_render_test_32x16_seq_len_3_m3d_dist_0.5" / "00000007")
+    for path in (top, scene.parent, scene):
+        (pair,) = load_pairs(path)
+        assert pair.name == "00000007"
+        assert [panorama.name for panorama in (*pair.context, *pair.targets)] == ["00", "02", "01"]
+    views = pair.load_context(16)
+    assert views.depths is not None
+    assert views.depths.unique().tolist() == [2.5]
+    # Habitat's identity, in a z-up world: right is +x, down is -z, forward is +y (docs/official.md, section 2.1).
+    assert views.cam2world[0].tolist() == [[1, 0, 0, 0], [0, 0, 1, 0.5], [0, -1, 0, 0.5], [0, 0, 0, 1]]
+
+
+def test_game_map_triplets_are_read(tmp_path: Path) -> None:
+    for i in range(3):
+        _write_panorama(tmp_path / f"map_0_{i}.png")
+        _write_depth(tmp_path / f"map_0_{i}_depth.png", 1000)
+    (tmp_path / "map_0.json").write_text(json.dumps({"c2w": [_pose(0), _pose(1), _pose(3)]}))
+    (pair,) = load_pairs(tmp_path)
+    assert pair.name == "map_0"
+    assert _centres(pair) == [0, 3]
+    assert [target.name for target in pair.targets] == ["map_0_1"]
+
+
+def _sequence(folder: Path, count: int = 3) -> list[str]:
+    names = [f"{i:04d}.png" for i in range(count)]
+    for name in names:
+        _write_panorama(folder / "image" / name)
+    return names
+
+
+def test_360loc_sequences_pair_consecutive_frames(tmp_path: Path) -> None:
+    names = _sequence(tmp_path)
+    poses = {name: _pose(i) for i, name in enumerate(names)}
+    (tmp_path / "camera_pose.json").write_text(json.dumps(poses))
+    pairs = load_pairs(tmp_path)
+    assert [_centres(pair) for pair in pairs] == [[0, 1], [1, 2]]
+    assert pairs[0].far == 50
+    inverted = load_pairs(tmp_path, convention="world2cam opencv")[0].context[1].cam2world
+    assert torch.allclose(inverted, torch.linalg.inv(torch.tensor(_pose(1), dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "frame_trajectory.txt", "a.kitti"])
+def test_trajectory_lines_are_the_scaled_poses_of_the_sorted_images(tmp_path: Path, name: str) -> None:
+    _sequence(tmp_path)
+    lines = [" ".join(map(str, np.array(_pose(i))[:3].ravel())) for i in range(3)]
+    (tmp_path / name).write_text("\n".join(lines))
+    (tmp_path / "scale.txt").write_text("2.5\n")
+    assert [_centres(pair) for pair in load_pairs(tmp_path)] == [[0, 2.5], [2.5, 5]]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"convention": None}, 'needed a pose "convention", got none; write one of "cam2world opencv"'),
+        ({"convention": "mine"}, "needed a known pose convention, got 'mine'"),
+        ({"poses": None}, 'got no object "poses"'),
+        ({"poses": {}}, "needed poses of one or more panoramas, got none"),
+        ({"poses": {"left.png": _pose(0), "right.png": None}}, "'right.png': needed a pose, got none"),
+        ({"poses": {"left.png": _pose(0), "gone.png": _pose(1)}}, "needed the image .*gone.png"),
+        ({"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}}, r"needed a pose, got only \['room'\]"),
+        ({"poses": {"left.png": _pose(0), "right.png": {"world2cam": _pose(1)}}}, 'got the key "world2cam" under'),
+        ({"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "mask": "m.png"}}}, "needed the mask file"),
+        ({"near": 3, "far": 3}, "needed 0 < near < far in metres, got near=3 and far=3"),
+        ({"near": 0}, "needed 0 < near < far"),
+        ({"far": "much"}, "far: needed a number, got 'much'"),
+    ],
+)
+def test_invalid_pose_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
+    folder = _folder(tmp_path / "room", **content)
+    with pytest.raises(InputError, match=message) as caught:
+        load_pairs(folder)
+    assert "poses.json" in str(caught.value)
+
+
+def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"needed panoramas .* got none; give the folder"):
+        load_pairs(tmp_path)
+    with pytest.raises(InputError, match="got no such path"):
+        load_pairs(tmp_path / "gone")
+    _folder(tmp_path / "room")
+    (tmp_path / "room" / "poses.json").write_text('{\n "convention": "cam2world opencv",\n}')
+    with pytest.raises(InputError, match=r"poses\.json: needed JSON, got invalid text at line [23]"):
+        load_pairs(tmp_path / "room")
+    _write_panorama(tmp_path / "flats" / "one" / "left.png")
+    with pytest.raises(InputError, match=r"flats: needed panoramas .* got some without poses in one"):
+        load_pairs(tmp_path / "flats")
+    (tmp_path / "note.txt").write_text("x")
+    with pytest.raises(InputError, match=r"note\.txt: needed a panorama, a folder of panoramas, .* got another file"):
+        load_pairs(tmp_path / "note.txt")
+
+
+def _check_single_view(pair, name: str, world: int = 0) -> None:
+    (view,) = pair.context
+    assert (pair.name, view.world, pair.targets) == (name, world, ())
+    assert torch.equal(view.cam2world, torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "exr"])
+def test_one_panorama_is_a_pair_of_one_view(tmp_path: Path, suffix: str) -> None:
+    image = tmp_path / "flat" / f"photo.{suffix}"
+    _write_panorama(image, 0.25)
+    for path, name in ((image, "photo"), (image.parent, "flat")):
+        (pair,) = load_pairs(path, near=0.3, far=5)
+        _check_single_view(pair, name)
+        assert (pair.near, pair.far, pair.folder) == (0.3, 5, image.parent)
+    views = pair.load_context(8)
+    assert views.images.mean() == pytest.approx(0.25, abs=0.01)
+    assert views.masks.all() and views.names == ("photo",)
+
+
+def test_panoramas_without_poses_are_listed_for_their_estimate(tmp_path: Path, write_scene) -> None:
+    for number in range(3):
+        write_scene(tmp_path / f"{number}.png", 8)
+    with pytest.raises(
+        UnposedPanoramasError, match=r"needed poses .* got images only \(0\.png, 1\.png, 2\.png\)"
+    ) as caught:
+        load_pairs(tmp_path)
+    assert caught.value.folder == tmp_path
+    assert [panorama.name for panorama in caught.value.panoramas] == ["0", "1", "2"]
+
+
+def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "room")
+    for name in ("attic.jpg", "cellar.png", ".hidden.png", "left_mask.png", "attic_depth.png"):
+        write_scene(folder / name, 8)
+    _write_panorama(folder / "film_frame.png")  # with the metadata of an own rendering
+    with pytest.warns(UserWarning, match=r"poses\.json has no pose of attic\.jpg, cellar\.png; each is a scene"):
+        pair, attic, cellar = load_pairs(folder)
+    assert (pair.name, [view.world for view in pair.context]) == ("room", [0, 0])
+    _check_single_view(attic, "attic", 1)
+    _check_single_view(cellar, "cellar", 2)
+    assert attic.context[0].mask is None
+    names = ("attic.jpg", "cellar.png", "left.png", "right.png")
+    assert attic.siblings == tuple(folder / name for name in names), "in file order"
+
+
+def test_pictures_that_poses_name_are_panoramas_whoever_made_them(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    for name in ("frame.png", "taken.png", "view.png"):
+        _write_panorama(folder / name)  # with the metadata of an own rendering
+    content = json.loads((folder / "poses.json").read_text())
+    content |= {"estimate": {"unplaced": {"frame.png": "no door"}}, "rejected": [{"poses": {"taken.png": []}}]}
+    (folder / "poses.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"poses\.json has no pose of frame\.png, taken\.png; each is a scene"):
+        _, frame, taken = load_pairs(folder)
+    assert [pair.context[0].placement.reason for pair in (frame, taken)] == ["no door", "rejected by hand"]
+
+
+def test_panoramas_beside_posed_ones_in_subfolders_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
+    names = ("up/hall.png", "up/bath.png", "down/cellar.png")
+    folder = _folder(tmp_path / "house", names)
+    for name in ("up/attic.jpg", "down/hall.jpg", "loose.jpg"):
+        write_scene(folder / name, 8)
+    (folder / "links.json").write_text(json.dumps({"attic": [{"to": "down_hall", "yaw": 1}]}))
+    with pytest.warns(UserWarning, match=r"poses\.json has no pose of loose\.jpg, attic\.jpg, hall\.jpg; each is"):
+        *pairs, loose, attic, hall = load_pairs(folder)
+    assert len(pairs) == 2
+    for number, (pair, name) in enumerate(((loose, "loose"), (attic, "attic"), (hall, "down_hall")), start=1):
+        _check_single_view(pair, name, number)
+    assert attic.context[0].links == (Link("down_hall", 1.0),)
+
+
+def test_panoramas_of_other_folders_are_named_in_a_note(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "house" / "up")
+    write_scene(folder / "more" / "attic.jpg", 8)
+    write_scene(folder.parent / "garden.jpg", 8)
+    write_scene(folder.parent / "old" / "img" / "hall.jpg", 8)
+    (folder.parent / "old" / "tour.json").write_text(json.dumps({"panorama": "img/hall.jpg"}))
+    with pytest.warns(UserWarning) as caught:
+        (pair,) = load_pairs(folder.parent)
+    assert pair.name == "up"
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == 3
+    assert f"{folder.parent}: panoramas are left out" in messages[0] and "garden.jpg" in messages[0]
+    assert f"{folder.parent / 'old' / 'tour.json'} is another tour" in messages[1]
+    assert f"{folder / 'more'}: panoramas are left out" in messages[2] and "attic.jpg" in messages[2]
+
+
+def test_panoramas_below_or_beside_those_of_a_folder_without_poses_are_named(tmp_path: Path, write_scene) -> None:
+    write_scene(tmp_path / "hall.jpg", 8)
+    write_scene(tmp_path / "up" / "attic.jpg", 8)
+    with pytest.warns(UserWarning, match=r"up: panoramas are left out, .*: attic\.jpg; open"):
+        assert len(load_pairs(tmp_path)) == 1
+    (tmp_path / "tour.json").write_text(json.dumps({"panorama": "up/attic.jpg"}))
+    with pytest.warns(UserWarning, match=r"panoramas are left out, .*: hall\.jpg; open"):
+        assert load_pairs(tmp_path)[0].context[0].image.name == "attic.jpg"
+
+
+def test_posed_panoramas_in_no_pair_are_scenes_of_their_own(tmp_path: Path) -> None:
+    names = ("left.png", "right.png", "attic.png")
+    folder = _folder(tmp_path / "house", names)
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": list(names[:2])}]}))
+    with pytest.warns(UserWarning, match=r"in no pair of pairs\.json, and each a scene of its own: attic\.png"):
+        pair, attic = load_pairs(folder)
+    assert (pair.name, attic.name, attic.targets) == ("house", "attic", ())
+    assert attic.context[0].cam2world.tolist() == _pose(2) and attic.context[0].world == 0
+
+
+def test_pairs_of_panoramas_without_a_pose_are_left_out_with_a_note(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "house", ("a.png", "b.png", "c.png"))
+    write_scene(folder / "d.jpg", 8)
+    contexts = [["a.png", "d.jpg"], ["a.png", "b.png", "d.jpg"], ["b.png", "c.png"]]
+    pairs = [{"context": context, "target": ["d.jpg"]} for context in contexts[:2]]
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [*pairs, {"context": contexts[2]}]}))
+    with (
+        pytest.warns(UserWarning, match=r"pairs\.json, .* pose in poses\.json: d\.jpg; 1 of 3 pairs need them"),
+        pytest.warns(UserWarning, match=r"poses\.json has no pose of d\.jpg; each is a scene of its own"),
+    ):
+        first, second, single = load_pairs(folder)
+    assert [[view.name for view in pair.context] for pair in (first, second, single)] == [["a", "b"], ["b", "c"], ["d"]]
+    assert first.targets == second.targets == ()
+    (folder / "pairs.json").write_text(json.dumps({"pairs": pairs[:1]}))
+    with pytest.warns(UserWarning), pytest.raises(InputError, match=r"pairs 1: .* a pose in poses\.json, got 'd\.jpg'"):
+        load_pairs(folder)
+
+
+def test_frames_of_360loc_without_a_pose_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
+    names = _sequence(tmp_path)
+    (tmp_path / "camera_pose.json").write_text(json.dumps({name: _pose(i) for i, name in enumerate(names)}))
+    write_scene(tmp_path / "image" / "lost.jpg", 8)
+    write_scene(tmp_path / "loose.jpg", 8)
+    with (
+        pytest.warns(UserWarning, match=r"camera_pose\.json has no pose of lost\.jpg; each is a scene of its own"),
+        pytest.warns(UserWarning, match=r"panoramas are left out, .*: loose\.jpg; open"),
+    ):
+        pairs = load_pairs(tmp_path)
+    assert [len(pair.context) for pair in pairs] == [2, 2, 1]
+    _check_single_view(pairs[2], "lost", 1)
+
+
+def test_other_pictures_of_a_posed_folder_are_named(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    cv2.imwrite(str(folder / "plan.png"), np.full((20, 30, 3), (9, 90, 200), np.uint8))
+    cv2.imwrite(str(folder / "logo.png"), np.full((20, 20, 3), 90, np.uint8))
+    with pytest.warns(UserWarning) as caught:
+        (pair,) = load_pairs(folder)
+    assert pair.name == "room"
+    (message,) = {str(warning.message) for warning in caught if "logo" in str(warning.message)}
+    assert "logo.png: needed a 2:1 equirectangular panorama, got 20x20" in message
+
+
+def test_poses_of_one_panorama_are_enough(tmp_path: Path, write_scene) -> None:
+    folder = _folder(tmp_path / "room", ["only.png"])
+    (pair,) = load_pairs(folder)
+    assert pair.name == "room" and pair.context[0].cam2world.tolist() == _pose(0)
+    write_scene(folder / "other.jpg", 8)
+    with pytest.warns(UserWarning, match=r"no pose of other\.jpg"):
+        first, second = load_pairs(folder)
+    assert (first.name, first.context[0].world) == ("only", 0)
+    _check_single_view(second, "other", 1)
+
+
+def test_targets_and_pictures_of_entries_are_no_scenes_of_their_own(tmp_path: Path) -> None:
+    names = ("left.png", "middle.png", "right.png")
+    entries = {name: {"cam2world": _pose(i)} for i, name in enumerate(names)}
+    entries["left.png"] |= {"depth": "far.png", "mask": "own.png"}
+    folder = _folder(tmp_path / "room", names, poses=entries)
+    _write_depth(folder / "far.png", 1000)
+    cv2.imwrite(str(folder / "own.png"), np.full((16, 32), 255, np.uint8))
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": [names[0], names[2]], "target": names[1]}]}))
+    assert [pair.name for pair in load_pairs(folder)] == ["room"]
+
+
+def test_links_of_a_posed_folder_are_kept(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    links = {"left.png": [{"to": "right.png", "yaw": 1.5, "pitch": 0.2}], "right.png": {"title": "Kitchen"}}
+    (folder / "links.json").write_text(json.dumps(links))
+    for path in (folder, folder / "links.json"):
+        (pair,) = load_pairs(path)
+        assert pair.context[0].links == (Link("right", 1.5, 0.2),)
+        assert [view.label for view in pair.context] == ["left", "Kitchen"]
+
+
+def test_rooms_of_poses_are_titles_unless_links_state_others(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    content = json.loads((folder / "poses.json").read_text())
+    for name, pose in content["poses"].items():
+        content["poses"][name] = (pose if isinstance(pose, dict) else {"cam2world": pose}) | {"room": " living\nroom"}
+    content["poses"]["right.png"]["room"] = ["no text"]
+    (folder / "poses.json").write_text(json.dumps(content))
+    assert [view.label for view in load_pairs(folder)[0].context] == ["living room", "right"]
+    (folder / "links.json").write_text(json.dumps({"left.png": {"title": "Kitchen"}}))
+    assert load_pairs(folder)[0].context[0].label == "Kitchen"
+
+
+def test_a_faulty_web_tour_gives_way_to_the_pictures_of_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "tour.json").write_text("<html>404</html>")
+    with pytest.raises(InputError, match=r"tour\.json: needed a tour of Pannellum .* got an HTML page"):
+        load_pairs(tmp_path)
+    _write_panorama(tmp_path / "hall.png")
+    with pytest.warns(UserWarning, match=r"the web tour is left out: .*tour\.json"):
+        (pair,) = load_pairs(tmp_path)
+    assert pair.context[0].name == "hall"
+
+
+def test_a_web_tour_is_found_before_folders_below(tmp_path: Path, write_scene) -> None:
+    write_scene(tmp_path / "tiles" / "hall.jpg", 8)
+    (tmp_path / "tour.json").write_text(json.dumps({"title": "Hall", "panorama": "tiles/hall.jpg"}))
+    _folder(tmp_path / "tiles" / "room")
+    for path in (tmp_path, tmp_path / "tour.json"):
+        (pair,) = load_pairs(path)
+        assert pair.name == tmp_path.name and pair.context[0].label == "Hall"
+    assert find_panorama_folders(tmp_path) == [tmp_path]
+
+
+@pytest.mark.shared
+def test_zind_has_its_triplets_first(shared: Path) -> None:
+    pairs = load_pairs(shared / "data" / "zind")
+    assert [pair.name for pair in pairs[:3]] == ["pano_10-pano_12", "pano_07-pano_11", "pano_04-pano_10"]
+    assert [len(pair.targets) for pair in pairs] == [1] * 3 + [0] * 19
+    assert (pairs[0].near, pairs[0].far) == (0.45, 10.0)
+    baseline = (pairs[0].context[0].cam2world - pairs[0].context[1].cam2world)[:3, 3].norm()
+    assert float(baseline) == pytest.approx(2.545, abs=1e-3)

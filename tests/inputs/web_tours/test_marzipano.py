@@ -1,0 +1,236 @@
+"""Exports of the Marzipano Tool open with their pictures, names, links and start views, whatever else is broken."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pansplat.images.image_files import read_height, read_panorama
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.pairs import Link, Note, Panorama
+from pansplat.inputs.web_tours import find_web_tour, read_web_tour
+from pansplat.poses.edit import PoseEditor
+from pansplat.poses.files import name_pictures
+
+LEVELS = [
+    {"tileSize": 16, "size": 16, "fallbackOnly": True},
+    {"tileSize": 32, "size": 32},
+    {"tileSize": 32, "size": 64},
+]
+
+
+def _scene(key: str, **content: Any) -> dict[str, Any]:
+    return {
+        "id": key,
+        "name": key[2:].capitalize(),
+        "levels": LEVELS,
+        "faceSize": 60,
+        "initialViewParameters": {"yaw": 0.5, "pitch": 0.1, "fov": 1.3},
+        "linkHotspots": [],
+        "infoHotspots": [],
+    } | content
+
+
+Export = Callable[..., Path]
+
+
+@pytest.fixture
+def export(tmp_path: Path, write_tiles) -> Export:
+    """Write an export with these scenes; returns the folder."""
+
+    def write(*scenes: Any, tiles: bool = True, first: int = 0) -> Path:
+        data = {"scenes": list(scenes), "name": "Flat", "settings": {"mouseViewMode": "drag"}}
+        (tmp_path / "data.js").write_text(f"var APP_DATA = {json.dumps(data, indent=2)};\n")
+        (tmp_path / "index.html").write_text("<!DOCTYPE html><script src='data.js'></script>")
+        for scene in scenes if tiles else ():
+            base = tmp_path / "tiles" / scene["id"]
+            for level, content in enumerate(scene["levels"], start=first):
+                if level:
+                    write_tiles(
+                        content["size"],
+                        content["tileSize"],
+                        lambda f, r, c, b=base / str(level): b / f / str(r) / f"{c}.jpg",
+                    )
+        return tmp_path
+
+    return write
+
+
+def _check_picture(panorama: Panorama, check_colors, size: int = 64) -> None:
+    assert read_height(panorama.image) == 2 * size
+    check_colors(read_panorama(panorama.image, 2 * size)[0])
+    check_colors(read_panorama(panorama.image, 16)[0])
+
+
+def test_an_export_has_its_pictures_names_links_and_start_views(export: Export, check_colors) -> None:
+    spot = {"yaw": 3.0, "pitch": 0.25, "rotation": 0, "target": "1-kitchen"}
+    back = {"yaw": -0.1 - 2 * math.pi, "pitch": -0.2, "target": "0-hall"}
+    folder = export(_scene("0-hall", linkHotspots=[spot]), _scene("1-kitchen", name="", linkHotspots=[back]))
+    hall, kitchen = read_web_tour(folder / "data.js")
+    assert (hall.name, hall.label, kitchen.label) == ("0-hall", "Hall", "1-kitchen")
+    assert hall.links == (Link("1-kitchen", 3.0, 0.25),)
+    assert kitchen.links[0].target == "0-hall"
+    assert (kitchen.links[0].yaw, kitchen.links[0].pitch) == pytest.approx((-0.1, -0.2))
+    assert hall.start == (0.5, 0.1)
+    _check_picture(hall, check_colors)
+    _check_picture(kitchen, check_colors)
+
+
+def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Export) -> None:
+    spots = [[{"yaw": 3.0, "target": "1-kitchen"}], [{"yaw": 0.0, "target": "0-hall"}], []]
+    keys = "0-hall", "1-kitchen", "2-bath"
+    folder = export(*(_scene(key, linkHotspots=spot) for key, spot in zip(keys, spots, strict=True)))
+    poses = {name: np.eye(4).tolist() for name in ("0-hall", "1-kitchen")}
+    poses["1-kitchen"][0][3] = 2.0
+    reasons = {"unplaced": {"2-bath.cube.json": "bare walls"}}
+    content = {"convention": "cam2world opencv", "poses": poses, "estimate": reasons}
+    (folder / "poses.json").write_text(json.dumps(content))
+    for path in (folder, folder / "data.js", folder / "poses.json"):
+        placed, alone = load_pairs(path)
+        hall, kitchen = placed.context
+        assert (hall.title, kitchen.title, hall.start) == ("Hall", "Kitchen", (0.5, 0.1))
+        assert [link.target for view in placed.context for link in view.links] == ["1-kitchen", "0-hall"]
+        assert float((kitchen.cam2world - hall.cam2world)[:3, 3].norm()) == pytest.approx(2.0)
+        assert alone.context[0].title == "Bath" and alone.context[0].placement.reason == "bare walls"
+    panoramas = [*placed.context, *alone.context]
+    pose = np.eye(4)
+    pose[2, 3] = 3.0
+    editor = PoseEditor(folder, panoramas)
+    editor.place({alone.context[0].image: pose}, 0)
+    assert set(json.loads((folder / "poses.json").read_text())["poses"]) == {"0-hall", "1-kitchen", "2-bath"}
+    assert sum(len(pair.context) for pair in load_pairs(folder)) == 4, "two pairs of three panoramas"
+    names = name_pictures(folder / "poses.json", [view.image for view in panoramas])
+    assert set(names.values()) == {"0-hall", "1-kitchen", "2-bath"}, "those of an estimate"
+
+
+def test_the_export_is_found_from_its_folder_archive_and_page(export: Export) -> None:
+    folder = export(_scene("0-hall"))
+    assert find_web_tour(folder) == folder / "data.js"
+    assert [panorama.name for panorama in read_web_tour(folder / "index.html")] == ["0-hall"]
+    parent = folder / "archive"
+    parent.mkdir()
+    for name in ("data.js", "index.html", "tiles"):
+        (parent / "app-files").mkdir(exist_ok=True)
+        (folder / name).rename(parent / "app-files" / name)
+    assert find_web_tour(parent) == parent / "app-files" / "data.js"
+    assert len(read_web_tour(parent / "app-files" / "data.js")) == 1
+
+
+def test_levels_without_a_preview_count_from_one(export: Export, check_colors) -> None:
+    folder = export(_scene("0-hall", levels=LEVELS[1:]), first=1)
+    _check_picture(read_web_tour(folder / "data.js")[0], check_colors)
+
+
+def test_a_level_with_a_damaged_tile_gives_way_to_the_next_complete_one(export: Export, check_colors) -> None:
+    folder = export(_scene("0-hall"), _scene("1-attic"))
+    for tile in ("0-hall/2/u/1/0", "1-attic/1/f/0/0", "1-attic/2/f/0/0"):
+        (folder / f"tiles/{tile}.jpg").write_bytes(b"<html>404</html>")
+    with (
+        pytest.warns(UserWarning, match="'0-hall' is read at 32 instead of 64 pixels .*2/u/1/0.jpg is damaged"),
+        pytest.warns(UserWarning, match="'1-attic' is left out: needed all tiles .*1-attic/2/f/0/0.jpg is damaged"),
+    ):
+        (hall,) = read_web_tour(folder / "data.js")
+    _check_picture(hall, check_colors, 32)
+
+
+def test_without_tiles_the_preview_is_read(export: Export, color_face, check_colors) -> None:
+    folder = export(_scene("0-hall"), tiles=False)
+    preview = Image.new("RGB", (16, 96))
+    for place, face in enumerate("bdflru"):
+        preview.paste(Image.fromarray(color_face(face, 16)), (0, 16 * place))
+    (folder / "tiles/0-hall").mkdir(parents=True)
+    preview.save(folder / "tiles/0-hall/preview.jpg", quality=97, subsampling=0)
+    with pytest.warns(UserWarning, match="is read at 16 instead of 64 pixels"):
+        (hall,) = read_web_tour(folder / "data.js")
+    assert read_height(hall.image) == 32
+    check_colors(read_panorama(hall.image, 32)[0], tolerance=12)
+
+
+def test_a_broken_start_view_is_dropped(export: Export) -> None:
+    views = [{"yaw": {}}, None]
+    folder = export(*(_scene(f"{n}-room", initialViewParameters=view) for n, view in enumerate(views)))
+    with pytest.warns(UserWarning, match="the start view of 0-room is left out: direction, yaw: needed a number"):
+        panoramas = read_web_tour(folder / "data.js")
+    assert [panorama.start for panorama in panoramas] == [None, None]
+
+
+def test_links_to_nowhere_and_to_itself_are_dropped(export: Export) -> None:
+    spots = [{"yaw": 1, "pitch": 0, "target": name} for name in ("9-gone", "0-hall")] + [
+        {"yaw": "x", "target": "0-hall"}
+    ]
+    folder = export(_scene("0-hall", linkHotspots=[*spots, None, "x"]))
+    with pytest.warns(UserWarning) as caught:
+        (hall,) = read_web_tour(folder / "data.js")
+    assert hall.links == ()
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == 2
+    assert "a link of 0-hall is left out: direction, yaw: needed a number, got 'x'" in messages[0]
+    assert "a link of 0-hall is left out: it leads to '9-gone'" in messages[1]
+
+
+def test_information_is_kept_as_plain_text_with_addresses_of_web_pages(export: Export) -> None:
+    text = """<p>Oak &amp; ash<br>1 &lt; 2</p><script>alert(1)</script><img src="img/oven.jpg" onerror="alert(2)">
+        <a href="https://example.org/a?b=1&amp;c">more</a>
+        <a href="javascript://x/%0Aalert(3)">one</a><a href="data:,x">two</a><a href="https://user name@x">three</a>
+        <img alt="a tap" src="http://example.org/tap.png">"""
+    spots = [
+        {"yaw": 0.5, "pitch": -0.2, "title": "<b>Floor</b>", "text": text},
+        {"yaw": 0, "pitch": 0, "title": " ", "text": 7},
+        {"yaw": "x", "title": "gone"},
+    ]
+    with pytest.warns(UserWarning, match="a hot spot of 0-hall is left out: direction, yaw: needed a number"):
+        (hall,) = read_web_tour(export(_scene("0-hall", infoHotspots=spots)) / "data.js")
+    shown = "Floor\nOak & ash\n1 < 2\n[oven.jpg]\nmore\nonetwothree\n[a tap]"
+    assert hall.notes == (Note(0.5, -0.2, shown, ("https://example.org/a?b=1&c", "http://example.org/tap.png")),)
+
+
+@pytest.mark.parametrize(("name", "title"), [("Our <i>home</i>", "Our <i>home</i>"), ("Project Title", ""), (3, "3")])
+def test_the_title_of_the_tour_is_that_of_the_project(export: Export, name: object, title: str) -> None:
+    folder = export(_scene("0-hall"))
+    data = json.loads((folder / "data.js").read_text().removeprefix("var APP_DATA = ").rstrip(";\n"))
+    (folder / "data.js").write_text(f"var APP_DATA = {json.dumps(data | {'name': name})};")
+    assert [panorama.tour for panorama in read_web_tour(folder / "data.js")] == [title]
+
+
+def test_scripts_in_names_are_plain_text(export: Export) -> None:
+    name = "<script>alert('x')</script>\n\u2028\0 & more"
+    (hall,) = read_web_tour(export(_scene("0-hall", name=name)) / "data.js")
+    assert hall.title == "<script>alert('x')</script> & more"
+
+
+@pytest.mark.parametrize("key", ["../../etc", "/..", "a/../../b", "..\\..\\x", "%2e%2e/%2e%2e/x", "https://x.org/a"])
+def test_tiles_outside_of_the_folder_are_not_read(export: Export, key: str) -> None:
+    folder = export(_scene("0-hall"))
+    data = json.loads((folder / "data.js").read_text().removeprefix("var APP_DATA = ").rstrip(";\n"))
+    data["scenes"].append(_scene(key))
+    (folder / "data.js").write_text(f"var APP_DATA = {json.dumps(data)}")
+    with pytest.warns(UserWarning, match="is left out: needed (a file|all tiles)"):
+        panoramas = read_web_tour(folder / "data.js")
+    assert [panorama.name for panorama in panoramas] == ["0-hall"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"id": None}, 'number 2\' is left out: needed an "id"'),
+        ({"levels": None}, "needed all tiles of a level"),
+        ({"levels": [{"size": "big"}]}, "size: needed a whole number, got 'big'"),
+        ({"levels": [{"size": 64, "tileSize": 0}]}, "tileSize: needed a whole number >= 1, got 0"),
+    ],
+)
+def test_a_broken_scene_is_named_and_the_others_open(export: Export, content: dict, message: str) -> None:
+    broken = _scene("1-attic", **content)
+    folder = export(_scene("0-hall"), broken, tiles=False)
+    level = [{"tileSize": 4, "size": 4}]
+    export(_scene("0-hall", levels=level), first=1)
+    (folder / "data.js").write_text(f"APP_DATA = {json.dumps({'scenes': [_scene('0-hall', levels=level), broken, 7]})}")
+    with pytest.warns(UserWarning) as caught:
+        panoramas = read_web_tour(folder / "data.js")
+    assert [panorama.name for panorama in panoramas] == ["0-hall"]
+    assert message in str(caught[0].message)
+    assert "'number 3' is left out: needed an object, got '7'" in str(caught[1].message)

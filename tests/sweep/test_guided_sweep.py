@@ -1,0 +1,187 @@
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.evaluation.metrics import ws_psnr
+from pansplat.model.weights import pack_weights, save_weights
+from pansplat.networks.depth_network import DepthNetworkConfig
+from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
+from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.pipeline import load_model, load_pairs, predict, render
+from pansplat.sweep.guided_sweep import (
+    GuidedSweep,
+    NetworkPrior,
+    default_weights,
+    load_guided_sweep,
+    save_depth_network,
+)
+from pansplat.sweep.prior import DepthPrior
+from pansplat.sweep.surface import list_others, resize_sphere
+
+_OF_A_VIEW = ("images", "masks", "cam2world")
+_CONFIG = RefinementConfig(
+    mono=DepthNetworkConfig(room_channels=24, attention_layers=1, attention_heads=3, decoder_channels=(16, 12, 8, 8)),
+    candidates=9,
+    matching_channels=4,
+    channels=(8, 12, 16),
+)
+
+
+def _network(seed=0):
+    torch.manual_seed(seed)
+    network = DepthRefinement(_CONFIG)
+    for head in (network.head, network.mono.head):
+        torch.nn.init.normal_(head.weight, std=0.1)
+    return network.eval()
+
+
+def _sharpening():
+    return DepthSharpening(SharpeningConfig(24, 1, 3, (16, 12, 8, 8), 64, 8)).eval()
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "depth.safetensors"
+    network = _network()
+    save_depth_network(path, network, network.state_dict())
+    return path
+
+
+def _images(views=2, height=64):
+    return np.random.default_rng(0).random((views, height, 2 * height, 3), np.float32)
+
+
+def test_saved_network_estimates_the_same_depth(weights):
+    loaded, network = load_guided_sweep(weights), NetworkPrior(_network(), _sharpening(), "", 64)
+    assert isinstance(loaded.prior, NetworkPrior)
+    loaded.prior.height = 64
+    first, second = (prior.observe(_images()).priors for prior in (loaded.prior, network))
+    assert first[0].log_depth.shape == (32, 64)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_allclose(a.log_depth, b.log_depth, atol=5e-3)
+        np.testing.assert_allclose(a.scale, b.scale, rtol=2e-2)
+
+
+def test_sharpened_depth_has_the_networks_size_and_the_views_order():
+    observed = NetworkPrior(_network(), _sharpening(), "", 64).observe(_images())
+    both = observed.sharpen()
+    assert [log_depth.shape for log_depth in both] == [(64, 128)] * 2
+    estimates = [prior.log_depth.ravel() for prior in observed.priors]
+    for view, log_depth in enumerate(both):  # an untrained network smooths the estimate
+        small = resize_sphere(log_depth, 32).ravel()
+        own, other = (np.corrcoef(small, estimates[n])[0, 1] for n in (view, 1 - view))
+        assert own > 0.3 and abs(other) < 0.5 * own
+
+
+def test_refined_depth_is_in_the_unit_of_the_poses():
+    prior = NetworkPrior(_network(), _sharpening(), "", 64)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = (0, 0.5, 1)
+    far = poses.copy()
+    far[:, :3, 3] *= 10
+    observed = prior.observe(_images(3))
+    starts = [[DepthPrior(p.log_depth + np.log(height), p.scale) for p in observed.priors] for height in (1.5, 15.0)]
+    others = list_others(3)
+    small, large = observed.refine(starts[0], poses, others, 2), observed.refine(starts[1], far, others, 2)
+    for a, b in zip(small, large, strict=True):
+        np.testing.assert_allclose(a.log_depth + np.log(10), b.log_depth, atol=5e-3)
+
+
+def test_fingerprint_depends_on_the_weights(weights, tmp_path):
+    other = _network(1)
+    save_depth_network(tmp_path / "other.safetensors", other, other.state_dict())
+    fingerprints = {load_guided_sweep(path).fingerprint for path in (weights, tmp_path / "other.safetensors")}
+    fingerprints.add(load_model("sweep").fingerprint)
+    assert len(fingerprints) == 3
+
+
+def test_file_of_weights_is_a_model(weights):
+    model = load_model(weights)
+    assert model.name == "depth" and model.fingerprint == load_guided_sweep(weights).fingerprint
+
+
+def test_other_weights_are_refused(tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_weights(path, pack_weights("pansplat", _CONFIG, {"a": torch.zeros(1)}, compat="fixed"))
+    with pytest.raises(InputError, match=r"needed weights of a depth network, got weights of 'pansplat'"):
+        load_guided_sweep(path)
+
+
+def test_missing_weight_is_refused(tmp_path):
+    network = _network()
+    state = {name: tensor for name, tensor in network.state_dict().items() if name != "head.bias"}
+    save_depth_network(tmp_path / "part.safetensors", network, state)
+    with pytest.raises(InputError, match=r"head\.bias"):
+        load_guided_sweep(tmp_path / "part.safetensors")
+
+
+@pytest.mark.slow
+def test_prediction_takes_any_number_of_views(weights):
+    model = load_guided_sweep(weights)
+    images = torch.from_numpy(_images(3)).permute(0, 3, 1, 2)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.tensor((0.0, 0.5, 1.0))
+    gaussians = model(images, poses, 0.3, 20.0)
+    assert set(gaussians.views.tolist()) == {0, 1, 2}
+    assert all(torch.isfinite(getattr(gaussians, name)).all() for name in ("means", "scales", "opacities"))
+
+
+def test_shipped_model_is_small():
+    path = default_weights()
+    assert path.stat().st_size <= 16e6
+    model = load_model("default")
+    assert isinstance(model, GuidedSweep) and model.name == "default"
+    assert sum(weight.numel() for weight in model.network.parameters()) <= 8_000_000
+
+
+@pytest.mark.slow
+def test_shipped_model_estimates_the_sample_within_a_fifth():
+    (pair,) = load_pairs(Path(__file__).parents[2] / "assets" / "living_room")
+    views = pair.load_context(128)
+    images = [image.permute(1, 2, 0).numpy() for image in views.images]
+    observed = load_model("default").prior.observe(images)
+    depth = views.depths[:, ::2, ::2].numpy()
+    for prior, true in zip(observed.priors, depth, strict=True):
+        error = prior.log_depth - np.log(true)
+        assert np.abs(error - np.median(error)).mean() < 0.2
+
+
+@pytest.fixture(scope="module")
+def sample():
+    (pair,) = load_pairs(Path(__file__).parents[2] / "assets" / "living_room")
+    return pair.load_context(64), pair.load_targets(64), load_model("default")
+
+
+def _error_between(sample, **changes):
+    """Error of the middle view, drawn from a prediction with other inputs, dB."""
+    views, targets, model = sample
+    views = dataclasses.replace(views, **changes)
+    middle = render(predict(views, model), targets.cam2world[0], size=(64, 128)).color
+    return ws_psnr(middle.clamp(0, 1), targets.images[0])
+
+
+@pytest.mark.slow
+def test_errors_of_poses_and_depth_range_cost_little(sample):
+    views, exact = sample[0], _error_between(sample)
+    poses, angle = views.cam2world.clone(), math.radians(0.3)
+    poses[1, :3, :3] @= torch.tensor(
+        [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]], dtype=poses.dtype
+    )
+    poses[1, :3, 3] += torch.tensor([0.01, -0.01, 0.014], dtype=poses.dtype)  # 2 cm
+    assert _error_between(sample, cam2world=poses) > exact - 0.5  # 1.46 for errors four times as large
+    assert _error_between(sample, near=views.near / 2, far=2 * views.far) > exact - 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:left, right. the cameras are at one place")
+def test_coincident_cameras_give_a_scene_that_is_better_than_a_sphere(sample, sphere_predictor):
+    views, targets, _ = sample
+    same = {name: getattr(views, name)[:1].repeat(2, *[1] * (getattr(views, name).ndim - 1)) for name in _OF_A_VIEW}
+    sphere = predict(dataclasses.replace(views, **same), sphere_predictor())
+    drawn = render(sphere, targets.cam2world[0], size=(64, 128)).color.clamp(0, 1)
+    assert _error_between(sample, **same) > ws_psnr(drawn, targets.images[0]) + 2

@@ -1,0 +1,127 @@
+"""Hashes of source code follow imports."""
+
+import ast
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pansplat.poses.files import _hash_inputs
+from pansplat.refinement import refinement_fingerprint
+from pansplat.sweep import Sweep
+from pansplat.system import source_hash
+from pansplat.system.source_hash import hash_sources, list_imports
+
+PACKAGE = Path(source_hash.__file__).parents[1]
+
+
+@pytest.fixture
+def copied(tmp_path, monkeypatch):
+    """A copy of the package's sources, which fingerprints read."""
+    for source in PACKAGE.rglob("*.py"):
+        copy = tmp_path / source.relative_to(PACKAGE)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source, copy)
+    monkeypatch.setattr(source_hash, "_FOLDER", tmp_path)
+    hash_sources.cache_clear()
+    yield tmp_path
+    hash_sources.cache_clear()
+
+
+def change(source: Path) -> None:
+    with source.open("a") as file:
+        file.write("# another line\n")
+    hash_sources.cache_clear()
+
+
+FINGERPRINTS = {
+    "sweep": lambda: Sweep().fingerprint,
+    "default": lambda: hash_sources("pansplat.sweep.guided_sweep"),
+    "network": lambda: hash_sources("pansplat.model.network"),
+    "refinement": refinement_fingerprint,
+    "poses": lambda: _hash_inputs([], 1.5),
+}
+RASTERISER = ("rasterize.py", "reference.py", "cpu/rasterize.py", "cpu/backend.py", "cuda/rasterize.py")
+
+
+@pytest.mark.parametrize(
+    ("result", "source"),
+    [
+        *((result, f"rendering/{name}") for result in ("sweep", "refinement") for name in RASTERISER),
+        *(
+            ("sweep", name)
+            for name in ("sweep/lift.py", "geometry/world.py", "rendering/color_fit.py", "images/masks.py")
+        ),
+        *(
+            ("refinement", name)
+            for name in ("refinement/fusion.py", "rendering/image_planes.py", "geometry/equirect.py")
+        ),
+        *(("default", name) for name in ("sweep/guided_sweep.py", "model/layers.py", "model/weights.py")),
+        *(("network", name) for name in ("model/heads.py", "gaussians/harmonics.py", "predictor.py")),
+        *(("poses", name) for name in ("poses/two_view.py", "networks/lightglue.py", "sweep/prior.py")),
+    ],
+)
+def test_a_change_of_a_source_that_computes_a_result_changes_its_fingerprint(copied, result, source):
+    before = FINGERPRINTS[result]()
+    change(copied / source)
+    assert FINGERPRINTS[result]() != before
+
+
+@pytest.mark.parametrize("result", FINGERPRINTS)
+def test_a_change_of_a_command_keeps_fingerprints(copied, result):
+    before = FINGERPRINTS[result]()
+    for source in ("cli/render.py", "__init__.py", "pipeline.py"):
+        change(copied / source)
+    assert FINGERPRINTS[result]() == before
+
+
+def test_the_folder_and_the_ends_of_lines_do_not_change_a_hash(copied):
+    in_copy = hash_sources("pansplat.refinement")
+    for source in copied.rglob("*.py"):
+        source.write_bytes(source.read_bytes().replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"))
+    hash_sources.cache_clear()
+    with_carriage_returns = hash_sources("pansplat.refinement")
+    program = "from pansplat.system.source_hash import hash_sources; print(hash_sources('pansplat.refinement'))"
+    original = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert [in_copy, with_carriage_returns] == [original.stdout.strip()] * 2
+
+
+def test_imports_of_imports_count_and_strangers_do_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(source_hash, "_FOLDER", tmp_path)
+    (tmp_path / "upper.py").write_text("from pansplat import middle as m, other\n")
+    (tmp_path / "middle.py").write_text(
+        "def f():\n    from pansplat.lower import (  # (late)\n        a,\n        b,\n    )\n"
+    )
+    for name in ("lower", "other", "stranger"):
+        (tmp_path / f"{name}.py").write_text("a = 1\n")
+
+    def compute(*prefixes: str) -> str:
+        hash_sources.cache_clear()
+        return hash_sources("pansplat.upper", prefixes or ("pansplat.",))
+
+    hashes, restricted = [compute()], [compute("pansplat.middle")]
+    for name in ("lower", "other", "stranger"):
+        (tmp_path / f"{name}.py").write_text("a = 2\n")
+        hashes.append(compute())
+        restricted.append(compute("pansplat.middle"))
+    assert len(set(hashes[:3])) == 3 and hashes[2] == hashes[3] and len(set(restricted)) == 1
+    hash_sources.cache_clear()
+
+
+@pytest.mark.parametrize("source", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_all_imports_of_the_syntax_tree_are_listed(source):
+    text = source.read_text("utf-8")
+    expected = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            expected |= {alias.name for alias in node.names if source_hash._find(alias.name)}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "hashes of sources follow absolute imports only"
+            members = [f"{node.module}.{alias.name}" for alias in node.names]
+            known = node.module or ""
+            expected |= {
+                member if source_hash._find(member) else known for member in members if source_hash._find(known)
+            }
+    assert expected <= list_imports(text) | {"pansplat"}

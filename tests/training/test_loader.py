@@ -1,0 +1,113 @@
+"""Batches are determined by seed and step; unreadable samples are skipped, counted and named."""
+
+import itertools
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.images.image_files import write_image
+from pansplat.inputs.views import Batch
+from pansplat.training.augment import Augmentation
+from pansplat.training.loader import Loader
+from pansplat.training.sources import ConcatSource, TripletSource, read_game_maps
+
+
+def _triplets(folder: Path, count: int) -> TripletSource:
+    for k in range(count):
+        for i in range(3):
+            write_image(folder / f"{k}_{i}.png", torch.full((3, 8, 16), (3 * k + i) / 40))
+        poses = [[[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, k], [0, 0, 0, 1]] for i in range(3)]
+        (folder / f"{k}.json").write_text(json.dumps({"c2w": poses}))
+    return TripletSource(read_game_maps(folder))
+
+
+def _take(loader: Loader, count: int, step: int = 0) -> list[Batch]:
+    return list(itertools.islice(loader.batches(step), count))
+
+
+def _equal(first: list[Batch], second: list[Batch]) -> bool:
+    return all(
+        a.names == b.names and torch.equal(a.images, b.images) and torch.equal(a.cam2world, b.cam2world)
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+def test_each_epoch_is_a_permutation_of_all_samples(tmp_path: Path) -> None:
+    loader = Loader(_triplets(tmp_path, 6), height=8, batch_size=2)
+    names = [name for batch in _take(loader, 9) for name in batch.names]
+    epochs = [names[6 * k : 6 * k + 6] for k in range(3)]
+    assert all(sorted(epoch) == [str(k) for k in range(6)] for epoch in epochs)
+    assert len(set(map(tuple, epochs))) > 1
+
+
+def test_batches_from_a_step_equal_those_of_an_uninterrupted_run(tmp_path: Path) -> None:
+    loader = Loader(_triplets(tmp_path, 5), height=8, batch_size=2, seed=3, augmentation=Augmentation(tilt_degrees=4))
+    whole = _take(loader, 7)
+    assert _equal(_take(loader, 3, step=4), whole[4:])
+    assert not _equal(_take(loader, 3, step=3), whole[4:])
+
+
+@pytest.mark.slow
+def test_batches_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    source = _triplets(tmp_path, 5)
+    options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": Augmentation(exposure=0.3)}
+    alone = _take(Loader(source, **options), 3)
+    assert _equal(_take(Loader(source, workers=2, **options), 3), alone)
+    assert not _equal(_take(Loader(source, **(options | {"seed": 2})), 3), alone)
+
+
+def test_ranks_get_consecutive_parts_of_each_batch(tmp_path: Path) -> None:
+    source = _triplets(tmp_path, 8)
+    whole = _take(Loader(source, height=8, batch_size=4), 2)
+    parts = [_take(Loader(source, height=8, batch_size=2, rank=rank, world_size=2), 2) for rank in range(2)]
+    for batch, first, second in zip(whole, *parts, strict=True):
+        assert batch.names == first.names + second.names
+
+
+def test_unreadable_samples_are_skipped_counted_and_named(tmp_path: Path) -> None:
+    source = _triplets(tmp_path, 6)
+    (tmp_path / "2_1.png").write_bytes(b"")
+    (tmp_path / "4_0.png").write_bytes((tmp_path / "4_0.png").read_bytes()[:40])
+    loader = Loader(source, height=8, batch_size=3)
+    with pytest.warns(UserWarning, match="skipped sample") as caught:
+        batches = _take(loader, 4)
+    assert all(len(batch) == 3 for batch in batches)
+    assert not {"2", "4"} & {name for batch in batches for name in batch.names}
+    assert len(caught) == 2 and any("2_1.png" in str(w.message) for w in caught)
+    assert sorted(message.split(":")[0].rsplit("/")[-1] for message in loader.skipped) == ["2_1.png", "4_0.png"]
+    assert all(count >= 2 for count in loader.skipped.values())  # in each of the two epochs
+    with pytest.warns(UserWarning):
+        assert _equal(_take(Loader(source, height=8, batch_size=3), 2, step=2), batches[2:])
+
+
+def test_an_error_names_files_when_all_samples_are_unreadable(tmp_path: Path) -> None:
+    source = _triplets(tmp_path, 4)
+    for path in tmp_path.glob("*_1.png"):
+        path.write_bytes(b"")
+    with (
+        pytest.warns(UserWarning, match="skipped"),
+        pytest.raises(InputError, match=r"got 4 consecutive unreadable ones \(of 4\)(.|\n)*_1\.png"),
+    ):
+        _take(Loader(source, height=8, batch_size=1), 1)
+
+
+def test_other_exceptions_of_a_source_are_not_caught() -> None:
+    class Broken:
+        def __len__(self) -> int:
+            return 3
+
+        def sample(self, index: int, height: int, seed: int):
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        _take(Loader(Broken(), height=8, batch_size=1), 1)
+
+
+def test_empty_sources_and_batches_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="empty source"):
+        Loader(ConcatSource([]), height=8, batch_size=1)
+    with pytest.raises(InputError, match="batch_size >= 1"):
+        Loader(_triplets(tmp_path, 1), height=8, batch_size=0)

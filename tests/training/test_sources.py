@@ -1,0 +1,113 @@
+"""Every kind of data gives the same kind of samples."""
+
+import itertools
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.views import collate
+from pansplat.training.sources import ConcatSource, PairSource, TripletSource, read_game_maps, read_panogrf
+
+
+@pytest.fixture
+def write_triplets(write_panorama: Callable, write_depth: Callable, matrix: Callable) -> Callable[..., TripletSource]:
+    def write(folder: Path, *names: str) -> TripletSource:
+        for name in names:
+            for i in range(3):
+                write_panorama(folder / f"{name}_{i}.png", 0.2 * (i + 1))
+                write_depth(folder / f"{name}_{i}_depth.png", 1000 * (i + 1))
+            (folder / f"{name}.json").write_text(json.dumps({"c2w": [matrix(0), matrix(1), matrix(2)]}))
+        return TripletSource(read_game_maps(folder))
+
+    return write
+
+
+def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_triplets: Callable) -> None:
+    source = write_triplets(tmp_path, "a", "b")
+    samples = [source.sample(index, 8, 0) for index in range(len(source))]
+    assert [sample.name for sample in samples] == ["a", "b"]
+    batch = collate(samples)
+    assert len(batch) == 2 and batch.names == ("a", "b")
+    assert batch.images.shape == (2, 2, 3, 8, 16) and batch.target_images.shape == (2, 1, 3, 8, 16)
+    assert batch.cam2world[0, :, 0, 3].tolist() == [0, 2] and batch.target_cam2world[0, :, 0, 3].tolist() == [1]
+    assert batch.depths is not None and batch.depths[0, :, 0, 0].tolist() == [1, 3]
+    assert samples[0].targets.depths is not None and samples[0].targets.depths.unique().tolist() == [2]
+    assert torch.equal(batch.near, torch.full((2, 2), 0.45)) and torch.equal(batch.far, torch.full((2, 2), 10.0))
+    assert batch.masks.all() and batch.target_masks.dtype == torch.bool
+    moved = batch.to("cpu")
+    assert torch.equal(moved.images, batch.images) and moved.names == batch.names
+
+
+def test_samples_without_depth_have_zero_depth_in_a_batch(tmp_path: Path, write_triplets: Callable) -> None:
+    source = write_triplets(tmp_path, "a", "b")
+    for depth in tmp_path.glob("b_*_depth.png"):
+        depth.unlink()
+    batch = collate([source.sample(index, 8, 0) for index in range(len(source))])
+    assert batch.depths is not None
+    assert (batch.depths[0] > 0).all() and (batch.depths[1] == 0).all()
+
+
+def test_samples_of_different_shapes_cannot_be_batched(tmp_path: Path, write_triplets: Callable) -> None:
+    source = write_triplets(tmp_path, "a")
+    with pytest.raises(InputError, match=r"cannot batch a with a: needed context of shape \(2, 3, 8, 16\)"):
+        collate([source.sample(0, 8, 0), source.sample(0, 4, 0)])
+    with pytest.raises(InputError, match="at least one sample"):
+        collate([])
+
+
+def test_panogrf_sets_are_read_by_stage_and_missing_ones_warn(tmp_path: Path, write_panorama: Callable) -> None:
+    for kind, scenes in (("m3d_dist_0.5", 2), ("m3d_dist_1.0", 1)):
+        for scene, i in itertools.product(range(scenes), range(3)):
+            view = tmp_path / f"png_render_test_1024x512_seq_len_3_{kind}" / f"{scene:08d}" / f"{i:02d}"
+            write_panorama(view / "rgb.png", 0.2 * (i + 1))
+            np.savetxt(view / "rot.txt", np.eye(3))
+            np.savetxt(view / "tran.txt", [0, 0, 0.5 * i])
+    with pytest.warns(UserWarning, match=r"no PanoGRF scenes in .*m3d_dist_0\.1.*replica_dist_0\.5; these sets"):
+        sets = read_panogrf(tmp_path, "test", 256)
+    assert [(s.name, len(s.sources)) for s in sets if s.sources] == [("m3d_dist_0.5", 2), ("m3d_dist_1.0", 1)]
+    assert len(sets) == 7
+    sample = TripletSource(sets[2]).sample(1, 8, 0)
+    assert sample.name == "00000001"
+    assert sample.context.images[:, 0, 0, 0].tolist() == pytest.approx([0.2, 0.6], abs=3e-3)
+    # A file's +z is the world's -y (docs/official.md, section 2.1).
+    assert sample.context.cam2world[:, 1, 3].tolist() == [0, -1.0]
+    with pytest.raises(InputError, match=r"scenes for train, got none in .*png_render_train_1024x512_seq_len_3_m3d"):
+        read_panogrf(tmp_path, "train", 512)
+    with pytest.raises(InputError, match=r"4096x2048_seq_len_3_m3d_dist_0\.5"):
+        read_panogrf(tmp_path, "test", 2048, [("m3d", 0.5)])
+
+
+def test_pairs_need_targets_and_a_random_one_is_chosen(
+    tmp_path: Path, write_panorama: Callable, matrix: Callable
+) -> None:
+    names = [f"{i}.png" for i in range(5)]
+    for i, name in enumerate(names):
+        write_panorama(tmp_path / name, i / 10)
+    poses = {name: matrix(i) for i, name in enumerate(names)}
+    (tmp_path / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    with pytest.raises(InputError, match="needed 1 target panorama"):
+        PairSource(load_pairs(tmp_path))
+    groups = {"pairs": [{"context": ["0.png", "4.png"], "target": ["1.png", "2.png", "3.png"]}]}
+    (tmp_path / "pairs.json").write_text(json.dumps(groups))
+    pairs = load_pairs(tmp_path)
+    assert PairSource(pairs).sample(0, 8, 0).targets.names == ("1", "2", "3")
+    chosen = {PairSource(pairs, targets=1).sample(0, 8, seed).targets.names for seed in range(20)}
+    assert chosen == {("1",), ("2",), ("3",)}
+    with pytest.raises(InputError, match="needed 4 target"):
+        PairSource(pairs, targets=4)
+
+
+def test_concatenated_sources_keep_their_order(tmp_path: Path, write_triplets: Callable) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    second.mkdir()
+    maps, others = write_triplets(first, "a", "b"), write_triplets(second, "c", "d", "e")
+    concatenated = ConcatSource([maps, ConcatSource([]), others, maps])
+    assert len(concatenated) == 7
+    assert [concatenated.sample(i, 8, 0).name for i in range(7)] == ["a", "b", "c", "d", "e", "a", "b"]
