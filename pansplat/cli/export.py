@@ -169,9 +169,9 @@ class _Page:
                 out,
                 gaussians=count,
                 split=split,
-                title=self.title or export.path.resolve().stem.replace("_", " "),
+                title=self.title or _name_page(export.path, photographs),
                 embed=self.embed,
-                photographs=photographs if has_photographs else (),
+                photographs=photographs if shows_all else (),
                 photo_height=self.photo_height,
                 progress=progress,
             )
@@ -195,6 +195,17 @@ class _Page:
         _print_changes(changes)
         if self.serve:
             serve_page(page)
+
+
+def _name_page(path: Path, photographs: Sequence[Pair]) -> str:
+    """The name of a tour by its author, else that of its folder or file."""
+    from pansplat.inputs.web_tours import is_web_tour_file
+
+    named = path.resolve()
+    if photographs and is_web_tour_file(named):
+        named = named.parent
+    tour = photographs[0].context[0].tour if photographs else ""
+    return tour or named.stem.replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -274,9 +285,10 @@ class _Photographs:
         panoramas = load_panoramas(export.path)
         with replacing_folder(export.out) as folder, progress_bar() as progress:
             size = write_panoramas(folder, panoramas, progress)
-        print(
-            f"{export.out}: {len(panoramas)} photographs, {size / 1e6:.1f} MB; `pansplat-view {export.out}` opens them"
-        )
+        print(f"{export.out}: {len(panoramas)} photographs, {size / 1e6:.1f} MB")
+        notes = sum(len(panorama.notes) for panorama in panoramas)
+        if notes:
+            print(f"note: {export.out}: {notes} notes of hot spots are left out", file=sys.stderr)
 
 
 @dataclass(frozen=True)

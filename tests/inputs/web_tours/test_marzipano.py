@@ -13,7 +13,7 @@ from PIL import Image
 from pansplat.cli import run
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.folders import load_pairs, load_panoramas
-from pansplat.inputs.pairs import Link, Panorama
+from pansplat.inputs.pairs import Link, Note, Panorama
 from pansplat.inputs.web_tours import find_web_tour, read_web_tour
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.files import name_pictures
@@ -208,10 +208,28 @@ def test_links_to_nowhere_and_to_itself_are_dropped(export: Export) -> None:
     assert "a link of 0-hall is left out: it leads to '9-gone'" in messages[1]
 
 
-def test_information_is_counted_as_left_out(export: Export) -> None:
-    folder = export(_scene("0-hall", infoHotspots=[{"yaw": 0, "pitch": 0, "title": "a", "text": "b"}] * 3))
-    with pytest.warns(UserWarning, match="3 hot spots with information are left out"):
-        read_web_tour(folder / "data.js")
+def test_information_is_kept_as_plain_text_with_addresses_of_web_pages(export: Export) -> None:
+    text = """<p>Oak &amp; ash<br>1 &lt; 2</p><script>alert(1)</script><img src="img/oven.jpg" onerror="alert(2)">
+        <a href="https://example.org/a?b=1&amp;c">more</a>
+        <a href="javascript://x/%0Aalert(3)">one</a><a href="data:,x">two</a><a href="https://user name@x">three</a>
+        <img alt="a tap" src="http://example.org/tap.png">"""
+    spots = [
+        {"yaw": 0.5, "pitch": -0.2, "title": "<b>Floor</b>", "text": text},
+        {"yaw": 0, "pitch": 0, "title": " ", "text": 7},
+        {"yaw": "x", "title": "gone"},
+    ]
+    with pytest.warns(UserWarning, match="a hot spot of 0-hall is left out: direction, yaw: needed a number"):
+        (hall,) = read_web_tour(export(_scene("0-hall", infoHotspots=spots)) / "data.js")
+    shown = "Floor\nOak & ash\n1 < 2\n[oven.jpg]\nmore\nonetwothree\n[a tap]"
+    assert hall.notes == (Note(0.5, -0.2, shown, ("https://example.org/a?b=1&c", "http://example.org/tap.png")),)
+
+
+@pytest.mark.parametrize(("name", "title"), [("Our <i>home</i>", "Our <i>home</i>"), ("Project Title", ""), (3, "3")])
+def test_the_title_of_the_tour_is_that_of_the_project(export: Export, name: object, title: str) -> None:
+    folder = export(_scene("0-hall"))
+    data = json.loads((folder / "data.js").read_text().removeprefix("var APP_DATA = ").rstrip(";\n"))
+    (folder / "data.js").write_text(f"var APP_DATA = {json.dumps(data | {'name': name})};")
+    assert [panorama.tour for panorama in read_web_tour(folder / "data.js")] == [title]
 
 
 def test_scripts_in_names_are_plain_text(export: Export) -> None:
