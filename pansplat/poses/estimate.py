@@ -59,8 +59,11 @@ from pansplat.system.threads import one_thread, worker_threads
 _HEIGHT = 1024  # pixels; larger panoramas are reduced
 _MIN_HEIGHT = 256
 _QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared thoroughly
-_THOROUGH = 6  # pairs of each panorama that are compared with all features
-_FEW = 6  # up to this number of panoramas, all pairs are compared with all features
+_THOROUGH = 6  # pairs of each panorama that are compared with all features, at most
+_FEW = 3  # up to this number of panoramas, all pairs are compared with all features
+_SUFFICIENT = 3  # certain pairs of a panorama; more are not looked for within a group
+_LEAST_BATCH = 4  # pairs that are compared before others are chosen
+_CHANCE = 25.0  # expected matches by `_quick_overlap`, below which pairs of one group are not compared
 _MOST = 0.6  # of the panoramas whose common mask is kept when others are added
 _DARK = 8.0  # mean grey value of an image that shows nothing
 _LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
@@ -507,7 +510,11 @@ def _find_scene_mask(paths: Sequence[Path], stems: Sequence[str], cache: PoseCac
 def _relate_views(
     views: Sequence[_View], ways: Mapping[Pair, Ways], seed: int, cache: PoseCache, report: Progress
 ) -> dict[Pair, RelativePose]:
-    """Relative poses of the pairs that have most in common, and of those that links connect."""
+    """Relative poses of the pairs that have most in common, and of those that links connect.
+
+    Pairs are compared in the order of what they have in common. Those within a group that certain pairs connect are
+    left out if both panoramas have enough of them, or if both have no more in common than by chance.
+    """
     pairs = list(itertools.combinations(range(len(views)), 2))
     overlap: dict[Pair, float] = {}
     if len(views) > _FEW:
@@ -519,7 +526,7 @@ def _relate_views(
         for view in range(len(views)):
             own = sorted((pair for pair in pairs if view in pair), key=lambda pair: -overlap[pair])
             chosen |= set(own[:_THOROUGH])
-        pairs = sorted(chosen)
+        pairs = sorted(chosen, key=lambda pair: (-overlap[pair], pair))
 
     matcher = None if views[0].learned is None else load_matcher()
 
@@ -543,11 +550,26 @@ def _relate_views(
         key = hash_parts(first.key, second.key, f"{ways[pair]} {seed}")
         return cache.get(f"pair-{hash_parts(first.stem, second.stem)}", key, lambda: relate(pair))
 
-    relations = {}
+    groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
+
+    def is_needed(pair: Pair) -> bool:
+        i, j = pair
+        if groups[i] != groups[j] or ways[pair] != NO_WAYS:
+            return True
+        return min(counts[i], counts[j]) < _SUFFICIENT and overlap.get(pair, math.inf) >= _CHANCE
+
+    relations: dict[Pair, RelativePose] = {}
     with worker_threads() as pool:
-        for position, (pair, relation) in enumerate(zip(pairs, pool.map(look_up, pairs), strict=True)):
-            report("comparing pairs", 0.5 + 0.4 * position / len(pairs))
-            relations[pair] = relation
+        size = max(len(views) // 2, _LEAST_BATCH)  # the same one for any number of threads
+        for start in range(0, len(pairs), size):
+            batch = [pair for pair in pairs[start : start + size] if is_needed(pair)]
+            for number, (pair, relation) in enumerate(zip(batch, pool.map(look_up, batch), strict=True)):
+                report("comparing pairs", 0.5 + 0.4 * (start + number) / len(pairs))
+                relations[pair] = relation
+                if relation.is_certain:
+                    i, j = pair
+                    groups = [groups[i] if group == groups[j] else group for group in groups]
+                    counts[i], counts[j] = counts[i] + 1, counts[j] + 1
     return relations
 
 
