@@ -96,6 +96,7 @@ def load_pairs(
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
     progress: Progress | None = None,
+    on_unposed: Callable[[list[Pair]], None] | None = None,
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
@@ -109,6 +110,8 @@ def load_pairs(
         near, far: radial depth range in metres; overrides that of the files.
         camera_height: of the cameras over the floor, metres; the scale of estimated poses and of single views.
         progress: called with a description of the estimate of poses and the completed fraction.
+        on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
+            panorama.
     """
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
@@ -118,7 +121,9 @@ def load_pairs(
         unposed = error.folder, error.panoramas
     else:
         return [_with_camera_height(pair, camera_height) for pair in pairs]
-    pairs = estimate_pairs(*unposed, near=near, far=far, camera_height=camera_height, progress=progress)
+    pairs = estimate_pairs(
+        *unposed, near=near, far=far, camera_height=camera_height, progress=progress, on_unposed=on_unposed
+    )
     return [_with_camera_height(pair, camera_height) for pair in pairs]
 
 

@@ -17,8 +17,11 @@ from pansplat.system.options import EYE_DISTANCE, EyeDistance, PredictOptions, R
 from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
+    Progress,
     SceneEntry,
     SceneLoader,
+    Show,
+    choose_entry,
     find_entries,
     load_entry,
 )
@@ -134,17 +137,6 @@ def run_arguments(args: Sequence[str] | None = None) -> int:
         return _run(options)
 
 
-def choose_entry(entries: list[SceneEntry], pair: str | None) -> int:
-    """Return the index of the entry with this name or number (from 1); None is the first."""
-    if pair is None:
-        return 0
-    for index, entry in enumerate(entries):
-        if pair in (entry.name, str(index + 1)):
-            return index
-    names = ", ".join(entry.name for entry in entries[:12]) + (", ..." if len(entries) > 12 else "")
-    raise InputError(f"`--pair` must be a number from 1 to {len(entries)} or one of {names}, got {pair!r}")
-
-
 def _run(options: Options) -> int:
     pixels = options.pixels
     options.image_format.check(pixels, options.preset)
@@ -165,20 +157,20 @@ def _run(options: Options) -> int:
         if options.path_file is None or options.offscreen is not None or options.pair == "all":
             raise InputError("--out needs --path, one scene and no --offscreen; give the file of a camera path")
     path = None if options.path_file is None else read_path(expand_home(options.path_file))
-    with progress_bar() as progress:  # of poses, which take minutes for a tour without them
-        entries = find_entries(expand_home(options.path), options.load_options, progress)
-    show_all = options.pair == "all"
-    first = 0 if show_all else choose_entry(entries, options.pair)
     folder = options.offscreen
-    if options.out is not None:
-        _write_film(options, entries[first], options.out.parent, pixels, path)
-        return 0
-    if folder is None:
-        problem = _run_window(options, entries, first, pixels if options.size else _WINDOW_SIZE, path)
+    if folder is None and options.out is None:
+        problem = _run_window(options, pixels if options.size else _WINDOW_SIZE, path)
         if problem is None:
             return 0
         print(f"{problem}: writing a fly-through instead")
         require_output_folder("the folder", Path("renders"))
+    with progress_bar() as progress:  # of poses, which take minutes for a tour without them
+        entries = find_entries(expand_home(options.path), options.load_options, progress)
+    show_all = options.pair == "all"
+    first = 0 if show_all else choose_entry(entries, options.pair)
+    if options.out is not None:
+        _write_film(options, entries[first], options.out.parent, pixels, path)
+        return 0
     chosen = entries if show_all else entries[first : first + 1]
     if len(chosen) < len(entries):
         print(f"{options.path} has {len(entries)} scenes: showing {chosen[0].name}; select with --pair NAME or all")
@@ -191,10 +183,11 @@ def _run(options: Options) -> int:
     return 0
 
 
-def _run_window(
-    options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int], path: "CameraPath | None"
-) -> str | None:
-    """Run the viewer in a window; if no window can be opened, returns the reason."""
+def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | None") -> str | None:
+    """Run the viewer in a window; if no window can be opened, returns the reason.
+
+    The window opens when the panoramas are known. Their poses may arrive later.
+    """
     if options.stereo != "mono":
         if options.renderer == "cpu":
             raise InputError("--stereo in a window needs OpenGL, got --renderer cpu; use --renderer gl")
@@ -211,16 +204,34 @@ def _run_window(
 
     load_options = options.load_options
     state = ViewerState(settings=options.settings, path=path or CameraPath())
-    source: Path | None = expand_home(options.path)
+    source = expand_home(options.path)
+
+    def create_loader() -> SceneLoader:
+        return SceneLoader(lambda entry, progress, show: load_entry(entry, load_options, progress, show))
+
+    def find(path: Path, progress: Progress, show: Show) -> list[SceneEntry]:
+        found = find_entries(path, load_options, progress, show)
+        choose_entry(found, options.pair if path == source else None)
+        return found
+
+    loader = create_loader()
+    loader.search(source, find)
+    loader.wait_for_entries()
+    entries = loader.poll()
+    if isinstance(entries, BaseException):
+        loader.close()
+        raise entries
+    first = 0 if loader.is_searching else choose_entry(entries, options.pair)
     for attempt in range(_MAX_CONTEXTS):
         try:
             window = Window("pansplat", pixels)
         except NoWindowError as error:
+            loader.close()
             return str(error)
         viewer = Viewer(
             window.ctx,
-            SceneLoader(lambda entry, progress, show: load_entry(entry, load_options, progress, show)),
-            find=lambda path, progress: find_entries(path, load_options, progress),
+            loader,
+            find=find,
             state=state,
             at=options.at or 0.0,
             dpi_scale=window.dpi_scale,
@@ -228,15 +239,21 @@ def _run_window(
             memory=options.memory,
             preferences=find_file(),
         )
-        viewer.show(entries, first, source)
+        if loader.is_searching:
+            viewer.expect(entries, source, options.pair)
+        else:
+            viewer.show(entries, first, source)
         try:
             run_viewer(window, viewer)
             return None
         except ContextLostError:  # start again with the same scene, camera and settings
             if attempt == _MAX_CONTEXTS - 1:
                 raise
-            library = viewer.library
-            entries, first, source = library.entries, max(library.current, 0), library.path
+            library, loader = viewer.library, create_loader()
+            if library.path is None:  # poses were being estimated
+                loader.search(source, find)
+            else:
+                entries, first, source = library.entries, max(library.current, 0), library.path
     return None
 
 

@@ -32,7 +32,7 @@ from pansplat_viewer.scene.cleaning import CLEANING_JOB, Painting, measure_bound
 from pansplat_viewer.scene.doll_house import DollHouseView
 from pansplat_viewer.scene.key_frames import read_path, write_path
 from pansplat_viewer.scene.library import Library
-from pansplat_viewer.scene.loader import LoadedScene, Progress, SceneEntry, SceneLoader
+from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
 from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import RendererChoice
@@ -74,7 +74,7 @@ class Viewer:
         ctx: moderngl.Context,
         loader: SceneLoader,
         *,
-        find: Callable[[Path, Progress], list[SceneEntry]],
+        find: Find,
         state: ViewerState | None = None,
         folder: Path = Path("renders"),
         at: float = 0.0,
@@ -153,8 +153,8 @@ class Viewer:
 
     @property
     def loading(self) -> tuple[str, str, float] | None:
-        """Name, task and fraction done of the scene that will be shown; None if nothing is loading."""
-        if self._loads_for_tour:
+        """Name, task and fraction done of the search, or of the scene that will be shown; None without them."""
+        if self._loads_for_tour and not self.library.loader.is_searching:
             return None
         progress = self.stage.preparer.progress
         if self._incoming is not None and progress is not None:
@@ -312,6 +312,22 @@ class Viewer:
             self._preview(entries[index])
         self.library.loader.request(entries[index])
 
+    def expect(self, entries: list[SceneEntry], path: Path, name: str | None) -> None:
+        """Show panoramas while their poses are estimated by a search of the loader, which has begun.
+
+        Args:
+            entries: the panoramas, none of which is placed.
+            path: where they are.
+            name: name or number of the entry to show when the search ends; None for the first.
+        """
+        self.library.expect(path, name)
+        self._show_unplaced(entries)
+
+    def _show_unplaced(self, entries: list[SceneEntry]) -> None:
+        if self.loaded is None and entries:
+            self.library.offer(entries, 0, None)
+            self._preview(entries[0])
+
     def choose(self, index: int) -> None:
         """Show another entry of the list."""
         if index != self.library.current:
@@ -365,7 +381,9 @@ class Viewer:
             self._show_loaded(incoming)
         requested = loader.entry
         result = loader.poll() if self._incoming is None else None
-        if isinstance(result, list):
+        if isinstance(result, list) and loader.is_searching:
+            self._show_unplaced(result)
+        elif isinstance(result, list):
             self.show(result, *self.library.choose_found(result))
         elif isinstance(result, LoadedScene):
             loaded = self.loaded

@@ -168,7 +168,7 @@ def _load_pairs(root: Path, convention: str | None, near: float | None, far: flo
             return single_view_pairs([read_photograph(root)], root.parent, near, far)
         if root.is_file() and root in triplet_files(root.parent):
             collections = [(root.parent, read_triplet(root, convention))]
-        elif root.is_file() and not _is_pose_file(root):
+        elif root.is_file() and not _is_pose_file(root) and not (root.parent / _POSES).exists():
             return _make_unposed_pairs(root.parent, _read_tour_file(root), near, far)
         else:
             root = root.parent if root.is_file() else root
@@ -463,13 +463,18 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     is_stated = convention is None
     text, origin = (content.get("convention"), source) if is_stated else (convention, "`convention`")
     convention = parse_convention(text, origin)
-    panoramas = tuple(_read_pose_entry(folder, name, entry, convention, is_stated) for name, entry in entries.items())
+    tour = _read_tour_of_folder(folder)
+    panoramas = tuple(
+        _read_pose_entry(folder, name, entry, convention, is_stated, tour.get(name)) for name, entry in entries.items()
+    )
     if not panoramas:
         raise InputError(f"{source}: needed poses of one or more panoramas, got none; add them or remove the file.")
     panoramas = tuple(_judge_entries(content, panoramas, source))
     folders = tuple(dict.fromkeys((folder, *(view.image.parent for view in panoramas))))
-    reasons = _read_reasons(content)
-    unposed = [_explain_unposed(view, reasons, source) for view in _list_further(source, folders, panoramas, reasons)]
+    reasons, known = _read_reasons(content), {view.image for view in panoramas}
+    rest = [view for view in dict.fromkeys(tour.values()) if view.image not in known]
+    further = rest if tour else _list_further(source, folders, panoramas, reasons)
+    unposed = [_explain_unposed(view, reasons, source) for view in further]
     linked = add_links([*panoramas, *unposed], folder)
     ranges = _read_ranges(content, source)
     near, far = (
@@ -493,6 +498,21 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
         unposed=tuple(linked[len(panoramas) :]),
         folders=folders,
     )
+
+
+def _read_tour_of_folder(folder: Path) -> dict[str, Panorama]:
+    """The panoramas of the web tour in a folder, by the names that poses.json may have for them.
+
+    Empty without a tour, and for a faulty one, with a warning. The names are those of scenes, and files' paths.
+    """
+    source = find_web_tour(folder)
+    try:
+        views = [] if source is None else read_web_tour(source)
+    except InputError as error:
+        warnings.warn(f"the web tour is left out: {error}", category=InputWarning, stacklevel=4)
+        return {}
+    paths = {os.path.relpath(view.image, folder).replace(os.sep, "/"): view for view in views}
+    return paths | {view.name: view for view in views}
 
 
 def _judge_entries(content: dict[str, Any], panoramas: Sequence[Panorama], source: Path) -> list[Panorama]:
@@ -567,10 +587,23 @@ def _list_further(
     return unposed
 
 
-def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_stated: bool) -> Panorama:
-    """One entry of poses.json. `is_stated`: whether `convention` comes from the file."""
+def _read_pose_entry(
+    folder: Path, name: str, entry: Any, convention: str, is_stated: bool, view: Panorama | None
+) -> Panorama:
+    """One entry of poses.json.
+
+    Args:
+        folder: of the file.
+        name: of the entry.
+        entry: its value.
+        convention: of the pose.
+        is_stated: whether `convention` comes from the file.
+        view: what a web tour states of the panorama; None for a file.
+    """
     source = f"{folder / _POSES}, {name!r}"
-    image = locate_inside(folder, name, source)
+    if view is None:
+        image = locate_inside(folder, name, source)
+        view = Panorama(image.stem, image, torch.eye(4, dtype=torch.float64), find_mask(image, folder))
     matrix, mask, depth, world, room = entry, None, None, 0, ""
     if isinstance(entry, dict):
         key = next((key for key in MATRIX_KEYS if key in entry), None)
@@ -586,7 +619,9 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
         world = read_field(entry, "world", Annotated[int, Meta(ge=0, le=_MAX_WORLD)], source, 0)
         room = plain_text(entry.get("room"))
     cam2world = to_cam2world(rigid_matrix(matrix, source), convention)
-    return Panorama(image.stem, image, cam2world, mask or find_mask(image, folder), depth, world=world, title=room)
+    return dataclasses.replace(
+        view, cam2world=cam2world, mask=mask or view.mask, depth=depth, world=world, title=room or view.title
+    )
 
 
 def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -> Path | None:

@@ -24,7 +24,7 @@ from pansplat.inputs.folders import MATRIX_KEYS
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
-from pansplat.inputs.web_tours import find_web_tour
+from pansplat.inputs.web_tours import is_scene_of_tour
 from pansplat.poses.estimate import PoseEstimate
 from pansplat.poses.placing import Place, Suggestion
 from pansplat.poses.pose_file import (
@@ -65,11 +65,6 @@ class PoseEditor:
         self._by_name = {panorama.name: panorama.image for panorama in panoramas}
         if not self._sources:
             raise InputError(f"{folder}: needed estimated poses or a {POSES} to change poses, got another format.")
-        if not self.file.exists() and find_web_tour(folder) is not None:
-            raise InputError(
-                f"{folder}: needed photographs to place them by hand, got a tour of another program, whose titles and "
-                f"links a {POSES} would hide; copy its panoramas to a folder of their own."
-            )
         self._undo: list[tuple[bytes | None, bytes]] = []
         if self.file in self._sources:
             self._check_convention(panoramas)
@@ -297,6 +292,8 @@ def merge_estimate(
 def _name_in(folder: Path, panorama: Panorama) -> str:
     """The key of a panorama in the poses.json of a folder."""
     image = panorama.image
+    if is_scene_of_tour(folder, image):
+        return panorama.name
     if len(list_pictures(image)) > 1:
         raise InputError(
             f"{image}: needed 2:1 photographs to place them by hand, got cube faces; convert them to panoramas."

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import torch
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
+from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import list_masks, read_thumbnail
 from pansplat.inputs.folders import make_names_unique
 from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
@@ -22,6 +23,7 @@ from pansplat.inputs.placements import Placement, judge, read_ties
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.views import CAMERA_HEIGHT
+from pansplat.inputs.web_tours import is_scene_of_tour
 from pansplat.poses.edit import find_kept, merge_estimate, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
 from pansplat.poses.pose_file import (
@@ -87,9 +89,18 @@ def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) 
 
 
 def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
-    """The names of images in a poses.json, relative to its folder; an InputError for one outside of it."""
-    inside = {image: locate_inside(path.parent, os.path.abspath(image), path) for image in images}
-    return {image: file.relative_to(path.parent).as_posix() for image, file in inside.items()}
+    """The names of images in a poses.json, relative to its folder; an InputError for one outside of it.
+
+    Scenes of a web tour in this folder that are made from cube faces have their own names.
+    """
+    names = {}
+    for image in images:
+        if is_scene_of_tour(path.parent, image):
+            names[image] = image.name.removesuffix(CUBE_SUFFIX)
+        else:
+            file = locate_inside(path.parent, os.path.abspath(image), path)
+            names[image] = file.relative_to(path.parent).as_posix()
+    return names
 
 
 def estimate_pairs(
@@ -100,6 +111,7 @@ def estimate_pairs(
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
     progress: Progress | None = None,
+    on_unposed: Callable[[list[Pair]], None] | None = None,
 ) -> list[Pair]:
     """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
 
@@ -113,11 +125,16 @@ def estimate_pairs(
         near, far: metres; they override the estimated range.
         camera_height: of the cameras over the floor, metres.
         progress: called with a description of the current work and the completed fraction.
+        on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
+            panorama.
     """
     name = f"poses-{_hash_inputs(panoramas, camera_height)}.json"
     folders = cache_folders(folder)
     source = next((cache / name for cache in folders if (cache / name).is_file()), None)
     if source is None:
+        if on_unposed is not None:
+            single = single_view_pairs(panoramas, folder, near, far, siblings=panoramas)
+            on_unposed(localize_pairs(make_names_unique(single)))
         content = _estimate(folder, panoramas, camera_height, progress)
         source = write_cache_file(folders, name, json.dumps(content).encode())
         if source is None:

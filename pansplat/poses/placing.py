@@ -22,6 +22,7 @@ from numpy import ndarray as Array
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.path import level_pose, up_direction, wrap_angle
 from pansplat.images.image_files import read_height, read_panorama
+from pansplat.inputs.pairs import Panorama
 from pansplat.poses.axes import find_axes, with_hints
 from pansplat.poses.dense import Comparison, Surroundings, compare
 from pansplat.poses.depth import estimate_depth
@@ -35,8 +36,10 @@ _OUTLINE_STEP = 2  # of the pixels that an outline is traced from, rows and colu
 _UPRIGHT = math.radians(8)  # between a world's y axis and the mean down of its cameras, if y is down
 SNAP_RADIUS, SNAP_ANGLE = 0.35, math.radians(12)  # metres and radians, to a suggestion
 WALL_ANGLE = math.radians(6)  # to parallel walls
+POOR_FIT = 0.25  # quality below which a place is doubtful
 _LEAST_OVERLAP = 0.01  # of a comparison that counts
 _LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind
+_LINK_REACH = 1.0, 4.0  # camera heights, of a place by a link
 _NEIGHBOURS = 4  # nearest panoramas that a place is compared with
 
 
@@ -99,6 +102,39 @@ def list_suggestions(
         place = Place(float(centre[0]), float(centre[2]), math.atan2(forward[0], forward[2]))
         found.append(Suggestion(place, candidate.log_odds))
     return tuple(found)
+
+
+def suggest_by_links(
+    first: Panorama, second: Panorama, upright: tuple[Float[Array, "3 3"], Float[Array, "3 3"]]
+) -> Place | None:
+    """The place of the second panorama relative to the first one by the links of a tour, camera heights.
+
+    It is where a link meets the floor, 1 to 4 camera heights away. A link back states the heading. Without it the start
+    view looks onwards; without a start view, the middle of the picture. None without links.
+
+    Args:
+        first, second: names and links count.
+        upright: axes of both upright cameras in the cameras' frames, as columns (`DepthMap.rotation`).
+    """
+    there = next((link for link in first.links if link.target == second.name), None)
+    back = next((link for link in second.links if link.target == first.name), None)
+    if there is None:
+        turned = None if back is None else suggest_by_links(second, first, (upright[1], upright[0]))
+        return None if turned is None else turned.inverse()
+    yaw, distance = _meet_floor(there.yaw, there.pitch, upright[0])
+    if back is not None:
+        heading = yaw + math.pi - _meet_floor(back.yaw, back.pitch, upright[1])[0]
+    else:
+        heading = yaw - (_meet_floor(*second.start, upright[1])[0] if second.start else 0.0)
+    return Place(distance * math.sin(yaw), distance * math.cos(yaw), wrap_angle(heading))
+
+
+def _meet_floor(yaw: float, pitch: float, upright: Float[Array, "3 3"]) -> tuple[float, float]:
+    """Yaw of a direction of a camera for the upright camera, and the level distance to where it meets the floor."""
+    level = math.cos(pitch)
+    right, down, forward = upright.T @ (level * math.sin(yaw), math.sin(pitch), level * math.cos(yaw))
+    distance = math.hypot(right, forward) / down if down > 0 else math.inf
+    return math.atan2(right, forward), min(max(distance, _LINK_REACH[0]), _LINK_REACH[1])
 
 
 @dataclass(frozen=True, eq=False)

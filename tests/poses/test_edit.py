@@ -247,13 +247,6 @@ def test_suggestions_are_kept_from_the_cache_to_the_file(folder: Path):
         editor.place({folder / "e.png": np.eye(4)}, 0)
 
 
-def test_a_tour_of_another_program_is_not_changed(folder: Path):
-    scenes = {name: {"panorama": f"{name}.png"} for name in NAMES}
-    (folder / "tour.json").write_text(json.dumps({"scenes": scenes}))
-    with pytest.raises(InputError, match="got a tour of another program"):
-        _edit(folder)
-
-
 def test_a_new_estimate_keeps_the_poses_by_hand_and_adds_others_beside_them(folder: Path):
     """The new estimate has its origin elsewhere; e, whose pair was rejected, stays without a pose."""
     editor, pose = _edit(folder), np.eye(4)

@@ -1,10 +1,14 @@
 """Places on a floor plan: composition, snapping, suggestions of relative poses, outlines and the fit."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from pansplat.inputs.pairs import Link, Panorama
 from pansplat.poses.placing import (
     SNAP_ANGLE,
     SNAP_RADIUS,
@@ -16,6 +20,7 @@ from pansplat.poses.placing import (
     list_suggestions,
     measure_fit,
     snap,
+    suggest_by_links,
 )
 from pansplat.poses.solvers import rotation_exp
 from pansplat.poses.two_view import Hypotheses, RelativePose
@@ -138,3 +143,29 @@ def test_a_piece_that_has_nothing_in_common_with_the_others_has_no_fit(look_arou
     far[0, 3] = 1000.0
     assert measure_fit(view, far, [(view, np.eye(4))], 1.35) is None
     assert measure_fit(view, far, [], 1.35) is None
+
+
+def test_links_suggest_the_place_at_which_they_meet_the_floor_also_of_tilted_cameras():
+    truth, upright = Place(1.2, 1.6, -2.0), (_tilt(0.1), _tilt(-0.2))
+    levels = {"a": (truth.right, 1.0, truth.forward), "b": (truth.inverse().right, 1.0, truth.inverse().forward)}
+    links = {}
+    for name, axes in zip("ab", upright, strict=True):
+        x, y, z = axes @ levels[name]
+        links[name] = Link("ba"["ab".index(name)], math.atan2(x, z), math.atan2(y, math.hypot(x, z)))
+    first, second = (
+        Panorama(name, Path(f"{name}.jpg"), torch.eye(4, dtype=torch.float64), links=(links[name],)) for name in "ab"
+    )
+    _assert_same(suggest_by_links(first, second, upright), truth)
+    _assert_same(suggest_by_links(second, first, upright[::-1]), truth.inverse())
+    unlinked = replace(second, links=())
+    assert suggest_by_links(replace(first, links=()), unlinked, upright) is None
+    onwards = suggest_by_links(first, unlinked, upright)
+    assert onwards[:2] == pytest.approx(truth[:2]) and onwards.yaw == pytest.approx(math.atan2(1.2, 1.6))
+    turned = suggest_by_links(first, replace(unlinked, start=(0.5, 0.0)), (upright[0], np.eye(3)))
+    assert turned.yaw == pytest.approx(onwards.yaw - 0.5)
+    horizontal = replace(first, links=(replace(links["a"], pitch=-0.3),))
+    assert math.hypot(*suggest_by_links(horizontal, second, upright)[:2]) == pytest.approx(4.0)
+
+
+def _tilt(angle: float) -> np.ndarray:
+    return rotation_exp(np.array((angle, 0.0, 0.5 * angle)))

@@ -15,9 +15,9 @@ from pansplat.errors import InputError
 from pansplat.system.files import is_written
 from pansplat.system.options import PredictOptions, ReadOptions
 from pansplat_viewer import run
-from pansplat_viewer.app import Options, choose_entry
+from pansplat_viewer.app import Options
 from pansplat_viewer.capture import STILLS, Film, compute_flight_pose, compute_panorama_pose
-from pansplat_viewer.scene.loader import LoadOptions, SceneEntry
+from pansplat_viewer.scene.loader import LoadOptions, SceneEntry, choose_entry
 
 
 @pytest.fixture(autouse=True)

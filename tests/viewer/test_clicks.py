@@ -39,7 +39,7 @@ from pansplat_viewer.scene.loader import (
     SceneEntry,
     SceneLoader,
 )
-from pansplat_viewer.scene.settings import Comparison, Display, Preset
+from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Preset
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
@@ -72,6 +72,7 @@ INITIAL_SETTINGS = {
 # Widgets whose effect has its own test.
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
+    "photographs at panoramas",
     *get_args(Display), *get_args(Comparison),
     "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
     "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
@@ -88,7 +89,7 @@ class User:
     def __init__(self, viewer: Viewer, target: moderngl.Framebuffer, clock: list[float], load: Callable) -> None:
         self.viewer, self.target, self.clock = viewer, target, clock
         self.load = self.first_load = load
-        self.find = lambda path, progress: [SceneEntry("opened")]
+        self.find = lambda path, progress, show: [SceneEntry("opened")]
         self.state, self.panels = viewer.state, viewer.panels
 
     def draw_frames(self, count: int, seconds: float = 1 / 30) -> None:
@@ -249,7 +250,7 @@ def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp
 @pytest.fixture
 def user(session, ctx) -> User:
     """The session with scene, state and camera as at the start."""
-    session.load, session.find = session.first_load, lambda path, progress: [SceneEntry("opened")]
+    session.load, session.find = session.first_load, lambda path, progress, show: [SceneEntry("opened")]
     if session.viewer.library.names != NAMES or session.viewer.library.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
@@ -257,6 +258,7 @@ def user(session, ctx) -> User:
     for name in (field.name for field in fields(ViewerState) if field.name not in kept):
         setattr(state, name, getattr(start, name))
     state.camera, state.adaptive, state.message = state.home, True, ""
+    state.stops = False  # the camera is at a panorama, and tests look at the scene
     session.viewer.error, session.viewer.stage.resolution.budget_ms = None, BUDGET_MS
     imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
     session.draw_frames(2, SETTLE_AFTER)
@@ -457,7 +459,7 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
 def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
     opened = []
 
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+    def find(path: Path, progress: Progress, show: object) -> list[SceneEntry]:
         opened.append(path.name)
         return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
 
@@ -693,6 +695,38 @@ def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
     user.click("coarser while moving")
     user.press(imgui.Key.w, frames=4)
     assert user.viewer.stage.image_size == SIZE
+
+
+def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):
+    scene, state = user.read_image(), user.state
+    user.click("photographs at panoramas")
+    user.draw_frames(1, 1 / 60)
+    fading = user.read_screen()
+    photograph = user.read_image()
+    assert state.stops and changed_fraction(scene, photograph) > 0.5
+    between = np.abs(fading - scene).sum() / np.abs(photograph - scene).sum()
+    assert 0 < between < 0.7 and user.viewer.stage.stop.weight == 1
+    assert match_photograph(user, 0) < 1
+    state.camera = replace(state.camera, yaw_radians=state.camera.yaw_radians + 0.3)
+    user.settle()
+    assert match_photograph(user, 0) < 1, "also in another direction"
+    for change in ({"display": "depth"}, {"opacity_threshold": 0.5}, {"mode": "view"}, {"view_weights": (1.0, 0.0)}):
+        state.settings = replace(DrawSettings(), **change)
+        user.settle()
+        assert user.viewer.stage.stop.weight == 0, change
+    state.settings = DrawSettings()
+    state.camera = state.home
+    user.settle()
+    x, y, z = state.home.position
+    state.camera = replace(state.home, position=(x, y, z + 0.05))
+    user.draw_frames(1, 1 / 60)
+    assert 0 < user.viewer.stage.stop.weight < 1
+    user.settle()
+    assert user.viewer.stage.stop.weight == 0
+    state.camera = state.home
+    user.settle()
+    user.click("photographs at panoramas")
+    assert changed_fraction(user.read_image(), scene) < 0.01
 
 
 def test_a_refinement_is_cancelled_or_compared_with_its_prediction(user, small_scene):
@@ -985,7 +1019,7 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
     content = {"convention": "cam2world opencv", "worlds": [{"unit": 1.0}], "poses": poses, "estimate": estimate}
     (tmp_path / "poses.json").write_text(json.dumps(content))
 
-    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+    def find(path: Path, progress: Progress, show: object) -> list[SceneEntry]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_pairs(path))]
@@ -1081,6 +1115,9 @@ def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(plac
     user.click_at(*at)  # on the ghost
     assert placing.shown.suggestion == 0
     user.click("Save##pose")
+    assert user.viewer.placing.is_doubted, "noise has nothing in common"
+    user.draw_frames(1)
+    user.click("Save, although it fits poorly##pose")
     entry = json.loads((tmp_path / "poses.json").read_text())["poses"]["d.png"]
     assert entry["placed"] == "by hand" and entry["cam2world"][0][3] == pytest.approx(1.0)
     user.draw_frames(2)

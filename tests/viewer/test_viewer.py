@@ -85,13 +85,14 @@ class App:
 
     def __init__(self, load: Callable[..., LoadedScene], folder: Path, **options: Any) -> None:
         self.load, self.now, self.events = load, 0.0, Input()
-        self.find: Callable[..., list[SceneEntry]] = lambda path, progress: [SceneEntry("opened")]
+        self.find: Callable[..., list[SceneEntry]] = lambda path, progress, show: [SceneEntry("opened")]
         loader = SceneLoader(lambda *arguments: self.load(*arguments))
         self.viewer = Viewer(
             MagicMock(), loader, find=lambda *arguments: self.find(*arguments), folder=folder, clock=lambda: self.now,
             **options,
         )  # fmt: skip
         self.state, self.library, self.target = self.viewer.state, self.viewer.library, Mock(viewport=(0, 0, *SIZE))
+        self.state.stops = False  # the camera is at a panorama, and tests count images of the scene
 
     def frame(self, seconds: float = 1 / 30, **events: Any) -> None:
         self.now += seconds
@@ -199,7 +200,7 @@ class Gate:
 
 
 def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
-    def find(path: Path, progress: object) -> list[SceneEntry]:
+    def find(path: Path, progress: object, show: object) -> list[SceneEntry]:
         raise InputError(f"{path}: no such file or folder")
 
     app.find = find
@@ -216,7 +217,7 @@ def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
 
 
 def test_a_path_is_remembered_and_an_entry_is_chosen_by_its_name(app, pair):
-    app.find = lambda path, progress: [SceneEntry(name, pair=pair) for name in ("a", "b")]
+    app.find = lambda path, progress, show: [SceneEntry(name, pair=pair) for name in ("a", "b")]
     app.viewer.open(Path("kitchen"), "b")
     app.settle()
     assert app.library.current == 1 and app.library.path == Path("kitchen")
@@ -224,6 +225,32 @@ def test_a_path_is_remembered_and_an_entry_is_chosen_by_its_name(app, pair):
     app.viewer.choose(0)
     app.settle()
     assert app.viewer.loaded.entry.name == "a"
+
+
+def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_house, house):
+    gate = Gate(lambda _: [SceneEntry("placed", tour=house)], "pairs of panoramas", 0.3)
+
+    def find(path: Path, progress: Callable[..., None], show: Callable[..., None]) -> object:
+        show([SceneEntry("unplaced", tour=parted_house)])
+        return gate(path, progress, None)
+
+    app = make_app()
+    app.find = find
+    app.viewer.open(Path("home"))
+    app.until(lambda: app.viewer.tour is not None, "photographs")
+    assert app.library.names == ["unplaced"] and isinstance(app.content, int) and app.viewer.loaded is None
+    app.until(lambda: app.viewer.loading == ("home", "pairs of panoramas", 0.3), "progress")
+    assert app.library.loader.entry is None, "nothing is predicted from panoramas that may get poses"
+    gate.open()
+    app.settle()
+    assert app.library.names == ["placed"] and app.viewer.loaded.entry.tour is house
+    gate.event.clear()
+    shown = app.viewer.loaded
+    app.viewer.open(Path("another"))
+    app.until(lambda: app.viewer.loading == ("another", "pairs of panoramas", 0.3), "progress")
+    app.frames(2)
+    assert app.viewer.loaded is shown and app.library.names == ["placed"]
+    gate.open()
 
 
 def test_progress_is_shown_and_input_accepted_while_a_scene_is_loaded(app, small_scene):
@@ -239,7 +266,7 @@ def test_progress_is_shown_and_input_accepted_while_a_scene_is_loaded(app, small
 
 def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
     gate = Gate(lambda entry: LoadedScene(entry, small_scene), "estimating poses", 0.3)
-    app.find = lambda path, progress: gate(path, progress, None)
+    app.find = lambda path, progress, show: gate(path, progress, None)
     app.viewer.open(Path("unposed"))
     app.until(lambda: app.viewer.loading == ("unposed", "estimating poses", 0.3), "search")
     app.viewer.cancel_loading()
@@ -385,7 +412,7 @@ def test_a_folder_that_changes_is_announced_and_searched_again(app, pair, tmp_pa
     image.write_bytes(pair.context[0].image.read_bytes())
     pair = replace(pair, folder=folder, context=(replace(pair.context[0], image=image), *pair.context[1:]))
 
-    def find(path: Path, progress: object) -> list[SceneEntry]:
+    def find(path: Path, progress: object, show: object) -> list[SceneEntry]:
         found.append(path)
         return [SceneEntry(name, pair=pair) for name in ("new", "pair 1", "pair 2")[len(found) == 1 :]]
 

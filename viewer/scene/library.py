@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
-from pansplat_viewer.scene.loader import Progress, SceneEntry, SceneLoader
+from pansplat.errors import InputError
+from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader, choose_entry
 from pansplat_viewer.window.file_watch import FileWatch
 
 
@@ -20,7 +20,7 @@ class Library:
         watch: of the files of the current one.
     """
 
-    def __init__(self, loader: SceneLoader, find: Callable[[Path, Progress], list[SceneEntry]]) -> None:
+    def __init__(self, loader: SceneLoader, find: Find) -> None:
         """`find` returns the entries of a path; it is called in a worker thread."""
         self.loader, self._find = loader, find
         self.entries: list[SceneEntry] = []
@@ -41,15 +41,21 @@ class Library:
         return self.entries[self.current].notes if 0 <= self.current < len(self.entries) else ()
 
     def search(self, path: Path, name: str | None = None) -> None:
-        """Look for the entries at a path, to show that of a name, else the first one."""
-        self._wanted = path, name
+        """Look for the entries at a path, to show that of a name or number, else the first one."""
+        self.expect(path, name)
         self.loader.search(path, self._find)
+
+    def expect(self, path: Path, name: str | None = None) -> None:
+        """The search of the loader is for this path, to show the entry of a name or number, else the first one."""
+        self._wanted = path, name
 
     def choose_found(self, found: list[SceneEntry]) -> tuple[int, Path]:
         """The number of the entry to show of those that a search has found, and its path."""
         path, name = self._wanted
-        names = [entry.name for entry in found]
-        return names.index(name) if name in names else 0, path
+        try:
+            return choose_entry(found, name), path
+        except InputError:
+            return 0, path
 
     def offer(self, entries: list[SceneEntry], index: int, path: Path | None) -> None:
         """Offer these entries, of which one is loaded."""

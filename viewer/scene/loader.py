@@ -5,6 +5,7 @@ loaded; `tour` requests the predictions of its parts. A file that has the graph 
 are parts of the scene in the file. Imports no torch before it loads.
 """
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,6 +25,11 @@ if TYPE_CHECKING:
 
 
 Progress = Callable[[str, float], None]  # task, fraction done
+Show = Callable[[list["SceneEntry"]], None]
+Find = Callable[[Path, Progress, Show], list["SceneEntry"]]
+
+
+_WAIT = 0.01  # seconds between looks at a search
 
 
 def make_file_name(name: str) -> str:
@@ -110,13 +116,16 @@ class LoadOptions:
     prediction: PredictOptions = field(default_factory=PredictOptions)
 
 
-def find_entries(path: Path, options: LoadOptions, progress: Progress | None = None) -> list[SceneEntry]:
+def find_entries(
+    path: Path, options: LoadOptions, progress: Progress | None = None, show: Show | None = None
+) -> list[SceneEntry]:
     """Return all scenes at `path`: tours first, then pairs and single views, then scene files.
 
     Args:
         path: a file or folder.
         options: arguments of reading.
         progress: called while the poses of panoramas without poses are estimated.
+        show: called before that, with the panoramas as a tour of which none is placed.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene file")
@@ -127,7 +136,8 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
         from pansplat.pipeline import load_pairs
 
         with collect_notes() as notes:
-            pairs = load_pairs(path, progress=progress, **vars(options.reading))
+            on_unposed = None if show is None else lambda pairs: show(_list_tours(pairs))
+            pairs = load_pairs(path, progress=progress, on_unposed=on_unposed, **vars(options.reading))
     except InputError:
         if not scenes:
             raise
@@ -145,6 +155,23 @@ def find_entries(path: Path, options: LoadOptions, progress: Progress | None = N
     entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in tours]
     entries += [SceneEntry(pair.name, pair=pair, notes=tuple(notes)) for pair in pairs]
     return entries + [SceneEntry(p.stem, file=p) for p in scenes]
+
+
+def _list_tours(pairs: "list[Pair]") -> list[SceneEntry]:
+    from pansplat.tours import find_tours
+
+    return [SceneEntry(tour.name, tour=tour) for tour in find_tours(pairs)]
+
+
+def choose_entry(entries: Sequence[SceneEntry], name: str | None) -> int:
+    """Return the index of the entry with this name or number (from 1); None is the first."""
+    if name is None:
+        return 0
+    for index, entry in enumerate(entries):
+        if name in (entry.name, str(index + 1)):
+            return index
+    names = ", ".join(entry.name for entry in entries[:12]) + (", ..." if len(entries) > 12 else "")
+    raise InputError(f"`--pair` must be a number from 1 to {len(entries)} or one of {names}, got {name!r}")
 
 
 def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
@@ -281,11 +308,24 @@ class SceneLoader:
         self._searching: BackgroundWorker[list[SceneEntry]] = BackgroundWorker("scene-loader-search")
         self._request: _Request | None = None
         self._searched = ""
+        self._early: list[list[SceneEntry]] = []  # at most one list, of the search that goes on
 
-    def search(self, path: Path, find: Callable[[Path, Progress], list[SceneEntry]]) -> None:
-        """Start to find the entries at a path. The request of an entry goes on."""
+    def search(self, path: Path, find: Find) -> None:
+        """Start to find the entries at a path. The request of an entry goes on.
+
+        Args:
+            path: a file or folder.
+            find: called in a thread, as `find_entries` with its options.
+        """
         self._searched = path.name or str(path)
-        self._searching.start(lambda report: find(path, report), "looking for panoramas and scenes")
+        early = self._early = []
+        self._searching.start(lambda report: find(path, report, early.append), "looking for panoramas and scenes")
+
+    def wait_for_entries(self) -> None:
+        """Wait until `poll` has the entries or the error of a search, or its panoramas without poses."""
+        future = self._searching.future
+        while future is not None and not self._early and not future.done():
+            time.sleep(_WAIT)
 
     def request(self, entry: SceneEntry) -> None:
         """Start loading an entry."""
@@ -324,8 +364,11 @@ class SceneLoader:
     def poll(self) -> LoadedScene | list[SceneEntry] | BaseException | None:
         """Return a prediction that is being refined, then the result or exception of the request, each once.
 
-        Entries that are found come first. None while there is nothing new, or if there is no request.
+        Entries that are found come first; while `is_searching`, they are panoramas whose poses are being estimated.
+        None while there is nothing new, or if there is no request.
         """
+        if self._early and self._searching.future is not None and not self._searching.future.done():
+            return self._early.pop()
         found = self._searching.poll()
         if found is not None or self._request is None:
             return found

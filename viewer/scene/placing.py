@@ -20,6 +20,7 @@ from pansplat.inputs.folders import read_pose_file_folder
 from pansplat.inputs.pairs import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import (
+    POOR_FIT,
     Fit,
     Floor,
     Piece,
@@ -30,6 +31,7 @@ from pansplat.poses.placing import (
     measure_fit,
     read_piece,
     snap,
+    suggest_by_links,
 )
 from pansplat_viewer.scene.background import BackgroundWorker, CancelledError, Report
 from pansplat_viewer.scene.loader import SceneEntry, list_panoramas
@@ -52,10 +54,10 @@ Nodes = tuple[int, ...]
 
 @dataclass(frozen=True)
 class Ghost:
-    """A hypothesis of the pose estimate as a place on the plan.
+    """A hypothesis of the pose estimate, or of the links of a tour, as a place on the plan.
 
     Attributes:
-        log_odds: logarithm of the odds that it is right.
+        log_odds: logarithm of the odds that it is right; -inf for one by links, whose odds are not known.
         other: the photograph that it is relative to.
     """
 
@@ -119,6 +121,7 @@ class Placing:
         self.shown = Snapped(self._raw)
         self.fit: Fit | None = None
         self._measured: tuple[object, ...] = ()
+        self._doubted: Place | None = None  # a place of which the user was asked
         self._is_moved = False
         self._step = 0.0  # metres, of the adjustment in progress
         self.is_changed = False
@@ -270,7 +273,7 @@ class Placing:
         poses = np.stack([self._get_pose(target) for target in self.targets])
         self.floor = Floor.of_world(poses, unit or first.camera_height)
         self.places, self.ghosts, self.fit, self._measured, self._is_moved = {}, [], None, (), False
-        self._step = 0.0
+        self._step, self._doubted = 0.0, None
         self._start_reading()
         self.update()
 
@@ -410,6 +413,10 @@ class Placing:
                 for suggestion in self._suggestions.get(ends, ()):
                     relative = suggestion.place.inverse() if is_reversed else suggestion.place
                     found.append(Ghost(place.add(relative, self.floor.unit), suggestion.log_odds, target))
+            upright = self.pieces[other].upright, self.pieces[image].upright
+            linked = suggest_by_links(self.panoramas[target], self.panoramas[self.node], upright)
+            if linked is not None:
+                found.append(Ghost(place.add(linked, self.floor.unit), -math.inf, target))
         kept: list[Ghost] = []
         for ghost in sorted(found, key=lambda ghost: -ghost.log_odds):
             same = [
@@ -547,10 +554,19 @@ class Placing:
         piece = self.pieces[self._image(self.node)]
         return measure_fit(piece, self._find_poses(place)[self.node], others, self.floor.unit)
 
+    @property
+    def is_doubted(self) -> bool:
+        """Whether the next `save` writes a place that fits poorly."""
+        return self._doubted == self.shown.place
+
     def save(self) -> bool:
-        """Write the pose of the piece; returns whether it was written."""
+        """Write the pose of the piece; returns whether it was written. A poor fit is written by a second call."""
         if self.node is None or not self.places or self._get_piece(self.node) is None:
             self.error = "needed the depth of the photographs to place one of them; wait until it is estimated."
+            return False
+        self.update()  # the fit at this place
+        if (self.fit is None or self.fit.quality < POOR_FIT) and not self.is_doubted:
+            self._doubted = self.shown.place
             return False
         poses = {self._image(node): pose for node, pose in self.find_poses().items()}
         if self._world is None:

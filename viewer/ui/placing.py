@@ -228,8 +228,9 @@ class PlacingWindow:
                 _draw_line(canvas, points, (*_GHOST[:3], 0.6), scale)
                 other = placing.panoramas[ghost.other].label
                 percent = 100 * ghost.probability
-                share = f"{percent:.0f} %" if percent >= 1 else "less than 1 %"
-                imgui.set_tooltip(f"hypothesis beside {other}: right with {share}")
+                share = f"right with {percent:.0f} %" if percent >= 1 else "right with less than 1 %"
+                share = "by the links of the tour" if ghost.log_odds == -math.inf else share
+                imgui.set_tooltip(f"hypothesis beside {other}: {share}")
 
     def _draw_camera(
         self, canvas: imgui.ImDrawList, place: Place, color: tuple, scale: float, *, hollow: bool = False
@@ -326,7 +327,7 @@ class PlacingWindow:
             placing.adjust()
         imgui.end_disabled()
         imgui.same_line()
-        if button("Save##pose"):
+        if button("Save, although it fits poorly##pose" if placing.is_doubted else "Save##pose"):
             placing.save()
         imgui.same_line()
         imgui.begin_disabled(not placing.can_undo)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pansplat.errors import InputError
+from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.web_tours.entries import make_panoramas
 from pansplat.inputs.web_tours.marzipano import find_marzipano, read_marzipano
@@ -26,6 +27,11 @@ def find_web_tour(folder: Path) -> Path | None:
 def is_web_tour_file(file: Path) -> bool:
     """Whether a file may describe a tour, by its suffix."""
     return file.suffix.lower() in SUFFIXES
+
+
+def is_scene_of_tour(folder: Path, image: Path) -> bool:
+    """Whether a panorama is a scene of the web tour in a folder that is made from cube faces."""
+    return image.name.endswith(CUBE_SUFFIX) and find_web_tour(folder) is not None
 
 
 def read_web_tour(source: Path) -> list[Panorama]:

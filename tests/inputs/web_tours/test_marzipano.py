@@ -6,12 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from pansplat.images.image_files import read_height, read_panorama
+from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.pairs import Link, Panorama
 from pansplat.inputs.web_tours import find_web_tour, read_web_tour
+from pansplat.poses.edit import PoseEditor
+from pansplat.poses.files import name_pictures
 
 LEVELS = [
     {"tileSize": 16, "size": 16, "fallbackOnly": True},
@@ -75,6 +79,33 @@ def test_an_export_has_its_pictures_names_links_and_start_views(export: Export, 
     assert hall.start == (0.5, 0.1)
     _check_picture(hall, check_colors)
     _check_picture(kitchen, check_colors)
+
+
+def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Export) -> None:
+    spots = [[{"yaw": 3.0, "target": "1-kitchen"}], [{"yaw": 0.0, "target": "0-hall"}], []]
+    keys = "0-hall", "1-kitchen", "2-bath"
+    folder = export(*(_scene(key, linkHotspots=spot) for key, spot in zip(keys, spots, strict=True)))
+    poses = {name: np.eye(4).tolist() for name in ("0-hall", "1-kitchen")}
+    poses["1-kitchen"][0][3] = 2.0
+    reasons = {"unplaced": {"2-bath.cube.json": "bare walls"}}
+    content = {"convention": "cam2world opencv", "poses": poses, "estimate": reasons}
+    (folder / "poses.json").write_text(json.dumps(content))
+    for path in (folder, folder / "data.js", folder / "poses.json"):
+        placed, alone = load_pairs(path)
+        hall, kitchen = placed.context
+        assert (hall.title, kitchen.title, hall.start) == ("Hall", "Kitchen", (0.5, 0.1))
+        assert [link.target for view in placed.context for link in view.links] == ["1-kitchen", "0-hall"]
+        assert float((kitchen.cam2world - hall.cam2world)[:3, 3].norm()) == pytest.approx(2.0)
+        assert alone.context[0].title == "Bath" and alone.context[0].placement.reason == "bare walls"
+    panoramas = [*placed.context, *alone.context]
+    pose = np.eye(4)
+    pose[2, 3] = 3.0
+    editor = PoseEditor(folder, panoramas)
+    editor.place({alone.context[0].image: pose}, 0)
+    assert set(json.loads((folder / "poses.json").read_text())["poses"]) == {"0-hall", "1-kitchen", "2-bath"}
+    assert sum(len(pair.context) for pair in load_pairs(folder)) == 4, "two pairs of three panoramas"
+    names = name_pictures(folder / "poses.json", [view.image for view in panoramas])
+    assert set(names.values()) == {"0-hall", "1-kitchen", "2-bath"}, "those of an estimate"
 
 
 def test_the_export_is_found_from_its_folder_archive_and_page(export: Export) -> None:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.ply import save_ply
@@ -157,6 +158,47 @@ def test_a_folder_of_pairs_has_an_entry_for_each(shared):
     entries = find_entries(shared / "data" / "zind", LoadOptions())
     assert entries[0].tour is not None and len(entries[0].tour) == 13, "the tour of all panoramas is the first"
     assert len(entries) >= 4 and all(entry.pair is not None for entry in entries[1:])
+
+
+def test_panoramas_are_shown_before_their_poses_are_estimated_but_not_if_these_are_cached(tmp_path, monkeypatch):
+    shown, estimates = [], []
+    for name in ("kitchen", "hall"):
+        Image.fromarray(np.full((16, 32, 3), 100, np.uint8)).save(tmp_path / f"{name}.png")
+
+    def estimate(folder, panoramas, *_):
+        estimates.append([len(entries) for entries in shown])
+        unplaced = {panorama.name: "bare walls" for panorama in panoramas}
+        return {"worlds": [], "unplaced": unplaced, "unreadable": [], "pairs": [], "suggestions": []}
+
+    monkeypatch.setattr("pansplat.poses.files._estimate", estimate)
+    for _ in range(2):
+        with pytest.warns(InputWarning, match="bare walls"):
+            entries = find_entries(tmp_path, LoadOptions(), ignore, shown.append)
+    (early,), (entry, *_) = shown[0], entries
+    assert estimates == [[1]] and len(shown) == 1
+    assert [view.name for view in early.tour.panoramas] == [view.name for view in entry.tour.panoramas]
+    assert len(set(early.tour.parts)) == 2
+
+
+def test_a_search_hands_over_panoramas_before_its_result(wait_until):
+    go, early, found = threading.Event(), [SceneEntry("early")], [SceneEntry("found")]
+
+    def find(path, progress, show):
+        show(early)
+        assert go.wait(300)
+        return found
+
+    loader = SceneLoader(work_forever)
+    loader.search(Path("tour"), find)
+    loader.wait_for_entries()
+    assert loader.poll() is early and loader.is_searching and loader.poll() is None
+    go.set()
+    loader.wait_for_entries()
+    assert wait_until(loader.poll, "entries") is found and not loader.is_searching
+    loader.search(Path("tour"), lambda path, progress, show: show(early) or found)
+    time.sleep(0.05)
+    assert wait_until(loader.poll, "entries") is found and not loader.is_searching, "a finished search has its result"
+    loader.close()
 
 
 @pytest.mark.parametrize(

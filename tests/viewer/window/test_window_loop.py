@@ -126,7 +126,8 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
     monkeypatch.setattr(windows, "Window", Mock())
     monkeypatch.setattr(windows, "run_viewer", run)
     monkeypatch.setattr("pansplat_viewer.window.preferences.find_file", lambda: tmp_path / "viewer.json")
-    assert app._run_window(app.Options(tmp_path), [SceneEntry("a")], 0, (64, 32), None) is None
+    monkeypatch.setattr(app, "find_entries", lambda *_: [SceneEntry("a")])
+    assert app._run_window(app.Options(tmp_path), (64, 32), None) is None
     first, second = viewers
     assert second.options["state"] is first.options["state"], "camera and settings"
     second.show.assert_called_once_with(first.library.entries, 1, tmp_path / "opened")
