@@ -27,7 +27,7 @@ from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
 POINTS = "points.ply"
 
 _MAX_HEIGHT = 8192  # of a panorama, pixels
-_MASK_HEIGHT = 512
+_MASK_HEIGHT = 512  # pixels
 _LOSSLESS = (".png", ".exr", ".tif", ".tiff")  # pictures whose faces are PNG; those of others are JPG
 _MARGIN = 2  # pixels, of the cubic filter
 _BAND_ROWS = 256  # rows of a face that are sampled together

@@ -32,7 +32,7 @@ _MIN_DIFFERENCE = 0.02  # mean grey difference below which two panoramas count a
 
 _STEP = 0.5  # degrees between samples of the polar maps
 _REACH = 50.0  # degrees; radius of the polar maps
-_RINGS, _SECTORS = int(_REACH / _STEP), 180
+_RINGS, _SECTORS = int(_REACH / _STEP), 180  # of the polar maps
 _MIN_RADIUS, _MAX_RADIUS = 4.0, 45.0  # degrees from the pole to the outline
 _MAX_BEND = 2  # largest change of the outline's ring between neighbouring sectors
 _QUANTILE = 0.2  # over the panoramas: four of five must have the edge

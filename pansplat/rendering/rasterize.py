@@ -27,7 +27,7 @@ Backend = Literal["auto", "torch", "numba", "triton"]
 
 MIN_TRITON = 3, 2  # the kernels join tuples, which earlier versions do not compile
 MAX_EYE_OFFSET = 1e6  # metres
-_MAX_POSE_ERROR = 1e-4
+_MAX_POSE_ERROR = 1e-4  # of a rotation, see `orthonormal_error`
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

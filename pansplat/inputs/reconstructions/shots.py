@@ -35,7 +35,7 @@ _ROUNDING, _DIGITS = 1e-5, 1e-9  # of positions in a file, around the cameras an
 _AGREE = 0.999  # cosine between down axes
 _PANORAMIC = 0.6  # share of the sphere that the pictures of a panorama show; four side faces show two thirds
 _MIN_POINTS = 100  # to find near and far
-_NEAR_QUANTILE, _FAR_QUANTILE, _MARGIN = 0.01, 0.99, 2.0
+_NEAR_QUANTILE, _FAR_QUANTILE, _MARGIN = 0.01, 0.99, 2.0  # of the distances of points; a factor of them
 _BASELINES = (0.2, 20.0)  # near and far over the median distance of a camera to the next one, without points
 
 

@@ -29,7 +29,7 @@ Pixels = Annotated[int, Meta(ge=1, le=1 << 20)]
 
 MAX_BYTES = 1 << 24  # of a file that describes a tour
 _MAX_TEXT = 200  # characters of a title or label
-_MAX_NAME = 60
+_MAX_NAME = 60  # characters
 _MAX_TILES = 64  # along a face
 _ON_THE_WEB = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:|//")
 
