@@ -169,9 +169,9 @@ class _Page:
                 out,
                 gaussians=count,
                 split=split,
-                title=self.title or export.path.resolve().stem.replace("_", " "),
+                title=self.title or _name_page(export.path, photographs),
                 embed=self.embed,
-                photographs=photographs if has_photographs else (),
+                photographs=photographs if shows_all else (),
                 photo_height=self.photo_height,
                 progress=progress,
             )
@@ -195,6 +195,17 @@ class _Page:
         _print_changes(changes)
         if self.serve:
             serve_page(page)
+
+
+def _name_page(path: Path, photographs: Sequence[Pair]) -> str:
+    """The name of a tour by its author, else that of its folder or file."""
+    from pansplat.inputs.web_tours import is_web_tour_file
+
+    named = path.resolve()
+    if photographs and is_web_tour_file(named):
+        named = named.parent
+    tour = photographs[0].context[0].tour if photographs else ""
+    return tour or named.stem.replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -250,6 +261,37 @@ class _TrainingSet:
 
 
 @dataclass(frozen=True)
+class _Photographs:
+    """For a folder of photographs."""
+
+    suffixes: ClassVar = ()
+    files: ClassVar = "a folder of photographs"
+
+    photos: bool = False
+    """Write the panoramas of a tour as 2:1 photographs to a new folder, with titles, links and start views. Blur masks
+    are applied; no poses are estimated or written."""
+
+    def write(self, export: Export) -> None:
+        """Write the photographs and print their size."""
+        from pansplat.export.panoramas import write_panoramas
+        from pansplat.inputs.folders import load_panoramas
+        from pansplat.system.atomic import replacing_folder
+
+        require_new_folder("--out", export.out)
+        if is_scene_file(export.path):
+            raise InputError(
+                f"{export.path}: needed a tour or a folder of panoramas, got a scene file; give the folder"
+            )
+        panoramas = load_panoramas(export.path)
+        with replacing_folder(export.out) as folder, progress_bar() as progress:
+            size = write_panoramas(folder, panoramas, progress)
+        print(f"{export.out}: {len(panoramas)} photographs, {size / 1e6:.1f} MB")
+        notes = sum(len(panorama.notes) for panorama in panoramas)
+        if notes:
+            print(f"note: {export.out}: {notes} notes of hot spots are left out", file=sys.stderr)
+
+
+@dataclass(frozen=True)
 class Export(Writer):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
     web page (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan
@@ -261,7 +303,8 @@ class Export(Writer):
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg, .dxf or .png
     for a floor plan; .obj for a mesh. A folder, without a suffix, for a web page with photographs of their own
-    resolution, which are loaded as they are needed; with --training-set a new one for cube faces with poses."""
+    resolution, which are loaded as they are needed; a new one with --training-set for cube faces with poses, and with
+    --photos for the photographs of a tour."""
     degree: Annotated[int, Meta(ge=0, le=4)] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds."""
     min_opacity: Fraction = 0.0
@@ -283,15 +326,16 @@ class Export(Writer):
     plan: _FloorPlan = field(default_factory=_FloorPlan)
     mesh: _Mesh = field(default_factory=_Mesh)
     training: _TrainingSet = field(default_factory=_TrainingSet)
+    panoramas: _Photographs = field(default_factory=_Photographs)
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
 
     def run(self) -> int:
         """Write the file and print its size."""
-        kinds = self.scene, self.page, self.plan, self.mesh, self.training
+        kinds = self.scene, self.page, self.plan, self.mesh, self.training, self.panoramas
         table = {suffix: kind for kind in kinds for suffix in kind.suffixes}
         suffix = self.out.suffix.lower()
-        if self.training.training_set:
-            kind = self.training
+        if self.training.training_set or self.panoramas.photos:
+            kind = self.training if self.training.training_set else self.panoramas
         else:
             if suffix:
                 require_output_file("--out", self.out, tuple(filter(None, table)), overwrite=self.overwrite)

@@ -22,11 +22,13 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import shapely
 import torch
 from jaxtyping import Float, Int
 from PIL import Image
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
+from shapely.geometry import Polygon
 from torch import Tensor
 
 from pansplat import constants, pipeline
@@ -34,7 +36,7 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 from pansplat.export.page_photographs import PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
-from pansplat.geometry.path import path_poses, turn_pose
+from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
 from pansplat.predictor import Progress
@@ -50,17 +52,23 @@ from pansplat.tours import (
     Route,
     TourGraph,
     choose_camera_height,
+    choose_heading,
     find_angles,
+    find_blank,
     find_camera_height,
     find_link_ring,
     find_rooms,
     find_way_along_link,
+    is_hidden,
     make_graph,
     measure_box,
+    measure_outlook,
     plan_route,
     select_views,
 )
 from pansplat.tours.layout import REACH
+from pansplat.tours.plan import Plan
+from pansplat.tours.surfaces import locate_surfaces
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
 PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
@@ -137,8 +145,9 @@ def write_page(
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
         embed: origins of host pages that move the camera by messages (docs/web.md, Embedding).
-        photographs: of each view, which the page shows there (`pansplat.web.list_photographs`); none without them.
-        photo_height: their largest height, pixels; by default what fits, if it is split that of the files.
+        photographs: of each view, which the page shows there (`list_photographs`), with the notes of its
+            tour; none without them.
+        photo_height: their largest height, pixels, 0 for none; by default what fits, if it is split that of the files.
         progress: called with a description of the current work and the completed fraction.
     """
     path, embed = Path(path), parse_origins(embed)
@@ -162,14 +171,15 @@ def write_page(
         report("merging Gaussians", 0.1)
         scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0)
     report("compressing", 0.6)
-    degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if photographs and not split else 1))
+    has_pictures = len(photographs) > 0 and photo_height != 0
+    degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if has_pictures and not split else 1))
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     cameras = None if rooms is None else _find_cameras(scene, rooms)
     packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree, cameras)
     report("drawing the poster", 0.7)
     poster = _draw_poster(scene, flights.start)
     pictures: list[PackedPhotograph] = []
-    if photographs:
+    if has_pictures:
         left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - len(packed.content) - len(poster)
         pictures = pack_photographs(
             scene,
@@ -181,6 +191,16 @@ def write_page(
     report("writing", 0.95)
     header = _describe_scene(scene, packed, origin, flights, tour)
     header |= {"embed": embed, "doll": None, "photographs": [picture.describe() for picture in pictures]}
+    header["plan"] = _describe_plan(None if rooms is None else rooms.plan, tour, origin, flights.level)
+    for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
+        spot["notes"] = [
+            {
+                "direction": _round(find_direction(pose, note.yaw, note.pitch).numpy()),
+                "text": note.text,
+                "addresses": note.addresses,
+            }
+            for note in photograph.context[0].notes
+        ]
     if rooms is not None and cameras is not None:
         header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
     return _write_files(path, header, packed.content, pictures, poster, split, title or path.stem)
@@ -229,18 +249,22 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
         first = tour.find_start_view(0) if len(tour) else None
         start = path_poses(scene.cam2world)[0]
         level = start[:3, :3].numpy()
-        yaw, pitch = (0.0, 0.0) if first is None else find_angles(level.T @ first)
+        yaw, pitch = (_look_on(scene, 0, level, 0.0), 0.0) if first is None else find_angles(level.T @ first)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
     walk = tour.plan_walk()
     route = plan_route(tour, [*walk, *tour.find_walk(walk[-1], walk[0])[1:]])  # ends where it begins
     samples, jumps = _resample(route)
+    start, (yaw, pitch) = torch.from_numpy(route.pose(0.0)), samples[0, 3:].tolist()
+    if tour.find_start_view(walk[0]) is None:
+        yaw = _look_on(scene, walk[0], route.level, yaw)
+    start[:3, :3] = torch.from_numpy(route.level)
     return _Flights(
-        torch.from_numpy(route.pose(0.0)),
+        _look(start, route.level, yaw, pitch),
         route.level,
-        float(samples[0, 3]),
-        float(samples[0, 4]),
+        yaw,
+        pitch,
         tour.parts,
         groups,
         tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps),
@@ -256,6 +280,11 @@ def _order_views(scene: Scene, flights: _Flights) -> list[int]:
     distances = (scene.cam2world[:, :3, 3] - flights.start[:3, 3]).norm(dim=1).numpy()
     parts = np.array(flights.parts)
     return np.lexsort((distances, parts != parts[distances.argmin()])).tolist()
+
+
+def _look_on(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], yaw: float) -> float:
+    """A yaw at a view, or that of the widest view if it faces a wall."""
+    return choose_heading(measure_outlook(scene, view, level), math.remainder(yaw, 2 * math.pi))
 
 
 def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: float, pitch: float) -> Tensor:
@@ -380,15 +409,20 @@ def _describe_scene(
     usual_height = choose_camera_height(known, scene.far)
     heights = [height or usual_height for height in known]
     starts = [tour.find_start_view(node) for node in range(len(tour))] or [None]
+    marks = positions + np.outer(heights, level[:, 1])
     spots = [
         {
             "name": name,
             "position": _round(position),
-            "mark": _round(position + height * level[:, 1]),
+            "mark": _round(mark),
+            "notes": [],
+            **_describe_outlook(scene, view, level, (marks - position) @ level),
             "radius": round(0.12 * height, 6),
             **({} if start is None else {"start": _round(np.array(find_angles(level.T @ start)))}),
         }
-        for name, position, height, start in zip(scene.names, positions, heights, starts, strict=True)
+        for view, (name, position, mark, height, start) in enumerate(
+            zip(scene.names, positions, marks, heights, starts, strict=True)
+        )
     ]
     reaches = _measure_reaches(scene, np.array(flights.parts))
     views_of_page = [
@@ -428,6 +462,43 @@ def _describe_scene(
         "speed": _SPEED * float(np.median(reaches)),
         "limits": _limit_parts(reaches, positions, flights, len(tour)),
     }
+
+
+def _describe_outlook(
+    scene: Scene, view: int, level: Float[np.ndarray, "3 3"], marks: Float[np.ndarray, "node 3"]
+) -> dict[str, Any]:
+    """Where a camera at a view faces a wall (bits of the directions of `measure_outlook`), and the yaw of the widest
+    view; and the panoramas whose marks furniture or walls hide.
+
+    Args:
+        level: axes of a level camera.
+        marks: of all panoramas on the floor, relative to the camera.
+    """
+    is_blank, widest = find_blank(measure_outlook(scene, view, level))
+    places = locate_surfaces(scene, view, level, min_opacity=0.5)
+    hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
+    blank = sum(1 << number for number in np.flatnonzero(is_blank).tolist())
+    return {"blank": blank, "ahead": round(widest, 3), "hidden": hidden}
+
+
+def _describe_plan(
+    plan: Plan | None, tour: TourGraph, origin: Float[np.ndarray, "3"], level: Float[np.ndarray, "3 3"]
+) -> dict[str, Any]:
+    """The floor plan: outlines and names of rooms and the doors, to the right and forward of the origin, and the world
+    of each panorama; panoramas of other worlds are elsewhere."""
+    worlds = tour.worlds if tour.overlaps else (0,) * max(len(tour), 1)
+    if plan is None or not plan.rooms:
+        return {"worlds": worlds, "turn": 0.0, "rooms": [], "doors": []}
+    turn, middle = tour.level_axes[:, (0, 2)].T @ level[:, (0, 2)], origin @ level[:, (0, 2)]
+    turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in plan.rooms]
+    plan, rooms = dataclasses.replace(plan, rooms=tuple(turned)), []
+    for room in plan.rooms:
+        circle = shapely.maximum_inscribed_circle(Polygon(room.outline))
+        label = [*_round(np.array(circle.coords[0]) - middle), round(2 * circle.length, 4)]
+        outline = [_round(corner) for corner in room.outline - middle]
+        rooms.append({"name": room.name, "nodes": room.panoramas, "outline": outline, "label": label})
+    doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in plan.doors]
+    return {"worlds": worlds, "turn": round(plan.turn, 5), "rooms": rooms, "doors": doors}
 
 
 def _find_cameras(scene: Scene, rooms: Rooms) -> Int[np.ndarray, "n"]:

@@ -139,10 +139,8 @@ class _Drawing:
     @cached_property
     def _turn(self) -> Float[np.ndarray, "2 2"]:
         """The rotation, applied from the right, after which the longest wall is horizontal."""
-        walls = np.concatenate([np.roll(room.outline, -1, axis=0) - room.outline for room in self.plan.rooms])
-        x, y = walls[np.linalg.norm(walls, axis=1).argmax()]
-        angle = math.remainder(math.atan2(y, x), math.pi)
-        return np.array(((math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle))))
+        cosine, sine = math.cos(self.plan.turn), math.sin(self.plan.turn)
+        return np.array(((cosine, sine), (-sine, cosine)))
 
     @cached_property
     def storeys(self) -> list[int]:

@@ -48,6 +48,22 @@ class Link:
     text: str = ""
 
 
+@dataclass(frozen=True)
+class Note:
+    """Information at a direction in a panorama, as a tour states it.
+
+    Attributes:
+        yaw, pitch: as of a link, radians.
+        text: plain text of one or more lines.
+        addresses: of web pages, http or https.
+    """
+
+    yaw: float
+    pitch: float
+    text: str
+    addresses: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Panorama:
     """One panorama file with its pose.
@@ -63,6 +79,8 @@ class Panorama:
         world: number of the coordinate frame of the pose; one without a known pose has a world of its own.
         title: for people, if it differs from the name.
         links: to other panoramas of the tour.
+        notes: information in it.
+        tour: title of the tour; empty if it has none.
         start: yaw and pitch, as of a link, of the view that a visitor sees first; None if there is none.
         camera_height: over the floor, metres; the scale of a scene of this panorama alone.
         placement: how the pose was found, or why there is none.
@@ -78,6 +96,8 @@ class Panorama:
     world: int = 0
     title: str = ""
     links: tuple[Link, ...] = ()
+    notes: tuple[Note, ...] = ()
+    tour: str = ""
     start: tuple[float, float] | None = None
     camera_height: float = CAMERA_HEIGHT
     placement: Placement = PLACED

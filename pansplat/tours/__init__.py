@@ -33,7 +33,7 @@ from pansplat.tours.graph import (
     select_views,
 )
 from pansplat.tours.links import find_link_ring, find_way_along_link
-from pansplat.tours.outlook import measure_outlook
+from pansplat.tours.outlook import choose_heading, find_blank, is_hidden, measure_outlook
 from pansplat.tours.overlap import connect
 from pansplat.tours.route import FADE_SECONDS, Route, find_angles, plan_route
 from pansplat.tours.walls import find_walls
@@ -50,9 +50,11 @@ __all__ = [
     "TourGraph",
     "Views",
     "choose_camera_height",
+    "choose_heading",
     "connect",
     "draw_floor_plan",
     "find_angles",
+    "find_blank",
     "find_camera_height",
     "find_floor_outline",
     "find_floor_outlines",
@@ -65,6 +67,7 @@ __all__ = [
     "find_walls",
     "find_way_along_link",
     "fit_box",
+    "is_hidden",
     "list_starts",
     "make_graph",
     "measure_box",

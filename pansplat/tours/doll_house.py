@@ -28,7 +28,7 @@ from pansplat.tours.floor import (
     find_floor_outline,
 )
 from pansplat.tours.graph import make_graph
-from pansplat.tours.plan import make_plan
+from pansplat.tours.plan import Plan, make_plan
 from pansplat.tours.surfaces import locate_surfaces
 
 _CEILING = 0.88  # of its height over the camera; above that nothing is drawn
@@ -54,6 +54,7 @@ class Rooms:
         floors, ceilings: their distances below and above the camera of each view, metres.
         shape: the rooms from above, in plan coordinates.
         parts, storeys: of each view.
+        plan: the floor plan.
     """
 
     level: Float[np.ndarray, "3 3"]
@@ -63,6 +64,7 @@ class Rooms:
     shape: shapely.Geometry
     parts: tuple[int, ...]
     storeys: tuple[int, ...]
+    plan: Plan
 
     def list_level(self, view: int) -> tuple[int, ...]:
         """The views of the part and the storey of a view."""
@@ -124,9 +126,9 @@ def find_rooms(scene: Scene) -> Rooms:
     heights = [find_camera_height(scene, view, level) for view in range(count)]
     unit = choose_camera_height(heights, scene.far)
     ceilings = [find_ceiling(locate_surfaces(scene, view, level)) for view in range(count)]
-    rooms = make_plan(scene, tour).rooms
-    shapes = [Polygon(room.outline).buffer(_WALL * unit, join_style="mitre") for room in rooms]
-    enclosed = {view for room in rooms for view in room.panoramas}
+    plan = make_plan(scene, tour)
+    shapes = [Polygon(room.outline).buffer(_WALL * unit, join_style="mitre") for room in plan.rooms]
+    enclosed = {view for room in plan.rooms for view in room.panoramas}
     for view in set(range(count)) - enclosed:
         outline = find_floor_outline(scene, view, level)
         if outline is not None:
@@ -142,6 +144,7 @@ def find_rooms(scene: Scene) -> Rooms:
         shapely.union_all(shapes),
         tour.worlds,
         tuple(assign_storeys(tour)),
+        plan,
     )
 
 

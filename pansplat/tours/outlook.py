@@ -1,11 +1,11 @@
-"""Where there is something to see at a panorama: a flight does not end with the face to a wall."""
+"""What there is to see at a panorama: a flight does not end with the face to a wall, and furniture hides marks."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.surfaces import locate_surfaces
@@ -15,6 +15,8 @@ _ELEVATION = math.sin(math.radians(20))  # of the surfaces that count, above and
 _OPAQUE = 0.5  # least opacity of a surface
 _BLANK = 0.45  # of the median distance of surfaces, below which a view is blank
 _WINDOW = 3  # bins of a view, 45 degrees
+_CONE = math.cos(math.radians(2))  # around the direction of a mark
+_IN_FRONT, _HIDING = 0.8, 0.5  # of its distance, and the share of the surfaces there that hide it
 
 
 def measure_outlook(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "bin"]:
@@ -40,9 +42,25 @@ def choose_heading(outlook: Float[np.ndarray, "bin"], yaw: float) -> float:
         outlook: of `measure_outlook`.
         yaw: in which the camera arrives, radians.
     """
+    is_blank, widest = find_blank(outlook)
+    return widest if is_blank[int((yaw / (2 * math.pi) + 0.5) * BINS) % BINS] else yaw
+
+
+def find_blank(outlook: Float[np.ndarray, "bin"]) -> tuple[Bool[np.ndarray, "bin"], float]:
+    """Which directions of an outlook face a wall, and the yaw of the widest view, radians."""
     around = np.stack([np.roll(outlook, shift) for shift in range(-(_WINDOW // 2), _WINDOW // 2 + 1)])
     views = around.mean(axis=0)
-    here = int((yaw / (2 * math.pi) + 0.5) * BINS) % BINS
-    if not outlook.any() or views[here] >= _BLANK * np.median(outlook):
-        return yaw
-    return ((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi
+    is_blank = (views < _BLANK * np.median(outlook)) & outlook.any()
+    return is_blank, ((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi
+
+
+def is_hidden(places: Float[np.ndarray, "n 3"], mark: Float[np.ndarray, "3"]) -> bool:
+    """Whether most surfaces in the direction of a mark are in front of it.
+
+    Args:
+        places: of the surfaces relative to the camera (`locate_surfaces`).
+        mark: relative to the camera, in the same axes.
+    """
+    distances, length = np.linalg.norm(places, axis=1), float(np.linalg.norm(mark))
+    ahead = distances[places @ mark > _CONE * distances * length]
+    return len(ahead) > 0 and float(np.mean(ahead < _IN_FRONT * length)) > _HIDING

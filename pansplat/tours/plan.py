@@ -113,6 +113,14 @@ class Plan:
     num_heights: int
     num_walls: int
 
+    @property
+    def turn(self) -> float:
+        """The angle, anticlockwise, by which plan coordinates are turned so that the longest wall is horizontal."""
+        sides = [np.roll(room.outline, -1, axis=0) - room.outline for room in self.rooms]
+        walls = np.concatenate([*sides, np.eye(2)[:1] * 1e-9])
+        x, y = walls[np.linalg.norm(walls, axis=1).argmax()]
+        return -math.remainder(math.atan2(y, x), math.pi)
+
     def area_error(self, room: Room) -> float:
         """Standard deviation of a room's area, square metres, by those of the scale, of its walls and of its shape."""
         edges = np.linalg.norm(np.roll(room.outline, -1, axis=0) - room.outline, axis=1)

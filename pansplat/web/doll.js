@@ -3,7 +3,7 @@
 
 import { camera, nearestNode, parts, tangentOf } from "./camera.js";
 import { byId, calm } from "./dom.js";
-import { ease, freeze, isWaiting, jump, jumpTo, setTouring } from "./flight.js";
+import { ease, freeze, isWaiting, jump, jumpTo, lookOn, setTouring } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
 import { changed, measureAt, rayOf } from "./loop.js";
 import { DEGREE } from "./share.js";
@@ -18,7 +18,7 @@ const DOLL_TURN = Math.PI / 2;                     // radians a second, by keys
 
 class DollHouse {
   constructor() {
-    Object.assign(this, { isOn: false, node: 0, flight: null, center: null, distance: 0, first: 0, fov: 0 });
+    Object.assign(this, { isOn: false, node: 0, heading: null, flight: null, center: null, distance: 0, first: 0, fov: 0 });
   }
 
   get isPossible() {
@@ -37,7 +37,7 @@ class DollHouse {
   }
 
   toggle() {
-    if (this.isOn) this.visit(this.node);
+    if (this.isOn) this.visit(this.node, this.heading);
     else this.enter();
   }
 
@@ -49,7 +49,7 @@ class DollHouse {
     freeze();
     this.setOn(true);
     camera.roll = 0;
-    this.fov = camera.fov;
+    Object.assign(this, { fov: camera.fov, heading: { yaw: camera.yaw, pitch: camera.pitch } });
     const box = this.findBox(), yaws = [camera.yaw, camera.yaw + 0.5 * Math.PI];  // the one that is nearer to the rooms
     const distances = yaws.map((yaw) => this.fit(box, yaw, DOLL_PITCH)), best = Number(distances[1] < 0.95 * distances[0]);
     this.center = HEADER.level.map((row) => dot(row, scaled(plus(...box), 0.5)));
@@ -57,15 +57,15 @@ class DollHouse {
     this.flyTo({ ...this.place(yaws[best], DOLL_PITCH), yaw: yaws[best], pitch: DOLL_PITCH, fov: DOLL_FOV });
   }
 
-  // Flies to a panorama, and ends there.
-  visit(node) {
+  // Flies to a panorama, and ends there; by default it looks where the camera looks from outside.
+  visit(node, heading = { yaw: lookOn(node, camera.yaw), pitch: 0 }) {
     if (!this.shows(node)) {
       jumpTo(node);
       return;
     }
     this.node = node;
-    this.flyTo({ position: [...HEADER.spots[node].position], yaw: camera.yaw, pitch: 0, fov: this.fov }, () => {
-      jump(HEADER.spots[node].position, { yaw: camera.yaw, pitch: 0 });
+    this.flyTo({ position: [...HEADER.spots[node].position], ...heading, fov: this.fov }, () => {
+      jump(HEADER.spots[node].position, heading);
     });
   }
 

@@ -12,8 +12,9 @@ export function say(text) {
   spoken = setTimeout(() => { byId("status").textContent = ""; }, 5000);
 }
 
-export function explain(text) {
+export function explain(text, links = []) {
   byId("notice-text").textContent = text;
+  byId("notice-links").replaceChildren(...links);
   byId("notice").showModal();
 }
 

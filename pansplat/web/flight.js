@@ -15,13 +15,20 @@ import { changed, drawAt, fullSize, isSortedAs, renderer, sorted } from "./loop.
 import { headset } from "./xr.js";
 
 const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
+const DIRECTIONS = 24;              // of the bits of `blank`
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
 
 // The heading after a fade: away from the link back, or the start view, or that of before.
 function arriveAt(node, from) {
   const back = findLink(node, from), { start } = HEADER.spots[node];
-  if (back && back.leave) return { yaw: back.yaw + Math.PI, pitch: 0 };
-  return start ? { yaw: start[0], pitch: start[1] } : { yaw: camera.yaw, pitch: 0 };
+  if (start && !(back && back.leave)) return { yaw: start[0], pitch: start[1] };
+  return { yaw: lookOn(node, back && back.leave ? back.yaw + Math.PI : camera.yaw), pitch: 0 };
+}
+
+// A yaw at a panorama; if it faces a wall, that of the start view or of the widest view (choose_heading).
+export function lookOn(node, yaw) {
+  const { start, blank, ahead } = HEADER.spots[node], part = yaw / (2 * Math.PI) + 0.5;
+  return blank >> Math.floor(DIRECTIONS * (part - Math.floor(part))) & 1 ? start ? start[0] : ahead : yaw;
 }
 
 const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
@@ -72,7 +79,7 @@ export function flyTo(spot) {
     } else if (i + 1 < way.length && i === 0 && isFade(GRAPH, node, way[1])) return;  // it fades where the camera is
     path.push(GRAPH.positions[node]);
   });
-  legs.push({ path });
+  legs.push({ path, end: spot });
   flight = { spot, legs, began: null };
   changed();
 }
@@ -83,7 +90,7 @@ export function advanceFlight(now) {
   if (!flight || isWaiting()) return;
   const leg = flight.legs[0];
   if (leg.to !== undefined) {
-    jump(GRAPH.positions[leg.to], isFade(GRAPH, leg.from, leg.to) ? arriveAt(leg.to, leg.from) : camera);
+    jump(GRAPH.positions[leg.to], isFade(GRAPH, leg.from, leg.to) ? arriveAt(leg.to, leg.from) : { ...camera, yaw: lookOn(leg.to, camera.yaw) });
     flight.legs.shift();
     if (!flight.legs.length) flight = null;
     return;
@@ -107,9 +114,11 @@ function beginLeg(leg, now) {
   flight.began = now;
   leg.length = lengthOf(leg.path);
   leg.done = 0;
-  leg.turn = leg.yaw === undefined ? [0, 0] : [Math.atan2(Math.sin(leg.yaw - camera.yaw), Math.cos(leg.yaw - camera.yaw)), -camera.pitch];
+  const yaw = leg.yaw === undefined && leg.end !== undefined ? lookOn(leg.end, camera.yaw) : leg.yaw;
+  const across = yaw === undefined || headset.session ? 0 : Math.atan2(Math.sin(yaw - camera.yaw), Math.cos(yaw - camera.yaw));
+  leg.turn = [across, leg.yaw === undefined ? 0 : -camera.pitch];
   const turning = headset.session ? 0 : Math.hypot(...leg.turn) / TURN_SPEED;  // the head turns itself
-  leg.seconds = leg.rest || leg.length ? leg.rest || clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : turning;
+  leg.seconds = leg.rest || Math.max(turning, leg.length ? clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : 0);
 }
 
 function pointAlong(path, distance) {
@@ -194,7 +203,7 @@ export function goTo(node) {
 export function jumpTo(node) {
   setTouring(false);
   const isSame = parts[node] === currentPart(), from = edges.length ? nodeHere() : node;
-  jump(GRAPH.positions[node], isSame ? camera : arriveAt(node, from));
+  jump(GRAPH.positions[node], isSame ? { ...camera, yaw: lookOn(node, camera.yaw) } : arriveAt(node, from));
 }
 
 export const isFlying = () => flight !== null || route !== null;

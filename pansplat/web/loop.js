@@ -13,6 +13,7 @@ import { clamp, column, distanceOf, dot, minus, scaled } from "./graph.js";
 import { walkByKeys } from "./input.js";
 import { arrived, isComplete, worker } from "./loading.js";
 import { measure } from "./measure.js";
+import { placeNotes } from "./notes.js";
 import { photographs } from "./photographs.js";
 import { plan } from "./plan.js";
 import { placeRings, showPlace } from "./rings.js";
@@ -148,7 +149,9 @@ export function measureAt(left, top) {
 function showMarks(rotation) {
   const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
   const toCamera = (point) => [0, 1, 2].map((k) => dot(column(rotation, k), minus(point, camera.position)));
-  measure.show(toCamera, ([x, y, z]) => [0.5 * width + focal * x / z, 0.5 * height + focal * y / z]);
+  const toWindow = ([x, y, z]) => [0.5 * width + focal * x / z, 0.5 * height + focal * y / z];
+  measure.show(toCamera, toWindow);
+  placeNotes(rotation, toWindow);
 }
 
 export function takePicture() {

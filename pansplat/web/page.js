@@ -7,6 +7,7 @@ import { flyTo, jumpTo, setPose, setTouring } from "./flight.js";
 import { listen } from "./input.js";
 import { fail, failure, isComplete, load } from "./loading.js";
 import { drawAt, isSettled, isSortedFor, onFrame, redraw, renderer, setRenderer, sorted } from "./loop.js";
+import { makeNotes } from "./notes.js";
 import { photographs } from "./photographs.js";
 import { Renderer } from "./renderer.js";
 import { makeList, makeRings } from "./rings.js";
@@ -63,6 +64,7 @@ async function main() {
   headset.offer();
   makeRings();
   makeList();
+  makeNotes();
   embed.listen(canvas, window.pansplat);
   requestAnimationFrame(onFrame);
   byId("cover").className = "done";

@@ -1,21 +1,23 @@
-// The floor plan: panoramas, edges and links from above, and the camera. Forward of the level axes is up.
+// The floor plan: outlines of rooms, doors, panoramas and the camera from above, the longest wall horizontal. It shows the
+// world of the panorama at the camera; rooms of other worlds, whose places are unknown, are a list.
 
 import { camera } from "./camera.js";
-import { byId } from "./dom.js";
+import { byId, make } from "./dom.js";
 import { goTo } from "./flight.js";
-import { column, dot, minus, plus, scaled } from "./graph.js";
+import { clamp, column, distanceOf, dot, minus, plus, scaled } from "./graph.js";
 import { changed } from "./loop.js";
 import { drawSvg } from "./measure.js";
-import { here, isSingle } from "./rings.js";
+import { here } from "./rings.js";
 import { DEGREE } from "./share.js";
 
-const PLAN_MARGIN = 20;        // pixels
+const PLAN_MARGIN = 24;        // pixels
 const LARGEST_PLAN_SCALE = 60; // pixels for a metre
-const STOREY = 1.5;            // metres: panoramas with a larger difference in height from the camera are faint
+const STOREY = 1.5;            // metres: rooms with a larger difference in height from the camera are faint
+const PLAN_TEXT = 13;          // pixels, height of a room's name, at most
 
 class Plan {
   constructor() {
-    Object.assign(this, { panel: byId("plan"), buttons: [] });
+    Object.assign(this, { panel: byId("plan"), world: null, marks: [] });
   }
 
   get isOpen() {
@@ -25,51 +27,96 @@ class Plan {
   toggle() {
     this.panel.hidden = this.isOpen;
     byId("map").setAttribute("aria-pressed", this.isOpen);
-    if (this.isOpen && !this.buttons.length) this.make();
     changed();
   }
 
-  // To the right, down, and forward, in metres.
-  inLevel(position) {
-    return [0, 1, 2].map((k) => dot(column(HEADER.level, k), position) / HEADER.unit);
+  // To the right and forward in metres.
+  turned([right, forward]) {
+    const { turn } = HEADER.plan, [c, s] = [Math.cos(turn), Math.sin(turn)].map((value) => value / HEADER.unit);
+    return [c * right - s * forward, s * right + c * forward];
   }
 
-  make() {
-    const places = HEADER.spots.map((spot) => this.inLevel(spot.position)), size = this.panel.clientWidth;
-    const sides = [0, 2].map((k) => places.map((place) => place[k])), low = sides.map((side) => Math.min(...side));
-    const high = sides.map((side) => Math.max(...side)), extent = Math.max(...minus(high, low));
-    const scale = Math.min((size - 2 * PLAN_MARGIN) / Math.max(extent, 1e-6), LARGEST_PLAN_SCALE);
-    const center = scaled(plus(low, high), 0.5);
-    this.toPlan = ([right, , forward]) => [0.5 * size + scale * (right - center[0]), 0.5 * size - scale * (forward - center[1])];
-    const svg = drawSvg("svg", { width: size, height: size, "aria-hidden": true });
-    const line = (from, to, kind) => {
-      const [[x1, y1], [x2, y2]] = [from, to].map((node) => this.toPlan(places[node]));
-      svg.append(drawSvg("line", { x1, y1, x2, y2, class: kind }));
+  placeOf = (node) => this.turned([0, 2].map((k) => dot(column(HEADER.level, k), HEADER.spots[node].position)));
+
+  make(world) {
+    const { worlds, rooms, doors } = HEADER.plan, nodes = [...worlds.keys()].filter((node) => worlds[node] === world);
+    const outlines = rooms.map((room) => worlds[room.nodes[0]] === world ? room.outline.map((corner) => this.turned(corner)) : null);
+    const places = [...nodes.map((node) => this.placeOf(node)), ...outlines.flatMap((outline) => outline || [])];
+    const size = byId("drawing").clientWidth, sides = [0, 1].map((k) => places.map((place) => place[k]));
+    const [low, high] = [Math.min, Math.max].map((choose) => sides.map((side) => choose(...side)));
+    const scale = Math.min((size - 2 * PLAN_MARGIN) / Math.max(...minus(high, low), 1e-6), LARGEST_PLAN_SCALE);
+    const middle = scaled(plus(low, high), 0.5);
+    this.toPlan = ([right, forward]) => [0.5 * size + scale * (right - middle[0]), 0.5 * size - scale * (forward - middle[1])];
+    const svg = drawSvg("svg", { width: size, height: size, "aria-hidden": true }), named = new Set();
+    this.marks = [];
+    const add = (node, element) => {
+      this.marks.push([node, element]);
+      return element;
     };
-    HEADER.links.filter(({ from, to }) => HEADER.parts[from] !== HEADER.parts[to]).forEach(({ from, to }) => line(from, to, "link"));
-    HEADER.edges.filter(([from, to]) => from !== to).forEach(([from, to]) => line(from, to, "edge"));
+    const write = (node, [x, y], text, width) => {
+      svg.append(add(node, drawSvg("text", { x, y, "font-size": clamp(1.6 * width / text.length, 8, PLAN_TEXT) }, text)));
+    };
+    rooms.forEach(({ name, nodes: [node, ...others], label: [right, forward, width] }, k) => {
+      if (!outlines[k]) return;
+      const group = add(node, drawSvg("g", {})), [x, y] = this.toPlan(this.turned([right, forward]));
+      group.append(drawSvg("polygon", { points: outlines[k].map(this.toPlan).join(" ") }));
+      for (const { ends } of doors.filter(({ room }) => room === k)) {
+        const [[x1, y1], [x2, y2]] = ends.map((end) => this.toPlan(this.turned(end)));
+        group.append(drawSvg("line", { x1, y1, x2, y2 }));
+      }
+      svg.append(group);
+      [node, ...others].forEach((each) => named.add(each));
+      const near = [node, ...others].some((each) => distanceOf(this.toPlan(this.placeOf(each)), [x, y]) < PLAN_TEXT);
+      write(node, [x, near ? y - 12 : y], name, scale * width / HEADER.unit);
+    });
     this.camera = drawSvg("path", { d: "M0 0L-9 -22L9 -22Z" });
     svg.append(this.camera);
-    this.buttons = HEADER.spots.map(({ name }, node) => {
-      const button = document.createElement("button"), [left, top] = this.toPlan(places[node]);
-      button.title = button.ariaLabel = `Go to ${name}`;
-      button.className = isSingle(node) ? "single" : "";
-      button.style.transform = `translate(${left - 12}px, ${top - 12}px)`;
-      button.onclick = () => goTo(node);
-      return button;
+    const buttons = nodes.map((node) => {
+      const button = make("button", ""), [left, top] = this.toPlan(this.placeOf(node));
+      if (!named.has(node)) write(node, [left, top - 10], HEADER.spots[node].name, 80);
+      button.title = button.ariaLabel = `Go to ${HEADER.spots[node].name}`;
+      button.style.transform = `translate(${left - 22}px, ${top - 22}px)`;
+      button.onclick = ({ detail, clientX, clientY }) => goTo(detail ? this.nearest(nodes, clientX, clientY) : node);
+      return add(node, button);
     });
-    this.heights = places.map(([, down]) => down);
-    this.panel.replaceChildren(svg, ...this.buttons);
+    byId("drawing").replaceChildren(svg, ...buttons);
+    byId("elsewhere").replaceChildren(...[...worlds.keys()].filter((node) => !nodes.includes(node)).map((node) => {
+      const button = make("button", "", HEADER.spots[node].name);
+      button.onclick = () => goTo(node);
+      return add(node, button);
+    }));
+    byId("elsewhere").hidden = nodes.length === worlds.length;
+    this.world = world;
+  }
+
+  // Areas of panoramas next to each other overlap.
+  nearest(nodes, x, y) {
+    const { left, top } = byId("drawing").getBoundingClientRect();
+    const distances = nodes.map((node) => distanceOf(this.toPlan(this.placeOf(node)), [x - left, y - top]));
+    return nodes[distances.indexOf(Math.min(...distances))];
+  }
+
+  // The world of the panorama at the camera; for one alone, the one that is shown, at first the largest.
+  chooseWorld() {
+    const { worlds } = HEADER.plan, sizeOf = (world) => worlds.filter((each) => each === world).length;
+    const largest = worlds.reduce((best, world) => sizeOf(world) > sizeOf(best) ? world : best);
+    const isAlone = sizeOf(worlds[here]) === 1 && sizeOf(largest) > 1;
+    return isAlone ? this.world === null ? largest : this.world : worlds[here];
   }
 
   show() {
     if (!this.isOpen) return;
-    const place = this.inLevel(camera.position), [x, y] = this.toPlan(place);
-    this.camera.setAttribute("transform", `translate(${x} ${y}) rotate(${camera.yaw / DEGREE})`);
-    this.buttons.forEach((button, node) => {
-      button.classList.toggle("faint", Math.abs(this.heights[node] - this.heights[here]) > STOREY);
-      if (node === here) button.setAttribute("aria-current", "location");
-      else button.removeAttribute("aria-current");
+    const world = this.chooseWorld(), heightOf = (position) => dot(column(HEADER.level, 1), position) / HEADER.unit;
+    if (world !== this.world) this.make(world);
+    const place = this.turned([0, 2].map((k) => dot(column(HEADER.level, k), camera.position))), [x, y] = this.toPlan(place);
+    this.camera.setAttribute("visibility", HEADER.plan.worlds[here] === world ? "visible" : "hidden");
+    this.camera.setAttribute("transform", `translate(${x} ${y}) rotate(${(camera.yaw - HEADER.plan.turn) / DEGREE})`);
+    const [floor, ...others] = [here, ...this.marks.map(([node]) => node)].map((node) => heightOf(HEADER.spots[node].position));
+    this.marks.forEach(([node, element], k) => {
+      const isElsewhere = HEADER.plan.worlds[node] !== world;
+      element.classList.toggle("faint", !isElsewhere && HEADER.plan.worlds[here] === world && Math.abs(others[k] - floor) > STOREY);
+      if (node === here && element.tagName === "BUTTON") element.setAttribute("aria-current", "location");
+      else element.removeAttribute("aria-current");
     });
   }
 }

@@ -39,12 +39,14 @@ function chooseRings() {
   }
 }
 
-// Those of chooseRings without that at the camera.
+// Those of chooseRings without that at the camera, and those behind furniture, unless all are.
 export function findRings() {
   chooseRings();
   if (doll.isOn) return rings.filter(({ link, node }) => !link && doll.shows(node));
   const isAtCamera = (ring) => ring.camera !== null && distanceOf(ring.camera, camera.position) < 2 * ring.radius;
-  return rings.filter((ring) => ring.isNext && !isAtCamera(ring));
+  const next = rings.filter((ring) => ring.isNext && !isAtCamera(ring)), { hidden } = HEADER.spots[nodeHere()];
+  const seen = next.filter(({ link, node }) => link || !hidden.includes(node));
+  return seen.length ? seen : next;
 }
 
 // Rings in perspective. A label that would cover the label of a nearer ring is not shown.
@@ -76,28 +78,17 @@ export function placeRings(rotation) {
 const listed = [];  // a button for each panorama
 export let here = null;    // the panorama at the camera
 
-export const isSingle = (node) => parts.filter((part) => part === parts[node]).length === 1;
-
-// The panoramas with a common world by part, then those without others.
+// The panoramas in the order of the tour.
 export function makeList() {
-  const nodes = [...HEADER.spots.keys()], placed = [...new Set(nodes.filter((node) => !isSingle(node)).map((node) => parts[node]))];
-  const sections = placed.map((part, i) => {
-    const title = placed.length > 1 ? `Placed panoramas, part ${i + 1}` : "Placed panoramas";
-    return [title, nodes.filter((node) => parts[node] === part)];
+  HEADER.spots.forEach(({ name }, node) => {
+    const button = make("button", "", `${node + 1}. ${name}`);
+    button.onclick = () => {
+      byId("list").close();
+      goTo(node);
+    };
+    listed.push(button);
   });
-  sections.push(["Single photographs, not placed", nodes.filter(isSingle)]);
-  for (const [title, members] of sections.filter((section) => section[1].length)) {
-    byId("panoramas").append(make("h2", "", title));
-    for (const node of members) {
-      const button = make("button", "", `${node + 1}. ${HEADER.spots[node].name}`);
-      button.onclick = () => {
-        byId("list").close();
-        goTo(node);
-      };
-      listed[node] = button;
-      byId("panoramas").append(button);
-    }
-  }
+  byId("panoramas").append(...listed);
 }
 
 export function openList() {
@@ -114,5 +105,4 @@ export function showPlace() {
   here = node;
   listed[here].setAttribute("aria-current", "location");
   byId("name").textContent = HEADER.spots[here].name;
-  byId("kind").textContent = isSingle(here) ? "single photograph" : "";
 }

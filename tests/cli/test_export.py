@@ -1,6 +1,7 @@
 """`pansplat export`: files, refused arguments."""
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -145,6 +146,20 @@ def test_a_page_of_panoramas_shows_them_and_a_crop_does_not(
     assert "without photographs, which would show what is left out" in capsys.readouterr().err
     (out / "index.html").write_text("mine")
     assert "index.html" in refusal(*command, out), "a page of another program stays"
+
+
+@pytest.mark.parametrize(("stated", "title"), [({"title": "Our <home>"}, "Our &lt;home&gt;"), ({}, "my home")])
+def test_the_page_of_a_web_tour_has_its_title_or_the_name_of_its_folder(
+    stated: dict[str, str], title: str, tmp_path: Path, write_tour: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
+    (image,) = list(write_tour(tmp_path / "my_home", height=64).glob("*0.png"))[:1]
+    note = {"type": "info", "text": "a lamp"}
+    tour, out = image.parent / "tour.json", tmp_path / "out.html"
+    tour.write_text(json.dumps({**stated, "scenes": {"hall": {"panorama": image.name, "hotSpots": [note]}}}))
+    options = ["--model", "sphere", "--refine", "0", "--predict-height", "64", "--photo-height", "0"]
+    assert run(["export", str(tour), "-o", str(out), *options]) == 0
+    assert f"<title>{title}</title>" in out.read_text() and '"text": "a lamp"' in out.read_text()
 
 
 def test_options_of_pages_are_for_pages(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:

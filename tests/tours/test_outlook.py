@@ -7,8 +7,9 @@ import pytest
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import measure_outlook, plan_route
+from pansplat.tours import find_blank, is_hidden, measure_outlook, plan_route
 from pansplat.tours.outlook import BINS, choose_heading
+from pansplat.tours.surfaces import locate_surfaces
 
 
 def test_the_outlook_is_the_distance_of_the_walls_around():
@@ -34,3 +35,25 @@ def test_a_flight_turns_from_a_wall_to_the_widest_view(comb):
     assert ended.yaws[-1] == pytest.approx(turned, abs=math.radians(2))
     assert np.allclose(ended.pose(1.0)[:3, 3], plain.pose(1.0)[:3, 3])
     assert np.abs(np.diff(ended.yaws)).max() < math.radians(1.0), "not at once"
+
+
+def test_a_wall_fills_the_blank_directions():
+    wall = np.full(BINS, 3.0)
+    wall[[0, 1, 2, -1, -2]] = 0.4
+    is_blank, widest = find_blank(wall)
+    assert np.flatnonzero(is_blank).tolist() == [0, 1, 2, 22, 23] and choose_heading(wall, -math.pi + 0.1) == widest
+    assert not find_blank(np.zeros(BINS))[0].any()
+    wall[10] = 0.4  # a post
+    assert not find_blank(wall)[0][10]
+
+
+def test_marks_are_hidden_by_what_is_in_front_of_them_only():
+    """The floor of the room of boxes is seen to its walls, but for what boxes hide."""
+    scene = Scene(full_lattice_room(128, views=1), make_room_cameras(1), 0.1, 10.0)
+    places = locate_surfaces(scene, 0, np.eye(3), min_opacity=0.5)
+    floor = np.quantile(places[:, 1], 0.99)
+    on_floor = places[(places[:, 1] > 0.97 * floor) & (np.abs(places[:, [0, 2]]).max(axis=1) > 1)]
+    seen = [is_hidden(places, mark) for mark in on_floor[::10]]
+    beyond = [is_hidden(places, 1.6 * mark) for mark in places[np.abs(places[:, 1]) < 0.5][::10]]
+    assert len(seen) > 50 and np.mean(seen) < 0.05 and np.mean(beyond) > 0.95
+    assert not is_hidden(np.zeros((0, 3)), np.ones(3))

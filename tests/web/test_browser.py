@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import io
+import json
 import math
 import os
 import shutil
@@ -31,7 +32,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import path_poses
 from pansplat.images.image_files import read_panorama
-from pansplat.inputs.pairs import Link, Pair, Panorama
+from pansplat.inputs.pairs import Link, Note, Pair, Panorama
 from pansplat.tours import EDGE_HYSTERESIS, TourGraph, find_fronts, find_rooms, make_graph, select_views
 from pansplat.tours.layout import REACH
 
@@ -117,8 +118,16 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sites]:
 
 @pytest.fixture(scope="module")
 def photographs(scene: Scene, take_photographs: Callable[..., list[Pair]]) -> list[Pair]:
-    """Of the scene, 1024 rows."""
-    return take_photographs(scene, 1024)
+    """Of the scene, 1024 rows; the second one has a note ahead on the right, the third one another."""
+    taken = take_photographs(scene, 1024)
+    notes = (
+        Note(0.3, 0.1, "<b>Oak</b>\nfloor", ("https://example.org/a?b=<c>&d", "http://example.org")),
+        Note(1.0, 0.0, "x"),
+    )
+    for number, note in enumerate(notes, start=1):
+        (panorama,) = taken[number].context
+        taken[number] = dataclasses.replace(taken[number], context=(dataclasses.replace(panorama, notes=(note,)),))
+    return taken
 
 
 @pytest.fixture(scope="module")
@@ -293,7 +302,84 @@ def test_the_dolls_house_is_the_picture_of_the_fronts_in_the_rooms_and_a_click_g
     home.page.mouse.click(left, top)
     home.wait("HEADER.spots.some((s) => s.position.every((x, i) => x === pansplat.camera.position[i]))")
     assert home.camera["fov"] == start["fov"] and home.page.get_attribute("#doll", "aria-pressed") == "false"
+    home.run("pansplat.setPose({ yaw: 77, pitch: 5 })")
+    before = home.run("pansplat.getPose()")
+    home.page.keyboard.press("KeyO")
+    home.wait("pansplat.camera.fov === 45")
+    home.page.keyboard.press("KeyO")
+    home.wait("pansplat.camera.fov !== 45 && pansplat.isSettled()")
+    after = home.run("pansplat.getPose()")
+    assert (after["yaw"], after["pitch"]) == pytest.approx((before["yaw"], before["pitch"])), (
+        "closing keeps the heading"
+    )
     home.page.emulate_media(reduced_motion="no-preference")
+
+
+def test_an_arrival_faces_no_wall(chromium: Any, folder: Path) -> None:
+    """Where a panorama says that the directions of a heading are blank, the camera turns to its widest view."""
+    with opened(chromium, folder / "tour.html") as page:
+        page.run("Object.assign(HEADER.spots[1], { blank: 1 << 13, ahead: -2 })")  # 15 to 30 degrees
+        for jump in (False, True):
+            for yaw, expected in ((20, math.degrees(-2)), (-20, -20), (40, 40)):
+                page.run("pansplat.goTo(1, { jump: true }).then(() => null)")
+                page.settle()
+                page.run("(yaw) => pansplat.setPose({ yaw, pitch: 0 })", yaw)
+                assert page.run("(jump) => pansplat.goTo(2, { jump })", jump)
+                assert page.run("pansplat.getPose().yaw") == pytest.approx(expected, abs=1e-3), (jump, yaw)
+        page.run("HEADER.spots[1].start = [1, 0.2]; pansplat.setPose({ position: HEADER.spots[0].position, yaw: 20 })")
+        assert page.run("pansplat.goTo(2)") and page.camera["yaw"] == pytest.approx(1)
+        assert page.messages == []
+
+
+def test_rings_behind_furniture_are_hidden_unless_all_are(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "tour.html") as page:
+        shown = "Array.from(document.querySelectorAll('#spots button:not([hidden])'), (button) => button.title).sort()"
+        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        for hidden, expected in (([], [1, 2]), ([2], [1]), ([1, 2], [1, 2])):
+            page.run("(hidden) => { HEADER.spots[0].hidden = hidden; }", hidden)
+            found = set()
+            for yaw in range(0, 360, 60):
+                page.run(
+                    "(yaw) => pansplat.setPose({ position: HEADER.spots[0].position, yaw, pitch: -30, fov: 90 })", yaw
+                )
+                page.settle()
+                found |= set(page.run(shown))
+            assert sorted(found) == [f"Go to room {node}" for node in expected]
+
+
+def test_a_note_of_the_tour_is_a_marker_at_its_panorama_that_opens_plain_text(
+    chromium: Any, folder: Path, scene: Scene
+) -> None:
+    with opened(chromium, folder / "photos.html") as page:
+        marker = page.page.locator("#spots button.note:not([hidden])")
+        assert marker.count() == 0
+        direction = np.array((math.sin(0.3) * math.cos(0.1), math.sin(0.1), math.cos(0.3) * math.cos(0.1)))
+        local = np.array(page.run("HEADER.level")).T @ scene.cam2world[1, :3, :3].numpy() @ direction
+        yaw, pitch = math.degrees(math.atan2(local[0], local[2])), -math.degrees(math.asin(local[1]))
+        at = """([yaw, pitch, away]) => {
+            const [x, y, z] = HEADER.spots[1].position;
+            pansplat.setPose({ position: [x + away, y, z], yaw, pitch, fov: 60 });
+        }"""
+        page.run(at, [yaw, pitch, 0])
+        page.settle()
+        (box,) = (each.bounding_box() for each in marker.element_handles())
+        assert (box["x"] + 22, box["y"] + 22) == pytest.approx((SIZE[0] / 2, SIZE[1] / 2), abs=1)
+        assert min(box["width"], box["height"]) >= 44
+        marker.click()
+        assert page.page.inner_text("#notice-text") == "<b>Oak</b>\nfloor"
+        links = page.run(
+            "Array.from(document.querySelectorAll('#notice-links a'), (a) => [a.textContent, a.href, a.rel, a.target])"
+        )
+        assert [link[0] for link in links] == ["https://example.org/a?b=<c>&d", "http://example.org"]
+        assert [link[2:] for link in links] == [["noopener noreferrer", "_blank"]] * 2
+        page.page.click("#notice button")
+        page.run(at, [yaw + 150, 0, 0])
+        page.settle()
+        assert marker.count() == 0, "behind the camera"
+        page.run(at, [yaw, pitch, 0.6])
+        page.settle()
+        assert marker.count() == 0, "away from the panorama"
+        assert page.messages == []
 
 
 def look_at_photograph(photograph: Pair, level: np.ndarray, camera: dict[str, Any]) -> np.ndarray:
@@ -786,17 +872,13 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         keyboard, start = page.page.keyboard, page.camera
         assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
         page.wait("document.getElementById('name').innerText === 'room 0'")  # of the first frame
-        assert page.page.inner_text("#kind") == ""
         # Titles are text. The keyboard opens the list and chooses from it.
         shown = "Array.from(document.querySelectorAll('#spots button:not([hidden])'), (button) => button.title)"
         page.run("pansplat.camera.yaw = 1.5; pansplat.camera.pitch = -0.6; dispatchEvent(new Event('resize'))")
         page.wait(f"{shown}.includes('Go to </script><b>hall <i>down')")
         keyboard.press("l")
         listed = page.page.inner_text("#panoramas").split("\n")
-        assert [line for line in listed if line] == [
-            *("Placed panoramas", "1. room 0", "2. room 1"),
-            *("Single photographs, not placed", "3. </script><b>hall", "4. attic"),
-        ]
+        assert [line for line in listed if line] == ["1. room 0", "2. room 1", "3. </script><b>hall", "4. attic"]
         assert page.run("document.activeElement.textContent") == "1. room 0"
         page.run("passed = []; record()")
         keyboard.press("Tab")
@@ -824,7 +906,7 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         page.settle()
         assert page.camera["position"] == page.run("HEADER.spots[3].position")
         assert (page.camera["yaw"], page.camera["pitch"]) == pytest.approx((3.1, 0.2), abs=1e-5)
-        assert page.page.inner_text("#kind") == "single photograph" and page.run(shown) == []
+        assert page.run(shown) == []
         # The camera slows down near the limit.
         page.run("passed = []; HEADER.speed *= 3")
         keyboard.down("KeyW")
@@ -1145,28 +1227,49 @@ def test_distances_are_those_of_the_rasterisers_depth(home: OpenPage, scene: Sce
 @pytest.mark.slow
 def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, folder: Path) -> None:
     with opened(chromium, folder / "flat.html", size=(640, 480)) as page:
+        level = np.array(page.run("HEADER.level"))
+        positions = (np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level)[:, [0, 2]]
+        outline = (positions[0] + ((-15, -20), (25, -20), (25, 20), (-15, 20))).tolist()
+        room = {"name": "<i>salon", "nodes": [0], "outline": outline, "label": [*outline[0], 2]}
+        rooms = [room, {**room, "nodes": [2], "name": "other world"}]
+        page.run(f"HEADER.plan.turn = 0.3; HEADER.plan.rooms = {json.dumps(rooms)}")
+        page.run(f"HEADER.plan.doors = [{{ room: 0, ends: {outline[:2]} }}]")
         page.page.keyboard.press("m")
         page.settle()
-        assert page.run("document.querySelectorAll('#plan button').length") == 4
         boxes = [each.bounding_box() for each in page.page.query_selector_all("#plan button")]
-        centers = np.array([(box["x"] + 12, box["y"] + 12) for box in boxes])
-        level = np.array(page.run("HEADER.level"))
-        places = np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level
-        across, up = (centers[:, 0] - centers[0, 0]), (centers[0, 1] - centers[:, 1])
-        scale = across[3] / (places[3, 0] - places[0, 0])
-        assert scale > 0 and across == pytest.approx(scale * (places[:, 0] - places[0, 0]), abs=0.6)
-        assert up == pytest.approx(scale * (places[:, 2] - places[0, 2]), abs=0.6)
-        assert page.page.locator("#plan .single").count() == 2 and page.page.locator("#plan .link").count() == 2
-        assert page.run("document.querySelector('#plan [aria-current]').ariaLabel") == "Go to room 0"
+        assert len(boxes) == 4 and min(box[side] for box in boxes for side in ("width", "height")) >= 43.99
+        centers = np.array([(box["x"] + 22, box["y"] + 22) for box in boxes[:2]])
+        turn = np.array(((math.cos(0.3), math.sin(0.3)), (-math.sin(0.3), math.cos(0.3)))) * (1, -1)  # down is positive
+        places = positions @ turn
+        scale = np.linalg.norm(centers[1] - centers[0]) / np.linalg.norm(places[1] - places[0])
+        assert centers[1] - centers[0] == pytest.approx(scale * (places[1] - places[0]), abs=0.6)
+        # Outlines of rooms are to the same scale, and those of other worlds are in no drawing but a list.
+        drawn = page.run(
+            "Array.from(document.querySelectorAll('#plan polygon'), (each) => each.getAttribute('points'))"
+        )
+        drawing = page.page.query_selector("#drawing").bounding_box()
+        assert len(drawn) == page.page.locator("#plan line").count() == 1
+        corners = np.array([float(number) for number in drawn[0].replace(",", " ").split()]).reshape(-1, 2)
+        expected = centers[0] + scale * (np.array(outline) @ turn - places[0])
+        assert corners == pytest.approx(expected - (drawing["x"], drawing["y"]), abs=0.6)
+        elsewhere = page.page.locator("#elsewhere button")
+        assert elsewhere.all_inner_texts() == ["</script><b>hall", "attic"]
+        assert page.page.locator("#plan svg text").all_text_contents() == ["<i>salon", "room 1"]
+        assert page.run("document.querySelector('#drawing [aria-current]').ariaLabel") == "Go to room 0"
         turned = "document.querySelector('#plan path').getAttribute('transform')"
-        page.run("pansplat.setPose({ yaw: 90 })")
-        page.wait(f"{turned}.endsWith('rotate(90)')")
-        box = page.page.query_selector("#plan").bounding_box()
+        page.run("pansplat.setPose({ yaw: 90 + HEADER.plan.turn * 180 / Math.PI })")
+        page.wait(f"Math.abs({turned}.split('rotate(')[1].slice(0, -1) - 90) < 1e-3")
         x, y = (float(value) for value in page.run(turned)[10:].split(")")[0].split())
-        assert (box["x"] + x, box["y"] + y) == pytest.approx(centers[0], abs=0.6)
+        assert (drawing["x"] + x, drawing["y"] + y) == pytest.approx(centers[0], abs=0.6)
         page.run("HEADER.speed *= 100")
-        page.page.click("#plan button[title='Go to attic']")
-        page.wait("document.querySelector('#plan [aria-current]').ariaLabel === 'Go to attic'")
+        assert np.linalg.norm(centers[1] - centers[0]) < 20, "buttons of 44 pixels overlap"
+        for node in (1, 0):
+            page.page.mouse.click(*centers[node])
+            page.wait(f"document.querySelector('#drawing [aria-current]').ariaLabel === 'Go to room {node}'")
+        elsewhere.nth(1).click()
+        page.wait("document.querySelector('#elsewhere [aria-current]')?.textContent === 'attic'")
+        assert page.run("document.querySelector('#plan path').getAttribute('visibility')") == "hidden"
+        assert page.run("document.querySelectorAll('#drawing button').length") == 2, "the drawing stays"
         page.page.keyboard.press("m")
         assert page.page.is_hidden("#plan") and page.messages == []
 

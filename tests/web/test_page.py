@@ -13,9 +13,11 @@ from urllib.parse import unquote_to_bytes, urljoin, urlsplit
 
 import numpy as np
 import pytest
+import shapely
 import torch
 
 from pansplat import pipeline
+from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
 from pansplat.export.page import write_page
@@ -24,7 +26,8 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.refinement.budget import merge_to
-from pansplat.tours import find_camera_height, find_rooms, select_views
+from pansplat.tours import find_camera_height, find_rooms, make_graph, select_views
+from pansplat.tours.plan import make_plan
 
 
 @pytest.fixture(autouse=True)
@@ -52,6 +55,48 @@ def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
     for view, spot in enumerate(header["spots"]):  # rings are on the floor below the cameras
         height = find_camera_height(scene, view, level)
         assert np.array(spot["mark"]) - spot["position"] == pytest.approx((0, height, 0), abs=1e-5)
+
+
+def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) -> None:
+    cameras = make_room_cameras(2)
+    room = Scene(full_lattice_room(128), cameras, 0.1, 10.0, names=("west", "east"), height=128)
+    write_page(room, tmp_path / "room.html")
+    header = read_header(tmp_path / "room.html")
+    level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
+    tour = make_graph(room)
+    (drawn,), (expected,) = header["plan"]["rooms"], make_plan(room, tour).rooms
+    assert drawn["name"] == "west / east" and drawn["nodes"] == [0, 1] and header["plan"]["worlds"] == [0, 0]
+    turn = level[:, (0, 2)].T @ tour.level_axes[:, (0, 2)]  # they differ by a quarter turn
+    outline = np.array(drawn["outline"]) + level[:, (0, 2)].T @ middle
+    assert shapely.Polygon(outline).symmetric_difference(shapely.Polygon(expected.outline @ turn.T)).area < 0.05
+    assert shapely.Polygon(outline).contains(shapely.Point(np.array(drawn["label"][:2]) + level[:, (0, 2)].T @ middle))
+    # What hides the mark of the other panorama is a wall between them.
+    assert [spot["hidden"] for spot in header["spots"]] == [[], []]
+    gaussians = room.gaussians
+    wall = gaussians.select((gaussians.views == 0) & (gaussians.means[:, 0] > 0.1))
+    offset = (wall.means - cameras[0, :3, 3].float()) * torch.tensor(0.3)
+    near = dataclasses.replace(wall, means=cameras[0, :3, 3].float() + offset, opacities=torch.ones(len(wall)))
+    hiding = Gaussians.cat([gaussians.select((gaussians.views == 1) | (gaussians.means[:, 0] <= 0.1)), near])
+    write_page(dataclasses.replace(room, gaussians=hiding), tmp_path / "wall.html")
+    assert [spot["hidden"] for spot in read_header(tmp_path / "wall.html")["spots"]] == [[1], []]
+
+
+def test_a_page_starts_with_the_widest_view_unless_it_has_a_start_view(house: Scene, tmp_path: Path) -> None:
+    """Half of the surfaces around the first camera come close, those ahead."""
+    level, gaussians = make_graph(house).level_axes, house.gaussians
+    write_page(house, tmp_path / "free.html")
+    yaw = read_header(tmp_path / "free.html")["start"]["yaw"]
+    ahead = torch.from_numpy(level @ (math.sin(yaw), 0, math.cos(yaw))).float()
+    offsets = gaussians.means - house.cam2world[0, :3, 3].float()
+    close = (gaussians.views == 0) & (offsets @ ahead > 0.3 * offsets.norm(dim=1))
+    means = torch.where(close[:, None], house.cam2world[0, :3, 3].float() + 0.2 * offsets, gaussians.means)
+    facing = dataclasses.replace(house, gaussians=dataclasses.replace(gaussians, means=means))
+    write_page(facing, tmp_path / "wall.html")
+    assert math.cos(read_header(tmp_path / "wall.html")["start"]["yaw"] - yaw) < 0
+    local = house.cam2world[0, :3, :3].numpy().T @ ahead.numpy()
+    start = math.atan2(local[0], local[2]), math.asin(local[1])
+    write_page(dataclasses.replace(facing, starts=(start, None, None)), tmp_path / "start.html")
+    assert math.cos(read_header(tmp_path / "start.html")["start"]["yaw"] - yaw) == pytest.approx(1, abs=1e-5)
 
 
 def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: Path) -> None:

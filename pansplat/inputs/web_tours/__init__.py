@@ -35,7 +35,7 @@ def is_scene_of_tour(folder: Path, image: Path) -> bool:
 
 
 def read_web_tour(source: Path) -> list[Panorama]:
-    """The panoramas of a tour, with titles, links and start views, and without poses. No pixels are read.
+    """The panoramas of a tour, with titles, links, notes and start views, and without poses. No pixels are read.
 
     Warns about panoramas, links and levels that cannot be used.
 
@@ -45,9 +45,9 @@ def read_web_tour(source: Path) -> list[Panorama]:
     """
     marzipano = find_marzipano(source.parent)
     if marzipano is not None and (marzipano == source or source.suffix.lower() in (".html", ".htm")):
-        source, entries = marzipano, read_marzipano(marzipano)
+        source, (title, entries) = marzipano, read_marzipano(marzipano)
     else:
-        entries = read_pannellum(source)
+        title, entries = read_pannellum(source)
     if not entries:
         raise InputError(f"{source}: needed panoramas, got none that can be used; the notes name the reasons.")
-    return make_panoramas(entries, source)
+    return make_panoramas(entries, source, title)

@@ -8,9 +8,10 @@ import unicodedata
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
-from urllib.parse import unquote
+from urllib.parse import unquote, urlsplit
 
 import torch
 from msgspec import Meta
@@ -18,7 +19,7 @@ from msgspec import Meta
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
 from pansplat.images.cube_images import CubeImage, write_cube
-from pansplat.inputs.pairs import Link, Panorama, find_mask
+from pansplat.inputs.pairs import Link, Note, Panorama, find_mask
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.system.files import make_portable_name, read_file
 from pansplat.system.strict_json import convert
@@ -30,7 +31,11 @@ Pixels = Annotated[int, Meta(ge=1, le=1 << 20)]
 MAX_BYTES = 1 << 24  # of a file that describes a tour
 _MAX_TEXT = 200  # characters of a title or label
 _MAX_NAME = 60  # characters
+_MAX_NOTE, _MAX_HTML = 2_000, 20_000  # characters of a note, and of its HTML
+_MAX_ADDRESSES = 10  # of a note
 _MAX_TILES = 64  # along a face
+_HIDDEN = ("script", "style", "template")  # elements whose text is not shown
+_BREAKS = ("br", "p", "div", "li", "ul", "ol", "tr", "h1", "h2", "h3", "h4")  # elements on lines of their own
 _ON_THE_WEB = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:|//")
 
 
@@ -43,6 +48,7 @@ class Entry:
         picture: a 2:1 image, or cube faces.
         title: for people.
         links: their targets are keys.
+        notes: hot spots with information.
         start: yaw and pitch of the first view, as of a link.
     """
 
@@ -50,6 +56,7 @@ class Entry:
     picture: Path | CubeImage
     title: str = ""
     links: tuple[Link, ...] = ()
+    notes: tuple[Note, ...] = ()
     start: tuple[float, float] | None = None
 
 
@@ -123,10 +130,67 @@ def plain_text(value: Any) -> str:
     return " ".join("".join(letters).split())[:_MAX_TEXT]
 
 
-def make_panoramas(entries: Sequence[Entry], source: Path) -> list[Panorama]:
+class _HtmlText(HTMLParser):
+    """The text of HTML, with the names of its pictures, and the addresses that it leads to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.parts: list[str] = []
+        self.addresses: list[str | None] = []
+        self._hidden = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        stated = dict(attrs)
+        self._hidden += tag in _HIDDEN
+        self.parts += ["\n"] * (tag in _BREAKS)
+        if tag == "img":
+            self.parts.append(f" [{stated.get('alt') or posixpath.basename(stated.get('src') or '') or 'picture'}] ")
+        self.addresses.append(stated.get("href") if tag == "a" else stated.get("src") if tag == "img" else None)
+
+    def handle_endtag(self, tag: str) -> None:
+        self._hidden -= tag in _HIDDEN and self._hidden > 0
+        self.parts += ["\n"] * (tag in _BREAKS)
+
+    def handle_data(self, data: str) -> None:
+        if not self._hidden:
+            self.parts.append(data)
+
+
+def read_note(direction: tuple[float, float], texts: Sequence[Any], addresses: Sequence[Any] = ()) -> Note:
+    """A hot spot with information.
+
+    Args:
+        direction: yaw and pitch, as of a link.
+        texts: HTML of its title and of what follows; of other values nothing is shown.
+        addresses: further ones that it leads to; of files of the tour, and of other protocols, none is kept.
+    """
+    parser = _HtmlText()
+    for text in texts:
+        parser.feed(f"{text[:_MAX_HTML]}\n" if isinstance(text, str) else "")
+    parser.close()
+    lines = (plain_text(line) for line in "".join(parser.parts).splitlines())
+    kept = dict.fromkeys(each for each in (*parser.addresses, *addresses) if _is_address(each))
+    return Note(*direction, "\n".join(line for line in lines if line)[:_MAX_NOTE], tuple(kept)[:_MAX_ADDRESSES])
+
+
+def _is_address(value: Any) -> bool:
+    """Whether a value is the whole address of a web page."""
+    if not isinstance(value, str) or len(value) > _MAX_NOTE or not value.isprintable():
+        return False
+    try:
+        parts = urlsplit(value)
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and bool(parts.hostname) and " " not in value
+
+
+def make_panoramas(entries: Sequence[Entry], source: Path, tour: str) -> list[Panorama]:
     """Panoramas with file-safe, unique names; the same picture counts once. Cube faces get files in the cache folder.
 
     Warns about links to a panorama that does not exist, and drops them.
+
+    Args:
+        tour: its title.
     """
     folder = source.parent
     names: dict[str, str] = {}  # by key
@@ -147,7 +211,9 @@ def make_panoramas(entries: Sequence[Entry], source: Path) -> list[Panorama]:
         pose = torch.eye(4, dtype=torch.float64)
         title = "" if entry.title == name else entry.title
         links = resolve_links(entry.links, names, name, source)
-        panoramas.append(Panorama(name, image, pose, mask, title=title, links=links, start=entry.start))
+        notes = tuple(note for note in entry.notes if note.text or note.addresses)
+        about = {"title": title, "links": links, "notes": notes, "tour": tour, "start": entry.start}
+        panoramas.append(Panorama(name, image, pose, mask, **about))
     return panoramas
 
 

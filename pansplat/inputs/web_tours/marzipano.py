@@ -21,7 +21,7 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.images.cube_faces import find_gap, strip_level
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
 from pansplat.images.image_files import read_size, require_complete
-from pansplat.inputs.pairs import Link
+from pansplat.inputs.pairs import Link, Note
 from pansplat.inputs.web_tours.entries import (
     Entry,
     Pixels,
@@ -30,6 +30,7 @@ from pansplat.inputs.web_tours.entries import (
     plain_text,
     read_direction,
     read_entries,
+    read_note,
     read_text,
     require_tiles,
 )
@@ -42,6 +43,7 @@ _FACES = "frblud"
 _PREVIEW = "bdflru"
 _ASSIGNMENT = re.compile(r"(?<![\w$])[A-Za-z_$][\w$]*\s*=\s*(?=\{)")
 _SHOWN = 30  # characters of a file in a message
+_UNNAMED = "Project Title"  # of a project whose author gave no name
 
 
 def find_marzipano(folder: Path) -> Path | None:
@@ -50,18 +52,12 @@ def find_marzipano(folder: Path) -> Path | None:
     return next((path for path in found if path.is_file()), None)
 
 
-def read_marzipano(source: Path) -> list[Entry]:
-    """The scenes of an export that have a complete level."""
+def read_marzipano(source: Path) -> tuple[str, list[Entry]]:
+    """The title of an export, and its scenes that have a complete level."""
     content = _read_data(source)
     entries = read_entries(source, _list_scenes(content["scenes"]), lambda key, scene: _read_scene(key, scene, source))
-    infos = sum(len(_objects(scene.get("infoHotspots"))) for scene in _objects(content["scenes"]))
-    if infos:
-        warnings.warn(
-            f"{source}: {infos} hot spots with information are left out; links are kept.",
-            category=InputWarning,
-            stacklevel=3,
-        )
-    return entries
+    title = plain_text(content.get("name"))
+    return "" if title == _UNNAMED else title, entries
 
 
 def _read_data(source: Path) -> dict[str, Any]:
@@ -95,12 +91,20 @@ def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
         optional(f"{source}: a link of {key}", lambda spot=spot: _read_link(spot))
         for spot in _objects(scene.get("linkHotspots"))
     ]
-    title = plain_text(scene.get("name"))
-    return Entry(key, CubeImage(source.parent, levels), title, tuple(link for link in links if link), start)
+    notes = [
+        optional(f"{source}: a hot spot of {key}", lambda spot=spot: _read_note(spot))
+        for spot in _objects(scene.get("infoHotspots"))
+    ]
+    picture, title = CubeImage(source.parent, levels), plain_text(scene.get("name"))
+    return Entry(key, picture, title, tuple(filter(None, links)), tuple(filter(None, notes)), start)
 
 
 def _read_link(spot: Mapping[str, Any]) -> Link:
     return Link(plain_text(spot.get("target")), *read_direction(spot), plain_text(spot.get("text")))
+
+
+def _read_note(spot: Mapping[str, Any]) -> Note:
+    return read_note(read_direction(spot), [spot.get("title"), spot.get("text")])
 
 
 def _objects(value: Any) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ doc/json-config-parameters.md, utils/multires/generate.py (levels and tiles), sr
 
 from __future__ import annotations
 
+import html
 import math
 import re
 import warnings
@@ -24,7 +25,7 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.images.cube_faces import find_gap, find_layout, require_faces
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
 from pansplat.images.image_files import read_size, require_complete
-from pansplat.inputs.pairs import Link
+from pansplat.inputs.pairs import Link, Note
 from pansplat.inputs.web_tours.entries import (
     MAX_BYTES,
     Entry,
@@ -35,6 +36,7 @@ from pansplat.inputs.web_tours.entries import (
     plain_text,
     read_direction,
     read_entries,
+    read_note,
     read_text,
     require_tiles,
 )
@@ -75,8 +77,8 @@ def find_pannellum(folder: Path) -> Path | None:
     return None
 
 
-def read_pannellum(source: Path) -> list[Entry]:
-    """The scenes of a tour, or its only panorama; the first scene of the tour is the first."""
+def read_pannellum(source: Path) -> tuple[str, list[Entry]]:
+    """The title of a tour and its scenes, or its only panorama; the first scene of the tour is the first."""
     content = _find_configuration(source)
     if content is None:
         got = "an HTML page" if read_text(source).lstrip().startswith("<") else "other text"
@@ -97,16 +99,7 @@ def read_pannellum(source: Path) -> list[Entry]:
     else:
         ordered = [(source.resolve().parent.name if source.stem in ("index", "tour") else source.stem, content)]
     entries = read_entries(source, iter(ordered), lambda key, scene: _read_scene(key, scene, source))
-    others = [
-        spot for _, scene in ordered if isinstance(scene, dict) for spot in _spots(scene) if not spot.get("sceneId")
-    ]
-    if others:
-        warnings.warn(
-            f"{source}: {len(others)} hot spots with information are left out; links are kept.",
-            category=InputWarning,
-            stacklevel=3,
-        )
-    return entries
+    return plain_text(common.get("title", content.get("title") if isinstance(scenes, dict) else "")), entries
 
 
 def _find_configuration(source: Path) -> dict[str, Any] | None:
@@ -184,12 +177,24 @@ def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
         for spot in _spots(scene)
         if spot.get("sceneId")
     ]
+    notes = [
+        optional(f"{source}: a hot spot of {key}", lambda spot=spot: _read_note(spot))
+        for spot in _spots(scene)
+        if not spot.get("sceneId")
+    ]
     title = plain_text(scene.get("title"))
-    return Entry(key, picture, title, tuple(link for link in links if link), start)
+    return Entry(key, picture, title, tuple(filter(None, links)), tuple(filter(None, notes)), start)
 
 
 def _read_link(spot: Mapping[str, Any]) -> Link:
     return Link(str(spot["sceneId"]), *_read_direction(spot), plain_text(spot.get("text")))
+
+
+def _read_note(spot: Mapping[str, Any]) -> Note:
+    text = spot.get("text")
+    picture = [f"[{str(spot['image']).rpartition('/')[2]}]"] if spot.get("image") else []
+    shown = [html.escape(each) for each in (text, *picture) if isinstance(each, str)]  # Pannellum shows no HTML
+    return read_note(_read_direction(spot), shown, [spot.get(name) for name in ("URL", "image", "video")])
 
 
 def _read_direction(content: Mapping[str, Any]) -> tuple[float, float]:

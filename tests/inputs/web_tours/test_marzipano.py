@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pansplat.cli import run
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Link, Panorama
+from pansplat.inputs.folders import load_pairs, load_panoramas
+from pansplat.inputs.pairs import Link, Note, Panorama
 from pansplat.inputs.web_tours import find_web_tour, read_web_tour
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.files import name_pictures
@@ -108,6 +109,40 @@ def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Exp
     assert set(names.values()) == {"0-hall", "1-kitchen", "2-bath"}, "those of an estimate"
 
 
+def test_a_tour_comes_out_of_its_tiles_as_photographs(export: Export, check_colors, tmp_path_factory, capsys) -> None:
+    spot = {"yaw": 3.0, "pitch": 0.25, "target": "1-kitchen"}
+    folder = export(_scene("0-hall", linkHotspots=[spot]), _scene("1-kitchen", name="Küche"))
+    out = tmp_path_factory.mktemp("photos") / "panoramas"
+    assert run(["export", str(folder), "-o", str(out), "--photos"]) == 0
+    assert "2 photographs" in capsys.readouterr().out
+    assert sorted(file.name for file in out.iterdir()) == ["0-hall.jpg", "1-kitchen.jpg", "links.json"]
+    assert read_height(out / "0-hall.jpg") == 128
+    check_colors(read_panorama(out / "0-hall.jpg", 128)[0], tolerance=8)  # two generations of JPEG
+    before, after = load_panoramas(folder), load_panoramas(out)
+    for old, new in zip(before, after, strict=True):
+        assert (new.name, new.title, new.start, new.links) == (old.name, old.title, old.start, old.links)
+    assert run(["export", str(folder), "-o", str(out), "--photos"]) == 2
+    assert "new or empty folder" in capsys.readouterr().err
+    assert run(["export", str(folder), "-o", str(out / "a"), "--photos", "--split"]) == 2
+    assert "--split is for an .html page" in capsys.readouterr().err
+
+
+def test_what_is_hidden_stays_hidden_in_the_photographs_of_a_tour(tmp_path: Path, write_scene) -> None:
+    write_scene(tmp_path / "in" / "hall.jpg", 64)
+    hidden = np.zeros((64, 128), np.uint8)
+    hidden[28:36, 60:68] = 255
+    Image.fromarray(hidden).save(tmp_path / "in" / "hall_blur.png")
+    Image.fromarray(255 - hidden).save(tmp_path / "in" / "hall_mask.png")
+    assert run(["export", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--photos"]) == 0
+    shown, written = (read_panorama(tmp_path / name / "hall.jpg", 64)[0] for name in ("in", "out"))
+    assert float((shown - written).abs().max()) < 0.02
+    (tmp_path / "in" / "hall_blur.png").unlink()
+    original = read_panorama(tmp_path / "in" / "hall.jpg", 64)[0]
+    assert float((original - written)[:, 28:36, 60:68].abs().max()) > 0.02, "the file has the blur"
+    masks = [np.asarray(Image.open(tmp_path / name / "hall_mask.png").convert("L")) > 127 for name in ("in", "out")]
+    assert np.array_equal(*masks)
+
+
 def test_the_export_is_found_from_its_folder_archive_and_page(export: Export) -> None:
     folder = export(_scene("0-hall"))
     assert find_web_tour(folder) == folder / "data.js"
@@ -173,10 +208,28 @@ def test_links_to_nowhere_and_to_itself_are_dropped(export: Export) -> None:
     assert "a link of 0-hall is left out: it leads to '9-gone'" in messages[1]
 
 
-def test_information_is_counted_as_left_out(export: Export) -> None:
-    folder = export(_scene("0-hall", infoHotspots=[{"yaw": 0, "pitch": 0, "title": "a", "text": "b"}] * 3))
-    with pytest.warns(UserWarning, match="3 hot spots with information are left out"):
-        read_web_tour(folder / "data.js")
+def test_information_is_kept_as_plain_text_with_addresses_of_web_pages(export: Export) -> None:
+    text = """<p>Oak &amp; ash<br>1 &lt; 2</p><script>alert(1)</script><img src="img/oven.jpg" onerror="alert(2)">
+        <a href="https://example.org/a?b=1&amp;c">more</a>
+        <a href="javascript://x/%0Aalert(3)">one</a><a href="data:,x">two</a><a href="https://user name@x">three</a>
+        <img alt="a tap" src="http://example.org/tap.png">"""
+    spots = [
+        {"yaw": 0.5, "pitch": -0.2, "title": "<b>Floor</b>", "text": text},
+        {"yaw": 0, "pitch": 0, "title": " ", "text": 7},
+        {"yaw": "x", "title": "gone"},
+    ]
+    with pytest.warns(UserWarning, match="a hot spot of 0-hall is left out: direction, yaw: needed a number"):
+        (hall,) = read_web_tour(export(_scene("0-hall", infoHotspots=spots)) / "data.js")
+    shown = "Floor\nOak & ash\n1 < 2\n[oven.jpg]\nmore\nonetwothree\n[a tap]"
+    assert hall.notes == (Note(0.5, -0.2, shown, ("https://example.org/a?b=1&c", "http://example.org/tap.png")),)
+
+
+@pytest.mark.parametrize(("name", "title"), [("Our <i>home</i>", "Our <i>home</i>"), ("Project Title", ""), (3, "3")])
+def test_the_title_of_the_tour_is_that_of_the_project(export: Export, name: object, title: str) -> None:
+    folder = export(_scene("0-hall"))
+    data = json.loads((folder / "data.js").read_text().removeprefix("var APP_DATA = ").rstrip(";\n"))
+    (folder / "data.js").write_text(f"var APP_DATA = {json.dumps(data | {'name': name})};")
+    assert [panorama.tour for panorama in read_web_tour(folder / "data.js")] == [title]
 
 
 def test_scripts_in_names_are_plain_text(export: Export) -> None:

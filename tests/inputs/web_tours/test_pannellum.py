@@ -12,7 +12,7 @@ from PIL import Image
 
 from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.pairs import Link
+from pansplat.inputs.pairs import Link, Note
 from pansplat.inputs.web_tours import find_web_tour, read_web_tour
 
 MULTIRES = {
@@ -45,17 +45,23 @@ def test_a_tour_of_panoramas_has_titles_links_and_start_views(tmp_path: Path, wr
     write_scene(tmp_path / "img/my kitchen.jpg", turn=5)
     spots = [
         {"type": "scene", "pitch": -10, "yaw": 90, "sceneId": "hall", "text": "Hall", "targetYaw": 5},
-        {"type": "info", "pitch": 0, "yaw": 0, "text": "a lamp", "URL": "https://example.org"},
+        {"type": "info", "pitch": 10, "yaw": 90, "text": "a <b>lamp", "URL": "https://example.org"},
+        {"type": "info", "yaw": 0, "image": "img/lamp.png", "URL": "javascript:alert(1)"},
     ]
     content = {
         "default": {"firstScene": "hall", "basePath": "img/", "yaw": 20},
+        "title": "Our home",
         "scenes": {
             "kitchen": {"panorama": "my%20kitchen.jpg?v=2", "hotSpots": spots, "pitch": 30},
             "hall": {"title": "The hall", "type": "equirectangular", "panorama": "hall.jpg", "yaw": -190},
         },
     }
-    with pytest.warns(UserWarning, match="1 hot spots with information are left out"):
-        hall, kitchen = read_web_tour(_write(tmp_path, content))
+    hall, kitchen = read_web_tour(_write(tmp_path, content))
+    assert hall.tour == kitchen.tour == "Our home" and hall.notes == ()
+    lamp, picture = kitchen.notes
+    assert (lamp.yaw, lamp.pitch) == pytest.approx((math.pi / 2, -math.radians(10)))
+    assert (lamp.text, lamp.addresses) == ("a <b>lamp", ("https://example.org",))
+    assert picture == Note(0, 0, "[lamp.png]")
     assert (hall.name, hall.label, kitchen.label) == ("hall", "The hall", "kitchen")
     assert hall.image == tmp_path / "img/hall.jpg" and kitchen.image == tmp_path / "img/my kitchen.jpg"
     (link,) = kitchen.links
