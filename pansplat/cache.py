@@ -24,7 +24,7 @@ from pansplat.system.cache_folders import cache_folders, write_cache_file
 from pansplat.system.files import read_file
 from pansplat.system.options import PredictOptions
 
-_MAX_LEVELS = 256
+_MAX_LEVELS = 256  # of Gaussians; their labels are bytes
 _FORMAT = "1"  # version of the file's layout; part of the hash
 _GAINS, _REFINEMENT = "gains", "refinement"
 _ENOUGH_STEPS = 40  # of a refinement; more change little

@@ -302,7 +302,16 @@ class _Task:
     def views(self) -> Views:
         """The loaded panoramas."""
         height = self.options.height or 0
-        return self.source if isinstance(self.source, Views) else self.source.load_context(height)
+        views = self.source if isinstance(self.source, Views) else self.source.load_context(height)
+        centres = views.cam2world[:, :3, 3]
+        if len(centres) > 1 and float(torch.pdist(centres).max()) < _ONE_PLACE * views.near:
+            warnings.warn(
+                f"{', '.join(views.names)}: the cameras are at one place, so that depth is that of each photograph "
+                "alone; check the poses.",
+                InputWarning,
+                stacklevel=4,
+            )
+        return views
 
     def open_cache(self, *, refined: bool) -> CachedPrediction:
         """The file of the prediction or of its refinement."""
@@ -745,13 +754,6 @@ def _as_tensors(views: Views) -> Views:
             f"`images` must be RGB in [0, 1], got values up to {float(images.max()):g}; divide them by 255"
         )
     poses = torch.as_tensor(views.cam2world, dtype=torch.float64)
-    if len(poses) > 1 and float(torch.cdist(poses[:, :3, 3], poses[:, :3, 3]).max()) < _ONE_PLACE * views.near:
-        warnings.warn(
-            f"{', '.join(views.names)}: the cameras are at one place, so that depth is that of each photograph alone; "
-            "check the poses.",
-            InputWarning,
-            stacklevel=4,
-        )
     return replace(views, images=images, masks=masks, cam2world=poses)
 
 

@@ -41,7 +41,7 @@ MAX_SIZE = 8000  # pixels along a face; OpenCV resamples at most 32,767 rows
 _MIN_HEIGHT = 4  # of a panorama in which every face has rows and columns
 _PAD = 2  # pixels of the neighbouring faces, for the cubic filter
 _SAMPLES = 2  # per pixel and axis; faces are up to twice as dense at their edges as a panorama
-_ENOUGH = 2 / math.pi  # face size over panorama height at which the centre of a face is as dense as the panorama
+_DENSE_FACE = 2 / math.pi  # face size over panorama height at which the centre of a face is as dense as the panorama
 _LARGEST_DENSITY, _DENSITY = 1.5, 1.28  # the same ratio, above which faces are reduced, and of reduced faces
 _CAP = 0.6  # latitude above which a column meets the upper or lower face, radians; at the cube's corners 0.615
 
@@ -123,7 +123,7 @@ class CubeImage:
 
     def read(self, height: int, decode: Decode) -> tuple[UInt8[Array, "height width 3"], None]:
         """The equirectangular panorama at (height, 2 height); None, as the pictures show all of it."""
-        level = next((level for level in self.levels if level.size >= _ENOUGH * height), self.levels[-1])
+        level = next((level for level in self.levels if level.size >= _DENSE_FACE * height), self.levels[-1])
         return equirect_from_faces(level.read(self.folder, decode), height), None
 
 

@@ -47,7 +47,7 @@ from pansplat.model.layers import (
 _UNET_MULTIPLE = 4  # a U-Net of three scales halves the map twice
 
 _GROUPS = 8  # of the group normalisation
-_HEAD_CHANNELS = 32
+_HEAD_CHANNELS = 32  # of one attention head
 
 
 @dataclass(frozen=True)

@@ -65,10 +65,10 @@ _SUFFICIENT = 3  # certain pairs of a panorama; more are not looked for within a
 _LEAST_BATCH = 4  # pairs that are compared before others are chosen
 _CHANCE = 25.0  # expected matches by `_quick_overlap`, below which pairs of one group are not compared
 _MOST = 0.6  # of the panoramas whose common mask is kept when others are added
-_DARK = 8.0  # mean grey value of an image that shows nothing
+_BLANK_BRIGHTNESS = 8.0  # mean grey value of an image that shows nothing
 _LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
 _SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
-_ENOUGH = 100.0  # expected number of right matches by SIFT, above which the learned matcher is not asked
+_ENOUGH_SIFT_MATCHES = 100.0  # expected number of right matches by SIFT, above which the learned matcher is not asked
 _LIKELY = 0.3  # prior probability of the matches that count for it
 _LEARNED_PRIOR, _LEARNED_NOISE = 0.7, 1.6e-3  # largest prior, as matches of one pair of faces depend; radians
 _LEARNED_SIZE = 7.0  # pixels
@@ -398,7 +398,7 @@ def _read_images(
         grey = cv2.cvtColor((image.transpose(1, 2, 0) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
         small = cv2.resize(grey, (128, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
         copy = next((m for m, other in thumbnails.items() if np.abs(small - other).mean() < _SAME_IMAGE), None)
-        if grey.mean() < _DARK:
+        if grey.mean() < _BLANK_BRIGHTNESS:
             reasons[n] = f"too dark (mean grey value {grey.mean():.0f} of 255)"
         elif small.std() < 2:
             reasons[n] = "it shows nothing (one colour)"
@@ -587,7 +587,7 @@ def _match(first: _View, second: _View, matcher: Matcher | None) -> Matches:
     matches = match_features(first.features, second.features)
     if matcher is None or first.learned is None or second.learned is None:
         return matches
-    if matches.prior[matches.prior > _LIKELY].sum() > _ENOUGH:
+    if matches.prior[matches.prior > _LIKELY].sum() > _ENOUGH_SIFT_MATCHES:
         return matches
     found = match_learned(matcher, first.learned, second.learned)
     learned = Matches(found.indices, np.minimum(found.probability, _LEARNED_PRIOR))

@@ -144,8 +144,9 @@ def test_a_name_that_is_not_utf8_is_refused_before_the_estimate(tmp_path: Path, 
 
 
 def _relation(log_odds: float, problem: str | None = None) -> RelativePose:
-    figures = 90.0, 50.0, 40.0, 0.3, (0.01, 0.01), 1.0, log_odds
-    return RelativePose(np.eye(3), np.eye(3)[0], np.empty((0, 2), int), *figures, problem)
+    figures = {"score": 90.0, "margin": 50.0, "places": 40.0, "uncertainty": (0.01, 0.01), "distance": 1.0}
+    none = np.empty((0, 2), int)
+    return RelativePose(np.eye(3), np.eye(3)[0], none, log_odds=log_odds, problem=problem, **figures)
 
 
 def test_the_summary_names_groups_and_probable_pairs() -> None:
