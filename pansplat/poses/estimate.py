@@ -64,6 +64,7 @@ _FEW = 3  # up to this number of panoramas, all pairs are compared with all feat
 _SUFFICIENT = 3  # certain pairs of a panorama; more are not looked for within a group
 _LEAST_BATCH = 4  # pairs that are compared before others are chosen
 _CHANCE = 25.0  # expected matches by `_quick_overlap`, below which pairs of one group are not compared
+_PAIR_TIME = 1.3  # of a comparison, over that of the features of a panorama
 _MOST = 0.6  # of the panoramas whose common mask is kept when others are added
 _BLANK_BRIGHTNESS = 8.0  # mean grey value of an image that shows nothing
 _LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
@@ -287,13 +288,15 @@ def estimate_poses(
         files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
         fingerprint = "" if cache_folder is None else hash_sources(__name__) + load_default_sweep().fingerprint
         cache = PoseCache(cache_folder, _CACHED, fingerprint)
-        views = _describe_views(paths, files, pixels, hints, kept, cache, report)
+        count = len(kept)
+        split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
+        views = _describe_views(paths, files, pixels, hints, kept, cache, part_of(progress, 0.0, split))
         ways = links or {}
         yaws = {
             (i, j): Ways(ways.get(paths[a], {}).get(paths[b]), ways.get(paths[b], {}).get(paths[a]))
             for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
         }
-        relations = _relate_views(views, yaws, seed, cache, report)
+        relations = _relate_views(views, yaws, seed, cache, part_of(progress, split, 0.9))
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
@@ -469,8 +472,8 @@ def _describe_views(
     views = []
     with worker_threads() as pool:
         for position, view in enumerate(pool.map(look_up, kept)):
-            report("finding features", 0.4 * position / len(kept))
             views.append(view)
+            report("finding features", (position + 1) / len(kept))
     return views
 
 
@@ -518,7 +521,7 @@ def _relate_views(
     pairs = list(itertools.combinations(range(len(views)), 2))
     overlap: dict[Pair, float] = {}
     if len(views) > _FEW:
-        report("comparing all pairs", 0.4)
+        report("comparing all pairs", 0.0)
         with worker_threads() as pool:
             quick = pool.map(lambda pair: _quick_overlap(views[pair[0]].features, views[pair[1]].features), pairs)
             overlap.update(zip(pairs, quick, strict=True))
@@ -564,8 +567,8 @@ def _relate_views(
         for start in range(0, len(pairs), size):
             batch = [pair for pair in pairs[start : start + size] if is_needed(pair)]
             for number, (pair, relation) in enumerate(zip(batch, pool.map(look_up, batch), strict=True)):
-                report("comparing pairs", 0.5 + 0.4 * (start + number) / len(pairs))
                 relations[pair] = relation
+                report("comparing pairs", (start + number + 1) / len(pairs))
                 if relation.is_certain:
                     i, j = pair
                     groups = [groups[i] if group == groups[j] else group for group in groups]
