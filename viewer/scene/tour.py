@@ -189,6 +189,8 @@ class TourScenes:
         self.outlines |= loaded.outlines
         self._outlooks |= loaded.outlooks
         self._block(loaded.walls)
+        if poor := set(loaded.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
+            self.tour = replace(self.tour, poor=(*self.tour.poor, *sorted(poor)))
         if views not in self._predictions:
             self._selected[views] = loaded
             return
