@@ -172,6 +172,8 @@ def write_page(
     if not scene.joint and tour.overlaps:
         tour = dataclasses.replace(tour, poor=find_poor_edges(scene, range(len(tour)), tour.overlaps))
     rooms = find_rooms(scene) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
+    if rooms is not None and not rooms.plan.num_heights:
+        rooms = None  # without a floor the doll's house is a heap
     scene = _prepare(scene)
     flights = _plan_flights(scene, tour)
     if len(scene.gaussians) > gaussians:

@@ -637,7 +637,7 @@ def _find_scale(
         return baseline[2] / distance, f"{files[ends[0]].name} and {files[ends[1]].name} are {baseline[2]:g} m apart"
     found = find_common_height(find_floors(images, poses, camera_height))
     if found is None:
-        return camera_height, f"cameras {camera_height:g} m over the floor, by estimated depth (no floor was found)"
+        return camera_height, f"by estimated depth and an assumed height of {camera_height:g} m: no floor was found"
     height, doubt = found
     source = f"cameras {camera_height:g} m over the floor"
     if doubt is not None:

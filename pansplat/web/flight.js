@@ -229,8 +229,9 @@ export function freeze(zoom = null) {
     frozen = { began: null, left: 1, position: null, zoom: null };
     return;
   }
-  drawAt(canvas.width, canvas.height);  // what a canvas shows can be copied in the task that drew it
-  const size = fullSize(), context = still.getContext("2d");
+  const size = fullSize();  // a photograph is drawn fast
+  drawAt(...(photographs.isOpaque ? size : [canvas.width, canvas.height]));  // it can be copied in the task that drew it
+  const context = still.getContext("2d");
   const isSame = still.width === size[0] && still.height === size[1];
   context.globalAlpha = frozen && isSame ? 1 - frozen.left : 1;
   if (!isSame) [still.width, still.height] = size;

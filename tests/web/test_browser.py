@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import sys
 import time
@@ -1303,6 +1304,11 @@ def test_distances_are_those_of_the_rasterisers_depth(home: OpenPage, scene: Sce
     home.page.mouse.move(140, 100)
     home.page.mouse.up()
     home.wait(f"document.querySelector('#marks circle').cx.baseVal.value > {places[0][0] + 20}")
+    home.run("({ worlds } = HEADER.plan, HEADER.plan.worlds = [0, 1, 1])")  # the panorama here is alone
+    home.page.mouse.click(100, 100)
+    value, error = re.fullmatch(r"([.\d]+) m ± ([.\d]+) m from the camera", home.page.inner_text("#status")).groups()
+    assert float(error) == pytest.approx(0.35 * float(value), abs=0.01)
+    home.run("HEADER.plan.worlds = worlds, 0")
     home.page.keyboard.press("Escape")
     assert home.run("document.getElementById('marks').childElementCount") == 0
     home.page.mouse.click(100, 100)

@@ -102,6 +102,16 @@ def test_a_page_starts_with_the_widest_view_unless_it_has_a_start_view(house: Sc
     assert math.cos(read_header(tmp_path / "start.html")["start"]["yaw"] - yaw) == pytest.approx(1, abs=1e-5)
 
 
+def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tmp_path: Path) -> None:
+    centers = scene.cam2world[scene.gaussians.views.long(), :3, 3].float()
+    above = scene.gaussians.select(scene.gaussians.means[:, 1] < centers[:, 1])
+    write_page(scene, tmp_path / "floor.html")
+    write_page(dataclasses.replace(scene, gaussians=above), tmp_path / "none.html")
+    headers = [read_header(tmp_path / f"{name}.html") for name in ("floor", "none")]
+    assert headers[0]["doll"] and headers[1]["doll"] is None and headers[1]["plan"]["rooms"] == []
+    assert headers[1]["plan"]["worlds"] == [0, 0, 0]
+
+
 def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good = write_page(house, tmp_path / "good.html")
     assert (good.num_flights, good.num_fades) == (2, 0) and read_header(tmp_path / "good.html")["jumps"] == []
