@@ -98,7 +98,7 @@ class Options:
 
     @property
     def image_format(self) -> "ImageFormat":
-        """Projection and stereo."""
+        """The image format of films and stills: projection and stereo."""
         from pansplat_viewer.draw.stereo import ImageFormat
 
         return ImageFormat(self.projection, self.stereo, self.ipd)
@@ -110,7 +110,7 @@ class Options:
 
     @property
     def settings(self) -> DrawSettings:
-        """Initial draw settings."""
+        """The draw settings with which the viewer begins."""
         return DrawSettings(preset=self.preset, mode=self.mode, stereo=self.stereo, eye_distance=self.ipd)
 
     @property

@@ -111,7 +111,7 @@ class Batch(Writer):
         return batch.BatchOptions(chosen, prediction, self.camera_height, suffix)
 
     def _parse_memory(self) -> int | None:
-        """Bytes of --memory."""
+        """The number of bytes that `--memory` states."""
         if self.memory is None:
             return None
         from dask.utils import parse_bytes

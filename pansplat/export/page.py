@@ -102,7 +102,7 @@ _EXPORT = re.compile(r"^export ", re.MULTILINE)
 
 @dataclass(frozen=True)
 class PageFiles:
-    """What was written.
+    """The files of a page that was written.
 
     Attributes:
         files: the page, and its parts if it is split.

@@ -26,7 +26,7 @@ _CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
 
 @dataclass(frozen=True, eq=False)
 class PackedGaussians:
-    """Gaussians as bytes.
+    """Gaussians as the bytes that a web page reads.
 
     Attributes:
         content: gzip of planes of bytes, those of one view after those of another.

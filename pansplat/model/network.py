@@ -123,7 +123,7 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
-        """As `__call__`, with the radial depth maps of the swept levels, metres, coarse to fine."""
+        """Predict Gaussians like `__call__`, and the radial depth maps of the swept levels, metres, coarse to fine."""
         matched, tiles = self._match(images, cam2world, near, far, masks, progress)
         parts = list(self._lift(matched, tiles, progress))
         gaussians = merge_tiles(parts, self.network.compat)[0].to(device=images.device)

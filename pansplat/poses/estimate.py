@@ -135,7 +135,7 @@ class PoseEstimate:
 
     @property
     def poses(self) -> dict[Path, Float[Array, "4 4"]]:
-        """Those of the largest group."""
+        """The poses, cam2world, of the panoramas of the largest group."""
         return self.groups[0].poses
 
     @property
@@ -222,7 +222,7 @@ class _View:
 
     @functools.cached_property
     def joined(self) -> Features:
-        """All features."""
+        """The features of `matched`, and those of the faces turned against the walls."""
         return self.matched.joined(self.turned)
 
     @functools.cached_property

@@ -91,7 +91,7 @@ class TourGraph:
 
     @cached_property
     def positions(self) -> Float[np.ndarray, "node 3"]:
-        """Camera centres, metres."""
+        """The camera centres of all panoramas, metres."""
         return self.cam2world[:, :3, 3].numpy()
 
     @cached_property

@@ -141,7 +141,7 @@ class TourScenes:
         return gather
 
     def copy(self) -> TourScenes:
-        """The same scenes in memory, for a film in another thread."""
+        """A copy with the scenes that are in memory, for a film in another thread."""
         memory = self._budget / 2**30
         scenes = TourScenes(self.tour, memory=memory, merged=self._merged, max_views=self._max_views)
         scenes._views, scenes._providers = self._views, self._providers
