@@ -34,7 +34,8 @@ from pansplat.inputs.views import CAMERA_HEIGHT, Views
 from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
-from pansplat.predictor import MIN_HEIGHT, Predictor, Progress, part_of
+from pansplat.prediction_options import CompatChoice, Precision, PredictOptions
+from pansplat.predictor import Predictor, Progress, part_of
 from pansplat.refinement import (
     DISPLAY_HEIGHT,
     RefineConfig,
@@ -48,7 +49,7 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import expand_home, find_scene_suffix
-from pansplat.system.options import CompatChoice, Precision, PredictOptions
+from pansplat.system.options import MIN_HEIGHT
 from pansplat.tours import (
     MAX_SCENE_VIEWS,
     TourGraph,

@@ -11,9 +11,10 @@ import tyro
 from msgspec import Meta
 
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import own_warnings, parse_arguments, progress_bar
 from pansplat.system.files import expand_home, require_output_file, require_output_folder, require_replaceable
-from pansplat.system.options import EYE_DISTANCE, EyeDistance, PredictOptions, ReadOptions, check_numbers
+from pansplat.system.options import EYE_DISTANCE, EyeDistance, check_numbers
 from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,

@@ -33,8 +33,8 @@ from pansplat.model.weights import (
     read_checkpoint,
     require_shapes,
 )
+from pansplat.prediction_options import CompatChoice
 from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
-from pansplat.system.options import CompatChoice
 from pansplat.system.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {

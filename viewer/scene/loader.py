@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pansplat.errors import InputError, collect_notes
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_scene_file, make_portable_name
-from pansplat.system.options import PredictOptions, ReadOptions
 from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
