@@ -421,8 +421,9 @@ def _refine_prediction(task: _Task, progress: Progress | None, on_predicted: Cal
     if final is not None:
         return final
     began = time.process_time()
-    source = task.source
-    photographs = load_photographs(source, scene.height, options.gaussians) if isinstance(source, Pair) else source
+    photographs = task.views
+    if isinstance(task.source, Pair) and options.gaussians is not None:
+        photographs = load_photographs(task.source, scene.height, options.gaussians)
     refinement = Refinement(scene, photographs, RefineConfig(gaussians=options.gaussians))
     report = refinement.run(seconds=options.refine_seconds, progress=part_of(progress, 0.5))
     content = cached.write_refinement(refinement.scene(), report, time.process_time() - began)
