@@ -20,7 +20,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,6 +35,7 @@ from pansplat.images.image_files import list_masks
 from pansplat.inputs.folders import find_panorama_folders
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import CAMERA_HEIGHT
+from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
 from pansplat.system.atomic import replacing
@@ -84,23 +85,16 @@ class BatchOptions:
 
     Attributes:
         steps: a part of `STEPS`, in this order.
-        model, compat, precision: see `pansplat.load_model`.
-        height: see `pansplat.predict`.
+        prediction: the time limit is that of a pair, or of three panoramas of a tour; the number of Gaussians is that
+            of a web page.
         camera_height: see `pansplat.load_pairs`.
-        refine_seconds: time limit of the refinement of a pair, or of three panoramas of a tour.
         suffix: of the exported files; one of `EXPORT_SUFFIXES`.
-        gaussians: largest number in a web page; None for the default.
     """
 
     steps: tuple[str, ...] = ("predict",)
-    model: str = "default"
-    compat: pipeline.CompatChoice = "trained"
-    precision: pipeline.Precision = "float32"
-    height: int | None = None
+    prediction: PredictOptions = field(default_factory=PredictOptions)
     camera_height: float = CAMERA_HEIGHT
-    refine_seconds: float = 10.0
     suffix: str = ".html"
-    gaussians: int | None = None
 
 
 @dataclass(frozen=True)
@@ -195,11 +189,11 @@ def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path)
         try:
             outputs.folder.mkdir(parents=True, exist_ok=True)
             _remove_unfinished(outputs.folder)
-            predictor = load_predictor(options)
+            predictor = load_predictor(options.prediction)
             if predictor.fingerprint != fingerprint:
                 raise InputError(
-                    f"worker: needed the predictor {options.model} of the machine that started the batch, got another "
-                    "one; install the same version of pansplat and the same weights on all machines"
+                    f"worker: needed the predictor {options.prediction.model} of the machine that started the batch, "
+                    "got another one; install the same version of pansplat and the same weights on all machines"
                 )
             for pairs, tour in _list_units(item, options.camera_height, pipeline.find_max_views(predictor), outputs):
                 _process_unit(pairs, tour, predictor, options, outputs)
@@ -278,14 +272,10 @@ def _connect(tour: TourGraph, outputs: _Outputs) -> TourGraph:
     return tour.with_overlaps(tuple(read_json(path, dict[str, list[tuple[int, int, float]]])["overlaps"]))
 
 
-def load_predictor(options: BatchOptions) -> Predictor:
-    """The predictor of a batch."""
-    return _load_model(options.model, options.compat, options.precision)
-
-
 @lru_cache(maxsize=1)
-def _load_model(model: str, compat: pipeline.CompatChoice, precision: pipeline.Precision) -> Predictor:
-    return pipeline.load_model(model, compat=compat, precision=precision)
+def load_predictor(options: PredictOptions) -> Predictor:
+    """The predictor of a batch."""
+    return pipeline.load_predictor(options)
 
 
 def _process_unit(
@@ -327,7 +317,7 @@ def _process_unit(
         else:
             pipeline.save(pipeline.fuse(scene, pairs[0].load_context(scene.height)), path)
 
-    settings = [__version__, options.suffix, options.gaussians, [] if tour is None else _list_graph(tour)]
+    settings = [__version__, options.suffix, options.prediction.gaussians, [] if tour is None else _list_graph(tour)]
     key = _join_hash(",".join(key for key, _ in made), "export", settings)
     outputs.make("export", key, name, options.suffix, export)
 
@@ -343,9 +333,8 @@ def _process_pair(
     Returns:
         Hash of all that the scene depends on, and a function that reads it, or computes it if no step writes a file.
     """
-    height, count = options.height, None
-    if part is not None:
-        height, count = pipeline.choose_tour_size(pair, part, options.height)
+    fitted = pipeline.fit_to_scene(options.prediction, pair, part or math.inf)
+    height, count = options.prediction.height if part is None else fitted.height, fitted.gaussians
     key = _join_hash(_hash_pair(pair), "predict", [predictor.name, predictor.fingerprint, height])
     read = partial(pipeline.predict, pair, predictor, height=height, cache=False)
     is_refined = "refine" in options.steps and len(pair.context) > 1
@@ -363,7 +352,7 @@ def _process_pair(
 
         read = partial(pipeline.load, outputs.make("predict", key, pair.name, ".ply", predict))
     if is_refined:
-        read_prediction, seconds = read, pipeline.scale_seconds(options.refine_seconds, pair)
+        read_prediction, seconds = read, fitted.refine_seconds
 
         def refine(path: Path) -> None:
             scene = read_prediction()
@@ -392,7 +381,7 @@ def _count_of_page(options: BatchOptions) -> float:
         return math.inf
     from pansplat.export.page import PHOTO_GAUSSIANS
 
-    return options.gaussians or PHOTO_GAUSSIANS
+    return options.prediction.gaussians or PHOTO_GAUSSIANS
 
 
 def _hash_pair(pair: Pair) -> str:
@@ -547,7 +536,7 @@ def run_items(address: str, items: Sequence[Item], options: BatchOptions, out: P
         ) from error
     run = secrets.token_hex(4)  # the scheduler would answer a repeated key with an old report
     names = {f"pansplat-{run}-{item.name}": item.name for item in items}
-    arguments = {"options": options, "fingerprint": load_predictor(options).fingerprint, "out": out}
+    arguments = {"options": options, "fingerprint": load_predictor(options.prediction).fingerprint, "out": out}
     with client:
         futures = client.map(process_item, items, key=list(names), pure=False, **arguments)
         for future in as_completed(futures, loop=client.loop):

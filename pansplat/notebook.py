@@ -34,7 +34,7 @@ _MERGE_SIZE = 128, 256  # pixels, of the images that find what Gaussians contrib
 _MAX_MERGERS = 8  # Gaussians that become one on average; more take up to half a minute
 _MAX_WIDTH = 1024  # pixels, of a picture
 _MAX_PICTURES = 4  # of the panoramas of an object; the others are named in its text
-_JPEG_QUALITY = 85
+_JPEG_QUALITY = 85  # of pictures in a notebook
 _POSTER = re.compile(r'src="data:image/jpeg;base64,([^"]+)"')
 _BUNDLE = dict[str, str]  # data by MIME type; pictures in base64
 

@@ -10,37 +10,38 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import Unpack
 
 from pansplat.cache import CachedPrediction, CachedScene
 from pansplat.errors import InputError, InputWarning
-from pansplat.gaussians.formats import load_scene, save_scene
+from pansplat.gaussians.formats import load_scene as load
+from pansplat.gaussians.formats import save_scene as save
 from pansplat.gaussians.ply import save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs import folders
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import CAMERA_HEIGHT, Views
-from pansplat.model.layers import Precision
-from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
+from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
-from pansplat.predictor import MIN_HEIGHT, Predictor, Progress, part_of
+from pansplat.prediction_options import CompatChoice, Precision, PredictOptions
+from pansplat.predictor import Predictor, Progress, part_of
 from pansplat.refinement import (
     DISPLAY_HEIGHT,
     RefineConfig,
     Refinement,
     RefineReport,
     fuse_views,
-    refinement_fingerprint,
 )
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
@@ -48,6 +49,7 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import expand_home, find_scene_suffix
+from pansplat.system.options import MIN_HEIGHT
 from pansplat.tours import (
     MAX_SCENE_VIEWS,
     TourGraph,
@@ -81,8 +83,6 @@ _DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
 _MAX_CACHED_HEIGHT = 512  # of predictions of networks; taller ones are written tile by tile
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
 _GAUSSIANS_OF_ROWS = 0.75  # of a panorama, over the square of its height
-_ENOUGH_STEPS = 40  # of a refinement; more change little
-_STARVED_SHARE = 1 / 3  # of the processor's threads, below which a refinement of fewer steps is starved by load
 _ONE_PLACE = 1e-3  # of the distance of cameras, relative to near
 _BRIGHTEST = 1.5  # value of an image in [0, 1], after any filter
 _MAX_MERGERS = 4  # Gaussians that become one on average
@@ -171,6 +171,11 @@ def load_model(
     return load_predictor(path, compat, precision=precision, **options)
 
 
+def load_predictor(options: PredictOptions) -> Predictor:
+    """The predictor of options; an InputError if there is none of that name or file, or it lacks the options."""
+    return load_model(options.model, compat=options.compat, precision=options.precision)
+
+
 def _load_default() -> Predictor:
     from pansplat.sweep.guided_sweep import load_default_sweep
 
@@ -233,29 +238,23 @@ def choose_height(pair: Pair, predictor: Predictor) -> int:
     return max(MIN_HEIGHT, min(pair.image_height, getattr(predictor, "default_height", _DEFAULT_HEIGHT)))
 
 
-def choose_tour_height(pair: Pair, gaussians: float = math.inf) -> int:
-    """The height to predict a scene of a tour at: that of its photographs, at most 512.
+def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.inf) -> PredictOptions:
+    """The options of a scene of a tour, from those of the tour; the time limit is that of three panoramas.
 
     Args:
         pair: of `TourGraph.make_pair`.
-        gaussians: number that is kept of each panorama. The height is halved while there are more than four times as
-            many: a refinement after a few mergers fits the photographs better than after many.
+        gaussians: number that is kept of each panorama. The height, by default that of the photographs, at most 512, is
+            halved while there are more than four times as many: a refinement after a few mergers fits the photographs
+            better than after many.
     """
-    height = max(MIN_HEIGHT, min(pair.image_height, _TOUR_HEIGHT))
-    while height >= 2 * MIN_HEIGHT and _GAUSSIANS_OF_ROWS * height**2 > _MAX_MERGERS * gaussians:
-        height //= 2
-    return height
-
-
-def choose_tour_size(pair: Pair, gaussians: float = math.inf, height: int | None = None) -> tuple[int, int | None]:
-    """The height to predict a scene of a tour at, and the number of Gaussians to refine it with; None for no limit.
-
-    Args:
-        pair, gaussians: see `choose_tour_height`.
-        height: that the user has chosen.
-    """
+    height = options.height
+    if height is None:
+        height = max(MIN_HEIGHT, min(pair.image_height, _TOUR_HEIGHT))
+        while height >= 2 * MIN_HEIGHT and _GAUSSIANS_OF_ROWS * height**2 > _MAX_MERGERS * gaussians:
+            height //= 2
     count = None if math.isinf(gaussians) else max(int(gaussians * len(pair.context)), 1)
-    return height or choose_tour_height(pair, gaussians), count
+    seconds = choose_refine_seconds(None) if options.refine_seconds is None else options.refine_seconds
+    return replace(options, height=height, refine_seconds=scale_seconds(seconds, pair), gaussians=count)
 
 
 def choose_refine_seconds(gaussians: int | None, *, joint: bool = False) -> float:
@@ -280,100 +279,155 @@ def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
     return pair.load_context(height)
 
 
+class PredictKeywords(TypedDict, total=False):
+    """Keywords of predictions, which `predict` documents."""
+
+    compat: CompatChoice
+    precision: Precision
+    height: int | None
+    refine_seconds: float | None
+    gaussians: int | None
+    joint: bool
+    cache: bool
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is predicted and how; `options` has no defaults that are still to be chosen."""
+
+    source: Pair | Views
+    predictor: Predictor
+    options: PredictOptions
+
+    @cached_property
+    def views(self) -> Views:
+        """The loaded panoramas."""
+        height = self.options.height or 0
+        views = self.source if isinstance(self.source, Views) else self.source.load_context(height)
+        centres = views.cam2world[:, :3, 3]
+        if len(centres) > 1 and float(torch.pdist(centres).max()) < _ONE_PLACE * views.near:
+            warnings.warn(
+                f"{', '.join(views.names)}: the cameras are at one place, so that depth is that of each photograph "
+                "alone; check the poses.",
+                InputWarning,
+                stacklevel=4,
+            )
+        return views
+
+    def open_cache(self, *, refined: bool) -> CachedPrediction:
+        """The file of the prediction or of its refinement."""
+        return CachedPrediction(self.source, self.views, self.predictor, self.options, refined=refined)
+
+
 @with_progress_bar
 def predict(
     source: Pair | Views | str | Path | Sequence[str | Path],
     model: str | Path | Predictor = "default",
     *,
-    compat: CompatChoice = "trained",
-    precision: Precision = "float32",
-    height: int | None = None,
-    refine_seconds: float = 0.0,
-    gaussians: int | None = None,
-    joint: bool = False,
-    cache: bool = True,
     progress: Progress | None = None,
     on_predicted: Callable[[Scene], None] | None = None,
+    **options: Unpack[PredictKeywords],
 ) -> Scene:
     """Predict the scene of a pair's context panoramas, and refine it.
 
-    The prediction of a pair and its refinement are cached in its folder (`pansplat.cache`). A cached refinement of few
-    steps, which shared the processor with other work, is run once more, and the one of more steps is kept.
+    The prediction of a pair and its refinement are cached in its folder (`pansplat.cache`).
 
     Args:
         source: a pair; the path of a panorama or of a folder that holds exactly one pair; the panoramas of one folder
             to use, whose poses are estimated if they have none; or loaded panoramas (never cached).
         model: the name of a predictor, a file of weights, or a predictor.
+        progress: called with a description of the current work and the completed fraction.
+        on_predicted: called with the prediction before it is refined.
         compat, precision: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
-        refine_seconds: time limit of the refinement; 0 for none. A single view is not refined.
+        refine_seconds: time limit of the refinement; by default 0, for none. None is `choose_refine_seconds`. A single
+            view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it.
         joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without
             a refinement, only the colours are fitted.
         cache: whether to read and write the cache.
-        progress: called with a description of the current work and the completed fraction.
-        on_predicted: called with the prediction before it is refined.
     """
-    if not 0 <= refine_seconds < math.inf:
-        raise InputError(f"`refine_seconds` must be at least 0, got {refine_seconds}")
-    config = RefineConfig(gaussians=gaussians)
-    predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
+    task = _prepare(source, model, options, progress)
+    if task.options.refine_seconds:
+        return _refine_prediction(task, progress, on_predicted)
+    scene = _predict_views(task, part_of(progress))
+    return fuse(scene, task.views) if task.options.joint else scene
+
+
+def _prepare(
+    source: Pair | Views | str | Path | Sequence[str | Path],
+    model: str | Path | Predictor,
+    options: PredictKeywords,
+    progress: Progress | None,
+) -> _Task:
+    """The task of `predict`; what cannot be predicted is refused."""
+    settings = _make_options(options)
+    RefineConfig(gaussians=settings.gaussians)
+    seconds = settings.refine_seconds
+    if seconds is not None and not 0 <= seconds < math.inf:
+        raise InputError(f"`refine_seconds` must be at least 0, got {seconds}")
+    predictor = _choose_model(model, settings)
     pair = _load_source(source, progress)
     _require_views(pair, predictor)
-    height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
-    views = pair if isinstance(pair, Views) else pair.load_context(height)
-    report = part_of(progress)
-    joint = joint and len(views.images) > 1
-    if not refine_seconds or len(views.images) == 1:
-        scene = _predict_views(pair, views, predictor, height, cache, report)
-        return fuse(scene, views) if joint else scene
-    refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s" + ("-joint" if joint else "")
-    is_cached = cache and isinstance(pair, Pair)
-    cached = CachedPrediction(pair, views, predictor, height, refinement) if is_cached else None
-    found = None if cached is None else cached.read()
-    final = None if found is None or found.is_starved else _make_scene(found, pair, views, predictor, joint)
+    is_single = len(pair.images if isinstance(pair, Views) else pair.context) == 1
+    joint = settings.joint and not is_single
+    if seconds is None:
+        seconds = choose_refine_seconds(settings.gaussians, joint=joint)
+    height = pair.images.shape[-2] if isinstance(pair, Views) else settings.height or choose_height(pair, predictor)
+    chosen = replace(settings, height=height, refine_seconds=0.0 if is_single else seconds, joint=joint)
+    return _Task(pair, predictor, chosen)
+
+
+def _make_options(options: PredictKeywords) -> PredictOptions:
+    """The options of keywords; without a time limit, there is no refinement."""
+    defaults: PredictKeywords = {"refine_seconds": 0.0}
+    return PredictOptions(**(defaults | options))
+
+
+def _choose_model(model: str | Path | Predictor, options: PredictOptions) -> Predictor:
+    return load_predictor(replace(options, model=str(model))) if isinstance(model, (str, Path)) else model
+
+
+def _predict_views(task: _Task, progress: Progress) -> Scene:
+    """The scene without a refinement."""
+    cached, views = task.open_cache(refined=False), task.views
+    content = cached.read()
+    if content is not None:
+        progress("read from the cache", 1.0)
+        return _make_scene(content, task)
+    gaussians = task.predictor(
+        views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
+    )
+    assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
+    content = CachedScene(gaussians)
+    cached.write(content)
+    return _make_scene(content, task)
+
+
+def _refine_prediction(task: _Task, progress: Progress | None, on_predicted: Callable[[Scene], None] | None) -> Scene:
+    """The scene after its refinement."""
+    cached, options = task.open_cache(refined=True), task.options
+    found = cached.read()
+    final = None if found is None or found.is_starved else _make_scene(found, task, options.joint)
     if final is not None and on_predicted is None:
-        report("read from the cache", 1.0)
+        part_of(progress)("read from the cache", 1.0)
         return final
-    scene = _predict_views(pair, views, predictor, height, cache, part_of(progress, 0, 0.5))
-    if joint:
+    scene = _predict_views(task, part_of(progress, 0, 0.5))
+    if options.joint:
         scene = fuse_views(scene)
     if on_predicted is not None:
         on_predicted(scene)
     if final is not None:
         return final
     began = time.process_time()
-    photographs = load_photographs(pair, height, gaussians) if isinstance(pair, Pair) else views
-    refinement = Refinement(scene, photographs, config)
-    done = refinement.run(seconds=refine_seconds, progress=part_of(progress, 0.5))
-    scene = refinement.scene()
-    if cached is None:
-        return scene
-    share = (time.process_time() - began) / (done.seconds * torch.get_num_threads())  # of the processor
-    is_starved = done.stopped == "done" and done.steps < _ENOUGH_STEPS and share < _STARVED_SHARE
-    refined = CachedScene(scene.gaussians, scene.gains, done.steps, is_starved and found is None)
-    if found is not None and found.steps > done.steps:
-        refined = found._replace(is_starved=False)  # it runs once more only
-    cached.write(refined)
-    return _make_scene(refined, pair, views, predictor, joint)
-
-
-def _predict_views(
-    source: Pair | Views, views: Views, predictor: Predictor, height: int, cache: bool, progress: Progress
-) -> Scene:
-    """Predict without refinement; of a pair, the cache is read and written if `cache`."""
-    cached = CachedPrediction(source, views, predictor, height) if cache and isinstance(source, Pair) else None
-    found = None if cached is None else cached.read()
-    if found is not None:
-        progress("read from the cache", 1.0)
-        return _make_scene(found, source, views, predictor)
-    gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress)
-    assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
-    predicted = CachedScene(gaussians)
-    if cached is not None:
-        cached.write(predicted)
-    return _make_scene(predicted, source, views, predictor)
+    photographs = task.views
+    if isinstance(task.source, Pair) and options.gaussians is not None:
+        photographs = load_photographs(task.source, scene.height, options.gaussians)
+    refinement = Refinement(scene, photographs, RefineConfig(gaussians=options.gaussians))
+    report = refinement.run(seconds=options.refine_seconds, progress=part_of(progress, 0.5))
+    content = cached.write_refinement(refinement.scene(), report, time.process_time() - began)
+    return _make_scene(content, task, options.joint)
 
 
 @with_progress_bar
@@ -453,14 +507,8 @@ def predict_tour(
     tour: TourGraph | str | Path,
     model: str | Path | Predictor = "default",
     *,
-    compat: CompatChoice = "trained",
-    precision: Precision = "float32",
-    height: int | None = None,
-    refine_seconds: float = 0.0,
-    gaussians: int | None = None,
-    joint: bool = False,
-    cache: bool = True,
     progress: Progress | None = None,
+    **options: Unpack[PredictKeywords],
 ) -> Scene:
     """Predict one scene of all panoramas of a tour: the scenes of its parts, merged.
 
@@ -469,44 +517,36 @@ def predict_tour(
 
     Args:
         tour: of `pansplat.tours.connect`, or the path of a folder that holds the panoramas of one tour.
-        model, compat, precision, refine_seconds, cache, progress: see `predict`; the time limit is that of three
+        model, progress, compat, precision, refine_seconds, cache: see `predict`; the time limit is that of three
             panoramas.
-        height: panoramas are resized to (height, 2 height); by default `choose_tour_height`.
+        height: panoramas are resized to (height, 2 height); by default that of the photographs, at most 512.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.
         joint: see `predict`; the refinement is then that of each part of the tour as a whole, and not cached.
     """
-    predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
+    settings = _make_options(options)
+    if settings.refine_seconds is None:
+        settings = replace(settings, refine_seconds=choose_refine_seconds(None, joint=settings.joint))
+    predictor = _choose_model(model, settings)
     tour = _load_only_tour(tour, progress) if isinstance(tour, (str, Path)) else tour
     warn_of_single_views(tour, predictor)
-    max_views = find_max_views(predictor)
+    max_views, is_refined = find_max_views(predictor), settings.joint and settings.refine_seconds
     total = len(tour.choose_sources(max_views))
-    part = math.inf if gaussians is None else gaussians / len(tour)  # of a panorama
-    counter, predicted = itertools.count(), 0.5 if joint and refine_seconds else 1.0
+    part = math.inf if settings.gaussians is None else settings.gaussians / len(tour)  # of a panorama
+    counter, predicted = itertools.count(), 0.5 if is_refined else 1.0
+    each = replace(settings, joint=False, refine_seconds=0.0) if settings.joint else settings
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
         number, pair = next(counter), tour.make_pair(views)
         begun = predicted * number
-        rows, count = choose_tour_size(pair, part, height)
-        return predict(
-            pair,
-            choose_predictor(pair, predictor),
-            height=rows,
-            refine_seconds=0.0 if joint else scale_seconds(refine_seconds, pair),
-            gaussians=count,
-            cache=cache,
-            progress=part_of(progress, begun / total, (begun + predicted) / total, f"scene {number + 1} of {total}: "),
-        )
+        shown = part_of(progress, begun / total, (begun + predicted) / total, f"scene {number + 1} of {total}: ")
+        fitted = fit_to_scene(each, pair, part)
+        return predict(pair, choose_predictor(pair, predictor), progress=shown, **fitted.keywords)
 
     scene = merge_scenes(tour, predict_scene, max_views)
-    if not joint:
+    if not settings.joint:
         return scene
-    return fuse_tour(
-        tour,
-        scene,
-        refine_seconds=refine_seconds,
-        progress=part_of(progress, predicted),
-    )
+    return fuse_tour(tour, scene, refine_seconds=settings.refine_seconds or 0.0, progress=part_of(progress, predicted))
 
 
 def fuse(scene: Scene, views: Views) -> Scene:
@@ -559,15 +599,10 @@ def predict_to_file(
     path: str | Path,
     model: str | Path | Predictor = "default",
     *,
-    compat: CompatChoice = "trained",
-    precision: Precision = "float32",
-    height: int | None = None,
-    refine_seconds: float = 0.0,
-    joint: bool = False,
-    cache: bool = False,
     degree: int | None = None,
     min_opacity: float = 0.0,
     progress: Progress | None = None,
+    **options: Unpack[PredictKeywords],
 ) -> int:
     """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
 
@@ -575,32 +610,31 @@ def predict_to_file(
     is written tile by tile, too. The Gaussians are those of `predict`, ordered by tile.
 
     Args:
-        source, model, compat, precision, height, refine_seconds, joint, progress: see `predict`.
+        source, model, progress, **options: see `predict`.
         path: the file.
-        cache: whether to read and write the cache; networks do not cache heights above 512.
         degree: highest degree of harmonics in the file; None keeps all.
         min_opacity: Gaussians of lower opacity are omitted.
+        cache: whether to read and write the cache, by default not; networks do not cache heights above 512.
 
     Returns:
         The number of Gaussians in the file.
     """
     suffix = find_scene_suffix(path)
-    predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
-    pair = _load_source(source, progress)
-    _require_views(pair, predictor)
-    height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
-    if can_stream(predictor) and not joint and not refine_seconds and not (cache and height <= _MAX_CACHED_HEIGHT):
-        views = pair if isinstance(pair, Views) else pair.load_context(height)
+    options.setdefault("cache", False)
+    task = _prepare(source, model, options, progress)
+    predictor, settings = task.predictor, task.options
+    is_cached = settings.cache and (settings.height or 0) <= _MAX_CACHED_HEIGHT
+    if can_stream(predictor) and not (settings.joint or settings.refine_seconds or is_cached):
+        views = task.views
         parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
             views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
         )
         pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
         if suffix == ".ply":
-            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), pair, views, predictor), pruned, path)
-        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), pair, views, predictor)
+            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), task), pruned, path)
+        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), task)
     else:
-        options = {"height": height, "refine_seconds": refine_seconds, "joint": joint, "cache": cache}
-        scene = predict(pair, predictor, **options, progress=progress)
+        scene = predict(task.source, predictor, progress=progress, **settings.keywords)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
     save(scene, path)
     return len(scene.gaussians)
@@ -698,16 +732,6 @@ def _choose_rasterizer(
     return partial(rasterize_official, size=size, near=scene.near, **raster)
 
 
-def save(scene: Scene, path: str | Path) -> None:
-    """Write a scene in the format of the file's suffix (docs/formats.md), atomically, in the user's unit."""
-    save_scene(scene, path)
-
-
-def load(path: str | Path) -> Scene:
-    """Read a scene file of `save` or of another tool (docs/formats.md); it is brought to a unit near metres."""
-    return load_scene(path)
-
-
 def _load_source(source: Pair | Views | str | Path | Sequence[str | Path], progress: Progress | None) -> Pair | Views:
     """The pair of a path or of listed panoramas; a pair or views as they are, with tensors in place of arrays."""
     if isinstance(source, (str, Path)):
@@ -732,13 +756,6 @@ def _as_tensors(views: Views) -> Views:
             f"`images` must be RGB in [0, 1], got values up to {float(images.max()):g}; divide them by 255"
         )
     poses = torch.as_tensor(views.cam2world, dtype=torch.float64)
-    if len(poses) > 1 and float(torch.cdist(poses[:, :3, 3], poses[:, :3, 3]).max()) < _ONE_PLACE * views.near:
-        warnings.warn(
-            f"{', '.join(views.names)}: the cameras are at one place, so that depth is that of each photograph alone; "
-            "check the poses.",
-            InputWarning,
-            stacklevel=4,
-        )
     return replace(views, images=images, masks=masks, cam2world=poses)
 
 
@@ -787,10 +804,9 @@ def _load_only_tour(path: str | Path, progress: Progress | None) -> TourGraph:
     return connect(tours[0], progress)
 
 
-def _make_scene(
-    content: CachedScene, source: Pair | Views, views: Views, predictor: Predictor, joint: bool = False
-) -> Scene:
-    panoramas, gaussians = source.context if isinstance(source, Pair) else (), content.gaussians
+def _make_scene(content: CachedScene, task: _Task, joint: bool = False) -> Scene:
+    views, gaussians = task.views, content.gaussians
+    panoramas = task.source.context if isinstance(task.source, Pair) else ()
     if len(views.images) == 1:  # predicted as of a camera at the usual height
         gaussians = gaussians.scaled(views.camera_height / CAMERA_HEIGHT, views.cam2world[0, :3, 3])
     return Scene(
@@ -799,7 +815,7 @@ def _make_scene(
         near=views.near,
         far=views.far,
         names=tuple(panorama.label for panorama in panoramas) or views.names,
-        model=predictor.name,
+        model=task.predictor.name,
         height=views.images.shape[-2],
         gains=content.gains,
         starts=list_starts(panoramas),

@@ -26,8 +26,10 @@ from pansplat.errors import InputError
 from pansplat.export import page as page_module
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
+from pansplat.prediction_options import PredictOptions
 
 HEIGHT = 64
+SPHERE = PredictOptions("sphere", height=HEIGHT)
 
 
 ignores_notes = pytest.mark.filterwarnings("ignore::pansplat.errors.InputWarning")  # as workers do
@@ -37,9 +39,9 @@ ignores_notes = pytest.mark.filterwarnings("ignore::pansplat.errors.InputWarning
 def sphere(sphere_predictor: type, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """`--model sphere` in this process."""
     monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
-    batch._load_model.cache_clear()
+    batch.load_predictor.cache_clear()
     yield
-    batch._load_model.cache_clear()
+    batch.load_predictor.cache_clear()
 
 
 @pytest.fixture
@@ -84,7 +86,7 @@ def test_only_steps_whose_inputs_changed_are_done_again(
     out, item = tmp_path / "out", Item("room0", rooms / "room0")
 
     def process(*steps: str, height: int = HEIGHT, suffix: str = ".spz") -> batch.ItemReport:
-        return process_item(item, BatchOptions(steps, "sphere", height=height, suffix=suffix), "1", out)
+        return process_item(item, BatchOptions(steps, PredictOptions("sphere", height=height), suffix=suffix), "1", out)
 
     first = process("predict", "export")
     assert (first.status, len(first.outputs)) == ("done", 2) and first.error is None
@@ -110,7 +112,7 @@ def test_a_tour_has_a_file_for_each_scene_and_one_page(
     house, out = write_tour(tmp_path / "house", 4, height=HEIGHT), tmp_path / "out"
 
     def process(*steps: str, **options: Any) -> batch.ItemReport:
-        return process_item(Item("house", house), BatchOptions(steps, "sphere", height=HEIGHT, **options), "1", out)
+        return process_item(Item("house", house), BatchOptions(steps, SPHERE, **options), "1", out)
 
     report = process("predict", "export")
     assert report.error is None and report.status == "done"
@@ -123,7 +125,7 @@ def test_a_tour_has_a_file_for_each_scene_and_one_page(
     whole = process("export", suffix=".splat")  # nothing is predicted into files
     assert whole.error is None and len(whole.outputs) == 2
     assert (out / whole.outputs[1]).stat().st_size < 0.9 * 32 * 4 * HEIGHT * 2 * HEIGHT, "each surface once"
-    one = process_item(Item("pair", house, "p1-p2"), BatchOptions(("predict",), "sphere", height=HEIGHT), "1", out)
+    one = process_item(Item("pair", house, "p1-p2"), BatchOptions(("predict",), SPHERE), "1", out)
     assert one.error is None and len(one.outputs) == 1
 
 
@@ -146,7 +148,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     of_single_views = sphere_predictor("2")
     of_single_views.min_views = 1
     monkeypatch.setitem(pipeline._MODELS, "default", lambda: of_single_views)
-    options, item = BatchOptions(("predict",), "sphere", height=HEIGHT), Item("house", parted_house)
+    options, item = BatchOptions(("predict",), SPHERE), Item("house", parted_house)
     report = process_item(item, options, "1", tmp_path / "out")
     assert report.error is None and len(report.outputs) == 3 and of_single_views.calls == 1
     assert sum("single view is predicted by default" in note for note in report.notes) == 1
@@ -159,7 +161,7 @@ def test_predictions_depend_on_titles_start_views_and_of_single_views_the_camera
 ) -> None:
     def process(camera_height: float = 1.5, **entry: Any) -> dict[str, str]:
         (parted_house / "links.json").write_text(json.dumps({"p0.png": entry, "p2.png": entry}))
-        options = BatchOptions(("predict",), "sphere", height=HEIGHT, camera_height=camera_height)
+        options = BatchOptions(("predict",), SPHERE, camera_height=camera_height)
         report = process_item(Item("house", parted_house), options, "1", tmp_path / "out")
         assert report.error is None
         return {name.split("-", 2)[2]: name for name in report.outputs if "predict-" in name}
@@ -189,14 +191,14 @@ def test_single_views_are_not_refined_with_one_note(
 
     monkeypatch.setattr(pipeline, "refine_to_file", refine)
     for steps, count in ((("predict", "refine", "export"), 5), (("refine",), 3)):
-        options = BatchOptions(steps, "sphere", height=HEIGHT, suffix=".splat")
+        options = BatchOptions(steps, SPHERE, suffix=".splat")
         report = process_item(Item("house", parted_house), options, "1", tmp_path / steps[0])
         assert report.error is None and len(report.outputs) == count and refined.pop() == 2 and not refined
         assert sum("a single view is not refined" in note for note in report.notes) == 1
 
 
 def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path, sphere: None) -> None:
-    options = BatchOptions(model="sphere", height=HEIGHT)
+    options = BatchOptions(prediction=SPHERE)
     report = process_item(Item("room0", rooms / "room0"), options, "2", tmp_path / "out")
     assert report.status == "failed" and "same version of pansplat" in str(report.error)
     assert not list_outputs(tmp_path / "out")
@@ -205,7 +207,7 @@ def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path,
 def test_files_that_a_killed_worker_left_are_removed_and_others_are_kept(
     rooms: Path, tmp_path: Path, sphere: None
 ) -> None:
-    out, options = tmp_path / "out", BatchOptions(model="sphere", height=HEIGHT)
+    out, options = tmp_path / "out", BatchOptions(prediction=SPHERE)
     (name,) = process_item(Item("room0", rooms / "room0"), options, "1", out).outputs
     stem = Path(name).stem
     for left in (f".{stem}.0123abcd.ply", f".{stem[:48]}.0123abcd.html", ".gitignore"):
@@ -218,7 +220,7 @@ def test_on_a_full_disk_no_half_file_is_left_and_the_item_is_done_later(
     rooms: Path, tmp_path: Path, sphere: None
 ) -> None:
     resource = pytest.importorskip("resource")
-    out, options, item = tmp_path / "out", BatchOptions(model="sphere", height=HEIGHT), Item("room0", rooms / "room0")
+    out, options, item = tmp_path / "out", BatchOptions(prediction=SPHERE), Item("room0", rooms / "room0")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))  # of a file; the error is that of a full disk
     try:
@@ -234,10 +236,10 @@ def test_without_space_for_its_file_an_item_is_not_predicted(
     rooms: Path, tmp_path: Path, sphere: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=600_000))
-    options = BatchOptions(model="sphere", height=HEIGHT)
+    options = BatchOptions(prediction=SPHERE)
     report = process_item(Item("room0", rooms / "room0"), options, "1", tmp_path / "out")
     assert report.status == "failed" and "needed at least 0.7 MB of free disk space" in str(report.error)
-    assert "got 0.6 MB" in str(report.error) and batch._load_model("sphere", "trained", "float32").calls == 0
+    assert "got 0.6 MB" in str(report.error) and batch.load_predictor(SPHERE).calls == 0
 
 
 def test_lines_of_the_report_wait_while_the_disk_is_full(tmp_path: Path) -> None:
@@ -263,7 +265,7 @@ def test_lines_of_the_report_wait_while_the_disk_is_full(tmp_path: Path) -> None
 def test_a_batch_without_space_for_its_report_finishes_its_items_and_fails(
     rooms: Path, tmp_path: Path, sphere: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options, out = BatchOptions(model="sphere", height=HEIGHT), tmp_path / "out"
+    options, out = BatchOptions(prediction=SPHERE), tmp_path / "out"
     (out / batch.REPORT_NAME).parent.mkdir()
     (out / batch.REPORT_NAME).symlink_to("/dev/full")
     monkeypatch.setattr(batch, "start_workers", lambda *_: nullcontext())

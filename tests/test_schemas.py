@@ -246,7 +246,8 @@ def make_default(kind: type) -> Any:
 def list_numbers(options: Any, prefix: str, prefixed: bool) -> Iterator[tuple[Any, str, str, Any]]:
     """The options that are numbers: their dataclass, field, name and type."""
     for name, hint in typing.get_type_hints(type(options), include_extras=True).items():
-        option, value = prefix + name.replace("_", "-"), getattr(options, name)
+        named = [mark.name for mark in getattr(hint, "__metadata__", ()) if getattr(mark, "name", None)]
+        option, value = prefix + [name, *named][-1].replace("_", "-"), getattr(options, name)
         if dataclasses.is_dataclass(value):
             yield from list_numbers(value, f"{option}." if prefixed else prefix, prefixed)
         elif "Meta(" in str(hint):

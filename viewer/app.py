@@ -3,17 +3,18 @@
 import glob
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from msgspec import Meta
 
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import own_warnings, parse_arguments, progress_bar
 from pansplat.system.files import expand_home, require_output_file, require_output_folder, require_replaceable
-from pansplat.system.options import EYE_DISTANCE, Depth, EyeDistance, Height, Positive, Seconds, check_numbers
+from pansplat.system.options import EYE_DISTANCE, EyeDistance, check_numbers
 from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
@@ -58,28 +59,10 @@ class Options:
     """With --offscreen or --out: replace files that pansplat did not write, too."""
     pair: str | None = None
     """Name or number of the tour, pair or scene to show first if the path holds several; offscreen also "all"."""
-    model: str = "default"
-    """Predictor for pairs: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an official
-    .ckpt)."""
-    compat: Literal["trained", "official", "fixed"] = "trained"
-    """For a network: as the official code, with its defects fixed, or as the weights were trained."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Type of a network's convolutions; bfloat16 is faster on CPUs that support it, and less accurate."""
-    height: Height | None = None
-    """Height of the panoramas that the prediction reads, pixels; by default that of the photographs, at most 1024 (for
-    networks and tours 512)."""
-    refine: Seconds = 10.0
-    """Time limit of the refinement after the prediction, seconds; 0 for none. A window shows the prediction first."""
+    prediction: PredictOptions = field(default_factory=PredictOptions)
     no_cache: bool = False
     """Predict even if the pair's folder has a cached result."""
-    convention: str | None = None
-    """Pose convention, such as "world2cam opengl", instead of the one in the files."""
-    near: Depth | None = None
-    """Nearest depth of the search, metres, instead of the one in the files."""
-    far: Depth | None = None
-    """Farthest depth of the search, metres."""
-    camera_height: Positive = 1.5
-    """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
+    reading: ReadOptions = field(default_factory=ReadOptions)
     mode: Mode = "deferred"
     """How the Gaussians of the input views are combined."""
     preset: Preset = "exact"
@@ -116,7 +99,7 @@ class Options:
 
     @property
     def image_format(self) -> "ImageFormat":
-        """Projection and stereo."""
+        """The image format of films and stills: projection and stereo."""
         from pansplat_viewer.draw.stereo import ImageFormat
 
         return ImageFormat(self.projection, self.stereo, self.ipd)
@@ -124,14 +107,11 @@ class Options:
     @property
     def load_options(self) -> LoadOptions:
         """Options of reading and prediction."""
-        names = ("model", "compat", "precision", "height", "convention", "near", "far", "camera_height")
-        return LoadOptions(
-            **{name: getattr(self, name) for name in names}, refine_seconds=self.refine, cache=not self.no_cache
-        )
+        return LoadOptions(self.reading, replace(self.prediction, cache=not self.no_cache))
 
     @property
     def settings(self) -> DrawSettings:
-        """Initial draw settings."""
+        """The draw settings with which the viewer begins."""
         return DrawSettings(preset=self.preset, mode=self.mode, stereo=self.stereo, eye_distance=self.ipd)
 
     @property
@@ -147,7 +127,9 @@ class Options:
 def run_arguments(args: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, those of the process by default, and return its exit status."""
     options = parse_arguments(
-        lambda: tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,)),
+        lambda: tyro.cli(
+            Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+        ),
         "pansplat-view",
         args,
     )

@@ -16,7 +16,7 @@ from pansplat.geometry.pose import quats_from_rotations
 
 NUM_LEVELS = 4
 _BASELINE = 1.0  # metres
-_CHUNK = 1 << 17
+_CHUNK = 1 << 17  # rays that are cast at once
 
 # Corners of the room, then of its furniture, metres; the cameras are 1.2 m above the floor (y points down).
 _ROOM = ((-3.4, -1.5, -2.6), (3.0, 1.2, 3.9))
@@ -33,7 +33,7 @@ NUM_SURFACES = 6 * (1 + len(_FURNITURE))
 _FOOTPRINT = (0.5, 1.0)  # standard deviations of discs across the line of sight, in pixels of their level
 _MAX_STRETCH = 4.0  # of a disc seen at a slant
 _THICKNESS = 0.1  # of a disc's width
-_OPACITY = (0.3, 0.95)
+_OPACITY = (0.3, 0.95)  # smallest and largest
 
 
 def make_room_cameras(views: int = 2) -> Float[Tensor, "view 4 4"]:

@@ -8,17 +8,18 @@ import json
 import time
 from collections import Counter
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from pansplat.cli.inputs import Compat, Out, Precision, Writer
+from pansplat.cli.inputs import Out, Writer
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import print_message, progress_bar
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
-from pansplat.system.options import Count, Height, Positive, Seconds, Threads
+from pansplat.system.options import Count, Positive, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,19 +46,9 @@ class Batch(Writer):
     """Memory of each worker, such as 4GiB; a worker that takes more is replaced. By default an equal part."""
     scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
     """Address of a running Dask scheduler, such as tcp://host:8786, whose workers are used instead."""
-    model: str = "default"
-    """Predictor: `default`, `sweep` (without weights), or a file of weights."""
-    compat: Compat = "trained"
-    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
-    precision: Precision = "float32"
-    """Number type of a network's convolutions."""
-    height: Height | None = None
-    """Panoramas are resized to this height, pixels; by default that of the photographs, at most 1024 (for networks
-    512)."""
+    prediction: PredictOptions = field(default_factory=PredictOptions)
     camera_height: Positive = 1.5
     """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
-    refine: Seconds = 10.0
-    """Time limit of the refinement of a pair, seconds."""
     format: str = "html"
     """Format of the export: html, png (a floor plan), ply, compressed.ply, spz, splat, sog or glb."""
     gaussians: Count | None = None
@@ -76,7 +67,7 @@ class Batch(Writer):
             )
         memory = self._parse_memory()
         items = batch.list_items(self.path)
-        batch.load_predictor(options)  # an unknown model is an error of the command, not of each item
+        batch.load_predictor(options.prediction)  # an unknown model is an error of the command, not of each item
         out = expand_home(self.out).absolute()
         with batch.lock_folder(out):
             try:
@@ -113,21 +104,15 @@ class Batch(Writer):
             raise InputError(f"--gaussians is for --format html, got {self.format}; leave it out")
         if self.scheduler is not None and (self.workers is not None or self.memory is not None):
             raise InputError("--workers and --memory are for workers of this machine; leave them out with --scheduler")
-        is_file = Path(self.model).suffix != ""
-        return batch.BatchOptions(
-            steps=tuple(step for step in batch.STEPS if step in steps),
-            model=str(expand_home(self.model).absolute()) if is_file else self.model,
-            compat=self.compat,
-            precision=self.precision,
-            height=self.height,
-            camera_height=self.camera_height,
-            refine_seconds=self.refine,
-            suffix=suffix,
-            gaussians=self.gaussians,
-        )
+        model = self.prediction.model
+        if Path(model).suffix != "":
+            model = str(expand_home(model).absolute())  # of workers in other folders
+        prediction = dataclasses.replace(self.prediction, model=model, gaussians=self.gaussians)
+        chosen = tuple(step for step in batch.STEPS if step in steps)
+        return batch.BatchOptions(chosen, prediction, self.camera_height, suffix)
 
     def _parse_memory(self) -> int | None:
-        """Bytes of --memory."""
+        """The number of bytes that `--memory` states."""
         if self.memory is None:
             return None
         from dask.utils import parse_bytes

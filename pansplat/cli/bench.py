@@ -15,6 +15,7 @@ import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
 from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.files import is_scene_file, require_output_folder, require_replaceable
 from pansplat.system.options import Positive, Threads
 
@@ -106,8 +107,8 @@ class BenchRaster(_Options):
         if is_scene_file(path):
             scene = pipeline.load(path)
         else:
-            pair, model = choose_pair(path, PairChoice()), pipeline.load_model("sweep")
-            scene = predict_scene(pair, model, max(height, _MIN_SWEEP_HEIGHT), cache=True)
+            options = PredictOptions("sweep", height=max(height, _MIN_SWEEP_HEIGHT), refine_seconds=0.0)
+            scene = predict_scene(choose_pair(path, PairChoice()), options)
         pose = scene.pose_between(0.5) if len(scene.cam2world) else torch.eye(4, dtype=torch.float64)
         return BenchScene(path.stem, lambda: scene.gaussians, pose)
 

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import ModelChoice, Out, Writer, parse_blend
+from pansplat.cli.inputs import Out, Writer, parse_blend
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import make_table_console, progress_bar
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
-from pansplat.system.options import Count, CountOrNone, Depth, Height, Seconds
+from pansplat.system.options import Count, CountOrNone
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 _WRITTEN = "results.json", "*/prediction.png", "*/target.png", "*/error.png"
 _WRITTEN_OF_PROTOCOL = "results.json", "table.md", "frame_distance.png", "*/*/*.png"
+_HEIGHT = 512  # pixels, of the paper's panoramas
 _PROTOCOL_WIDTH = 150  # characters of a protocol's tables if there is no terminal
 
 
@@ -67,11 +69,7 @@ class Evaluate(Writer):
     """Folders of pairs; pairs without target views are skipped. None with --protocol."""
     out: Out
     """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
-    model: ModelChoice = field(default_factory=ModelChoice)
-    height: Height = 512
-    """Panoramas are resized to this height, pixels."""
-    refine: Seconds = 0.0
-    """Time limit of the refinement after each prediction, seconds; 0 for none. Not with --protocol."""
+    prediction: PredictOptions = field(default_factory=lambda: PredictOptions(height=_HEIGHT, refine_seconds=0.0))
     blend: str | None = None
     """deferred, joint, or view0, view1, ...; by default deferred, with --protocol that of the paper's table. For joint,
     each surface is kept once, except of networks."""
@@ -79,14 +77,13 @@ class Evaluate(Writer):
     """exact, or original: render as the official code does, to compare with its published figures."""
     leave_one_out: bool = False
     """Instead of targets: each panorama of a tour against the scene that the tour without it shows there."""
-    convention: str | None = None
-    """Pose convention, if a folder does not state it."""
-    near: Depth | None = None
-    """Nearest depth to search, metres."""
-    far: Depth | None = None
-    """Farthest depth to search, metres."""
+    reading: ReadOptions = field(default_factory=ReadOptions)
     lpips: LpipsChoice = field(default_factory=LpipsChoice)
     protocol: ProtocolChoice = field(default_factory=ProtocolChoice)
+
+    @property
+    def _height(self) -> int:
+        return self.prediction.height or _HEIGHT
 
     def run(self) -> int:
         """Evaluate the folders' pairs, or a protocol of the paper."""
@@ -103,10 +100,10 @@ class Evaluate(Writer):
         if not self.paths:
             raise InputError("`pansplat evaluate` needs at least one folder of pairs, or --protocol")
         blend = parse_blend(self.blend or "deferred")
-        lpips = choose_lpips(self.lpips, self.height)
+        lpips = choose_lpips(self.lpips, self._height)
         pairs = []
         for path in self.paths:
-            found = pipeline.load_pairs(path, convention=self.convention, near=self.near, far=self.far)
+            found = pipeline.load_pairs(path, **vars(self.reading))
             if self.leave_one_out:
                 with_targets = _leave_out_each(path, found)
             else:
@@ -114,14 +111,14 @@ class Evaluate(Writer):
                 if not with_targets:
                     print(f"note: {path}: none of its {len(found)} pairs has a target view; skipped", file=sys.stderr)
             pairs += with_targets
-        predictor = self.model.load()
+        predictor = pipeline.load_predictor(self.prediction)
         with progress_bar() as progress:
             cases = evaluate(
                 pairs,
                 predictor,
                 self.out,
-                height=self.height,
-                refine_seconds=self.refine,
+                height=self._height,
+                refine_seconds=self.prediction.refine_seconds or 0.0,
                 blend=blend,
                 drawing=self.drawing,
                 lpips=lpips,
@@ -139,8 +136,8 @@ class Evaluate(Writer):
         from pansplat.evaluation.tables import report_notes, rich_tables, write_report
 
         data = self._protocol_data()
-        options = ProtocolOptions(self.height, self.protocol.limit, self.protocol.pictures)
-        lpips = choose_lpips(self.lpips, self.height)
+        options = ProtocolOptions(self._height, self.protocol.limit, self.protocol.pictures)
+        lpips = choose_lpips(self.lpips, self._height)
         methods = self._protocol_methods(protocol)
         with progress_bar() as progress:
             result = run_protocol(protocol, data, methods, self.out, options=options, lpips=lpips, progress=progress)
@@ -164,12 +161,13 @@ class Evaluate(Writer):
         if self.blend not in (None, "joint", "deferred"):
             raise InputError(f"--blend must be joint or deferred with --protocol, got {self.blend!r}")
         for name in ("near", "far", "convention"):
-            if getattr(self, name) is not None:
+            if getattr(self.reading, name) is not None:
                 raise InputError(f"--{name} is set by the protocol; leave it out")
         return expand_home(self.protocol.data)
 
     def _protocol_methods(self, protocol: ProtocolName) -> list[Method]:
         """The methods of all predictors; a predictor with weights has the name of their file."""
+        from pansplat import pipeline
         from pansplat.evaluation.protocol import list_methods
         from pansplat.model.weights import WEIGHTS_SUFFIXES
 
@@ -177,11 +175,14 @@ class Evaluate(Writer):
         methods: list[Method] = []
         more = (
             # sweep has neither of the other options
-            replace(self.model, model=name) if Path(name).suffix.lower() in WEIGHTS_SUFFIXES else ModelChoice(name)
+            replace(self.prediction, model=name)
+            if Path(name).suffix.lower() in WEIGHTS_SUFFIXES
+            else PredictOptions(name)
             for name in self.protocol.models
         )
-        for choice in (self.model, *more):
-            methods += list_methods(choice.load(), protocol, blend, Path(choice.model).stem, self.drawing)
+        for options in (self.prediction, *more):
+            predictor = pipeline.load_predictor(options)
+            methods += list_methods(predictor, protocol, blend, Path(options.model).stem, self.drawing)
         names = [method.name for method in methods]
         if len(set(names)) < len(names):
             raise InputError(f"--model and --models must have distinct names, got {', '.join(names)}; rename a file")

@@ -6,27 +6,25 @@ Modules of this package import torch and everything that needs it inside functio
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.files import is_scene_file
-from pansplat.system.options import Depth, Height, Positive, Seconds
+from pansplat.system.options import Height
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.pairs import Pair
-    from pansplat.predictor import Predictor
     from pansplat.tours import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
 OptionalOut = Annotated[Path | None, arg(aliases=["-o"])]
-Compat = Literal["trained", "official", "fixed"]
-Precision = Literal["float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -43,48 +41,21 @@ class PairChoice:
 
     pair: str | None = None
     """Name or number (from 1) of the pair, if the folder holds several; the first by default."""
-    convention: str | None = None
-    """Pose convention, if the folder does not state it: "cam2world opencv", "cam2world opengl",
-    "world2cam opencv" or "world2cam opengl" (Habitat and Blender use opengl)."""
-    near: Depth | None = None
-    """Nearest depth to search, metres; by default the folder's."""
-    far: Depth | None = None
-    """Farthest depth to search, metres; by default the folder's."""
-    camera_height: Positive = 1.5
-    """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
+    reading: Annotated[ReadOptions, arg(name="")] = field(default_factory=ReadOptions)
 
 
 @dataclass(frozen=True)
-class ModelChoice:
-    """The predictor of a pair."""
+class _SceneOptions(PredictOptions):
+    """How the scene of panoramas is predicted and refined; unused for a scene file."""
 
-    model: str = "default"
-    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an official
-    .ckpt)."""
-    compat: Compat = "trained"
-    """For a network: official computes what the official code does, fixed corrects its defects; by default the one
-    that the weights were trained with, which is official for official weights."""
-    precision: Precision = "float32"
-    """Number type of a network's convolutions; bfloat16 is less exact, and faster if the processor supports it."""
-
-    def load(self) -> Predictor:
-        """The predictor; an InputError if there is none of that name or file, or it lacks the options."""
-        from pansplat import pipeline
-
-        return pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+    height: Annotated[Height | None, arg(name="predict-height")] = None
 
 
 @dataclass(frozen=True)
 class ScenePrediction:
-    """How to predict the scene of a pair; unused for a scene file."""
+    """How the scene of a path is predicted."""
 
-    model: ModelChoice = field(default_factory=ModelChoice)
-    refine: Seconds | None = None
-    """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none. 10 by default, for the page
-    of a pair 30, for a file of other programs 20."""
-    predict_height: Height | None = None
-    """Height that the panoramas are resized to before the prediction, for a pair; by default that of the photographs,
-    at most 1024 (for networks 512)."""
+    options: _SceneOptions = field(default_factory=_SceneOptions)
     choice: PairChoice = field(default_factory=PairChoice)
 
     def open(self, path: Path) -> Scene:
@@ -93,7 +64,7 @@ class ScenePrediction:
 
         if is_scene_file(path):
             return pipeline.load(path)
-        return self._predict_pair(choose_pair(path, self.choice), None, joint=False)
+        return predict_scene(choose_pair(path, self.choice), self.options)
 
     def open_panoramas(
         self, path: Path, gaussians: int | None = None, *, joint: bool = False
@@ -105,59 +76,27 @@ class ScenePrediction:
             gaussians: of a page; see `pansplat.predict_tour`.
             joint: see `pansplat.predict`; predictions of networks are returned as they are.
         """
-        from pansplat import pipeline
         from pansplat.tours import connect, find_tours
 
         pairs = load_choice(path, self.choice)
         tours = find_tours(pairs) if self.choice.pair is None else []
+        options = replace(self.options, gaussians=gaussians, joint=joint)
         if not tours:
             pair = pick_pair(path, pairs, self.choice)
-            return self._predict_pair(pair, gaussians, joint), pair
+            return predict_scene(pair, options), pair
         alone = sum(a == b for a, b in tours[0].overlaps)
         kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
         more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
         print(
             f"note: {path}: a tour of {len(tours[0])} panoramas ({kinds}--pair chooses one pair){more}", file=sys.stderr
         )
-        model = self.model.load()
-        joint = joint and not pipeline.can_stream(model)
         with progress_bar() as progress:
             tour = connect(tours[0], progress)
-            scene = pipeline.predict_tour(
-                tour,
-                model,
-                height=self.predict_height,
-                refine_seconds=self._choose_seconds(None, joint),
-                gaussians=gaussians,
-                joint=joint,
-                progress=progress,
-            )
-        return scene, tour
+        return predict_scene(tour, options), tour
 
     def predict_layers(self, source: Pair | TourGraph) -> Scene:
         """The unrefined scene of the panoramas of `open_panoramas` with all that each of them shows, from the cache."""
-        from pansplat import pipeline
-        from pansplat.inputs.pairs import Pair
-
-        model = self.model.load()
-        with progress_bar() as progress:
-            if isinstance(source, Pair):
-                return pipeline.predict(source, model, height=self.predict_height, progress=progress)
-            return pipeline.predict_tour(source, model, height=self.predict_height, progress=progress)
-
-    def _predict_pair(self, pair: Pair, gaussians: int | None, joint: bool) -> Scene:
-        from pansplat import pipeline
-
-        model = self.model.load()
-        joint = joint and len(pair.context) > 1 and not pipeline.can_stream(model)
-        seconds, height = self._choose_seconds(gaussians, joint), self.predict_height
-        return predict_scene(pair, model, height, cache=True, refine_seconds=seconds, gaussians=gaussians, joint=joint)
-
-    def _choose_seconds(self, gaussians: int | None, joint: bool) -> float:
-        """The time limit of a refinement."""
-        from pansplat import pipeline
-
-        return pipeline.choose_refine_seconds(gaussians, joint=joint) if self.refine is None else self.refine
+        return predict_scene(source, replace(self.options, refine_seconds=0.0))
 
 
 def choose_pair(path: Path, choice: PairChoice) -> Pair:
@@ -169,9 +108,7 @@ def load_choice(path: Path, choice: PairChoice) -> list[Pair]:
     """The pairs of a folder."""
     from pansplat import pipeline
 
-    return pipeline.load_pairs(
-        path, convention=choice.convention, near=choice.near, far=choice.far, camera_height=choice.camera_height
-    )
+    return pipeline.load_pairs(path, **vars(choice.reading))
 
 
 def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
@@ -190,30 +127,17 @@ def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
     raise InputError(f"--pair {choice.pair}: {path} holds {listed}")
 
 
-def predict_scene(
-    pair: Pair,
-    model: Predictor,
-    height: int | None,
-    *,
-    cache: bool,
-    refine_seconds: float = 0.0,
-    gaussians: int | None = None,
-    joint: bool = False,
-) -> Scene:
-    """Predict and refine a scene, and show a progress bar."""
+def predict_scene(source: Pair | TourGraph, options: PredictOptions) -> Scene:
+    """Predict and refine the scene of a pair or tour, and show a progress bar; networks draw layers jointly."""
     from pansplat import pipeline
+    from pansplat.inputs.pairs import Pair
 
+    model = pipeline.load_predictor(options)
+    options = replace(options, joint=options.joint and not pipeline.can_stream(model))
     with progress_bar() as progress:
-        return pipeline.predict(
-            pair,
-            model,
-            height=height,
-            refine_seconds=refine_seconds,
-            gaussians=gaussians,
-            joint=joint,
-            cache=cache,
-            progress=progress,
-        )
+        if isinstance(source, Pair):
+            return pipeline.predict(source, model, progress=progress, **options.keywords)
+        return pipeline.predict_tour(source, model, progress=progress, **options.keywords)
 
 
 def parse_blend(text: str) -> str | int:

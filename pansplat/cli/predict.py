@@ -3,38 +3,34 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import ModelChoice, Out, PairChoice, Writer, choose_pair
+from pansplat.cli.inputs import Out, PairChoice, Writer, choose_pair
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, require_output_file
-from pansplat.system.options import Fraction, Height, Seconds
+from pansplat.system.options import Fraction
 
 
 @dataclass(frozen=True)
 class Predict(Writer):
     """Predict the 3D Gaussians of one panorama or of a pair, and write them in the format of the file's suffix
-    (docs/formats.md)."""
+    (docs/formats.md). Networks predict heights above 512 tile by tile, in bounded memory, and do not cache the
+    result."""
 
     path: Positional[Path]
     """One panorama, a folder of panoramas, or a web tour; of several pairs the first, or that of --pair."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
-    model: ModelChoice = field(default_factory=ModelChoice)
-    height: Height | None = None
-    """Panoramas are resized to this height, pixels; by default that of the photographs, at most 1024 (for networks
-    512). Networks predict heights above 512 tile by tile, in bounded memory, and do not cache the result."""
-    refine: Seconds | None = None
-    """Time limit of the refinement after the prediction, seconds; 0 for none. 20 by default, with --layers and for
-    networks 0. `pansplat refine` has more options."""
     layers: bool = False
     """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
-    draw all Gaussians together (docs/formats.md). Networks keep all."""
+    draw all Gaussians together (docs/formats.md). Networks keep all. What keeps all is not refined
+    by default."""
     degree: Annotated[int, Meta(ge=0, le=4)] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds. The .ply of 4K
     panoramas has 5 GB with degree 4, 1 GB with degree 0."""
@@ -42,6 +38,7 @@ class Predict(Writer):
     """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
     no_cache: bool = False
     """Predict again even if the pair's folder holds a cached result."""
+    prediction: PredictOptions = field(default_factory=PredictOptions)
     choice: PairChoice = field(default_factory=PairChoice)
 
     def run(self) -> int:
@@ -50,22 +47,21 @@ class Predict(Writer):
 
         require_output_file("--out", self.out, SCENE_SUFFIXES, overwrite=self.overwrite)
         pair = choose_pair(self.path, self.choice)
-        model = self.model.load()
+        model = pipeline.load_predictor(self.prediction)
         joint = not self.layers and len(pair.context) > 1 and not pipeline.can_stream(model)
-        seconds = pipeline.choose_refine_seconds(None, joint=True) if joint else 0.0
+        options = replace(self.prediction, joint=joint, cache=not self.no_cache)
+        if options.refine_seconds is None and not joint:
+            options = replace(options, refine_seconds=0.0)
         began = time.perf_counter()
         with progress_bar() as progress:
             count = pipeline.predict_to_file(
                 pair,
                 self.out,
                 model,
-                height=self.height,
-                refine_seconds=seconds if self.refine is None else self.refine,
-                joint=joint,
-                cache=not self.no_cache,
                 degree=self.degree,
                 min_opacity=self.min_opacity,
                 progress=progress,
+                **options.keywords,
             )
         seconds = time.perf_counter() - began
         names = ", ".join(panorama.name for panorama in pair.context)

@@ -8,20 +8,28 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Fixed, Positional, Suppress
 
-from pansplat.cli.inputs import ModelChoice, Out, PairChoice, Writer, choose_pair, predict_scene
+from pansplat.cli.inputs import Out, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import call_at_first_signal, progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, is_scene_file, require_output_file
-from pansplat.system.options import Count, Height, Seconds, Seed
+from pansplat.system.options import Count, Seconds, Seed
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.views import Views
     from pansplat.refinement import RefineReport
+
+
+@dataclass(frozen=True)
+class _Prediction(PredictOptions):
+    """The prediction of a pair. The photographs of a scene file are resized to its height by default."""
+
+    refine_seconds: Annotated[float, Fixed, Suppress] = 0.0
 
 
 @dataclass(frozen=True)
@@ -52,10 +60,7 @@ class Refine(Writer):
     """Of the blocks of pixels that are held out to detect overfitting."""
     report: Path | None = None
     """A .json file for errors, gains, times and the error over the steps."""
-    model: ModelChoice = field(default_factory=ModelChoice)
-    height: Height | None = None
-    """The photographs are resized to this height, pixels; by default that of the scene. For a pair that of its
-    files, at most 1024 (for networks 512)."""
+    prediction: _Prediction = field(default_factory=_Prediction)
     choice: PairChoice = field(default_factory=PairChoice)
 
     def run(self) -> int:
@@ -109,11 +114,11 @@ class Refine(Writer):
 
         if self.photographs is not None:
             scene = pipeline.load(self.path)
-            return scene, choose_pair(self.photographs, self.choice).load_context(self.height or scene.height)
+            views = choose_pair(self.photographs, self.choice).load_context(self.prediction.height or scene.height)
+            return scene, views
         pair = choose_pair(self.path, self.choice)
-        model = self.model.load()
-        height = self.height or pipeline.choose_height(pair, model)
-        return predict_scene(pair, model, height, cache=True), pair.load_context(height)
+        scene = predict_scene(pair, self.prediction)
+        return scene, pair.load_context(scene.height)
 
 
 def _describe(report: RefineReport, compared: str) -> str:

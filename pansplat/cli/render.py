@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _VIDEO_SUFFIXES = (".mp4", ".webm")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
-_VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440
+_VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # pixels
 _MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
 
 

@@ -39,8 +39,8 @@ MIN_IMAGE_SIZE = 32
 # Normalisation of the classifiers' training images, for images in [-1, 1].
 _MEAN = (-0.030, -0.088, -0.188)
 _DEVIATION = (0.458, 0.448, 0.450)
-# VGG has the largest activations: an image of more than _WHOLE pixels is processed in bands of _BAND pixels.
-_WHOLE, _BAND = 1 << 19, 1 << 18
+# VGG has the largest activations: more than _MAX_WHOLE_PIXELS are processed in bands of _BAND_PIXELS.
+_MAX_WHOLE_PIXELS, _BAND_PIXELS = 1 << 19, 1 << 18
 
 _VGG = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)  # outputs; 0 is a pooling
 # inputs, squeezed, expanded by each of two; 0 is a pooling
@@ -102,8 +102,8 @@ class Lpips(nn.Module):
 
     def _compare_layers(self, a: Tensor, b: Tensor) -> Iterator[Float[Tensor, "batch _ _"]]:
         """The distance map of each compared layer."""
-        if self.backbone == "vgg" and a.shape[-2] * a.shape[-1] > _WHOLE:
-            return banded_distances(a, b, self.features, self.heads, _BAND)
+        if self.backbone == "vgg" and a.shape[-2] * a.shape[-1] > _MAX_WHOLE_PIXELS:
+            return banded_distances(a, b, self.features, self.heads, _BAND_PIXELS)
         activations = (self._compute_activations(maps) for maps in (a, b))
         return (distances(*pair, head) for head, *pair in zip(self.heads, *activations, strict=True))
 

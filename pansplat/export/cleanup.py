@@ -37,7 +37,7 @@ _CONFIRMED = 0.03  # distance from a Gaussian of another camera, relative to tha
 _LONELY = 3.0  # distance of the neighbours, relative to that of their own ones and to the largest standard deviation
 _IN_FRONT = 0.85  # largest distance from a camera, relative to that of the surface behind
 _OPAQUE = 0.5  # least alpha of that surface
-_DEPTH_ROWS, _PICTURE_ROWS = 512, 256
+_DEPTH_ROWS, _PICTURE_ROWS = 512, 256  # of the images that are compared
 _MAX_PICTURES = 16  # cameras at which pictures are compared
 
 

@@ -24,9 +24,9 @@ from pansplat.geometry.equirect import pad_equirect, pixel_directions
 from pansplat.refinement.fusion import BACKGROUND_LEVEL, OPAQUE, are_seen, measure_reach
 from pansplat.rendering import rasterize
 
-DEFAULT_TRIANGLES = 2_000_000
+DEFAULT_TRIANGLES = 2_000_000  # of a mesh, at most
 
-_MOST_ROWS, _FEWEST_ROWS = 512, 8
+_MOST_ROWS, _FEWEST_ROWS = 512, 8  # of the grid of one panorama
 _GRAZING = math.radians(83)  # largest angle between a ray and the normal of a surface that it meets
 _TEXTURE_ROWS = 2048  # of a texture that is drawn; at most those of the photographs
 

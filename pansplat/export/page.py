@@ -83,7 +83,7 @@ _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; di
 _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _START_FOV = 75.0  # degrees, vertical, of a landscape image
 _TALLEST = 1.5  # height of a portrait image relative to it; the poster has this height
-_POSTER_SIZE = (810, 960)
+_POSTER_SIZE = (810, 960)  # height and width, pixels
 _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
@@ -104,7 +104,7 @@ _EXPORT = re.compile(r"^export ", re.MULTILINE)
 
 @dataclass(frozen=True)
 class PageFiles:
-    """What was written.
+    """The files of a page that was written.
 
     Attributes:
         files: the page, and its parts if it is split.

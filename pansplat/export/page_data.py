@@ -20,13 +20,13 @@ from pansplat.geometry.morton import morton_codes
 
 MAX_DEGREE = 3  # of the harmonics of a page
 _CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
-_MORTON_BITS = 10
+_MORTON_BITS = 10  # of each coordinate
 _CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
 
 
 @dataclass(frozen=True, eq=False)
 class PackedGaussians:
-    """Gaussians as bytes.
+    """Gaussians as the bytes that a web page reads.
 
     Attributes:
         contents: gzip of planes of bytes of each view.

@@ -68,11 +68,11 @@ class PackedPhotograph:
 
     @property
     def num_bytes(self) -> int:
-        """Of all tiles."""
+        """The bytes of all tiles."""
         return sum(map(len, self.tiles))
 
     def describe(self) -> dict[str, Any]:
-        """What photographs.js reads."""
+        """The description of the photograph that photographs.js reads."""
         return {"name": self.name, "levels": self.levels, "rotation": self.rotation.tolist()}
 
     def make_elements(self) -> list[str]:

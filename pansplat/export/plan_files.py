@@ -32,7 +32,7 @@ from pansplat.tours.plan import Plan, Room, make_plan
 SUFFIXES = (".svg", ".png", ".dxf")
 
 _PAPER = 0.02  # metres of paper for a metre: 1:50
-_INCH = 0.0254
+_INCH = 0.0254  # metres
 _DOTS_PER_INCH = 150
 _MARGIN, _GAP, _LINE = 0.8, 1.5, 0.35  # around a storey, between two, and between lines of notes, metres
 _TEXT, _SMALL_TEXT = 0.22, 0.13  # heights, metres

@@ -27,10 +27,10 @@ from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
 POINTS = "points.ply"
 
 _MAX_HEIGHT = 8192  # of a panorama, pixels
-_MASK_HEIGHT = 512
+_MASK_HEIGHT = 512  # pixels
 _LOSSLESS = (".png", ".exr", ".tif", ".tiff")  # pictures whose faces are PNG; those of others are JPG
 _MARGIN = 2  # pixels, of the cubic filter
-_BAND = 256  # rows of a face that are sampled together
+_BAND_ROWS = 256  # rows of a face that are sampled together
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,12 +123,12 @@ def cut_faces(image: Float[Tensor, "3 height width"], size: int) -> Iterator[Flo
     position = (torch.arange(size, dtype=torch.float64) + 0.5) / size * 2 - 1
     for rotation in face_rotations():
         face = np.empty((size, size, 3), np.float32)
-        for first in range(0, size, _BAND):
-            y, x = torch.meshgrid(position[first : first + _BAND], position, indexing="ij")
+        for first in range(0, size, _BAND_ROWS):
+            y, x = torch.meshgrid(position[first : first + _BAND_ROWS], position, indexing="ij")
             uv = uv_from_directions(torch.stack((x, y, torch.ones_like(x)), dim=-1) @ rotation.T).numpy()
             columns, rows = (
                 (uv[..., axis] * count - 0.5 + _MARGIN).astype(np.float32) for axis, count in ((0, width), (1, height))
             )
             band = cv2.remap(padded, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            face[first : first + _BAND] = band.clip(0, 1)
+            face[first : first + _BAND_ROWS] = band.clip(0, 1)
         yield face

@@ -45,7 +45,7 @@ OPACITY_EPSILON = 1e-6  # opacities are clamped to this distance from 0 and 1, w
 SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarithm is finite
 
 COMMENT_PREFIX = "pansplat "  # of the header comment with the pansplat entry
-_MAX_HEADER = 1 << 24
+_MAX_HEADER = 1 << 24  # bytes
 _RUNS_SPACE = 4096  # bytes for about 300 runs; some browser viewers need the header within 10,000 bytes
 _READ_VERTICES = 1 << 17  # vertices that are read at a time
 _MAX_PROPERTIES = 1 << 10  # of an element

@@ -26,7 +26,7 @@ from pansplat.system.strict_json import convert, parse_json
 Y_UP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # from y down to y up, and back
 
 _MAX_RUNS = 4096  # the Gaussians are sorted if the entry would list more runs, which take megabytes
-_MAX_CAMERAS = 1 << 12
+_MAX_CAMERAS = 1 << 12  # of a scene
 _Camera = Annotated[int, Meta(ge=0)]
 _Level = Annotated[int, Meta(ge=0, le=255)]
 _Position = Annotated[float, Meta(ge=-MAX_POSITION, le=MAX_POSITION)]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 
-MIN_DEPTH, MAX_DEPTH = 1e-9, 1e9
+MIN_DEPTH, MAX_DEPTH = 1e-9, 1e9  # in the unit of the poses
 MAX_POSITION = 1e12  # of a camera
 MIN_RATIO = 1.001  # of the largest to the smallest depth
 

@@ -41,7 +41,7 @@ MAX_SIZE = 8000  # pixels along a face; OpenCV resamples at most 32,767 rows
 _MIN_HEIGHT = 4  # of a panorama in which every face has rows and columns
 _PAD = 2  # pixels of the neighbouring faces, for the cubic filter
 _SAMPLES = 2  # per pixel and axis; faces are up to twice as dense at their edges as a panorama
-_ENOUGH = 2 / math.pi  # face size over panorama height at which the centre of a face is as dense as the panorama
+_DENSE_FACE = 2 / math.pi  # face size over panorama height at which the centre of a face is as dense as the panorama
 _LARGEST_DENSITY, _DENSITY = 1.5, 1.28  # the same ratio, above which faces are reduced, and of reduced faces
 _CAP = 0.6  # latitude above which a column meets the upper or lower face, radians; at the cube's corners 0.615
 
@@ -75,7 +75,7 @@ class CubeLevel:
         return ((row, column) for row in range(count) for column in range(count))
 
     def read(self, folder: Path, decode: Decode) -> list[UInt8[Array, "size size 3"]]:
-        """The six faces."""
+        """Read the six faces of the cube."""
         if self.cells:
             picture = decode(folder / self.faces[0])
             rows, columns = self.grid
@@ -118,12 +118,12 @@ class CubeImage:
         return 2 * self.levels[-1].size
 
     def list_files(self) -> Iterator[Path]:
-        """All pictures."""
+        """The files of all pictures of the cube, of each level."""
         return (self.folder / file for level in self.levels for file in level.list_files())
 
     def read(self, height: int, decode: Decode) -> tuple[UInt8[Array, "height width 3"], None]:
         """The equirectangular panorama at (height, 2 height); None, as the pictures show all of it."""
-        level = next((level for level in self.levels if level.size >= _ENOUGH * height), self.levels[-1])
+        level = next((level for level in self.levels if level.size >= _DENSE_FACE * height), self.levels[-1])
         return equirect_from_faces(level.read(self.folder, decode), height), None
 
 

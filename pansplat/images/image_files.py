@@ -48,7 +48,7 @@ READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff", ".heic", ".heif")
 _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_MAX_BYTES = 1 << 31
+_MAX_BYTES = 1 << 31  # of a file
 _MAX_PIXELS = 178_956_970  # of Pillow: twice Image.MAX_IMAGE_PIXELS
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _JPEG_MAGIC, _JPEG_END, _PNG_MAGIC = b"\xff\xd8", b"\xff\xd9", b"\x89PNG"
@@ -64,7 +64,7 @@ _DAMAGED = (  # what Pillow raises for damaged files; InputError is a ValueError
     RuntimeError, struct.error,
 )  # fmt: skip
 _BITS_PER_SAMPLE = 258  # tag of TIFF
-_DARK, _BRIGHT = 30, 60  # grey values, of the corners of a fisheye picture, and of what its circles show
+_DARK_CORNER, _LIT_CIRCLE = 30, 60  # grey values, of the corners of a fisheye picture, and of what its circles show
 _WRAP = 16  # margin of the wrap-around at +-180 degrees for the resampling filter, target pixels
 
 
@@ -592,7 +592,7 @@ def _is_dual_fisheye(color: NDArray[Any]) -> bool:
     tips = grey[(np.abs(across) < 0.2) & (np.abs(down) > 0.75) & (np.abs(down) < 0.92)]  # black, too, at black poles
     if min(len(corners), len(tips)) < 16:
         return False
-    return bool(np.quantile(corners, 0.95) < _DARK and np.mean(inside) > _BRIGHT and np.median(tips) > _BRIGHT)
+    return bool(np.quantile(corners, 0.95) < _DARK_CORNER and min(np.mean(inside), np.median(tips)) > _LIT_CIRCLE)
 
 
 def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:

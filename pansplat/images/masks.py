@@ -32,14 +32,14 @@ _MIN_DIFFERENCE = 0.02  # mean grey difference below which two panoramas count a
 
 _STEP = 0.5  # degrees between samples of the polar maps
 _REACH = 50.0  # degrees; radius of the polar maps
-_RINGS, _SECTORS = int(_REACH / _STEP), 180
+_RINGS, _SECTORS = int(_REACH / _STEP), 180  # of the polar maps
 _MIN_RADIUS, _MAX_RADIUS = 4.0, 45.0  # degrees from the pole to the outline
 _MAX_BEND = 2  # largest change of the outline's ring between neighbouring sectors
 _QUANTILE = 0.2  # over the panoramas: four of five must have the edge
 _MIN_EDGE = 0.02  # grey contrast over a degree
 _MIN_COVERAGE = 0.85  # fraction of the outline with that contrast
 _MAX_SHIFT = 5  # samples between views of a static outline, because panoramas are levelled after capture
-_BAND = 5  # samples on both sides of the outline that are compared
+_OUTLINE_BAND = 5  # samples on both sides of the outline that are compared
 _SURROUNDINGS = 10, 30  # samples from the outline to the inner and outer edge of the surroundings
 _MIN_CORRELATION = 0.5  # of a static outline between two views
 _MAX_RELATIVE = 0.6  # largest correlation of the surroundings relative to that of the outline
@@ -245,7 +245,7 @@ def _is_static(discs: Array, inside: NDArray[Any]) -> bool:
     False where little moves at all, such as a high ceiling with a short baseline.
     """
     near = _disc_coordinates()[0] < _REACH
-    outline = (cv2.dilate(inside, _ellipse(_BAND)) > cv2.erode(inside, _ellipse(_BAND))) & near
+    outline = (cv2.dilate(inside, _ellipse(_OUTLINE_BAND)) > cv2.erode(inside, _ellipse(_OUTLINE_BAND))) & near
     around = (cv2.dilate(inside, _ellipse(_SURROUNDINGS[1])) > cv2.dilate(inside, _ellipse(_SURROUNDINGS[0]))) & near
     views = range(len(discs))
     pairs = list(itertools.combinations(views, 2)) if len(discs) <= 5 else list(itertools.pairwise(views))

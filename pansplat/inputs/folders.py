@@ -104,6 +104,15 @@ def load_pairs(
     return localize_pairs(pairs)
 
 
+def load_panoramas(path: Path | str) -> list[Panorama]:
+    """All panoramas at a path (see `load_pairs`), with titles, links and start views, with or without poses."""
+    try:
+        pairs = load_pairs(path)
+    except UnposedPanoramasError as error:
+        return error.panoramas
+    return list({view.image: view for pair in pairs for view in pair.context + pair.targets}.values())
+
+
 def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
     """Check that every mask is applied: another one would show what it should hide.
 

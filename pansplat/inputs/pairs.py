@@ -28,7 +28,6 @@ FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, s
 MAX_CONTEXT = 64  # context panoramas of a pair
 
 _MAX_NAMES = 20  # in a note
-_COINCIDENT = 1e-3  # metres
 _MATCHING_SECONDS = 2.0  # for two panoramas of 512 rows on two cores
 
 
@@ -155,18 +154,9 @@ class Pair:
         return min(read_height(panorama.image) for panorama in self.context)
 
     def load_context(self, height: int) -> Views:
-        """The context panoramas at (height, 2 height). Warns when two camera centres coincide."""
-        centres = torch.stack([panorama.cam2world[:3, 3] for panorama in self.context])
+        """The context panoramas at (height, 2 height)."""
         if len(self.context) > MAX_CONTEXT:
             raise too_many_panoramas(self.name, len(self.context))
-        if len(centres) > 1 and float(torch.pdist(centres).min()) < _COINCIDENT:
-            warnings.warn(
-                f"{self.name}: cameras of the context views coincide (less than 1 mm apart); "
-                "depth cannot be estimated without a baseline, and only rotations of the camera will look right. "
-                "Check the poses if the camera was moved.",
-                category=InputWarning,
-                stacklevel=2,
-            )
         return self._load(self.context, height)
 
     def load_targets(self, height: int) -> Views:

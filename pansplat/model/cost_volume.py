@@ -47,7 +47,7 @@ from pansplat.model.layers import (
 _UNET_MULTIPLE = 4  # a U-Net of three scales halves the map twice
 
 _GROUPS = 8  # of the group normalisation
-_HEAD_CHANNELS = 32
+_HEAD_CHANNELS = 32  # of one attention head
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class LevelDepth:
 
     @property
     def depth(self) -> Float[Tensor, "batch view height width"]:
-        """Radial depth, metres."""
+        """The estimated radial depth of the level, metres."""
         return 1 / self.inverse_depth
 
 

@@ -18,9 +18,9 @@ from torch.nn import functional
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import Border, pad_equirect, resize_equirect
 from pansplat.geometry.pose import orthonormal_error
+from pansplat.prediction_options import Precision
 
 Compat = Literal["official", "fixed"]
-Precision = Literal["float32", "bfloat16"]
 
 Size = Annotated[int, Meta(ge=1, le=4096)]
 """A number of channels, candidates or rows in the settings of a network; larger ones take gigabytes."""

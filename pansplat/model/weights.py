@@ -35,7 +35,6 @@ from pansplat.system.strict_json import convert, parse_json
 
 FORMAT = 1  # increased when tensor names or the meaning of the metadata change
 
-CompatChoice = Literal["trained", "official", "fixed"]
 CHECKPOINT_SUFFIXES = (".ckpt", ".pt", ".pth")
 WEIGHTS_SUFFIXES = (".safetensors", *CHECKPOINT_SUFFIXES)
 COMPATS: dict[str, Compat] = {"official": "official", "fixed": "fixed"}

@@ -21,7 +21,7 @@ from pansplat.poses.features import FACE_ROTATIONS, render_face
 from pansplat.poses.solvers import rotation_angle, rotation_exp, rotation_log
 
 _MIN_LENGTH = math.radians(2.5)  # of a segment
-_NOISE = 4e-3  # standard deviation of a normal, radians
+_NORMAL_NOISE = 4e-3  # standard deviation of a normal, radians
 _ROUNDS = 25  # of the fit; its tolerance shrinks
 _FIRST_TOLERANCE = math.radians(3)
 _SEARCH_TOLERANCE = math.radians(1.5)
@@ -81,13 +81,13 @@ def find_axes(image: UInt8[Array, "height width"]) -> SceneAxes:
             hessian + (1e-9 * np.trace(hessian) + 1e-12) * np.eye(3), -jacobian.T @ (weight * residual)
         )
         axes = axes @ rotation_exp(step).T
-        tolerance = max(0.75 * tolerance, _NOISE)
-    inlier = np.abs(residual) < 2.5 * _NOISE
+        tolerance = max(0.75 * tolerance, _NORMAL_NOISE)
+    inlier = np.abs(residual) < 2.5 * _NORMAL_NOISE
     support = np.bincount(nearest[inlier], minlength=3)
-    by_chance = 2.5 * _NOISE * len(normals)
+    by_chance = 2.5 * _NORMAL_NOISE * len(normals)
     is_clear = support > max(_MIN_SUPPORT, _MIN_CONTRAST * by_chance)
     weak = support[1:].sum() > max(1.5 * _MIN_SUPPORT, 2 * _MIN_CONTRAST * by_chance)
-    scatter, noise = np.abs(residual[(lengths > _LONG) & (np.abs(residual) < 3 * _NOISE)]), _LARGEST_NOISE
+    scatter, noise = np.abs(residual[(lengths > _LONG) & (np.abs(residual) < 3 * _NORMAL_NOISE)]), _LARGEST_NOISE
     if len(scatter) >= _MIN_SUPPORT:
         # Edges that are parallel to no wall are among them: a large scatter states little about stitching.
         noise = float(np.clip(1.48 * np.median(scatter), _LEAST_NOISE, _LARGEST_NOISE))
@@ -229,7 +229,7 @@ class RotationPrior:
         return heading + math.log(share * walls + others * upright + 1 - share - others)
 
     def _heading_score(self, rotation: Float[Array, "3 3"]) -> float:
-        """The same for the compass alone, which metal and careless programs disturb."""
+        """The score of a rotation by the compass alone, which metal and careless programs disturb."""
         if self.first.heading is None or self.second.heading is None:
             return 0.0
         north = [np.array((-math.sin(h), 0.0, math.cos(h))) for h in (self.first.heading, self.second.heading)]

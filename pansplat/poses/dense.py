@@ -25,7 +25,7 @@ from pansplat.poses.depth import DepthMap, sample_nearest
 _HEIGHT = 96  # rows of the maps that are compared
 _COARSE, _FINE = 4, 2  # of many poses, every fourth or second row and column are compared
 _BLUR, _REGION = 0.5, 6.0  # standard deviations of the compared detail and of its surroundings, pixels
-_LEAST_CONTRAST, _DARK = 0.03, 0.02  # grey values of 1
+_LEAST_CONTRAST, _LOG_OFFSET = 0.03, 0.02  # grey values of 1
 _LEAST_HUE = 0.06  # deviation of the logarithm of a ratio of colours that noise hides
 _TOLERANCE = 0.12  # of log-depth, beside the deviations of both estimates
 _CONFLICT = 0.25  # least log-depth that a surface in front of another one has against it
@@ -56,7 +56,7 @@ class Comparison:
 
     @property
     def weight(self) -> float:
-        """That of likeness, shade and hue: few directions correlate by chance."""
+        """The weight of likeness, shade and hue: few directions correlate by chance."""
         return float(overlap_weight(np.array(self.overlap)))
 
 
@@ -73,7 +73,7 @@ class Surroundings:
     depth: DepthMap
 
     def mirrored(self) -> Surroundings:
-        """Those of the panorama that is mirrored left to right."""
+        """The surroundings in the panorama that is mirrored left to right."""
         return Surroundings(self.image[:, ::-1], self.depth.mirrored())
 
     @functools.cached_property
@@ -88,8 +88,8 @@ class Surroundings:
         mean = cv2.GaussianBlur(grey, (0, 0), _REGION)
         variance = cv2.GaussianBlur(grey * grey, (0, 0), _REGION) - mean * mean
         detail = (grey - mean) / (np.sqrt(np.maximum(variance, 0)) + _LEAST_CONTRAST)
-        red, green, blue = np.moveaxis(np.log(cv2.GaussianBlur(image, (0, 0), _BLUR) + _DARK), 2, 0)
-        pictures = detail, np.log(grey + _DARK), red - green, blue - green
+        red, green, blue = np.moveaxis(np.log(cv2.GaussianBlur(image, (0, 0), _BLUR) + _LOG_OFFSET), 2, 0)
+        pictures = detail, np.log(grey + _LOG_OFFSET), red - green, blue - green
         log_depth, deviation = (values.reshape(_HEIGHT, -1) for values in self.depth.sample(rays))
         sampled = [sample_nearest(picture, rays).reshape(_HEIGHT, -1) for picture in pictures]
         maps = np.dstack((log_depth, deviation, _find_normals(log_depth), *sampled))

@@ -59,13 +59,17 @@ from pansplat.system.threads import one_thread, worker_threads
 _HEIGHT = 1024  # pixels; larger panoramas are reduced
 _MIN_HEIGHT = 256
 _QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared thoroughly
-_THOROUGH = 6  # pairs of each panorama that are compared with all features
-_FEW = 6  # up to this number of panoramas, all pairs are compared with all features
+_THOROUGH = 6  # pairs of each panorama that are compared with all features, at most
+_FEW = 3  # up to this number of panoramas, all pairs are compared with all features
+_SUFFICIENT = 3  # certain pairs of a panorama; more are not looked for within a group
+_LEAST_BATCH = 4  # pairs that are compared before others are chosen
+_CHANCE = 25.0  # expected matches by `_quick_overlap`, below which pairs of one group are not compared
+_PAIR_TIME = 1.3  # of a comparison, over that of the features of a panorama
 _MOST = 0.6  # of the panoramas whose common mask is kept when others are added
-_DARK = 8.0  # mean grey value of an image that shows nothing
+_BLANK_BRIGHTNESS = 8.0  # mean grey value of an image that shows nothing
 _LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
 _SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
-_ENOUGH = 100.0  # expected number of right matches by SIFT, above which the learned matcher is not asked
+_ENOUGH_SIFT_MATCHES = 100.0  # expected number of right matches by SIFT, above which the learned matcher is not asked
 _LIKELY = 0.3  # prior probability of the matches that count for it
 _LEARNED_PRIOR, _LEARNED_NOISE = 0.7, 1.6e-3  # largest prior, as matches of one pair of faces depend; radians
 _LEARNED_SIZE = 7.0  # pixels
@@ -131,7 +135,7 @@ class PoseEstimate:
 
     @property
     def poses(self) -> dict[Path, Float[Array, "4 4"]]:
-        """Those of the largest group."""
+        """The poses, cam2world, of the panoramas of the largest group."""
         return self.groups[0].poses
 
     @property
@@ -218,7 +222,7 @@ class _View:
 
     @functools.cached_property
     def joined(self) -> Features:
-        """All features."""
+        """The features of `matched`, and those of the faces turned against the walls."""
         return self.matched.joined(self.turned)
 
     @functools.cached_property
@@ -284,13 +288,15 @@ def estimate_poses(
         files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
         fingerprint = "" if cache_folder is None else hash_sources(__name__) + load_default_sweep().fingerprint
         cache = PoseCache(cache_folder, _CACHED, fingerprint)
-        views = _describe_views(paths, files, pixels, hints, kept, cache, report)
+        count = len(kept)
+        split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
+        views = _describe_views(paths, files, pixels, hints, kept, cache, part_of(progress, 0.0, split))
         ways = links or {}
         yaws = {
             (i, j): Ways(ways.get(paths[a], {}).get(paths[b]), ways.get(paths[b], {}).get(paths[a]))
             for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
         }
-        relations = _relate_views(views, yaws, seed, cache, report)
+        relations = _relate_views(views, yaws, seed, cache, part_of(progress, split, 0.9))
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
@@ -395,7 +401,7 @@ def _read_images(
         grey = cv2.cvtColor((image.transpose(1, 2, 0) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
         small = cv2.resize(grey, (128, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
         copy = next((m for m, other in thumbnails.items() if np.abs(small - other).mean() < _SAME_IMAGE), None)
-        if grey.mean() < _DARK:
+        if grey.mean() < _BLANK_BRIGHTNESS:
             reasons[n] = f"too dark (mean grey value {grey.mean():.0f} of 255)"
         elif small.std() < 2:
             reasons[n] = "it shows nothing (one colour)"
@@ -466,8 +472,8 @@ def _describe_views(
     views = []
     with worker_threads() as pool:
         for position, view in enumerate(pool.map(look_up, kept)):
-            report("finding features", 0.4 * position / len(kept))
             views.append(view)
+            report("finding features", (position + 1) / len(kept))
     return views
 
 
@@ -507,11 +513,15 @@ def _find_scene_mask(paths: Sequence[Path], stems: Sequence[str], cache: PoseCac
 def _relate_views(
     views: Sequence[_View], ways: Mapping[Pair, Ways], seed: int, cache: PoseCache, report: Progress
 ) -> dict[Pair, RelativePose]:
-    """Relative poses of the pairs that have most in common, and of those that links connect."""
+    """Relative poses of the pairs that have most in common, and of those that links connect.
+
+    Pairs are compared in the order of what they have in common. Those within a group that certain pairs connect are
+    left out if both panoramas have enough of them, or if both have no more in common than by chance.
+    """
     pairs = list(itertools.combinations(range(len(views)), 2))
     overlap: dict[Pair, float] = {}
     if len(views) > _FEW:
-        report("comparing all pairs", 0.4)
+        report("comparing all pairs", 0.0)
         with worker_threads() as pool:
             quick = pool.map(lambda pair: _quick_overlap(views[pair[0]].features, views[pair[1]].features), pairs)
             overlap.update(zip(pairs, quick, strict=True))
@@ -519,7 +529,7 @@ def _relate_views(
         for view in range(len(views)):
             own = sorted((pair for pair in pairs if view in pair), key=lambda pair: -overlap[pair])
             chosen |= set(own[:_THOROUGH])
-        pairs = sorted(chosen)
+        pairs = sorted(chosen, key=lambda pair: (-overlap[pair], pair))
 
     matcher = None if views[0].learned is None else load_matcher()
 
@@ -543,11 +553,26 @@ def _relate_views(
         key = hash_parts(first.key, second.key, f"{ways[pair]} {seed}")
         return cache.get(f"pair-{hash_parts(first.stem, second.stem)}", key, lambda: relate(pair))
 
-    relations = {}
+    groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
+
+    def is_needed(pair: Pair) -> bool:
+        i, j = pair
+        if groups[i] != groups[j] or ways[pair] != NO_WAYS:
+            return True
+        return min(counts[i], counts[j]) < _SUFFICIENT and overlap.get(pair, math.inf) >= _CHANCE
+
+    relations: dict[Pair, RelativePose] = {}
     with worker_threads() as pool:
-        for position, (pair, relation) in enumerate(zip(pairs, pool.map(look_up, pairs), strict=True)):
-            report("comparing pairs", 0.5 + 0.4 * position / len(pairs))
-            relations[pair] = relation
+        size = max(len(views) // 2, _LEAST_BATCH)  # the same one for any number of threads
+        for start in range(0, len(pairs), size):
+            batch = [pair for pair in pairs[start : start + size] if is_needed(pair)]
+            for number, (pair, relation) in enumerate(zip(batch, pool.map(look_up, batch), strict=True)):
+                relations[pair] = relation
+                report("comparing pairs", (start + number + 1) / len(pairs))
+                if relation.is_certain:
+                    i, j = pair
+                    groups = [groups[i] if group == groups[j] else group for group in groups]
+                    counts[i], counts[j] = counts[i] + 1, counts[j] + 1
     return relations
 
 
@@ -565,7 +590,7 @@ def _match(first: _View, second: _View, matcher: Matcher | None) -> Matches:
     matches = match_features(first.features, second.features)
     if matcher is None or first.learned is None or second.learned is None:
         return matches
-    if matches.prior[matches.prior > _LIKELY].sum() > _ENOUGH:
+    if matches.prior[matches.prior > _LIKELY].sum() > _ENOUGH_SIFT_MATCHES:
         return matches
     found = match_learned(matcher, first.learned, second.learned)
     learned = Matches(found.indices, np.minimum(found.probability, _LEARNED_PRIOR))

@@ -25,8 +25,8 @@ from pansplat.geometry.pose import rotations_from_quats
 
 _FIELD_OF_VIEW = 100.0  # degrees of a face; 10 more than a cube's
 _CONTRAST, _EDGE = 0.015, 12.0  # thresholds of SIFT; low, because matching removes weak features
-_DARK = 16.0  # mean grey value below which an image is brightened
-_SAME_PLACE = 0.008  # distance of matches that count once, radians in both panoramas together
+_DIM_BRIGHTNESS = 16.0  # mean grey value below which an image is brightened
+_REPEATED_MATCH = 0.008  # distance of matches that count once, radians in both panoramas together
 _NOISE_PIXELS, _MIN_NOISE = 0.45, 8e-4  # of a right match's epipolar angle: pixels at the horizon; radians
 # Prior probability that a match is right, by its ratio; measured on pairs of real panoramas 2 to 3 m apart.
 _RATIOS, _PRIORS = (0.5, 0.65, 0.75, 0.8, 0.85, 0.9, 1.0), (0.8, 0.6, 0.3, 0.15, 0.06, 0.02, 0.005)
@@ -131,7 +131,7 @@ def detect_features(
         faces: number of the faces that are used, the first ones.
         count: largest number of features.
     """
-    if image.mean() < _DARK:
+    if image.mean() < _DIM_BRIGHTNESS:
         image = cv2.equalizeHist(image)
     focal = image.shape[1] / (2 * math.pi)  # a face has the panorama's resolution at its centre
     sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, edgeThreshold=_EDGE)
@@ -233,7 +233,7 @@ def are_distinct(places: Float[Array, "match n"]) -> Bool[Array, "match"]:
     kept = np.ones(len(places), bool)
     if not len(places):
         return kept
-    near = cKDTree(places).query_pairs(_SAME_PLACE, output_type="ndarray")  # the better match first
+    near = cKDTree(places).query_pairs(_REPEATED_MATCH, output_type="ndarray")  # the better match first
     for better, worse in near[np.argsort(near[:, 1], kind="stable")].tolist():
         if kept[better]:
             kept[worse] = False

@@ -32,7 +32,7 @@ _AGREEMENT = 1.5  # logarithm: how much rarer hypotheses of two pairs agree if t
 _LEAST_ODDS = -9.0  # of a hypothesis
 _JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; of the way, camera heights, and relative
 _RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # least differences of junctions that exclude each other
-_SAME_PLACE = 0.2  # distance of two places of a panorama that confirm each other, relative to the way to it
+_AGREEING_PLACES = 0.2  # distance of two places of a panorama that confirm each other, relative to the way to it
 _OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
 _FEW_JOINT = 40  # points with two other panoramas, below which estimated distances count in the adjustment
 _ROUNDS = 3  # of adjustment and removal of outliers
@@ -390,7 +390,7 @@ class _GrowingGroup:
             sum(
                 other.score
                 for _, centre, other in places
-                if np.linalg.norm(centre - place[1]) < _SAME_PLACE * (place[2].distance + other.distance) / 2
+                if np.linalg.norm(centre - place[1]) < _AGREEING_PLACES * (place[2].distance + other.distance) / 2
             )
             for place in places
         ]

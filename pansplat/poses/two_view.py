@@ -541,14 +541,14 @@ class RelativePose:
     rotation: Rotation
     translation: Vector
     indices: Int[Array, "match 2"]
-    score: float
-    margin: float
-    places: float
-    parallax: float
-    uncertainty: tuple[float, float]
-    distance: float
-    log_odds: float
-    problem: str | None
+    score: float = 0.0
+    margin: float = 0.0
+    places: float = 0.0
+    parallax: float = 0.0
+    uncertainty: tuple[float, float] = (math.inf, math.inf)
+    distance: float = math.nan
+    log_odds: float = -math.inf
+    problem: str | None = None
     hypotheses: Hypotheses = Hypotheses()
 
     @property
@@ -611,19 +611,7 @@ def estimate_relative_pose(
     found, proposed = _search_hypotheses(evidence, np.random.default_rng(seed))
     if not found:
         no_match = f"only {count} features match"
-        return RelativePose(
-            np.eye(3),
-            np.array((0.0, 0, 1)),
-            indices[:0],
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            (math.inf,) * 2,
-            math.nan,
-            -math.inf,
-            no_match,
-        )
+        return RelativePose(np.eye(3), np.array((0.0, 0, 1)), indices[:0], problem=no_match)
     compared = [*found[:_COMPARED], *proposed]
     odds = np.array([_log_odds(h, evidence) for h in compared])
     best, log_odds = _choose_compared(compared, odds)
@@ -657,35 +645,32 @@ def estimate_relative_pose(
         rotation,
         translation,
         indices[right],
-        best.score,
-        support.margin,
-        support.places,
-        spread,
-        uncertainty,
-        best.distance,
-        math.inf if support.suffices else log_odds,
-        problem,
-        hypotheses,
+        score=best.score,
+        margin=support.margin,
+        places=support.places,
+        parallax=spread,
+        uncertainty=uncertainty,
+        distance=best.distance,
+        log_odds=math.inf if support.suffices else log_odds,
+        problem=problem,
+        hypotheses=hypotheses,
     )
 
 
 def _as_proposed(best: Hypothesis, log_odds: float, hypotheses: Hypotheses, evidence: _Evidence) -> RelativePose:
     """The relative pose of a comparison, which has no matches."""
     support = _Support(_count_all_places(best, evidence), best.score, 0.0)
-    uncertainty = _PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)
     return RelativePose(
         best.rotation,
         best.translation,
         np.empty((0, 2), np.int64),
-        best.score,
-        0.0,
-        support.places,
-        0.0,
-        uncertainty,
-        best.distance,
-        log_odds,
-        _find_problem(support, log_odds),
-        hypotheses,
+        score=best.score,
+        places=support.places,
+        uncertainty=(_PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)),
+        distance=best.distance,
+        log_odds=log_odds,
+        problem=_find_problem(support, log_odds),
+        hypotheses=hypotheses,
     )
 
 

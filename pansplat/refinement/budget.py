@@ -26,7 +26,7 @@ from pansplat.rendering.weights import compute_blending_weights
 
 DROP_ERROR = 5e-3  # largest mean absolute change of an image by all Gaussians that are dropped
 MAX_OTHERS = 3  # cameras of other views that a view is rasterised at
-_MAX_OPACITY = 0.99
+_MAX_OPACITY = 0.99  # of a merged Gaussian; larger ones make it wider
 _DIRECTION_BITS = 15  # of half a component of a direction, in the cells of a Z-order curve
 _SEARCHED = 8  # Gaussians before and after a Gaussian along the curve
 _BASE_COST = 0.008  # cost of a merger between equal Gaussians, as a difference of colours

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for, pooled_empty, thread_count
 
-_ROWS_PER_ITEM = 16
+_ROWS_PER_ITEM = 16  # of an image, for one thread
 
 
 class Difference(torch.autograd.Function):

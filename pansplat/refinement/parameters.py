@@ -12,7 +12,7 @@ from torch import Tensor
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import invert_pose, multiply_quats, quats_from_rotations, rotations_from_quats
 
-_MIN_OPACITY, _MAX_OPACITY = 1e-3, 0.999
+_MIN_OPACITY, _MAX_OPACITY = 1e-3, 0.999  # whose logit is refined
 _MAX_LOG_DISTANCE = 1.0  # largest change of a logarithm of distance
 _MAX_LOG_SCALE = 3.0  # largest change of a logarithm of scale
 _MIN_SCALE = 1e-9  # relative to the distance

@@ -52,6 +52,6 @@ def rasterize_official(
         size=size,
         layout="cubemap",
         face_size=official_face_size(size[0]),
-        options=replace(OFFICIAL, near=EWA_NEAR_FACTOR * near),
         backend=backend,
+        **vars(replace(OFFICIAL, near=EWA_NEAR_FACTOR * near)),
     )

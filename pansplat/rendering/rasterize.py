@@ -6,8 +6,8 @@ Source: docs/rendering.md; PanSplat, section 3.4; docs/adr/0005 for why there ar
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -27,7 +27,7 @@ Backend = Literal["auto", "torch", "numba", "triton"]
 
 MIN_TRITON = 3, 2  # the kernels join tuples, which earlier versions do not compile
 MAX_EYE_OFFSET = 1e6  # metres
-_MAX_POSE_ERROR = 1e-4
+_MAX_POSE_ERROR = 1e-4  # of a rotation, see `orthonormal_error`
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -203,13 +203,12 @@ def rasterize(
     background: Sequence[float] | Float[Tensor, "channel"] = (0.0, 0.0, 0.0),
     covariances: Float[Tensor, "n 3 3"] | None = None,
     backend: Backend = "auto",
-    options: RasterOptions | None = None,
-    kernel: Kernel | None = None,
-    order: Order | None = None,
-    lowpass: Lowpass | None = None,
-    near: float | None = None,
-    strict: bool | None = None,
-    stitching: Stitching | None = None,
+    kernel: Kernel = "ray",
+    order: Order = "radial",
+    lowpass: Lowpass = "angular",
+    near: float = NEAR,
+    strict: bool = False,
+    stitching: Stitching = "seamless",
 ) -> Rendering:
     """Rasterise Gaussians as one camera sees them.
 
@@ -229,16 +228,12 @@ def rasterize(
         covariances: world covariances in place of those of `scales` and `quats`, square metres.
         backend: "torch" is the reference, "numba" is fast on a CPU (kernel "ray" only), "triton" on CUDA; "auto"
             chooses the fastest available for the kernel and the Gaussians' type and device.
-        options: by default `RasterOptions()`.
-        kernel, order, lowpass, near, strict, stitching: each replaces that field of `options`.
+        kernel, order, lowpass, near, strict, stitching: see `RasterOptions`.
 
     Returns:
         The image, in the Gaussians' type.
     """
-    given: dict[str, Any] = dict(
-        kernel=kernel, order=order, lowpass=lowpass, near=near, strict=strict, stitching=stitching
-    )
-    options = replace(options or RasterOptions(), **{name: value for name, value in given.items() if value is not None})
+    options = RasterOptions(kernel, order, lowpass, near, strict, stitching)
     _check_arguments(size, layout, vertical_fov_degrees, face_size, eye_offset, backend, options)
     device = gaussians.means.device
     pose = torch.as_tensor(cam2world, device=device).double()

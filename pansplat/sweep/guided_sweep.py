@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pansplat.errors import InputError
@@ -35,52 +35,35 @@ from pansplat.sweep.search import SearchConfig
 from pansplat.sweep.surface import resize_sphere
 from pansplat.system.source_hash import hash_sources
 
-MODEL = "depth"  # name of the network in a weights file
-SHARPENING = "depth_sharpening"  # name of the sharpening network
+# Names in files of weights, and types of settings.
+_KINDS: dict[type, tuple[str, type]] = {
+    DepthRefinement: ("depth", RefinementConfig),
+    DepthSharpening: ("depth_sharpening", SharpeningConfig),
+}
 _SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
 
 
-class GuidedSweep(Sweep):
-    """A sweep guided by a depth network.
-
-    Args:
-        network: in eval mode.
-        sharpening: of a single view's depth; in eval mode.
-        weights_hash: changes with the weights.
-        name: in messages and scene files.
-    """
-
-    def __init__(
-        self, network: DepthRefinement, sharpening: DepthSharpening, weights_hash: str, name: str = "default"
-    ) -> None:
-        config = SweepConfig(search=SearchConfig(finest_height=_SEARCH_HEIGHT))
-        super().__init__(config, NetworkPrior(network, sharpening, weights_hash + hash_sources(__name__)))
-        self.name, self.network = name, network
-
-
-def load_guided_sweep(path: Path, name: str = "default") -> GuidedSweep:
-    """The guided sweep of a weights file that `save_depth_network` wrote, with the package's sharpening network."""
-    network = _load_network(path, MODEL, RefinementConfig, DepthRefinement)
-    sharpening = load_sharpening(_shipped("sharpening.safetensors"))
-    return GuidedSweep(network, sharpening, _hash_files(path, _shipped("sharpening.safetensors")), name)
+def load_guided_sweep(path: Path, name: str = "default") -> Sweep:
+    """The sweep guided by the network of a weights file, with the package's sharpening network."""
+    files_of_weights = path, _shipped("sharpening.safetensors")
+    networks = load_network(files_of_weights[0], DepthRefinement), load_network(files_of_weights[1], DepthSharpening)
+    digest = hashlib.blake2b(b"".join(file.read_bytes() for file in files_of_weights), digest_size=8)
+    prior = NetworkPrior(*networks, digest.hexdigest() + hash_sources(__name__))
+    return Sweep(SweepConfig(search=SearchConfig(finest_height=_SEARCH_HEIGHT)), prior, name)
 
 
 @lru_cache(maxsize=1)
-def load_default_sweep() -> GuidedSweep:
+def load_default_sweep() -> Sweep:
     """The guided sweep of the weights that the package ships; it is loaded once."""
     return load_guided_sweep(default_weights())
 
 
-def load_sharpening(path: Path) -> DepthSharpening:
-    """The sharpening network of a weights file that `save_sharpening` wrote, in eval mode."""
-    return _load_network(path, SHARPENING, SharpeningConfig, DepthSharpening)
+Network = TypeVar("Network", DepthRefinement, DepthSharpening)
 
 
-Network = TypeVar("Network", bound=nn.Module)
-
-
-def _load_network(path: Path, model: str, config_type: type, network_type: Callable[..., Network]) -> Network:
-    """A network in eval mode; all names and shapes of the weights must fit."""
+def load_network(path: Path, network_type: type[Network]) -> Network:
+    """The network of a file of `save_network`, in eval mode; all names and shapes of the weights must fit."""
+    model, config_type = _KINDS[network_type]
     weights = load_weights(path)
     if weights.model != model:
         raise InputError(f"{path}: needed weights of a {model} network, got weights of {weights.model!r}")
@@ -92,23 +75,14 @@ def _load_network(path: Path, model: str, config_type: type, network_type: Calla
     return network.eval()
 
 
-def save_depth_network(path: Path, network: DepthRefinement, state: dict[str, Tensor]) -> None:
+def save_network(path: Path, network: DepthRefinement | DepthSharpening, state: dict[str, Tensor]) -> None:
     """Write a network's weights: kernels in float16, the rest in float32.
 
     Args:
         state: the weights, such as their moving average.
     """
-    _save(path, MODEL, network.config, state)
-
-
-def save_sharpening(path: Path, network: DepthSharpening, state: dict[str, Tensor]) -> None:
-    """The same for the sharpening network."""
-    _save(path, SHARPENING, network.config, state)
-
-
-def _save(path: Path, model: str, config: object, state: dict[str, Tensor]) -> None:
     half = {name: t.half() if t.is_floating_point() and t.ndim > 1 else t for name, t in state.items()}
-    save_weights(path, pack_weights(model, config, half, compat="fixed"))
+    save_weights(path, pack_weights(_KINDS[type(network)][0], network.config, half, compat="fixed"))
 
 
 def default_weights() -> Path:
@@ -118,13 +92,6 @@ def default_weights() -> Path:
 
 def _shipped(name: str) -> Path:
     return Path(str(files("pansplat.default_model").joinpath(name)))
-
-
-def _hash_files(*paths: Path) -> str:
-    digest = hashlib.blake2b(digest_size=8)
-    for path in paths:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 class NetworkPrior:

@@ -49,7 +49,7 @@ from pansplat.sweep.surface import (
 _Lattice = tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]
 """Rays (n, 3) of a lattice, the same for all views, and the pixels (rows, columns) of a panorama that hold them."""
 
-NUM_LEVELS = 4
+NUM_LEVELS = 4  # PanSplat, section 3.3
 _MAX_LENGTH = 0.2  # largest standard deviation of a disc, relative to its distance
 _MIN_DISTANCE = 0.5  # smallest distance of a Gaussian from an input camera, relative to `near`
 

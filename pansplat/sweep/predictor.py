@@ -1,4 +1,4 @@
-"""The `sweep` predictor: from posed panoramas to Gaussians, without weights."""
+"""The default predictor and `sweep`, from posed panoramas to Gaussians: observe, search, lift, fit colours."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pansplat.predictor import Progress, part_of, require_matching_inputs, selec
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
-from pansplat.sweep.search import SearchConfig, search_surfaces
+from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import PosedImages
 from pansplat.system.source_hash import hash_sources
 
@@ -39,21 +39,20 @@ class SweepConfig:
 class Sweep:
     """Hierarchical sphere sweep with a hand-crafted matching cost; see docs/sweep.md.
 
-    It takes one or more views and matches each against all others. A prior model adds knowledge of rooms where the
-    panoramas have no evidence.
+    It takes one or more views and matches each against a few others. A prior model adds knowledge of rooms where the
+    panoramas have no evidence: `default` has one (`guided_sweep`), `sweep` has none.
     """
 
-    name = "sweep"
     max_views = MAX_CONTEXT
     """Of one prediction; each view is matched against a few others, so that time grows linearly with their number."""
     default_height = 1024
     """Largest height that is chosen for a pair without a given height."""
 
-    def __init__(self, config: SweepConfig | None = None, prior: PriorModel | None = None) -> None:
-        self.config, self.prior = config or SweepConfig(), prior
-        self.fingerprint = _compute_fingerprint(self.config)
-        if prior is not None:
-            self.fingerprint += f"-{prior.fingerprint}"
+    def __init__(self, config: SweepConfig | None = None, prior: PriorModel | None = None, name: str = "sweep") -> None:
+        self.config, self.prior, self.name = config or SweepConfig(), prior, name
+        digest = hashlib.blake2b(f"{self.config} {hash_sources(__name__)}".encode(), digest_size=8)
+        self.fingerprint = f"sweep-{digest.hexdigest()}" + ("" if prior is None else f"-{prior.fingerprint}")
+        """Hash of the settings and of the source code that computes the Gaussians; keys the prediction cache."""
 
     def __repr__(self) -> str:
         prior = "no weights" if self.prior is None else "guided by a depth network"
@@ -78,13 +77,10 @@ class Sweep:
                 exact black (0, 0, 0), the holes of scans, are masked too.
         """
         if images.ndim == 5:
+            bounds = [[select_item(bound, n) for n in range(len(images))] for bound in (near, far)]
             item_masks = [None] * len(images) if masks is None else masks
-            return [
-                self._predict(
-                    images[n], cam2world[n], select_item(near, n), select_item(far, n), item_masks[n], progress
-                )
-                for n in range(len(images))
-            ]
+            items = zip(images, cam2world, *bounds, item_masks, strict=True)
+            return [self._predict(*item, progress) for item in items]
         return self._predict(images, cam2world, near, far, masks, progress)
 
     def _predict(
@@ -99,24 +95,30 @@ class Sweep:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
         _check_inputs(images, cam2world, low, high, masks)
         images, masks = fit_panoramas(images, masks, _MULTIPLE)
+        # Holes of scans are fitted too: Gaussians next to a hole then do not reach into it. A single view fills them.
+        visible = torch.ones_like(images[:, 0], dtype=torch.bool) if masks is None else masks
+        shown = visible.cpu() & mask_holes(images)
+        visible = shown if len(images) == 1 else visible.cpu()
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
             cam2world=cam2world.detach().cpu().double().numpy(),
-            masks=(mask_holes(images) & (True if masks is None else masks.cpu())).numpy(),
+            masks=shown.numpy(),
             near=low,
             far=high,
         )
-        report = part_of(progress)
-        surfaces, neighbours = search_surfaces(posed, self.config.search, part_of(progress, 0, 0.7), self.prior)
+        report, config = part_of(progress), self.config
+        searching = part_of(progress, 0, 0.7)
+        # Axes of the scene, planes, and of each view its neighbours and the depth that the prior model expects.
+        scene = observe(posed, config.search, self.prior, searching)
+        # Inverse depth (h, 2h) of each view, at most `SearchConfig.finest_height` high.
+        surfaces = search(scene, searching)
         report("placing Gaussians", 0.7)
-        gaussians = lift(posed, surfaces, self.config.lift, neighbours)
+        # A Gaussian for each point of the lattices (n); the photograph's height gives their spacing.
+        gaussians = lift(posed, surfaces, config.lift, scene.neighbours)
         report("fitting colours", 0.8)
-        # Holes of scans are fitted too: Gaussians next to a hole then do not reach into it. A single view fills them.
-        visible = torch.ones_like(images[:, 0], dtype=torch.bool) if masks is None else masks
-        visible = torch.from_numpy(posed.masks) if len(images) == 1 else visible
-        gaussians = fit_colors(
-            gaussians, images.detach().cpu(), torch.from_numpy(posed.cam2world), visible.cpu(), self.config.colors
-        )
+        # Colours (n, 1, 3) with which the Gaussians of each view draw its photograph.
+        poses = torch.from_numpy(posed.cam2world)
+        gaussians = fit_colors(gaussians, images.detach().cpu(), poses, visible, config.colors)
         report("done", 1.0)
         return gaussians.to(device=images.device)
 
@@ -130,9 +132,3 @@ def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, ma
         )
     require_matching_inputs(images, cam2world, masks)
     require_working_world(cam2world, near, far)
-
-
-def _compute_fingerprint(config: SweepConfig) -> str:
-    """Hash of the settings and of the source code that computes the Gaussians; keys the prediction cache."""
-    digest = hashlib.blake2b(f"{config} {hash_sources(__name__)}".encode(), digest_size=8)
-    return f"sweep-{digest.hexdigest()}"

@@ -27,7 +27,7 @@ from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, Vi
 from pansplat.sweep.planes import texture_weights
 from pansplat.sweep.surface import Surface, list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
 
-_HEIGHT_CANDIDATES = 40
+_HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
@@ -57,7 +57,7 @@ class PriorConfig:
 
 @dataclass(frozen=True, eq=False)
 class DepthPrior:
-    """One view's prior.
+    """The prior of the depth of a view.
 
     Attributes:
         log_depth: (h, w) logarithm of radial depth.

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from pansplat.predictor import Progress, part_of
 from pansplat.rendering.cpu.runtime import thread_count
 from pansplat.sweep.bend import BendConfig, bend_surfaces
 from pansplat.sweep.matching import (
@@ -56,6 +57,7 @@ from pansplat.sweep.surface import (
 )
 
 _DETECTION_HEIGHT = 96  # pixels; planes are detected at this size
+_MIN_BASELINE = 1e-3  # largest distance of cameras at one place, relative to near
 
 
 @dataclass(frozen=True)
@@ -87,32 +89,51 @@ class SearchConfig:
     """Other views, at most, that a view is matched against."""
 
 
-def search_surfaces(
+@dataclass(frozen=True, eq=False)
+class ObservedScene:
+    """What the search is given.
+
+    Attributes:
+        depths: of all hypotheses.
+        neighbours: the other views that each view is matched against, best first.
+        planes: of each view; empty if nothing can be matched, because there is one view or all are at one place.
+        priors: of each view.
+        estimator: of further priors; None without a prior model.
+    """
+
+    posed: PosedImages
+    config: SearchConfig
+    depths: DepthRange
+    neighbours: list[list[int]]
+    planes: Sequence[ScenePlanes] = ()
+    priors: Sequence[Sequence[DepthPrior]] = ()
+    estimator: PriorEstimator | None = None
+
+
+def observe(
     posed: PosedImages,
     config: SearchConfig,
-    report: Callable[[str, float], None],
     prior_model: PriorModel | None = None,
-) -> tuple[list[Surface], list[list[int]]]:
-    """The surface of each view, at the finest level, and the other views that it was matched against, best first."""
+    progress: Progress | None = None,
+) -> ObservedScene:
+    """The depth range, neighbours, planes and priors of panoramas (v, h, 2h, 3)."""
+    report = part_of(progress)
     report("finding the scene's axes", 0.0)
-    finest = min(posed.images.shape[1], config.finest_height)
-    small = [resize_sphere(image, max(finest // 2, 32)) for image in posed.images]
+    height = min(posed.images.shape[1], config.finest_height)
+    small = [resize_sphere(image, max(height // 2, 32)) for image in posed.images]
     axes = estimate_axes(small, posed.cam2world[:, :3, :3])
-    heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
-    surfaces: list[Surface] | None = None
     low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
     depths = DepthRange(low / config.far_margin, low, high)
     empty = make_empty_planes(posed.cam2world, axes, posed.near, 1 / depths.farthest)
-    height, everywhere = min(finest, _DETECTION_HEIGHT), [empty] * len(posed.images)
-    detection = _SearchLevel(posed, height, everywhere, depths.limits, config, [], None)
+    rows = min(height, _DETECTION_HEIGHT)
+    views = _make_views(posed, [axis_components(axes, pose[:3, :3], rows) for pose in posed.cam2world], rows)
     estimator = None
     if prior_model is not None:
         report("estimating depth", 0.02)
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
     neighbours = choose_nearest(posed.cam2world, config.max_neighbours, 1 / high)
-    # One view, or views at one place: nothing can be matched.
-    if posed.measure_baseline(range(len(posed.images))) < 1e-3 * posed.near:
-        return _place_unmatched(posed, finest, depths, estimator), neighbours
+    if posed.measure_baseline(range(len(posed.images))) < _MIN_BASELINE * posed.near:
+        return ObservedScene(posed, config, depths, neighbours, estimator=estimator)
     if estimator is not None:
         neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
 
@@ -120,20 +141,19 @@ def search_surfaces(
         by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
         pairs = list_best_pairs(neighbours)
         for pair in set(pairs):
-            poses = posed.cam2world[list(pair)]
-            start = empty
+            poses, start = posed.cam2world[list(pair)], empty
             if len(posed.images) > len(pair):
-                own = estimate_axes([small[n] for n in pair], poses[:, :3, :3])
-                start = dataclasses.replace(empty, axes=own[match_axes(own, axes)])
-            rays = [axis_components(start.axes, pose[:3, :3], detection.height) for pose in poses]
-            views = [detection.views[n] for n in pair]
-            by_pair[pair] = detect_planes(views, rays, poses, start, depths, MIN_FLOOR * posed.near, config.matching)
+                turned = estimate_axes([small[n] for n in pair], poses[:, :3, :3])
+                start = dataclasses.replace(empty, axes=turned[match_axes(turned, axes)])
+            rays = [axis_components(start.axes, pose[:3, :3], rows) for pose in poses]
+            own, floor = [views[n] for n in pair], MIN_FLOOR * posed.near
+            by_pair[pair] = detect_planes(own, rays, poses, start, depths, floor, config.matching)
         return [by_pair[pair] for pair in pairs]
 
     def estimate_priors() -> Sequence[Sequence[DepthPrior]]:
         if estimator is None:
             return [()] * len(posed.images)
-        return estimator.estimate_by_matching(detection.views, neighbours, (low, high), config.matching)
+        return estimator.estimate_by_matching(views, neighbours, (low, high), config.matching)
 
     report("finding planes", 0.05)
     if thread_count() > 1:  # half of each is work of one thread
@@ -142,44 +162,51 @@ def search_surfaces(
             planes, priors = find_planes(), estimated.result()
     else:
         planes, priors = find_planes(), estimate_priors()
-    pixel = math.pi / heights[0] / (high - low)  # candidates are a pixel of parallax apart
+    return ObservedScene(posed, config, depths, neighbours, planes, priors, estimator)
+
+
+def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surface]:
+    """The surface (h, 2h) of each view at the height of the finest level."""
+    config, report = scene.config, part_of(progress)
+    posed, depths, neighbours, estimator = scene.posed, scene.depths, scene.neighbours, scene.estimator
+    finest = min(posed.images.shape[1], config.finest_height)
+    if not scene.planes:
+        return _place_unmatched(scene, finest)
+    heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
+    pixel = math.pi / heights[0] / (depths.high - depths.low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
     counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]
+    surfaces: list[Surface] = []
+    priors = scene.priors
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
-        if estimator is not None and surfaces is not None:
+        if estimator is not None and surfaces:
             priors = estimator.estimate_from_surfaces(surfaces)
         rows = heights[0] if n == config.coarse_passes - 1 else min(heights[0], config.first_height)
-        if surfaces is not None:
-            surfaces = _upsample(surfaces, posed.images, rows)
-        level = _SearchLevel(posed, rows, planes, depths.limits, config, neighbours, surfaces)
+        level = _SearchLevel(scene, rows, _upsample(surfaces, posed.images, rows))
         surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
     sharp, finest_posed = None, posed
     if estimator is not None:
-        sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen((low, high))]
+        sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen((depths.low, depths.high))]
         finest_posed = posed.resize(finest)
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
-        assert surfaces is not None
         surfaces = _upsample(surfaces, posed.images, height)
         if sharp is not None and height == finest:
             surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
-        level = _SearchLevel(posed, height, planes, depths.limits, config, neighbours, surfaces)
+        level = _SearchLevel(scene, height, surfaces)
         surfaces = [
             level.refine(view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
             for view, count in enumerate(counts)
         ]
-    assert surfaces is not None
-    if sharp is not None:
-        surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
-    return surfaces, neighbours
+    return surfaces if sharp is None else bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
 
 
 def _upsample(surfaces: list[Surface], images: np.ndarray, height: int) -> list[Surface]:
-    """The surfaces at a height, guided by their photographs."""
+    """The surfaces at a height, guided by their photographs; none before the first pass."""
     return [
         s if s.height == height else guided_upsample(s, resize_sphere(image, s.height), resize_sphere(image, height))
-        for s, image in zip(surfaces, images, strict=True)
+        for s, image in zip(surfaces, images, strict=False)
     ]
 
 
@@ -191,60 +218,51 @@ def choose_nearest(cam2world: np.ndarray, count: int, least: float) -> list[list
     return distances.argsort(axis=1, kind="stable")[:, 1 : count + 1].tolist()
 
 
-def _place_unmatched(
-    posed: PosedImages, height: int, depths: DepthRange, estimator: PriorEstimator | None
-) -> list[Surface]:
+def _place_unmatched(scene: ObservedScene, height: int) -> list[Surface]:
     """Surfaces of the prior alone; without a prior, spheres in the middle of the range."""
-    shape = (height, 2 * height)
-    if estimator is None:
+    posed, shape = scene.posed, (height, 2 * height)
+    if scene.estimator is None:
         inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far))
     else:
-        sharp = estimator.sharpen((depths.low, depths.high))
-        inverse = np.stack([np.exp(-resize_nearest(values, height)) for values in sharp]).clip(*depths.limits)
+        sharp = scene.estimator.sharpen((scene.depths.low, scene.depths.high))
+        inverse = np.stack([np.exp(-resize_nearest(values, height)) for values in sharp]).clip(*scene.depths.limits)
     return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
 
 
-class _SearchLevel:
-    """All views at the height of one level of the search, with the surfaces found so far."""
+def _make_views(
+    posed: PosedImages, rays: Sequence[Sequence[np.ndarray]], height: int, surfaces: Sequence[Surface] = ()
+) -> list[View]:
+    """What is matched of each view at a height; of `rays` (h, 2h), the first component is down."""
+    images, masks = [resize_sphere(i, height) for i in posed.images], [resize_mask(m, height) for m in posed.masks]
+    downs = [np.ascontiguousarray(components[0], np.float32) for components in rays]
+    known = [surface.inverse_depth for surface in surfaces] or [None] * len(images)
+    return list(map(View, images, masks, downs, known))
 
-    def __init__(
-        self,
-        posed: PosedImages,
-        height: int,
-        planes: Sequence[ScenePlanes],
-        limits: tuple[float, float],
-        config: SearchConfig,
-        neighbours: Sequence[Sequence[int]],
-        surfaces: list[Surface] | None,
-    ) -> None:
-        self.posed, self.height, self.limits, self.config, self.surfaces = posed, height, limits, config, surfaces
-        self.neighbours = neighbours
+
+class _SearchLevel:
+    """All views at the height of one level of the search, with the surfaces found so far, if any."""
+
+    def __init__(self, scene: ObservedScene, height: int, surfaces: list[Surface]) -> None:
+        posed, neighbours = scene.posed, scene.neighbours
+        self.posed, self.height, self.limits, self.config = posed, height, scene.depths.limits, scene.config
+        self.surfaces, self.neighbours, self.planes = surfaces, neighbours, scene.planes
         self.rays = [
-            axis_components(own.axes, pose[:3, :3], height) for own, pose in zip(planes, posed.cam2world, strict=True)
+            axis_components(own.axes, pose[:3, :3], height)
+            for own, pose in zip(scene.planes, posed.cam2world, strict=True)
         ]
-        self.planes = planes
-        masks = [resize_mask(mask, height) for mask in posed.masks]
-        self.consistent: list[np.ndarray] = []
-        if surfaces is not None:
-            self.consistent = [
-                consistency_mask(surfaces, posed.cam2world, n, neighbours[n]) & mask for n, mask in enumerate(masks)
+        self.views = _make_views(posed, self.rays, height, surfaces)
+        if surfaces:
+            consistent = [
+                consistency_mask(surfaces, posed.cam2world, n, neighbours[n]) & view.valid
+                for n, view in enumerate(self.views)
             ]
             groups = [[view, *others] for view, others in enumerate(neighbours)]
             self.planes = [
                 collect_planes(
-                    *([maps[n] for n in group] for maps in (surfaces, self.consistent)), posed.cam2world[group], own
+                    *([maps[n] for n in group] for maps in (surfaces, consistent)), posed.cam2world[group], own
                 )
-                for group, own in zip(groups, planes, strict=True)
+                for group, own in zip(groups, scene.planes, strict=True)
             ]
-        self.views = [
-            View(
-                resize_sphere(image, height),
-                mask,
-                np.ascontiguousarray(rays[0], np.float32),
-                None if surfaces is None else surfaces[n].inverse_depth,
-            )
-            for n, (image, mask, rays) in enumerate(zip(posed.images, masks, self.rays, strict=True))
-        ]
 
     def search_full_range(self, view: int, inverse: np.ndarray, priors: Sequence[DepthPrior]) -> Surface:
         """The best hypotheses: spheres of inverse depths (set 0) and planes across the axes (sets 1 to 3)."""
@@ -253,7 +271,7 @@ class _SearchLevel:
         slopes = [np.ones(shape, np.float32)] + [np.abs(r).astype(np.float32) for r in self.rays[view]]
         sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
         penalties = [np.zeros((2, count), np.float32) for _ in slopes]
-        if self.surfaces is not None:  # the first pass has no priors, so that other shapes are found too
+        if self.surfaces:  # the first pass has no priors, so that other shapes are found too
             penalties[0] += self.config.sphere_prior
             for axis in range(3):
                 penalties[axis + 1] = self.config.plane_prior * (
@@ -279,7 +297,6 @@ class _SearchLevel:
 
     def refine(self, view: int, count: int, step: float, *, widen: bool) -> Surface:
         """The best hypotheses near the surface; with `widen` also near the depths of neighbouring pixels."""
-        assert self.surfaces is not None
         known = self.surfaces[view].inverse_depth
         centres = [known]
         if widen:

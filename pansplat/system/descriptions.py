@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-_MAX_NAMES = 4
+_MAX_NAMES = 4  # of a list that is shown
 
 
 def describe_count(count: int, noun: str) -> str:

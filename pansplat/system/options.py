@@ -52,7 +52,8 @@ def check_numbers(options: Any, *, prefixed: bool = False, prefix: str = "--") -
     """
     hints = typing.get_type_hints(type(options), include_extras=True)
     for name, hint in hints.items():
-        value, option = getattr(options, name), prefix + name.replace("_", "-")
+        named = (getattr(mark, "name", None) for mark in getattr(hint, "__metadata__", ()))
+        value, option = getattr(options, name), prefix + next(filter(None, named), name).replace("_", "-")
         if dataclasses.is_dataclass(value):
             check_numbers(value, prefixed=prefixed, prefix=f"{option}." if prefixed else prefix)
         elif "Meta(" in str(hint):

@@ -18,7 +18,7 @@ import msgspec
 from pansplat.errors import InputError
 from pansplat.system.files import read_file
 
-MAX_BYTES = 1 << 28
+MAX_BYTES = 1 << 28  # of a file
 MAX_DEPTH = 32  # levels of lists and objects
 MAX_DIGITS = 18  # of a whole number, which then fits 64 bits
 

@@ -142,7 +142,7 @@ def find_rooms(scene: Scene) -> Rooms:
         np.array([height or unit for height in heights]),
         np.array([ceiling or _USUAL_CEILING * unit for ceiling in ceilings]),
         shapely.union_all(shapes),
-        tour.worlds if tour.overlaps else (0,) * count,
+        tour.worlds,
         tuple(assign_storeys(tour)),
         plan,
     )

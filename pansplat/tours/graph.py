@@ -93,7 +93,7 @@ class TourGraph:
 
     @cached_property
     def positions(self) -> Float[np.ndarray, "node 3"]:
-        """Camera centres, metres."""
+        """The camera centres of all panoramas, metres."""
         return self.cam2world[:, :3, 3].numpy()
 
     @cached_property
@@ -108,8 +108,8 @@ class TourGraph:
 
     @cached_property
     def worlds(self) -> tuple[int, ...]:
-        """The world of each node: parts with walls between them have known relative places."""
-        return self._number_components([*self.overlaps, *self.walls])
+        """The world of each node: parts with walls between them have known relative places. A pair has no edges."""
+        return self._number_components([*self.overlaps, *self.walls]) if self.overlaps else (0,) * len(self)
 
     def _number_components(self, edges: Sequence[Edge]) -> tuple[int, ...]:
         ends = np.array(edges, int).reshape(-1, 2).T
@@ -120,7 +120,7 @@ class TourGraph:
 
     def is_placed(self, node: int) -> bool:
         """Whether the place of a node relative to another one is known."""
-        return self.worlds.count(self.worlds[node]) > 1
+        return len(self.overlaps) > 0 and self.worlds.count(self.worlds[node]) > 1
 
     def with_walls(self, walls: Iterable[Edge]) -> TourGraph:
         """The graph with further walls in place of edges; a node without another edge gets a self-edge."""

@@ -29,7 +29,7 @@ from pansplat.tours.surfaces import locate_surfaces
 
 _RAYS = 360
 _SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it
-_BAND = 0.6, 0.85  # of a wall above doors and below beams, fractions of the ceiling's height over the camera
+_WALL_BAND = 0.6, 0.85  # of a wall above doors and below beams, fractions of the ceiling's height over the camera
 _LEAST_CEILING = 0.25  # height over the camera, below which doors may reach into the band
 _SURFACE = 0.12  # largest difference from the distance of a surface, as a fraction
 _BESIDE = 1  # rays whose places count, too
@@ -40,7 +40,7 @@ _PARALLEL = math.radians(15)  # of a chord and its wall
 _SKEW = math.radians(3)  # largest angle between a side of an outline and its wall
 _OBLIQUE, _OBLIQUE_SHARE = math.radians(12), 0.15  # least angle to the main directions, and share of all chords
 _CLUSTER, _LEAST_WALL, _MOST_LINES = 0.07, 0.2, 24  # half width of a line's chords, its length, lines of a direction
-_NOISE, _LARGEST_ERROR = 0.07, 0.35  # of the distance of a wall
+_DISTANCE_NOISE, _LARGEST_ERROR = 0.07, 0.35  # of the distance of a wall
 _CORNER, _JUMP, _LARGEST_JUMP = 5.0, 0.15, 5.0  # costs of another wall, in errors of one ray; of a jump in depth
 _NARROW, _COLLINEAR = 0.12, 0.02  # half width of spikes that are left out; merged pieces of walls
 _LEAST_AREA = 0.4  # of a room, squared camera heights
@@ -73,7 +73,7 @@ class Room:
 
     @property
     def area(self) -> float:
-        """Square metres."""
+        """The area of the room, square metres."""
         return float(Polygon(self.outline).area)
 
 
@@ -92,7 +92,7 @@ class Door:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A floor plan.
+    """The floor plan of a tour: rooms with straight walls, and doors.
 
     Attributes:
         tour: the panoramas, their edges and links.
@@ -167,7 +167,7 @@ def make_plan(scene: Scene, tour: TourGraph) -> Plan:
         return Plan(tour, (), (), math.nan, None, None, 0, 0)
     unit = float(np.median(known))
     sights = [_look(scene, view, level, heights[view] or unit) for view in range(count)]
-    storeys, parts = assign_storeys(tour), tour.worlds if tour.overlaps else (0,) * count  # a pair has no edges
+    storeys, parts = assign_storeys(tour), tour.worlds
     rooms: list[Room] = []
     for part, storey in sorted({*zip(parts, storeys, strict=True)}):
         members = [k for k in range(count) if sights[k] is not None and (parts[k], storeys[k]) == (part, storey)]
@@ -203,7 +203,7 @@ def _look(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], height: floa
         angles = _ray_angles()
         walls = np.linalg.norm(walls, axis=1)[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1)
         return _Sight(center, walls, center + walls, low[:0])  # no wall is above the openings
-    band = flat[(-down > _BAND[0] * ceiling) & (-down < _BAND[1] * ceiling)]
+    band = flat[(-down > _WALL_BAND[0] * ceiling) & (-down < _WALL_BAND[1] * ceiling)]
     band = band[np.linalg.norm(band, axis=1) > _LEAST_DISTANCE * height]
     reach = _measure_reach(band)
     if np.isfinite(reach).sum() < _RAYS // 2:
@@ -371,7 +371,7 @@ def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | Non
         return np.where(distance > 0, distance, np.inf)
 
     error = np.abs(meet(_rays()) - measured[:, None]) / unit
-    costs = np.minimum(np.where(np.isnan(error), 0, error), _LARGEST_ERROR) / _NOISE
+    costs = np.minimum(np.where(np.isnan(error), 0, error), _LARGEST_ERROR) / _DISTANCE_NOISE
     angles = np.arange(_RAYS) * 2 * math.pi / _RAYS
     between = np.minimum(meet(np.stack((np.sin(angles), np.cos(angles)), axis=1)), 1e3 * unit)
     total, origins = costs[0], []

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -123,7 +123,8 @@ class TargetRenderer:
         pose = face_poses(cam2world.double())[part.index]
         gaussians = self._select(gaussians, None)
         size = (self.face_size, self.face_size)
-        image = rasterize(gaussians, pose, size=size, layout="pinhole", options=self._options, stitching="seamless")
+        options = replace(self._options, stitching="seamless")
+        image = rasterize(gaussians, pose, size=size, layout="pinhole", **vars(options))
         return torch.cat((image.color, image.alpha[None]))
 
     def compose(
@@ -181,7 +182,7 @@ class TargetRenderer:
         if self.style == "panorama":
             return rasterize(gaussians, cam2world, size=self.size)
         return rasterize(
-            gaussians, cam2world, size=self.size, layout="cubemap", face_size=self.face_size, options=self._options
+            gaussians, cam2world, size=self.size, layout="cubemap", face_size=self.face_size, **vars(self._options)
         )
 
     @property

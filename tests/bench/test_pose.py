@@ -35,8 +35,8 @@ def _estimate(panoramas: list[Panorama], turn: float) -> PoseEstimate:
         pose[:3, 3] *= 2
         found[panorama.image] = world @ pose
     found[panoramas[0].image][:3, :3] @= rotation_exp(np.array((0, turn, 0)))
-    figures = 100.0, 50.0, 40.0, 0.3, (0.01, 0.01), 1.0, 9.0
-    relation = RelativePose(np.eye(3), np.eye(3)[0], np.empty((0, 2), int), *figures, None)
+    figures = {"score": 100.0, "margin": 50.0, "places": 40.0, "uncertainty": (0.01, 0.01), "log_odds": 9.0}
+    relation = RelativePose(np.eye(3), np.eye(3)[0], np.empty((0, 2), int), **figures)
     group = PoseGroup(found, 0.5, 10.0, 0.05, "cameras 1.5 m over the floor")
     return PoseEstimate(tuple(found), (group,), {}, {(0, 1): relation})
 

@@ -16,6 +16,7 @@ from pansplat.model.feature_pyramid import TransformerConfig
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import load
+from pansplat.prediction_options import PredictOptions
 from pansplat_viewer.scene.loader import LoadOptions, find_entries, load_entry
 
 
@@ -72,7 +73,7 @@ def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room) ->
         assert image.height == 16 and len(set(image.convert("L").getextrema())) == 2
     run_on_room("evaluate", tmp_path / "results", "--height", "64", "--compat", "fixed")
     assert (tmp_path / "results" / "results.json").exists()
-    options = LoadOptions(model=str(weights), compat="fixed", height=64, refine_seconds=0)
+    options = LoadOptions(prediction=PredictOptions(str(weights), "fixed", height=64, refine_seconds=0))
     (entry,) = (entry for entry in find_entries(room, options) if entry.pair is not None)
     viewed = load_entry(entry, options, lambda what, done: None).scene
     assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)

@@ -163,13 +163,13 @@ def test_the_page_of_a_web_tour_has_its_title_or_the_name_of_its_folder(
 
 
 def test_options_of_pages_are_for_pages(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
-    assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--split")
-    assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--photo-height", "1024")
-    assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--embed", "https://example.com")
+    for option, *values in (("--split",), ("--photo-height", "1024"), ("--embed", "https://example.com")):
+        message = refusal("export", scene, "-o", tmp_path / "out.ply", option, *values)
+        assert f"{option} is for an .html page, got {tmp_path / 'out.ply'}" in message
     refused = refusal("export", tmp_path / "none", "-o", tmp_path / "tour.html", "--embed", "example.com")
     assert "got 'example.com'" in refused, "before anything is loaded"
     assert ".sog, .glb, .ply" in refusal("export", scene, "-o", tmp_path / "scene.stl")
-    assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "x.spz", "--points")
+    assert "--points is for a .ply" in refusal("export", scene, "-o", tmp_path / "x.spz", "--points")
     assert "--up is for a scene file" in refusal("export", tmp_path, "-o", tmp_path / "out.ply", "--up", "z")
 
 
@@ -228,7 +228,7 @@ def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
 def test_a_floor_plan_needs_a_floor(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     message = refusal("export", scene, "-o", tmp_path / "plan.png", "--min-opacity", "0.95")
     assert "needed a floor below at least one of the 2 input cameras" in message
-    assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "plan.png", "--points")
+    assert "--points is for a .ply" in refusal("export", scene, "-o", tmp_path / "plan.png", "--points")
 
 
 def test_a_drawn_plan_needs_walls_and_all_that_each_panorama_shows(
@@ -238,7 +238,7 @@ def test_a_drawn_plan_needs_walls_and_all_that_each_panorama_shows(
     assert "needed a floor, and walls around at least one of the 2 input cameras" in message
     assert run(["export", str(scene), "-o", str(tmp_path / "joint.ply")]) == 0
     assert "exported with --layers" in refusal("export", tmp_path / "joint.ply", "-o", tmp_path / "plan.dxf")
-    assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "plan.dxf", "--points")
+    assert "--points is for a .ply" in refusal("export", scene, "-o", tmp_path / "plan.dxf", "--points")
 
 
 def test_a_plan_states_rooms_and_uncertainty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -336,10 +336,12 @@ def test_floaters_are_left_out_and_counted(scene: Path, tmp_path: Path, capsys: 
 
 
 def test_options_of_meshes_are_for_meshes(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
-    assert "--mesh writes a .glb or .obj" in refusal("export", scene, "-o", tmp_path / "x.ply", "--mesh")
+    assert "--mesh is for a mesh (.obj, or .glb with --mesh)" in refusal(
+        "export", scene, "-o", tmp_path / "x.ply", "--mesh"
+    )
     assert "--triangles is for a mesh" in refusal("export", scene, "-o", tmp_path / "x.glb", "--triangles", "9")
     assert "needs 512 triangles or more" in refusal("export", scene, "-o", tmp_path / "x.obj", "--triangles", "9")
-    assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "x.obj", "--points")
+    assert "--points is for a .ply" in refusal("export", scene, "-o", tmp_path / "x.obj", "--points")
     foreign = pipeline.load(scene)
     pipeline.save(dataclasses.replace(foreign, cam2world=foreign.cam2world[:0], names=()), tmp_path / "foreign.splat")
     message = refusal("export", tmp_path / "foreign.splat", "-o", tmp_path / "x.obj")

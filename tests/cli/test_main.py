@@ -82,7 +82,7 @@ def test_a_warning_of_pansplat_is_one_note(room: Path, predict, tmp_path: Path, 
     (room / "poses.json").write_text(json.dumps(content))
     assert predict() == 0
     err = capsys.readouterr().err
-    assert err.startswith("note: ") and "coincide" in err and err.count("\n") == 1
+    assert err.startswith("note: ") and "at one place" in err and err.count("\n") == 1
     assert (tmp_path / "scene.ply").exists()
 
 

@@ -80,7 +80,7 @@ def test_a_folder_with_files_and_a_scene_file_are_refused(
     message = refusal("export", scene, "-o", tmp_path / "set", "--training-set", *OPTIONS)
     assert "needed the folder of the panoramas to write their cube faces, got a scene file" in message
     assert not (tmp_path / "set").exists()
-    assert "--points writes a .ply" in refusal(
+    assert "--points is for a .ply" in refusal(
         "export", room, "-o", tmp_path / "set", "--training-set", "--points", *OPTIONS
     )
 

@@ -228,8 +228,8 @@ def test_bands_change_neither_distances_nor_gradients(
     size: tuple[int, int], pixels: int, weighted: bool, vgg: Lpips, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected, expected_gradient = measure_distances(vgg, size, weighted)
-    monkeypatch.setattr(lpips, "_WHOLE", 0)
-    monkeypatch.setattr(lpips, "_BAND", pixels)
+    monkeypatch.setattr(lpips, "_MAX_WHOLE_PIXELS", 0)
+    monkeypatch.setattr(lpips, "_BAND_PIXELS", pixels)
     found, gradient = measure_distances(vgg, size, weighted)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-9, atol=1e-9 * float(expected_gradient.abs().max()))
@@ -251,6 +251,6 @@ def test_bands_limit_the_activations_in_memory(vgg: Lpips, monkeypatch: pytest.M
         return sum(kept.values())
 
     whole = largest()
-    monkeypatch.setattr(lpips, "_WHOLE", 0)
-    monkeypatch.setattr(lpips, "_BAND", 16 * 64)
+    monkeypatch.setattr(lpips, "_MAX_WHOLE_PIXELS", 0)
+    monkeypatch.setattr(lpips, "_BAND_PIXELS", 16 * 64)
     assert largest() < whole / 3

@@ -158,13 +158,6 @@ def test_triplets_come_first_and_contexts_are_unique(tmp_path: Path) -> None:
     assert [(pair.name, [t.name for t in pair.targets]) for pair in loaded] == [("a-c", ["b"]), ("a-b", [])]
 
 
-def test_coincident_cameras_warn(tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "room", poses={"left.png": _pose(1), "right.png": _pose(1)})
-    (pair,) = load_pairs(folder)
-    with pytest.warns(UserWarning, match="room: cameras of the context views coincide"):
-        assert pair.load_context(8).images.shape == (2, 3, 8, 16)
-
-
 def _matterport3d(scene: Path) -> Path:
     for i in range(3):
         view = scene / f"{i:02d}"

@@ -23,7 +23,8 @@ EYE = np.eye(4).tolist()
 
 def _relation(log_odds: float) -> RelativePose:
     none = np.zeros((0, 2), np.int64)
-    return RelativePose(np.eye(3), np.array((0.0, 0, 1)), none, 100, 100, 40, 0.3, (0.01, 0.01), 1.0, log_odds, None)
+    figures = {"score": 100, "margin": 100, "places": 40, "uncertainty": (0.01, 0.01), "distance": 1.0}
+    return RelativePose(np.eye(3), np.array((0.0, 0, 1)), none, log_odds=log_odds, **figures)
 
 
 def _estimate(images, **options) -> PoseEstimate:

@@ -1,10 +1,13 @@
 """From panorama files to poses: the shipped sample, and input that cannot be used."""
 
+import itertools
 import json
 import math
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -141,8 +144,9 @@ def test_a_name_that_is_not_utf8_is_refused_before_the_estimate(tmp_path: Path, 
 
 
 def _relation(log_odds: float, problem: str | None = None) -> RelativePose:
-    figures = 90.0, 50.0, 40.0, 0.3, (0.01, 0.01), 1.0, log_odds
-    return RelativePose(np.eye(3), np.eye(3)[0], np.empty((0, 2), int), *figures, problem)
+    figures = {"score": 90.0, "margin": 50.0, "places": 40.0, "uncertainty": (0.01, 0.01), "distance": 1.0}
+    none = np.empty((0, 2), int)
+    return RelativePose(np.eye(3), np.eye(3)[0], none, log_odds=log_odds, problem=problem, **figures)
 
 
 def test_the_summary_names_groups_and_probable_pairs() -> None:
@@ -224,6 +228,34 @@ def test_a_linked_pair_is_compared_among_many(monkeypatch: pytest.MonkeyPatch) -
         for linked in ({}, {(4, 6): Ways(back=0.5)})
     ]
     assert set(found[1]) - set(found[0]) == {(4, 6)}
+
+
+def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Panoramas 0 to 7 are one home and 8 to 10 another one, in which no pair is certain."""
+    views = [replace(_view(_no_features(1), np.zeros((4, 8), np.float32)), stem=str(n)) for n in range(11)]
+    numbers = {id(view.features): n for n, view in enumerate(views)}
+
+    def quick(first: Features, second: Features) -> float:
+        i, j = numbers[id(first)], numbers[id(second)]
+        return 10.0 + (i > 7) if j > 7 or (i, j) == (0, 7) else 100.0 - i - j
+
+    def relate(first: _View, second: _View, *_: object) -> RelativePose:
+        return _relation(math.inf) if int(second.stem) < 8 else _relation(0.0, "nothing in common")
+
+    monkeypatch.setattr("pansplat.poses.estimate._quick_overlap", quick)
+    monkeypatch.setattr("pansplat.poses.estimate._estimate_pair", relate)
+    monkeypatch.setattr("pansplat.poses.estimate._is_mirrored", lambda *_: False)
+    monkeypatch.setattr("pansplat.poses.estimate.polish_relative_pose", lambda relation, *_: relation)
+    monkeypatch.setattr("pansplat.poses.estimate.match_features", lambda *_: MagicMock())
+    monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_: MagicMock())
+    ways = {pair: NO_WAYS for pair in itertools.combinations(range(11), 2)}
+    relations = _relate_views(views, ways, 0, PoseCache(None, (), ""), lambda *_: None)
+    home = {pair for pair in relations if pair[1] < 8}
+    assert (0, 7) not in home and 12 <= len(home) < 23, "of 28"
+    assert all(sum(n in pair for pair in home) >= 3 for n in range(8))
+    assert len([pair for pair in relations if pair[0] > 7]) == 3, "nothing is left out without certain pairs"
+    linked = ways | {(0, 7): Ways(back=0.5)}
+    assert (0, 7) in _relate_views(views, linked, 0, PoseCache(None, (), ""), lambda *_: None)
 
 
 def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> None:

@@ -71,9 +71,8 @@ def test_suggestions_are_where_the_second_camera_of_a_candidate_is():
     motion = np.linalg.inv(second) @ first
     rotations, ways = np.stack((motion[:3, :3], np.eye(3))), np.stack((motion[:3, 3], np.zeros(3)))
     hypotheses = Hypotheses(rotations, ways, np.array((-1.0, -4.0)))
-    relation = RelativePose(
-        np.eye(3), np.array((0.0, 0, 1)), np.zeros((0, 2), int), 0, 0, 0, 0, (1, 1), 1.0, -1.0, "no", hypotheses
-    )
+    none = np.zeros((0, 2), int)
+    relation = RelativePose(np.eye(3), np.array((0.0, 0, 1)), none, problem="no", hypotheses=hypotheses)
     best, other = list_suggestions(relation, uprights)
     _assert_same(best.place, Place(2, 1, 0.6))
     assert (best.log_odds, other.log_odds) == (-1.0, -4.0)

@@ -25,14 +25,12 @@ def relate(pair: Pair, indices: np.ndarray) -> RelativePose:
         ROTATIONS[j].T @ ROTATIONS[i],
         way / distance,
         indices,
-        300.0,
-        99.0,
-        50.0,
-        0.5,
-        (1e-3, 1e-3),
-        distance,
-        5.0,
-        None,
+        score=300.0,
+        margin=99.0,
+        places=50.0,
+        uncertainty=(1e-3, 1e-3),
+        distance=distance,
+        log_odds=5.0,
     )
 
 

@@ -10,6 +10,8 @@ from pansplat.rendering import rasterize
 from pansplat.rendering.image_planes import stitch_faces
 from pansplat.rendering.official import OFFICIAL
 
+_OPTIONS = {**vars(OFFICIAL), "near": 0.45}
+
 
 def _official_face(scene: Gaussians, pose: torch.Tensor, num: int, near: float) -> torch.Tensor:
     """RGB of a 90-degree face as docs/official.md, 10.3 describes, every pixel against every Gaussian; float64.
@@ -66,7 +68,7 @@ def outside(make_scene):
 def test_official_options_equal_the_official_rasteriser_without_its_two_cuts(scale, outside, pose):
     scene = outside(150, scale)
     expected = _official(scene, pose, 32, 0.45)
-    got = rasterize(scene, pose, size=(32, 64), face_size=16, near=0.45, layout="cubemap", options=OFFICIAL)
+    got = rasterize(scene, pose, size=(32, 64), face_size=16, layout="cubemap", **_OPTIONS)
     assert float(expected.mean()) > 0.05
     assert (got.color - expected).abs().max() < 1e-10
 
@@ -76,6 +78,6 @@ def test_only_the_official_rasteriser_rasterises_gaussians_nearer_than_near(make
     near_one = make_scene(1, scale=0.02)
     for mean, is_ours, is_official in (((0.0, 0, 0.3), 0, 1), ((0.0, 0, 0.08), 0, 0), ((0, 0, 0.5), 1, 1)):
         near_one.means.copy_(torch.tensor([mean]))
-        got = rasterize(near_one, eye, size=(32, 64), face_size=16, near=0.45, layout="cubemap", options=OFFICIAL).color
+        got = rasterize(near_one, eye, size=(32, 64), face_size=16, layout="cubemap", **_OPTIONS).color
         expected = _official(near_one, eye, 32, 0.45)
         assert (float(got.max()) > 0, float(expected.max()) > 0) == (is_ours, is_official)

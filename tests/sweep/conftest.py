@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from pansplat.sweep.search import SearchConfig, search_surfaces
+from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import PosedImages, Surface, ray_grid, resize_sphere
 
 
@@ -122,7 +122,7 @@ class Observed:
     @functools.cached_property
     def surfaces(self) -> list[Surface]:
         """The sweep's surfaces."""
-        return search_surfaces(self.posed, SearchConfig(), lambda what, fraction: None)[0]
+        return search(observe(self.posed, SearchConfig()))
 
     @property
     def inverse_depths(self) -> np.ndarray:

@@ -13,12 +13,12 @@ from pansplat.networks.depth_network import DepthNetworkConfig
 from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
 from pansplat.pipeline import load_model, load_pairs, predict, render
+from pansplat.sweep import Sweep
 from pansplat.sweep.guided_sweep import (
-    GuidedSweep,
     NetworkPrior,
     default_weights,
     load_guided_sweep,
-    save_depth_network,
+    save_network,
 )
 from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.surface import list_others, resize_sphere
@@ -48,7 +48,7 @@ def _sharpening():
 def weights(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "depth.safetensors"
     network = _network()
-    save_depth_network(path, network, network.state_dict())
+    save_network(path, network, network.state_dict())
     return path
 
 
@@ -94,7 +94,7 @@ def test_refined_depth_is_in_the_unit_of_the_poses():
 
 def test_fingerprint_depends_on_the_weights(weights, tmp_path):
     other = _network(1)
-    save_depth_network(tmp_path / "other.safetensors", other, other.state_dict())
+    save_network(tmp_path / "other.safetensors", other, other.state_dict())
     fingerprints = {load_guided_sweep(path).fingerprint for path in (weights, tmp_path / "other.safetensors")}
     fingerprints.add(load_model("sweep").fingerprint)
     assert len(fingerprints) == 3
@@ -115,7 +115,7 @@ def test_other_weights_are_refused(tmp_path):
 def test_missing_weight_is_refused(tmp_path):
     network = _network()
     state = {name: tensor for name, tensor in network.state_dict().items() if name != "head.bias"}
-    save_depth_network(tmp_path / "part.safetensors", network, state)
+    save_network(tmp_path / "part.safetensors", network, state)
     with pytest.raises(InputError, match=r"head\.bias"):
         load_guided_sweep(tmp_path / "part.safetensors")
 
@@ -135,8 +135,8 @@ def test_shipped_model_is_small():
     path = default_weights()
     assert path.stat().st_size <= 16e6
     model = load_model("default")
-    assert isinstance(model, GuidedSweep) and model.name == "default"
-    assert sum(weight.numel() for weight in model.network.parameters()) <= 8_000_000
+    assert isinstance(model, Sweep) and isinstance(model.prior, NetworkPrior) and model.name == "default"
+    assert sum(weight.numel() for weight in model.prior.network.parameters()) <= 8_000_000
 
 
 @pytest.mark.slow

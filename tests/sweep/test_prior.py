@@ -6,7 +6,7 @@ import pytest
 from pansplat.sweep import prior as prior_module
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, apply_prior_cost
-from pansplat.sweep.search import SearchConfig, search_surfaces
+from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import Surface, list_others, ray_grid, resize_sphere
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
@@ -186,7 +186,7 @@ def test_views_at_one_place_have_the_sharpened_depth_at_a_usual_height(make_room
     room = make_room()
     poses = [room.pose((-0.4, 0.0, -0.2))] * views
     observed = room.observe(64, poses)
-    surfaces, _ = search_surfaces(observed.posed, SearchConfig(), lambda what, fraction: None, TrueDepth(room, poses))
+    surfaces = search(observe(observed.posed, SearchConfig(), TrueDepth(room, poses)))
     assert len(surfaces) == views
     expected = observed.depths[0] * 1.5 / _CAMERA_HEIGHT
     for surface in surfaces:
@@ -208,8 +208,6 @@ def test_sharpened_depth_of_a_tilted_camera_is_turned_back(make_room, turn):
 def test_prior_decides_where_photographs_are_blank(make_room):
     room = make_room("blank")
     observed = room.observe(64)
-    surfaces, _ = search_surfaces(
-        observed.posed, SearchConfig(), lambda what, fraction: None, TrueHeights(room, room.two_poses())
-    )
+    surfaces = search(observe(observed.posed, SearchConfig(), TrueHeights(room, room.two_poses())))
     for surface, depth in zip(surfaces, observed.depths, strict=True):
         assert np.median(np.abs(surface.inverse_depth * depth - 1)) < 0.05

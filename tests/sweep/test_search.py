@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pansplat.sweep.search import SearchConfig, search_surfaces
+from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import PosedImages
 
 
 def _search(posed: PosedImages, **changes) -> np.ndarray:
     """Inverse depths (v, h, 2h) from the posed images with other values of some fields."""
-    found, _ = search_surfaces(dataclasses.replace(posed, **changes), SearchConfig(), lambda what, fraction: None)
+    found = search(observe(dataclasses.replace(posed, **changes), SearchConfig()))
     return np.stack([surface.inverse_depth for surface in found])
 
 
@@ -52,7 +52,7 @@ def test_walls_beyond_far_are_found(empty_room):
     medians = []
     for far_margin in (1.0, 10.0):
         posed, config = dataclasses.replace(empty_room.posed, far=1.8), SearchConfig(far_margin=far_margin)
-        found = np.stack([s.inverse_depth for s in search_surfaces(posed, config, lambda what, fraction: None)[0]])
+        found = np.stack([s.inverse_depth for s in search(observe(posed, config))])
         error = np.abs(1 / (found * empty_room.depths) - 1)
         medians.append(np.median(error[beyond]))
         assert np.median(error[~beyond]) < 0.03

@@ -96,7 +96,7 @@ def test_pose_estimates() -> None:
 
 
 def test_predictors(small_config) -> None:
-    assert repr(load_model("default")).startswith("<GuidedSweep default: guided by a depth network, ")
+    assert repr(load_model("default")).startswith("<Sweep default: guided by a depth network, ")
     assert repr(load_model("sweep")).startswith("<Sweep sweep: no weights, ")
     text = repr(NetworkPredictor("mine", PanSplat(small_config)))
     assert text.startswith("<NetworkPredictor mine: PanSplat of 1.5 million") and len(text) < 120

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_written
 from pansplat_viewer import run
 from pansplat_viewer.app import Options
@@ -180,10 +181,9 @@ def test_pairs_are_chosen_by_name_or_number():
 
 
 def test_options_are_passed_on(tmp_path):
-    given = {"model": "w.safetensors", "compat": "fixed", "precision": "bfloat16", "height": 256}
-    given |= {"convention": "world2cam opengl", "near": 0.3, "far": 9.0}
-    expected = LoadOptions(cache=False, refine_seconds=3.0, **given)
-    assert Options(tmp_path, no_cache=True, refine=3.0, **given).load_options == expected
+    reading, prediction = ReadOptions("world2cam opengl", 0.3, 9.0), PredictOptions("w.safetensors", height=256)
+    expected = LoadOptions(reading, replace(prediction, cache=False))
+    assert Options(tmp_path, no_cache=True, prediction=prediction, reading=reading).load_options == expected
     assert Options(tmp_path, preset="3dgs").renderer_choice == "gl"
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 

@@ -39,7 +39,7 @@ from pansplat_viewer.scene.loader import (
     SceneEntry,
     SceneLoader,
 )
-from pansplat_viewer.scene.settings import Comparison, Display, Preset
+from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Preset
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
@@ -72,6 +72,7 @@ INITIAL_SETTINGS = {
 # Widgets whose effect has its own test.
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
+    "photographs at panoramas",
     *get_args(Display), *get_args(Comparison),
     "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
     "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
@@ -257,6 +258,7 @@ def user(session, ctx) -> User:
     for name in (field.name for field in fields(ViewerState) if field.name not in kept):
         setattr(state, name, getattr(start, name))
     state.camera, state.adaptive, state.message = state.home, True, ""
+    state.stops = False  # the camera is at a panorama, and tests look at the scene
     session.viewer.error, session.viewer.stage.resolution.budget_ms = None, BUDGET_MS
     imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
     session.draw_frames(2, SETTLE_AFTER)
@@ -693,6 +695,38 @@ def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
     user.click("coarser while moving")
     user.press(imgui.Key.w, frames=4)
     assert user.viewer.stage.image_size == SIZE
+
+
+def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):
+    scene, state = user.read_image(), user.state
+    user.click("photographs at panoramas")
+    user.draw_frames(1, 1 / 60)
+    fading = user.read_screen()
+    photograph = user.read_image()
+    assert state.stops and changed_fraction(scene, photograph) > 0.5
+    between = np.abs(fading - scene).sum() / np.abs(photograph - scene).sum()
+    assert 0 < between < 0.7 and user.viewer.stage.stop.weight == 1
+    assert match_photograph(user, 0) < 1
+    state.camera = replace(state.camera, yaw_radians=state.camera.yaw_radians + 0.3)
+    user.settle()
+    assert match_photograph(user, 0) < 1, "also in another direction"
+    for change in ({"display": "depth"}, {"opacity_threshold": 0.5}, {"mode": "view"}, {"view_weights": (1.0, 0.0)}):
+        state.settings = replace(DrawSettings(), **change)
+        user.settle()
+        assert user.viewer.stage.stop.weight == 0, change
+    state.settings = DrawSettings()
+    state.camera = state.home
+    user.settle()
+    x, y, z = state.home.position
+    state.camera = replace(state.home, position=(x, y, z + 0.05))
+    user.draw_frames(1, 1 / 60)
+    assert 0 < user.viewer.stage.stop.weight < 1
+    user.settle()
+    assert user.viewer.stage.stop.weight == 0
+    state.camera = state.home
+    user.settle()
+    user.click("photographs at panoramas")
+    assert changed_fraction(user.read_image(), scene) < 0.01
 
 
 def test_a_refinement_is_cancelled_or_compared_with_its_prediction(user, small_scene):

@@ -92,6 +92,7 @@ class App:
             **options,
         )  # fmt: skip
         self.state, self.library, self.target = self.viewer.state, self.viewer.library, Mock(viewport=(0, 0, *SIZE))
+        self.state.stops = False  # the camera is at a panorama, and tests count images of the scene
 
     def frame(self, seconds: float = 1 / 30, **events: Any) -> None:
         self.now += seconds

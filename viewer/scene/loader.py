@@ -9,9 +9,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from pansplat.errors import InputError, collect_notes
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_scene_file, make_portable_name
 from pansplat_viewer.scene.background import BackgroundWorker
 
@@ -110,18 +111,10 @@ class LoadedScene:
 
 @dataclass(frozen=True)
 class LoadOptions:
-    """Arguments of `load_pairs` and `predict`."""
+    """Options of reading and prediction."""
 
-    model: str = "default"
-    compat: Literal["trained", "official", "fixed"] = "trained"
-    precision: Literal["float32", "bfloat16"] = "float32"
-    height: int | None = None
-    refine_seconds: float = 10.0
-    cache: bool = True
-    convention: str | None = None
-    near: float | None = None
-    far: float | None = None
-    camera_height: float = 1.5
+    reading: ReadOptions = field(default_factory=ReadOptions)
+    prediction: PredictOptions = field(default_factory=PredictOptions)
 
 
 def find_entries(
@@ -144,25 +137,18 @@ def find_entries(
         from pansplat.pipeline import load_pairs
 
         with collect_notes() as notes:
-            pairs = load_pairs(
-                path,
-                convention=options.convention,
-                near=options.near,
-                far=options.far,
-                camera_height=options.camera_height,
-                progress=progress,
-                on_unposed=None if show is None else lambda pairs: show(_list_tours(pairs)),
-            )
+            on_unposed = None if show is None else lambda pairs: show(_list_tours(pairs))
+            pairs = load_pairs(path, progress=progress, on_unposed=on_unposed, **vars(options.reading))
     except InputError:
         if not scenes:
             raise
         pairs, notes = [], []
-    from pansplat.pipeline import load_model, warn_of_single_views
+    from pansplat.pipeline import load_predictor, warn_of_single_views
     from pansplat.tours import find_tours
 
     tours = find_tours(pairs)
     if any(a == b for tour in tours for a, b in tour.overlaps):
-        predictor = load_model(options.model, compat=options.compat, precision=options.precision)
+        predictor = load_predictor(options.prediction)
         with collect_notes() as replaced:
             for tour in tours:
                 warn_of_single_views(tour, predictor)
@@ -236,14 +222,10 @@ def load_entry(
         return _load_tour_scene(replace(entry, tour=tour, merged=scene), options, progress, show)
     scene = pipeline.predict(
         entry.pair,
-        model=options.model,
-        compat=options.compat,
-        precision=options.precision,
-        height=options.height,
-        refine_seconds=options.refine_seconds,
-        cache=options.cache,
+        model=options.prediction.model,
         progress=progress,
         on_predicted=None if show is None else lambda scene: show(LoadedScene(entry, scene, is_final=False)),
+        **options.prediction.keywords,
     )
     return LoadedScene(entry, scene)
 
@@ -258,7 +240,7 @@ def _load_tour_scene(
     from pansplat import pipeline
     from pansplat.tours import connect, find_floor_outlines, find_poor_edges, find_walls, measure_outlook, select_views
 
-    tour, views, merged, seconds = entry.tour, entry.views, entry.merged, options.refine_seconds
+    tour, views, merged, prediction = entry.tour, entry.views, entry.merged, options.prediction
     assert tour is not None
     if merged is not None:
         first, views = _choose_first_scene(tour, tour)
@@ -267,7 +249,7 @@ def _load_tour_scene(
         outlooks = {node: measure_outlook(merged, node, tour.level_axes) for node in range(len(tour))}
         poor = () if merged.joint else find_poor_edges(merged, range(len(tour)), tour.overlaps)
         return LoadedScene(entry, select_views(merged, views), outlines=outlines, poor=poor, outlooks=outlooks)
-    predictor = pipeline.load_model(options.model, compat=options.compat, precision=options.precision)
+    predictor = pipeline.load_predictor(prediction)
     if not views:
         connected, max_views = connect(tour, progress), pipeline.find_max_views(predictor)
         # A window shows photographs before: they begin where the graph that is not connected yet does.
@@ -276,9 +258,10 @@ def _load_tour_scene(
         if show is None:
             views = part
         elif views != part:
-            seconds = 0.0
+            prediction = replace(prediction, refine_seconds=0.0)
         entry = replace(entry, tour=tour, views=views, start=first, max_views=max_views)
     pair = entry.pair or tour.make_pair(views)
+    fitted = pipeline.fit_to_scene(prediction, pair)
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
         scene = tour.place(scene, views)
@@ -290,11 +273,9 @@ def _load_tour_scene(
     scene = pipeline.predict(
         pair,
         model=pipeline.choose_predictor(pair, predictor),
-        height=options.height or pipeline.choose_tour_height(pair),
-        refine_seconds=pipeline.scale_seconds(seconds, pair),
-        cache=options.cache,
         progress=progress,
-        on_predicted=None if show is None or not seconds else lambda scene: show(finish(scene, is_final=False)),
+        on_predicted=None if show is None or not fitted.refine_seconds else lambda s: show(finish(s, is_final=False)),
+        **fitted.keywords,
     )
     return finish(scene, is_final=True)
 

@@ -48,7 +48,7 @@ class Glide:
 
     @property
     def camera(self) -> Camera:
-        """The camera now."""
+        """The camera of the flight at this time."""
         part = ease_in_out(self.seconds / GLIDE_SECONDS)
         a, b = self.start, self.end
         x, y, z = (p + part * (q - p) for p, q in zip(a.position, b.position, strict=True))
@@ -87,6 +87,7 @@ class ViewerState:
     photograph: int | None = None  # number of the photograph of the comparison; None is the nearest one
     max_error: float = 0.25  # the difference from a photograph with the last colour of the map
     refined: bool = True  # whether the refined scene is shown, where there is one, or the prediction
+    stops: bool = True  # whether the photograph is shown where the camera stands at a panorama
     adaptive: bool = True  # whether the resolution is lowered while the camera moves
     speed: float = 1.0  # of flying, metres per second
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))

@@ -34,6 +34,9 @@ from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
 
 DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
+STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
+STOP_SECONDS = 0.2  # of the fade between scene and photograph
+_LARGEST_STOP_STEP = 1 / 3  # of this fade in a frame, also after a pause without frames
 _NEXT_SCENES = 3  # that are dropped last
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor
 _MIN_HOTSPOT_PIXELS = 14.0
@@ -138,7 +141,7 @@ class TourScenes:
         return gather
 
     def copy(self) -> TourScenes:
-        """The same scenes in memory, for a film in another thread."""
+        """A copy with the scenes that are in memory, for a film in another thread."""
         memory = self._budget / 2**30
         scenes = TourScenes(self.tour, memory=memory, merged=self._merged, max_views=self._max_views)
         scenes._views, scenes._providers = self._views, self._providers
@@ -406,6 +409,33 @@ class CrossFade:
     def clear(self) -> None:
         """Forget both; the first slot is the front."""
         self.front, self.contents, self.poses, self._fading = 0, [None, None], [None, None], False
+
+
+class StopFade:
+    """The photograph of the panorama at which the camera stands; it fades in and out for `STOP_SECONDS`.
+
+    Attributes:
+        index: number of the photograph; None if none is shown.
+        weight: of the photograph over the scene, 0 to 1.
+    """
+
+    def __init__(self) -> None:
+        """No photograph is shown."""
+        self.index: int | None = None
+        self.weight = 0.0
+        self._last = 0.0
+
+    def update(self, index: int | None, now: float, *, at_once: bool = False) -> None:
+        """Go on to time `now` (seconds), while the camera stands at a panorama, or at none.
+
+        With `at_once` its photograph is shown already and does not fade in.
+        """
+        step = min(max(now - self._last, 0.0) / STOP_SECONDS, _LARGEST_STOP_STEP)
+        self._last = now
+        if self.weight <= 0 or at_once:
+            self.index = index
+        is_here = index is not None and index == self.index
+        self.weight = 1.0 if is_here and at_once else min(max(self.weight + (step if is_here else -step), 0.0), 1.0)
 
 
 @dataclass(frozen=True)

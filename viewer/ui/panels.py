@@ -64,7 +64,7 @@ _OPENED_NOTES = 3  # at most, at first
 
 
 class Panels:
-    """Draws the panels.
+    """Draws all panels of the window.
 
     Attributes:
         widgets: has the rectangles of the last frame.
@@ -282,6 +282,7 @@ class Panels:
             settings = replace(settings, background=(background[0], background[1], background[2]))
         state.settings = settings
         state.adaptive = self.widgets.check("coarser while moving", state.adaptive)
+        state.stops = self.widgets.check("photographs at panoramas", state.stops)
 
     def _draw_camera(self, viewer: Viewer) -> None:
         state, is_on = viewer.state, viewer.doll_house.is_on

@@ -20,7 +20,7 @@ from pansplat_viewer.scene.loader import LoadedScene
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
 from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot
 from pansplat_viewer.scene.state import ViewerState, adapt_settings, fit_settings
-from pansplat_viewer.scene.tour import CrossFade
+from pansplat_viewer.scene.tour import STOP_REACH, CrossFade, StopFade
 from pansplat_viewer.ui.compare import Comparer
 from pansplat_viewer.ui.presenter import PhotographLayer, Presenter
 
@@ -29,13 +29,14 @@ _CENTER_REACHES = 4, 16, 64  # pixels around the image centre
 
 
 class Stage:
-    """Draws the image.
+    """Draws the image of the window.
 
     Attributes:
         slots: renderers of a scene and of that which it fades to; the second one is for tours.
         scene_views: the panoramas in its tour of the scene that was shown last.
         outside: the doll's house; None inside of the rooms.
         fade: what is shown, and what it fades from.
+        stop: the photograph over the scene while the camera stands at a panorama.
         preparer: converts large scenes.
         comparer: the photographs and the pinned image.
         resolution: of the frames.
@@ -55,11 +56,12 @@ class Stage:
         self._scene_slot = 0  # that of the scene that was shown last
         self.scene_views: tuple[int, ...] = ()
         self.outside: SceneSlot | None = None
-        self.fade = CrossFade()
+        self.fade, self.stop = CrossFade(), StopFade()
         self.preparer = ScenePreparer(self.renderer.prepare)
         self.presenter = Presenter(ctx)
         self.comparer = Comparer(ctx, lambda: create_window_renderer(ctx, choice), show_error)
         self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
+        self._stop_layer = PhotographLayer(self.presenter)
         self.resolution = self._create_resolution()
         self.size: tuple[int, int] = (1, 1)
         self.image_size: tuple[int, int] = (1, 1)
@@ -103,6 +105,7 @@ class Stage:
         """Whether the image changes with the time alone."""
         state = self._state
         fading = self.fade.compute_weight(now) < 1
+        fading = fading or self.stop.weight not in (0, 1)
         return fading or state.path_playing or state.playing or state.glide is not None
 
     def is_moving(self, now: float) -> bool:
@@ -130,6 +133,7 @@ class Stage:
     def clear(self) -> None:
         """Show nothing; the next scene is that of the first slot."""
         self.fade.clear()
+        self.stop = StopFade()
         self._scene_slot, self.resolution = 0, self._create_resolution()
 
     def add_slot(self) -> None:
@@ -205,13 +209,17 @@ class Stage:
             milliseconds = self._render(self.outside, state.camera.cam2world, state.draw_settings, plan)
             image = self.outside.image
         else:
-            weight = self.fade.compute_weight(state.now)
-            image, milliseconds = self._draw_content(self.fade.front, plan)
-            if weight < 1:
-                fading, more = self._draw_content(1 - self.fade.front, plan)
-                milliseconds += more
-            if image is None:  # the first one of a large scene is not finished
-                image, fading = fading, None
+            stop, milliseconds = self._draw_stop(), 0.0
+            if stop is None or self.stop.weight < 1 or not plan.moving:
+                weight = self.fade.compute_weight(state.now)
+                image, milliseconds = self._draw_content(self.fade.front, plan)
+                if weight < 1:
+                    fading, more = self._draw_content(1 - self.fade.front, plan)
+                    milliseconds += more
+                if image is None:  # the first one of a large scene is not finished
+                    image, fading = fading, None
+            if stop is not None:
+                image, fading, weight = stop, image if self.stop.weight < 1 else None, self.stop.weight
         self._record_time(plan, milliseconds)
         if image is None:
             photograph = self.comparer.get_photograph(state) if self.outside is None else None
@@ -229,6 +237,31 @@ class Stage:
         can_compare = self.outside is None and state.settings.stereo == "mono"
         right = self.comparer.get_right_side(state, draw_pinned) if can_compare else None
         self.presenter.draw(image, target, state.camera, right=right, fading=fading, weight=weight)
+
+    def _draw_stop(self) -> moderngl.Texture | None:
+        """The photograph of the panorama at which the camera stands, or stood until now; None if none is shown."""
+        state, fade = self._state, self.fade
+        index = self._find_stop()
+        photograph = None if index is None else self.comparer.get_photograph(state, index)
+        was_shown = fade.compute_weight(state.now) < 1 and fade.contents[1 - fade.front] == index
+        self.stop.update(None if photograph is None else index, state.now, at_once=was_shown)
+        if self.stop.weight <= 0 or self.stop.index is None:
+            return None
+        photograph = photograph if self.stop.index == index else self.comparer.get_photograph(state, self.stop.index)
+        return None if photograph is None else self._stop_layer.draw(photograph, state.camera, self.size)
+
+    def _find_stop(self) -> int | None:
+        """The panorama at which the camera stands, if its scene is shown as it is."""
+        state, settings = self._state, self._state.settings
+        is_plain = settings.display == "color" and settings.mode != "view" and settings.stereo == "mono"
+        is_whole = settings.selection == (None, 0.0, None) and set(settings.view_weights) <= {1.0}
+        if not (state.stops and is_plain and is_whole and state.comparison == "off" and self.photograph is None):
+            return None
+        position, photographs = np.asarray(state.camera.position), self.comparer.photographs
+        index = photographs.find_nearest(position)
+        if index is None or np.linalg.norm(photographs.pose(index)[:3, 3] - position) > STOP_REACH:
+            return None
+        return index
 
     def _plan_resolution(self) -> ResolutionPlan:
         """The plan of the frame, from the movement since the last one."""
@@ -287,7 +320,7 @@ class Stage:
     def release(self) -> None:
         """Stop the threads and free every GL object."""
         self.preparer.close()
-        for layer in self._layers:
+        for layer in (*self._layers, self._stop_layer):
             layer.release()
         self.presenter.release()
         self.comparer.release()

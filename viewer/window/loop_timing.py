@@ -56,7 +56,7 @@ class _Loop:
         options, self._ctx = LoadOptions(), ctx
         self._target, self._last = ctx.simple_framebuffer(size, components=4), time.perf_counter()
         loader = SceneLoader(lambda entry, progress, show: load_entry(entry, options, progress, show))
-        state = ViewerState(settings=DrawSettings(mode=mode))
+        state = ViewerState(settings=DrawSettings(mode=mode), stops=False)
         self.viewer = Viewer(ctx, loader, find=lambda path, *calls: find_entries(path, options, *calls), state=state)
         imgui.get_io().display_size = size
         self.viewer.show(find_entries(path, options), 0)

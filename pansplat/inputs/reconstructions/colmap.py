@@ -36,9 +36,9 @@ _MODELS = (  # by number: name and count of parameters
     ("EUCM", 6), ("EQUIRECTANGULAR", 2),
 )  # fmt: skip
 _FOCALS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 1, "RADIAL": 1, "PINHOLE": 2, "OPENCV": 2, "FULL_OPENCV": 2}
-_MAX_BYTES = 1 << 31
+_MAX_BYTES = 1 << 31  # of a file
 _MAX_POINTS = 200_000  # that are read, for near and far
-_MAX_NAME = 4096
+_MAX_NAME = 4096  # bytes
 _NOT_COMPUTED = -1  # error of a point
 
 _Camera = tuple[str, int, int, list[float]]  # model, width, height, parameters

@@ -23,7 +23,7 @@ from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.reconstructions.shots import Reconstruction, Shot, find_picture, note_smaller
 from pansplat.system.files import read_file
 
-_MAX_BYTES = 1 << 28
+_MAX_BYTES = 1 << 28  # of a file
 _HEAD = 4096  # bytes that show what a file is
 
 

@@ -30,12 +30,12 @@ from pansplat.inputs.stated_files import find_inside
 
 _SCALE = "scale.txt"
 _IMAGE_FOLDERS = ("images", "image", "panos", "frames", "input", ".")
-_SAME_PLACE = 1e-3  # distance of cameras of one rig, over the median distance of cameras from their mean
+_RIG_SIZE = 1e-3  # distance of cameras of one rig, over the median distance of cameras from their mean
 _ROUNDING, _DIGITS = 1e-5, 1e-9  # of positions in a file, around the cameras and from the origin
 _AGREE = 0.999  # cosine between down axes
 _PANORAMIC = 0.6  # share of the sphere that the pictures of a panorama show; four side faces show two thirds
 _MIN_POINTS = 100  # to find near and far
-_NEAR_QUANTILE, _FAR_QUANTILE, _MARGIN = 0.01, 0.99, 2.0
+_NEAR_QUANTILE, _FAR_QUANTILE, _MARGIN = 0.01, 0.99, 2.0  # of the distances of points; a factor of them
 _BASELINES = (0.2, 20.0)  # near and far over the median distance of a camera to the next one, without points
 
 
@@ -240,7 +240,7 @@ def _group_by_place(shots: Sequence[Shot]) -> Iterable[list[Shot]]:
     offsets = centres - centres.mean(axis=0)
     spread = float(np.median(np.linalg.norm(offsets, axis=1)))
     local, farthest = (float(np.abs(places).max()) for places in (offsets, centres))
-    tolerance = _SAME_PLACE * spread + _ROUNDING * (1 + local) + _DIGITS * farthest
+    tolerance = _RIG_SIZE * spread + _ROUNDING * (1 + local) + _DIGITS * farthest
     flat = np.flatnonzero([shot.lens is not None for shot in shots])
     ends = flat[cKDTree(centres[flat]).query_pairs(tolerance, output_type="ndarray")].reshape(-1, 2).T
     graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(shots), len(shots)))

@@ -30,7 +30,7 @@ Pixels = Annotated[int, Meta(ge=1, le=1 << 20)]
 
 MAX_BYTES = 1 << 24  # of a file that describes a tour
 _MAX_TEXT = 200  # characters of a title or label
-_MAX_NAME = 60
+_MAX_NAME = 60  # characters
 _MAX_NOTE, _MAX_HTML = 2_000, 20_000  # characters of a note, and of its HTML
 _MAX_ADDRESSES = 10  # of a note
 _MAX_TILES = 64  # along a face

@@ -42,7 +42,7 @@ _FILES = "app-files"  # folder in the archive of the Tool
 _FACES = "frblud"
 _PREVIEW = "bdflru"
 _ASSIGNMENT = re.compile(r"(?<![\w$])[A-Za-z_$][\w$]*\s*=\s*(?=\{)")
-_SHOWN = 30
+_SHOWN = 30  # characters of a file in a message
 _UNNAMED = "Project Title"  # of a project whose author gave no name
 
 

@@ -48,7 +48,7 @@ _NAMES = ("tour.json", "pannellum.json", "config.json")  # looked at first
 _OTHERS = ("poses.json", "pairs.json", "links.json", "camera_pose.json")  # files of this package
 _PICTURES = ("panorama", "cubeMap", "multiRes")
 _FACES = "frblud"
-_MAX_LEVEL = 20
+_MAX_LEVEL = 20  # of tiles
 _CALL = re.compile(r"pannellum\s*\.\s*viewer\s*\(")
 _EMBEDDED = re.compile(r"pannellum\.html?([?#][^\"'\s]*)")
 _STATED = re.compile(r"[?#&]config=([^?#&]+)")

@@ -40,7 +40,7 @@ _MIN_HORIZONTAL = np.float32(1e-12)  # length of a unit direction's horizontal p
 _WRAP_TOLERANCE = np.float32(1e-6)  # radians
 _ABOVE_IMAGE = np.float32(-1e9)  # last row of an empty box
 _CULLED = np.float32(CULLED)
-_UNBOUNDED = np.float32(1e9)
+_UNBOUNDED = np.float32(1e9)  # pixels; the edge of a footprint without one
 
 # Rows of a block of Gaussians: the record's numbers, then those derived from them.
 _RADIAL_VARIANCE, _KAPPA = layout.RADIAL_VARIANCE, layout.LOG2_PEAK  # overwritten in place

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pansplat.cli import run
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.inputs.pairs import Link, Note, Panorama
 from pansplat.inputs.web_tours import find_web_tour, read_web_tour
 from pansplat.poses.edit import PoseEditor
@@ -106,6 +107,40 @@ def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Exp
     assert sum(len(pair.context) for pair in load_pairs(folder)) == 4, "two pairs of three panoramas"
     names = name_pictures(folder / "poses.json", [view.image for view in panoramas])
     assert set(names.values()) == {"0-hall", "1-kitchen", "2-bath"}, "those of an estimate"
+
+
+def test_a_tour_comes_out_of_its_tiles_as_photographs(export: Export, check_colors, tmp_path_factory, capsys) -> None:
+    spot = {"yaw": 3.0, "pitch": 0.25, "target": "1-kitchen"}
+    folder = export(_scene("0-hall", linkHotspots=[spot]), _scene("1-kitchen", name="Küche"))
+    out = tmp_path_factory.mktemp("photos") / "panoramas"
+    assert run(["export", str(folder), "-o", str(out), "--photos"]) == 0
+    assert "2 photographs" in capsys.readouterr().out
+    assert sorted(file.name for file in out.iterdir()) == ["0-hall.jpg", "1-kitchen.jpg", "links.json"]
+    assert read_height(out / "0-hall.jpg") == 128
+    check_colors(read_panorama(out / "0-hall.jpg", 128)[0], tolerance=8)  # two generations of JPEG
+    before, after = load_panoramas(folder), load_panoramas(out)
+    for old, new in zip(before, after, strict=True):
+        assert (new.name, new.title, new.start, new.links) == (old.name, old.title, old.start, old.links)
+    assert run(["export", str(folder), "-o", str(out), "--photos"]) == 2
+    assert "new or empty folder" in capsys.readouterr().err
+    assert run(["export", str(folder), "-o", str(out / "a"), "--photos", "--split"]) == 2
+    assert "--split is for an .html page" in capsys.readouterr().err
+
+
+def test_what_is_hidden_stays_hidden_in_the_photographs_of_a_tour(tmp_path: Path, write_scene) -> None:
+    write_scene(tmp_path / "in" / "hall.jpg", 64)
+    hidden = np.zeros((64, 128), np.uint8)
+    hidden[28:36, 60:68] = 255
+    Image.fromarray(hidden).save(tmp_path / "in" / "hall_blur.png")
+    Image.fromarray(255 - hidden).save(tmp_path / "in" / "hall_mask.png")
+    assert run(["export", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--photos"]) == 0
+    shown, written = (read_panorama(tmp_path / name / "hall.jpg", 64)[0] for name in ("in", "out"))
+    assert float((shown - written).abs().max()) < 0.02
+    (tmp_path / "in" / "hall_blur.png").unlink()
+    original = read_panorama(tmp_path / "in" / "hall.jpg", 64)[0]
+    assert float((original - written)[:, 28:36, 60:68].abs().max()) > 0.02, "the file has the blur"
+    masks = [np.asarray(Image.open(tmp_path / name / "hall_mask.png").convert("L")) > 127 for name in ("in", "out")]
+    assert np.array_equal(*masks)
 
 
 def test_the_export_is_found_from_its_folder_archive_and_page(export: Export) -> None:

@@ -13,6 +13,7 @@ from PIL import Image
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.ply import save_ply
+from pansplat.prediction_options import PredictOptions
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import fit_settings
@@ -136,7 +137,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     pairs = [parted_house.make_pair(views) for views in ((0, 1), (1, 2), (3,))]
     pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], world=1),))
     with pytest.warns(InputWarning, match="1 single view is predicted by default"):
-        entries = find_entries(parted_house.folder, LoadOptions(model="pairs"))
+        entries = find_entries(parted_house.folder, LoadOptions(prediction=PredictOptions("pairs")))
     assert all(any("predicted by default" in note for note in entry.notes) for entry in entries)
     assert not find_entries(parted_house.folder, LoadOptions())[0].notes
     used = []
@@ -148,7 +149,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     scenes = TourScenes(parted_house)
     for views in ((0, 1), (3,)):
-        load_entry(scenes.make_entry(views), LoadOptions(model="pairs"), ignore)
+        load_entry(scenes.make_entry(views), LoadOptions(prediction=PredictOptions("pairs")), ignore)
     assert used == ["pairs", "default"]
 
 
@@ -267,7 +268,7 @@ def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene)
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     tasks = []
     entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
-    options = LoadOptions(model="sweep", height=256, cache=False)
+    options = LoadOptions(prediction=PredictOptions("sweep", height=256, cache=False))
     loaded = load_entry(entry, options, lambda task, done: tasks.append(task))
     assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)
     assert loaded.scene is small_scene and tasks[0] == "predicting"
@@ -303,7 +304,7 @@ def test_an_entry_shows_its_prediction_before_the_refined_scene(monkeypatch, sma
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     shown = []
     entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
-    final = load_entry(entry, LoadOptions(refine_seconds=3.0), ignore, shown.append)
+    final = load_entry(entry, LoadOptions(prediction=PredictOptions(refine_seconds=3.0)), ignore, shown.append)
     assert [loaded.is_final for loaded in (*shown, final)] == [False, True]
 
 

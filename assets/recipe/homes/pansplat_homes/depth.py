@@ -30,7 +30,7 @@ from pansplat.model.layers import to_channels_last
 from pansplat.model.weights import load_weights
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
-from pansplat.sweep.guided_sweep import save_depth_network
+from pansplat.sweep.guided_sweep import save_network
 from pansplat.system.files import require_output_folder
 from pansplat.training.augment import mirror_views, roll_views
 from pansplat.training.checkpoint import (
@@ -287,7 +287,7 @@ class DepthTrainer:
 
     def save_network(self, path: Path) -> None:
         """Write the averaged weights."""
-        save_depth_network(path, self.network, self.average.state)
+        save_network(path, self.network, self.average.state)
 
     def _restore(self, path: Path, state: dict[str, Any]) -> None:
         """Restore the run from a checkpoint; a DamagedCheckpointError if it does not fit."""

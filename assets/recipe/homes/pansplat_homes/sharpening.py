@@ -19,8 +19,9 @@ from pansplat.geometry.equirect import resize_equirect, row_weights
 from pansplat.inputs.views import Views
 from pansplat.model.layers import to_channels_last
 from pansplat.networks.depth_network import DepthEstimate
+from pansplat.networks.depth_refinement import DepthRefinement
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
-from pansplat.sweep.guided_sweep import default_weights, load_guided_sweep, load_sharpening, save_sharpening
+from pansplat.sweep.guided_sweep import default_weights, load_network, save_network
 from pansplat_homes.depth import MAX_DEPTH, DepthTrainConfig, DepthTrainer, Sample, run_trainer
 from pansplat_homes.panes import close_panes
 
@@ -58,12 +59,12 @@ class SharpeningTrainer(DepthTrainer):
     TERMS = ("loss", "error", "differences", "likelihood", "estimate_error")
 
     def make_network(self) -> DepthSharpening:
-        self.depth_network = load_guided_sweep(self.config.depth).network.mono.to(self.device)
+        self.depth_network = load_network(self.config.depth, DepthRefinement).mono.to(self.device)
         return DepthSharpening(self.config.network)
 
     def load_start(self, path: Path | None) -> None:
         if path is not None:
-            self.network.load_state_dict(load_sharpening(path).state_dict())
+            self.network.load_state_dict(load_network(path, DepthSharpening).state_dict())
             return
         start_from_depth_network(self.network, self.depth_network.state_dict())
 
@@ -88,7 +89,7 @@ class SharpeningTrainer(DepthTrainer):
         }
 
     def save_network(self, path: Path) -> None:
-        save_sharpening(path, self.network, self.average.state)
+        save_network(path, self.network, self.average.state)
 
 
 def _make_target(views: Views, camera_heights: Float[Tensor, "view"]) -> Float[Tensor, "view h w"]:

@@ -6,7 +6,7 @@ import torch
 
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
-from pansplat.sweep.guided_sweep import load_sharpening
+from pansplat.sweep.guided_sweep import load_network
 from pansplat.training.logs import read_table
 from pansplat_homes import shards
 from pansplat_homes.shards import Tour
@@ -47,7 +47,7 @@ def test_a_run_resumes_and_its_weights_are_read(config):
     trainer = SharpeningTrainer(config, silent=True)
     assert trainer.step == 1
     assert trainer.train()
-    weights = load_sharpening(config.out / "model.safetensors")
+    weights = load_network(config.out / "model.safetensors", DepthSharpening)
     assert weights.config == _NETWORK
     assert [row["step"] for row in read_table(config.out / "validation.csv")] == ["3"]
     other = SharpeningTrainer(dataclasses.replace(config, out=config.out / "b", init=config.out / "model.safetensors"))
