@@ -35,12 +35,12 @@ from pansplat.images.image_files import list_masks
 from pansplat.inputs.folders import find_panorama_folders
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import CAMERA_HEIGHT
+from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
 from pansplat.system.atomic import replacing
 from pansplat.system.console import is_out_of_memory
 from pansplat.system.files import SCENE_SUFFIXES, expand_home, is_portable_name, read_file
-from pansplat.system.options import PredictOptions
 from pansplat.system.strict_json import read_json
 from pansplat.tours import TourGraph, find_tours, merge_scenes
 

@@ -18,11 +18,11 @@ import torch
 from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
+from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, RefineReport, refinement_fingerprint
 from pansplat.system.cache_folders import cache_folders, write_cache_file
 from pansplat.system.files import read_file
-from pansplat.system.options import PredictOptions
 
 _MAX_LEVELS = 256  # of Gaussians; their labels are bytes
 _FORMAT = "1"  # version of the file's layout; part of the hash

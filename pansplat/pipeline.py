@@ -34,7 +34,8 @@ from pansplat.inputs.views import CAMERA_HEIGHT, Views
 from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
-from pansplat.predictor import MIN_HEIGHT, Predictor, Progress, part_of
+from pansplat.prediction_options import CompatChoice, Precision, PredictOptions
+from pansplat.predictor import Predictor, Progress, part_of
 from pansplat.refinement import (
     DISPLAY_HEIGHT,
     RefineConfig,
@@ -48,7 +49,7 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import expand_home, find_scene_suffix
-from pansplat.system.options import CompatChoice, Precision, PredictOptions
+from pansplat.system.options import MIN_HEIGHT
 from pansplat.tours import (
     MAX_SCENE_VIEWS,
     TourGraph,
@@ -420,8 +421,9 @@ def _refine_prediction(task: _Task, progress: Progress | None, on_predicted: Cal
     if final is not None:
         return final
     began = time.process_time()
-    source = task.source
-    photographs = load_photographs(source, scene.height, options.gaussians) if isinstance(source, Pair) else source
+    photographs = task.views
+    if isinstance(task.source, Pair) and options.gaussians is not None:
+        photographs = load_photographs(task.source, scene.height, options.gaussians)
     refinement = Refinement(scene, photographs, RefineConfig(gaussians=options.gaussians))
     report = refinement.run(seconds=options.refine_seconds, progress=part_of(progress, 0.5))
     content = cached.write_refinement(refinement.scene(), report, time.process_time() - began)

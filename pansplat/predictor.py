@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
+from pansplat.system.options import MIN_HEIGHT
 
 Progress = Callable[[str, float], None]  # current step, fraction done in [0, 1]
 
@@ -23,9 +24,6 @@ def part_of(progress: Progress | None, start: float = 0.0, end: float = 1.0, nam
             progress(name + what, start + (end - start) * done)
 
     return report
-
-
-MIN_HEIGHT = 64  # pixels, of panoramas
 
 
 def require_matching_inputs(images: Tensor, cam2world: Tensor, masks: Tensor | None) -> None:

@@ -26,7 +26,7 @@ from pansplat.errors import InputError
 from pansplat.export import page as page_module
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
-from pansplat.system.options import PredictOptions
+from pansplat.prediction_options import PredictOptions
 
 HEIGHT = 64
 SPHERE = PredictOptions("sphere", height=HEIGHT)

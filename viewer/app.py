@@ -11,9 +11,10 @@ import tyro
 from msgspec import Meta
 
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import own_warnings, parse_arguments, progress_bar
 from pansplat.system.files import expand_home, require_output_file, require_output_folder, require_replaceable
-from pansplat.system.options import EYE_DISTANCE, EyeDistance, PredictOptions, ReadOptions, check_numbers
+from pansplat.system.options import EYE_DISTANCE, EyeDistance, check_numbers
 from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
@@ -98,7 +99,7 @@ class Options:
 
     @property
     def image_format(self) -> "ImageFormat":
-        """Projection and stereo."""
+        """The image format of films and stills: projection and stereo."""
         from pansplat_viewer.draw.stereo import ImageFormat
 
         return ImageFormat(self.projection, self.stereo, self.ipd)
@@ -110,7 +111,7 @@ class Options:
 
     @property
     def settings(self) -> DrawSettings:
-        """Initial draw settings."""
+        """The draw settings with which the viewer begins."""
         return DrawSettings(preset=self.preset, mode=self.mode, stereo=self.stereo, eye_distance=self.ipd)
 
     @property

@@ -216,14 +216,14 @@ class TourFrames:
     def draw(
         self, pose: Float[np.ndarray, "4 4"], vertical_fov_degrees: float, now: float, *, with_depth: bool = False
     ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
-        """As `SceneFrames.draw`; depth is that of the scene that fades in."""
+        """Draw a frame like `SceneFrames.draw`; depth is that of the scene that fades in."""
         self._scenes.move(pose[:3, 3])
         return self.draw_scene(pose, vertical_fov_degrees, now, with_depth=with_depth)
 
     def draw_scene(
         self, pose: Float[np.ndarray, "4 4"], vertical_fov_degrees: float, now: float, *, with_depth: bool = False
     ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
-        """As `draw`, with the edge that is chosen already."""
+        """Draw a frame of the scene of the edge that is chosen already."""
         scenes, fade = self._scenes, self._fade
         loaded = scenes.get(scenes.views)
         if loaded is None:

@@ -16,9 +16,10 @@ from tyro.conf import Positional, arg
 
 from pansplat.cli.inputs import Out, Writer
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import print_message, progress_bar
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
-from pansplat.system.options import Count, Positive, PredictOptions, Threads
+from pansplat.system.options import Count, Positive, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -111,7 +112,7 @@ class Batch(Writer):
         return batch.BatchOptions(chosen, prediction, self.camera_height, suffix)
 
     def _parse_memory(self) -> int | None:
-        """Bytes of --memory."""
+        """The number of bytes that `--memory` states."""
         if self.memory is None:
             return None
         from dask.utils import parse_bytes

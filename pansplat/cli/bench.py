@@ -15,8 +15,9 @@ import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
 from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.files import is_scene_file, require_output_folder, require_replaceable
-from pansplat.system.options import Positive, PredictOptions, Threads
+from pansplat.system.options import Positive, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -11,9 +11,10 @@ from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, Writer, parse_blend
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import make_table_console, progress_bar
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
-from pansplat.system.options import Count, CountOrNone, PredictOptions, ReadOptions
+from pansplat.system.options import Count, CountOrNone
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -181,6 +181,9 @@ class _Page:
             f"{out}{beside}: {page.num_gaussians:,} Gaussians,{pictures} {page.num_bytes / 1e6:.1f} MB; open it in a "
             "browser"
         )
+        if page.num_fades:
+            counts = f"{page.num_flights} ways between panoramas are flights, {page.num_fades} are fades"
+            print(f"note: {out}: {counts}, because the surfaces of their panoramas disagree", file=sys.stderr)
         if photographs and not shows_all:
             print(f"note: {out}: without photographs, which would show what is left out", file=sys.stderr)
         panoramas = max(len(scene.cam2world), 1)

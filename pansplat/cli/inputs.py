@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.files import is_scene_file
-from pansplat.system.options import Height, PredictOptions, ReadOptions
+from pansplat.system.options import Height
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene

@@ -11,9 +11,10 @@ from msgspec import Meta
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, PairChoice, Writer, choose_pair
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, require_output_file
-from pansplat.system.options import Fraction, PredictOptions
+from pansplat.system.options import Fraction
 
 
 @dataclass(frozen=True)

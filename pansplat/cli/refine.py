@@ -14,9 +14,10 @@ from tyro.conf import Fixed, Positional, Suppress
 
 from pansplat.cli.inputs import Out, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import call_at_first_signal, progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, is_scene_file, require_output_file
-from pansplat.system.options import Count, PredictOptions, Seconds, Seed
+from pansplat.system.options import Count, Seconds, Seed
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene

@@ -62,7 +62,7 @@ class EvaluationCase:
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """A test set.
+    """A test set of the paper, or what is missing of it.
 
     Attributes:
         name: as in the paper's tables, such as "M3D 1.0 m".

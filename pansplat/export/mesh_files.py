@@ -71,7 +71,7 @@ class Mesh:
 
     @property
     def num_triangles(self) -> int:
-        """Of all parts."""
+        """The number of triangles of all parts."""
         return sum(len(part.triangles) for part in self.parts)
 
 

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -57,6 +58,7 @@ from pansplat.tours import (
     find_blank,
     find_camera_height,
     find_link_ring,
+    find_poor_edges,
     find_rooms,
     find_way_along_link,
     is_hidden,
@@ -102,7 +104,7 @@ _EXPORT = re.compile(r"^export ", re.MULTILINE)
 
 @dataclass(frozen=True)
 class PageFiles:
-    """What was written.
+    """The files of a page that was written.
 
     Attributes:
         files: the page, and its parts if it is split.
@@ -111,6 +113,7 @@ class PageFiles:
         degree: of its harmonics.
         embed: origins of the pages that may frame it and exchange messages with it.
         photo_height: of its photographs, pixels; 0 without photographs.
+        num_flights, num_fades: edges along which it flies, and those along which it fades.
     """
 
     files: tuple[Path, ...]
@@ -119,6 +122,8 @@ class PageFiles:
     degree: int
     embed: tuple[str, ...] = ()
     photo_height: int = 0
+    num_flights: int = 0
+    num_fades: int = 0
 
 
 @with_progress_bar
@@ -164,7 +169,11 @@ def write_page(
         )
         scene = dataclasses.replace(scene, overlaps=(), links=(), starts=())
     tour, has_cameras = make_graph(scene), len(scene.cam2world) > 0
+    if not scene.joint and tour.overlaps:
+        tour = dataclasses.replace(tour, poor=find_poor_edges(scene, range(len(tour)), tour.overlaps))
     rooms = find_rooms(scene) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
+    if rooms is not None and not rooms.plan.num_heights:
+        rooms = None  # without a floor the doll's house is a heap
     scene = _prepare(scene)
     flights = _plan_flights(scene, tour)
     if len(scene.gaussians) > gaussians:
@@ -180,7 +189,7 @@ def write_page(
     poster = _draw_poster(scene, flights.start)
     pictures: list[PackedPhotograph] = []
     if has_pictures:
-        left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - len(packed.content) - len(poster)
+        left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - sum(map(len, packed.contents)) - len(poster)
         pictures = pack_photographs(
             scene,
             photographs,
@@ -203,7 +212,7 @@ def write_page(
         ]
     if rooms is not None and cameras is not None:
         header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
-    return _write_files(path, header, packed.content, pictures, poster, split, title or path.stem)
+    return _write_files(path, header, packed.contents, pictures, poster, split, title or path.stem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -451,6 +460,7 @@ def _describe_scene(
         "hysteresis": flights.hysteresis,
         "reach": REACH,
         "next": flights.next,
+        "poor": tour.poor,
         "routeRate": _ROUTE_RATE,
         "route": (flights.route - [*origin, 0.0, 0.0]).round(4).tolist(),
         "jumps": flights.jumps,
@@ -551,7 +561,7 @@ def _describe_links(
         found: dict[str, Any] = {"from": start, "to": end, "text": link.text}
         way = find_way_along_link(tour, start, end)
         ring = find_link_ring(tour, start, end, heights[start])
-        if way is not None and ring is not None and tour.is_fade(start, end):
+        if way is not None and ring is not None and tour.parts[start] != tour.parts[end]:
             found["mark"] = _round(positions[start] + ring)
             found["leave"] = _round(positions[start] + way)
             found["yaw"] = round(find_angles(level.T @ way / np.linalg.norm(way))[0], 5)
@@ -595,39 +605,55 @@ def _round(vector: np.ndarray) -> list[float]:
 def _write_files(
     path: Path,
     header: dict[str, Any],
-    content: bytes,
+    contents: Sequence[bytes],
     pictures: Sequence[PackedPhotograph],
     poster: bytes,
     split: bool,
     title: str,
 ) -> PageFiles:
-    """Write the page, and its parts if it is split."""
-    count = header["count"]
-    parts = [base64.b64encode(content[k : k + _PART_BYTES]).decode() for k in range(0, len(content), _PART_BYTES)]
-    texts = [f'addPart("{part}"); // {SOFTWARE}\n' for part in parts] if split else []
-    scripts = {f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js": text for text in texts}
+    """Write the page, and its parts if it is split.
+
+    Args:
+        contents: of the Gaussians of each view.
+    """
+    count, scripts = header["count"], {}
+    tags: dict[int, list[str]] = {}  # by view
+    for view, content in enumerate(contents):
+        ends = [*range(_PART_BYTES, len(content), _PART_BYTES), len(content)]
+        parts = [base64.b64encode(content[k:end]).decode() for k, end in pairwise((0, *ends))]
+        calls = [f"addPart({view}, {'true' if part is parts[-1] else 'false'}" for part in parts]
+        texts = [f'{call}, "{part}"); // {SOFTWARE}\n' for call, part in zip(calls, parts, strict=True)]
+        named = {f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js": text for text in texts}
+        header["views"][view]["files"] = [*named]
+        scripts |= named if split else {}
+        tags[view] = [
+            f'<script type="text/plain">{part}</script><script>{call})</script>'
+            for call, part in zip(calls, parts, strict=True)
+        ]
     folder = path.with_name(f"{path.stem}_files")
     address = quote(os.fsencode(folder.name))
-    tags = [f'<script src="{address}/{name}"></script>' for name in scripts]
+    elements: list[str] = []
     if split:
         for picture in pictures:
             scripts |= picture.make_scripts()
     else:
-        tags = [f'<script type="text/plain">{part}</script><script>addPart()</script>' for part in parts]
-        elements = [pictures[view].make_element() for view in header["loading"] if pictures]
-        tags[1:1] = elements[:1]  # of the first panorama early
-        tags += elements[1:]
+        first, *others = header["loading"]
+        shown = [picture.make_elements() for picture in pictures] or [[] for _ in tags]
+        # The smallest photograph of the first panorama, its Gaussians, and then its photograph.
+        elements = [*shown[first][:1], *tags[first], *shown[first][1:]]
+        for part in (tags, shown):
+            elements += [element for view in others for element in part[view]]
     page = _fill_template(
         script_sources="'self' file: blob:" if split else "blob:",
         title=html.escape(title),
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
         count=f"{count:,}",
-        header=_to_script(header | {"dataParts": len(parts), "folder": address if split else None}),
+        header=_to_script(header | {"folder": address if split else None}),
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         worker=_to_script("".join(map(_read, _WORKER))),
         programs=_bundle_programs(),
-        parts="\n".join(tags),
+        parts="\n".join(elements),
     ).encode(errors="replace")  # a title from a file name that is not UTF-8
     if len(page) > MAX_FILE_BYTES and not split:
         fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
@@ -648,7 +674,8 @@ def _write_files(
     files.insert(0, path)
     total = len(page) + sum(map(len, scripts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
-    return PageFiles(tuple(files), total, count, header["degree"], header["embed"], photo_height)
+    fades, edges = len(header["poor"]), sum(a != b for a, b, _ in header["edges"])
+    return PageFiles(tuple(files), total, count, header["degree"], header["embed"], photo_height, edges - fades, fades)
 
 
 def parse_origins(texts: Sequence[str]) -> tuple[str, ...]:

@@ -26,10 +26,10 @@ _CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
 
 @dataclass(frozen=True, eq=False)
 class PackedGaussians:
-    """Gaussians as bytes.
+    """Gaussians as the bytes that a web page reads.
 
     Attributes:
-        content: gzip of planes of bytes, those of one view after those of another.
+        contents: gzip of planes of bytes of each view.
         order: views in the order of their Gaussians.
         starts: index of the first Gaussian of each view.
         counts: number of Gaussians of each view.
@@ -39,7 +39,7 @@ class PackedGaussians:
         rooms: (camera, index of the first Gaussian, count) of the Gaussians that the doll's house view draws.
     """
 
-    content: bytes
+    contents: tuple[bytes, ...]
     order: tuple[int, ...]
     starts: tuple[int, ...]
     counts: tuple[int, ...]
@@ -94,11 +94,13 @@ def pack_gaussians(
     scale = max(float(np.quantile(np.abs(higher), 1 - _CLIPPED)) if higher.size else 0.0, 1e-6)
     quantised = np.clip(np.round(higher * (127.0 / scale)), -127, 127).astype(np.int8).view(np.uint8)
     ends = np.searchsorted(ranks[chosen], np.arange(len(order) + 1))
-    blocks = (plane[start:end].tobytes() for start, end in pairwise(ends) for plane in (*planes, *quantised.T))
-    content = gzip.compress(b"".join(blocks), 9, mtime=0)
+    blocks = [
+        b"".join(plane[start:end].tobytes() for plane in (*planes, *quantised.T)) for start, end in pairwise(ends)
+    ]
+    contents = tuple(gzip.compress(blocks[rank], 9, mtime=0) for rank in np.argsort(order))
     starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
     rooms = _list_runs(ranks[chosen], cameras[chosen])
-    return PackedGaussians(content, tuple(order), starts, counts, degree, (low, high), scale, rooms)
+    return PackedGaussians(contents, tuple(order), starts, counts, degree, (low, high), scale, rooms)
 
 
 def _list_runs(ranks: Int[np.ndarray, "n"], cameras: Int[np.ndarray, "n"]) -> tuple[tuple[int, int, int], ...]:

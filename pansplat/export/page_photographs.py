@@ -68,17 +68,23 @@ class PackedPhotograph:
 
     @property
     def num_bytes(self) -> int:
-        """Of all tiles."""
+        """The bytes of all tiles."""
         return sum(map(len, self.tiles))
 
     def describe(self) -> dict[str, Any]:
-        """What photographs.js reads."""
+        """The description of the photograph that photographs.js reads."""
         return {"name": self.name, "levels": self.levels, "rotation": self.rotation.tolist()}
 
-    def make_element(self) -> str:
-        """The elements of a page in one file that hold all tiles."""
-        texts = " ".join(base64.b64encode(tile).decode() for tile in self.tiles)
-        return f'<script type="text/plain">{texts}</script><script>addTile("{self.name}")</script>'
+    def make_elements(self) -> list[str]:
+        """The elements of a page in one file that hold the tiles of the smallest level, and all others."""
+        texts = [base64.b64encode(tile).decode() for tile in self.tiles]
+        (size, tile), *_ = self.levels
+        few = 6 * (-(-size // tile)) ** 2
+        return [
+            f'<script type="text/plain">{" ".join(chosen)}</script><script>addTile("{self.name}", {first})</script>'
+            for first, chosen in ((0, texts[:few]), (few, texts[few:]))
+            if chosen
+        ]
 
     def make_scripts(self) -> dict[str, str]:
         """A script for each tile by its file name: a page from disk may not read the pixels of image files."""

@@ -75,7 +75,7 @@ class CubeLevel:
         return ((row, column) for row in range(count) for column in range(count))
 
     def read(self, folder: Path, decode: Decode) -> list[UInt8[Array, "size size 3"]]:
-        """The six faces."""
+        """Read the six faces of the cube."""
         if self.cells:
             picture = decode(folder / self.faces[0])
             rows, columns = self.grid
@@ -118,7 +118,7 @@ class CubeImage:
         return 2 * self.levels[-1].size
 
     def list_files(self) -> Iterator[Path]:
-        """All pictures."""
+        """The files of all pictures of the cube, of each level."""
         return (self.folder / file for level in self.levels for file in level.list_files())
 
     def read(self, height: int, decode: Decode) -> tuple[UInt8[Array, "height width 3"], None]:

@@ -39,7 +39,7 @@ _EDGE = 0.5  # pixels beyond the outermost pixel centres' edges that count as co
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera.
+    """The intrinsics of a pinhole camera of a rig.
 
     Attributes:
         fx, fy: focal lengths, pixels.
@@ -62,7 +62,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class RigView:
-    """One of the pictures.
+    """A picture of a rig, and where its camera looks.
 
     Attributes:
         file: the picture.

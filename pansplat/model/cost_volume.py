@@ -111,7 +111,7 @@ class LevelDepth:
 
     @property
     def depth(self) -> Float[Tensor, "batch view height width"]:
-        """Radial depth, metres."""
+        """The estimated radial depth of the level, metres."""
         return 1 / self.inverse_depth
 
 

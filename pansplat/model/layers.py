@@ -18,7 +18,7 @@ from torch.nn import functional
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import Border, pad_equirect, resize_equirect
 from pansplat.geometry.pose import orthonormal_error
-from pansplat.system.options import Precision
+from pansplat.prediction_options import Precision
 
 Compat = Literal["official", "fixed"]
 

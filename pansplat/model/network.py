@@ -33,8 +33,8 @@ from pansplat.model.weights import (
     read_checkpoint,
     require_shapes,
 )
+from pansplat.prediction_options import CompatChoice
 from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
-from pansplat.system.options import CompatChoice
 from pansplat.system.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
@@ -123,7 +123,7 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
-        """As `__call__`, with the radial depth maps of the swept levels, metres, coarse to fine."""
+        """Predict Gaussians like `__call__`, and the radial depth maps of the swept levels, metres, coarse to fine."""
         matched, tiles = self._match(images, cam2world, near, far, masks, progress)
         parts = list(self._lift(matched, tiles, progress))
         gaussians = merge_tiles(parts, self.network.compat)[0].to(device=images.device)

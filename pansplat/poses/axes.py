@@ -229,7 +229,7 @@ class RotationPrior:
         return heading + math.log(share * walls + others * upright + 1 - share - others)
 
     def _heading_score(self, rotation: Float[Array, "3 3"]) -> float:
-        """The same for the compass alone, which metal and careless programs disturb."""
+        """The score of a rotation by the compass alone, which metal and careless programs disturb."""
         if self.first.heading is None or self.second.heading is None:
             return 0.0
         north = [np.array((-math.sin(h), 0.0, math.cos(h))) for h in (self.first.heading, self.second.heading)]

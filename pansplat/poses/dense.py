@@ -56,7 +56,7 @@ class Comparison:
 
     @property
     def weight(self) -> float:
-        """That of likeness, shade and hue: few directions correlate by chance."""
+        """The weight of likeness, shade and hue: few directions correlate by chance."""
         return float(overlap_weight(np.array(self.overlap)))
 
 
@@ -73,7 +73,7 @@ class Surroundings:
     depth: DepthMap
 
     def mirrored(self) -> Surroundings:
-        """Those of the panorama that is mirrored left to right."""
+        """The surroundings in the panorama that is mirrored left to right."""
         return Surroundings(self.image[:, ::-1], self.depth.mirrored())
 
     @functools.cached_property

@@ -49,7 +49,7 @@ class DepthMap:
         return sample_nearest(self.log_depth, upright), deviation
 
     def mirrored(self) -> DepthMap:
-        """That of the panorama that is mirrored left to right."""
+        """The depth of the panorama that is mirrored left to right."""
         flip = np.diag((-1.0, 1.0, 1.0))
         return DepthMap(self.log_depth[:, ::-1], self.scale[:, ::-1], flip @ self.rotation @ flip)
 
@@ -91,7 +91,7 @@ class MatchDepths:
     deviation: Float[Array, "match 2"]
 
     def select(self, chosen: Int[Array, "n"] | slice) -> MatchDepths:
-        """Those of some matches."""
+        """The depths of a selection of the matches."""
         return replace(self, log_depth=self.log_depth[chosen], deviation=self.deviation[chosen])
 
     def find_distance(self, depths: Float[Array, "match 2"], weight: Float[Array, "match"]) -> float:

@@ -135,7 +135,7 @@ class PoseEstimate:
 
     @property
     def poses(self) -> dict[Path, Float[Array, "4 4"]]:
-        """Those of the largest group."""
+        """The poses, cam2world, of the panoramas of the largest group."""
         return self.groups[0].poses
 
     @property
@@ -222,7 +222,7 @@ class _View:
 
     @functools.cached_property
     def joined(self) -> Features:
-        """All features."""
+        """The features of `matched`, and those of the faces turned against the walls."""
         return self.matched.joined(self.turned)
 
     @functools.cached_property
@@ -662,7 +662,7 @@ def _find_scale(
         return baseline[2] / distance, f"{files[ends[0]].name} and {files[ends[1]].name} are {baseline[2]:g} m apart"
     found = find_common_height(find_floors(images, poses, camera_height))
     if found is None:
-        return camera_height, f"cameras {camera_height:g} m over the floor, by estimated depth (no floor was found)"
+        return camera_height, f"by estimated depth and an assumed height of {camera_height:g} m: no floor was found"
     height, doubt = found
     source = f"cameras {camera_height:g} m over the floor"
     if doubt is not None:

@@ -32,7 +32,7 @@ class ParameterGroup:
     _states: dict[Tensor, tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict, init=False)
 
     def clear_gradients(self) -> None:
-        """Forget the gradients."""
+        """Set the gradients of all parameters to none, before the next step."""
         for parameter in self.parameters:
             parameter.grad = None
 

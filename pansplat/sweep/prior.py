@@ -57,7 +57,7 @@ class PriorConfig:
 
 @dataclass(frozen=True, eq=False)
 class DepthPrior:
-    """One view's prior.
+    """The prior of the depth of a view.
 
     Attributes:
         log_depth: (h, w) logarithm of radial depth.

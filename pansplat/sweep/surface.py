@@ -100,7 +100,7 @@ CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One view's surface.
+    """The surface that a view shows: its distance in each direction.
 
     Attributes:
         inverse_depth: (h, w) inverse radial depth, 1/m.

@@ -137,7 +137,12 @@ def require_output_folder(option: str, folder: Path) -> None:
 
 
 def require_new_folder(option: str, folder: Path) -> None:
-    """Check that a folder can be made, before the work: it does not exist, or is empty. Arguments as above."""
+    """Check that a folder can be made, before the work: it does not exist, or is empty.
+
+    Args:
+        option: the option that error messages name, such as "--out".
+        folder: the folder.
+    """
     require_output_folder(option, folder)
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{option} {folder}: needed a new or empty folder, got one with files; choose another name")

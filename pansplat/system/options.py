@@ -1,4 +1,4 @@
-"""Options of reading and prediction, types of the numbers on command lines, and one check of all of them.
+"""Types of the numbers on command lines, and one check of all of them.
 
 An option has a type such as `Height`, an integer with a range. `check_numbers` refuses a number out of range, with one
 line that names the option, before anything is loaded.
@@ -9,11 +9,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import typing
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from msgspec import Meta
-from tyro.conf import Fixed, Suppress, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from pansplat.system.strict_json import convert
@@ -41,54 +39,6 @@ Fraction = Annotated[float, Meta(ge=0, lt=1)]
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 Real = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Weight = Annotated[float, Meta(ge=0, le=1e9)]
-
-CompatChoice = Literal["trained", "official", "fixed"]
-Precision = Literal["float32", "bfloat16"]
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """How panoramas are read."""
-
-    # The names are those of the keywords of `pansplat.load_pairs`.
-    convention: str | None = None
-    """Pose convention, if the folder does not state it: "cam2world opencv", "cam2world opengl",
-    "world2cam opencv" or "world2cam opengl" (Habitat and Blender use opengl)."""
-    near: Depth | None = None
-    """Nearest depth to search, metres; by default the folder's."""
-    far: Depth | None = None
-    """Farthest depth to search, metres; by default the folder's."""
-    camera_height: Positive = 1.5
-    """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
-
-
-@dataclass(frozen=True)
-class PredictOptions:
-    """How the scene of panoramas is predicted and refined."""
-
-    # The names are those of the keywords of `pansplat.predict`.
-    model: str = "default"
-    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an official
-    .ckpt)."""
-    compat: CompatChoice = "trained"
-    """For a network: official computes what the official code does, fixed corrects its defects; by default the one
-    that the weights were trained with, which is official for official weights."""
-    precision: Precision = "float32"
-    """Number type of a network's convolutions; bfloat16 is less exact, and faster if the processor supports it."""
-    height: Height | None = None
-    """Panoramas are resized to this height before the prediction, pixels; by default that of the photographs, at
-    most 1024 (for networks and tours 512)."""
-    refine_seconds: Annotated[Seconds | None, arg(name="refine")] = None
-    """Time limit of the refinement after the prediction, seconds; 0 for none. By default 10; where each surface is kept
-    once 20, for the page of a pair 30."""
-    gaussians: Annotated[Count | None, Fixed, Suppress] = None
-    joint: Annotated[bool, Fixed, Suppress] = False
-    cache: Annotated[bool, Fixed, Suppress] = True
-
-    @property
-    def keywords(self) -> dict[str, Any]:
-        """All but the model, which is loaded once for many scenes."""
-        return {name: value for name, value in vars(self).items() if name != "model"}
 
 
 def check_numbers(options: Any, *, prefixed: bool = False, prefix: str = "--") -> None:

@@ -6,6 +6,7 @@ self-edge and the scene of a single view. Between parts the image fades.
 """
 
 from pansplat.tours.doll_house import Rooms, find_fronts, find_rooms, fit_box, measure_box
+from pansplat.tours.edges import find_poor_edges
 from pansplat.tours.floor import (
     FloorOutline,
     FloorPlan,
@@ -61,6 +62,7 @@ __all__ = [
     "find_fronts",
     "find_link_ring",
     "find_other_storeys",
+    "find_poor_edges",
     "find_rooms",
     "find_storeys",
     "find_tours",

@@ -59,6 +59,7 @@ class TourGraph:
         originals: the panoramas with poses in their own worlds, which scenes are predicted from; none if these
             are `panoramas`.
         walls: pairs of panoramas of one world between which is a wall or a closed door; they are no edges.
+        poor: edges along which the image fades, because the surfaces of their panoramas disagree (`judge_edges`).
     """
 
     name: str
@@ -70,6 +71,7 @@ class TourGraph:
     overlaps: dict[Edge, float] = field(default_factory=dict)
     originals: tuple[Panorama, ...] = ()
     walls: tuple[Edge, ...] = ()
+    poor: tuple[Edge, ...] = ()
 
     def __repr__(self) -> str:
         names = list_first([panorama.label for panorama in self.panoramas])
@@ -91,7 +93,7 @@ class TourGraph:
 
     @cached_property
     def positions(self) -> Float[np.ndarray, "node 3"]:
-        """Camera centres, metres."""
+        """The camera centres of all panoramas, metres."""
         return self.cam2world[:, :3, 3].numpy()
 
     @cached_property
@@ -358,11 +360,14 @@ class TourGraph:
             steps = np.linalg.norm(np.diff([position, *self.positions[walk]], axis=0), axis=1)
             return sum(fades), float(steps[~np.array([False, *fades])].sum())
 
-        return min((self.find_walk(end, node) for end in nearest), key=measure)
+        ends: Sequence[int] = nearest
+        if nearest in self.poor:  # no camera flies to its other end
+            ends = [min(nearest, key=lambda end: float(np.linalg.norm(self.positions[end] - position)))]
+        return min((self.find_walk(end, node) for end in ends), key=measure)
 
     def is_fade(self, start: int, end: int) -> bool:
-        """Whether a step of a walk is a fade: its nodes are of different parts."""
-        return self.parts[start] != self.parts[end]
+        """Whether a step of a walk is a fade: its nodes are of different parts, or its edge is poor."""
+        return self.parts[start] != self.parts[end] or (min(start, end), max(start, end)) in self.poor
 
     def find_next_nodes(self) -> list[list[int]]:
         """The next node on the cheapest way from a node (row) to another one (column)."""
@@ -402,7 +407,8 @@ class TourGraph:
         """Cost of the cheapest way between all nodes, and the node before its end."""
         costs = np.full((len(self), len(self)), np.inf)
         for (a, b), overlap in self.overlaps.items():
-            doubt = max(1 - overlap / 0.25, 0.0)  # with little overlap a way around looks better
+            # With little overlap a way around looks better.
+            doubt = 1.0 if (a, b) in self.poor else max(1 - overlap / 0.25, 0.0)
             costs[a, b] = costs[b, a] = max(self.length((a, b)), 1e-3) * (1 + 3 * doubt)
         ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
         is_near = np.isfinite(ways)
@@ -412,7 +418,7 @@ class TourGraph:
             fade = 0.5 * longest + _LINKED_FADE * self.far
             costs[~is_near] = _UNLINKED_FADE * fade + longest
             for a, b in (*self.links, *self.walls):
-                if self.is_fade(a, b):
+                if self.parts[a] != self.parts[b]:
                     costs[a, b] = costs[b, a] = fade
             ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
         return ways, previous

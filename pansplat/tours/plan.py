@@ -73,7 +73,7 @@ class Room:
 
     @property
     def area(self) -> float:
-        """Square metres."""
+        """The area of the room, square metres."""
         return float(Polygon(self.outline).area)
 
 
@@ -92,7 +92,7 @@ class Door:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A floor plan.
+    """The floor plan of a tour: rooms with straight walls, and doors.
 
     Attributes:
         tour: the panoramas, their edges and links.

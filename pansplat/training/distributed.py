@@ -86,7 +86,7 @@ class ProcessGroup:
         self._initialized = True
 
     def destroy(self) -> None:
-        """Undo `initialize`."""
+        """Leave the group of processes that `initialize` has joined."""
         if self._initialized and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
             self._initialized = False

@@ -38,7 +38,7 @@ TEST_SETS = (
 
 
 class SampleSource(Protocol):
-    """Samples by index."""
+    """Training samples, addressed by their index."""
 
     def __len__(self) -> int: ...
 

@@ -36,7 +36,7 @@ export function turn(yaw, pitch) {
 // Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part, or
 // near the panoramas of a scene without edges; steps away from them become shorter near the limit.
 export function walk(right, up, forward) {
-  if (doll.isOn) return;
+  if (doll.isOn || !sorted) return;
   const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
   const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
   const target = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
@@ -94,9 +94,10 @@ export function floorPoint(position) {
 
 const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
 export const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
+export const DOLLY_MS = 500;               // of a fade along a poor edge
 
-export const { edges, parts, next, hysteresis, reach } = HEADER;
-export const GRAPH = { positions: HEADER.spots.map((spot) => spot.position), edges, parts, next, hysteresis, reach };
+export const { edges, parts, next, poor, hysteresis, reach } = HEADER;
+export const GRAPH = { positions: HEADER.spots.map((spot) => spot.position), edges, parts, next, poor, hysteresis, reach };
 export let edge = 0, group = edges.length ? edges[0][2] : 0, fade = null;
 
 // Weights of the views of a group at a position: normalised inverse distances (docs/rendering.md, section 7). Other

@@ -5,7 +5,7 @@ import { camera, nearestNode, parts, tangentOf } from "./camera.js";
 import { byId, calm } from "./dom.js";
 import { ease, freeze, isWaiting, jump, jumpTo, lookOn, setTouring } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
-import { changed, measureAt, rayOf } from "./loop.js";
+import { changed, measureAt, rayOf, sorted } from "./loop.js";
 import { DEGREE } from "./share.js";
 import { headset } from "./xr.js";
 
@@ -43,7 +43,7 @@ class DollHouse {
 
   // Flies out of the panorama at the camera.
   enter() {
-    if (!this.isPossible || headset.session) return;
+    if (!this.isPossible || headset.session || !sorted) return;
     setTouring(false);
     this.node = nearestNode(camera.position);
     freeze();

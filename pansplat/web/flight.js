@@ -2,20 +2,22 @@
 // image of the camera before covers the new one until that is sorted, then it fades out.
 
 import {
-  camera, cameraFor, currentPart, edge, edges, FADE_MS, GRAPH, group, makeStart, nearestNode, nodeHere, parts,
-  settleAt, turn,
+  camera, cameraFor, currentPart, DOLLY_MS, edge, edges, FADE_MS, GRAPH, group, makeStart, nearestNode, nodeHere, parts,
+  rotationOf, settleAt, turn,
 } from "./camera.js";
 import { doll } from "./doll.js";
 import { byId, calm, canvas } from "./dom.js";
 import {
-  clamp, distanceOf, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
+  clamp, column, distanceOf, dot, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
 } from "./graph.js";
 import { isComplete } from "./loading.js";
 import { changed, drawAt, fullSize, isSortedAs, renderer, sorted } from "./loop.js";
+import { photographs } from "./photographs.js";
 import { headset } from "./xr.js";
 
 const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
 const DIRECTIONS = 24;              // of the bits of `blank`
+const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
 
 // The heading after a fade: away from the link back, or the start view, or that of before.
@@ -33,8 +35,9 @@ export function lookOn(node, yaw) {
 
 const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
 
-export function jump(position, { yaw, pitch }) {
-  freeze();
+// `zoom`: of the image of before, by which a fast fade along a poor edge looks like a step.
+export function jump(position, { yaw, pitch }, zoom = null) {
+  freeze(zoom);
   place({ position: [...position], yaw, pitch });
 }
 
@@ -90,7 +93,9 @@ export function advanceFlight(now) {
   if (!flight || isWaiting()) return;
   const leg = flight.legs[0];
   if (leg.to !== undefined) {
-    jump(GRAPH.positions[leg.to], isFade(GRAPH, leg.from, leg.to) ? arriveAt(leg.to, leg.from) : { ...camera, yaw: lookOn(leg.to, camera.yaw) });
+    const isElsewhere = parts[leg.from] !== parts[leg.to], isDolly = !isElsewhere && isFade(GRAPH, leg.from, leg.to) && !calm.matches;
+    const arrival = isElsewhere ? arriveAt(leg.to, leg.from) : { ...camera, yaw: lookOn(leg.to, camera.yaw) };
+    jump(GRAPH.positions[leg.to], arrival, isDolly ? zoomTowards(GRAPH.positions[leg.to]) : null);
     flight.legs.shift();
     if (!flight.legs.length) flight = null;
     return;
@@ -108,6 +113,12 @@ export function advanceFlight(now) {
   const { spot } = flight;
   flight = null;
   if (touring) flyTo((spot + 1) % HEADER.spots.length);
+}
+
+// Of an image, as of a camera that comes nearer; none if the way leads to the side or back.
+function zoomTowards(position) {
+  const way = minus(position, camera.position);
+  return ZOOM * Math.max(dot(column(rotationOf(camera), 2), way) / Math.max(Math.hypot(...way), 1e-9), 0);
 }
 
 function beginLeg(leg, now) {
@@ -212,19 +223,20 @@ export const isFlying = () => flight !== null || route !== null;
 const still = byId("still");
 export let frozen = null;
 
-export function freeze() {
+export function freeze(zoom = null) {
   if (!renderer || !sorted) return;
   if (headset.session) {  // it fades from black
-    frozen = { began: null, left: 1, position: null };
+    frozen = { began: null, left: 1, position: null, zoom: null };
     return;
   }
-  drawAt(canvas.width, canvas.height);  // what a canvas shows can be copied in the task that drew it
-  const size = fullSize(), context = still.getContext("2d");
+  const size = fullSize();  // a photograph is drawn fast
+  drawAt(...(photographs.isOpaque ? size : [canvas.width, canvas.height]));  // it can be copied in the task that drew it
+  const context = still.getContext("2d");
   const isSame = still.width === size[0] && still.height === size[1];
   context.globalAlpha = frozen && isSame ? 1 - frozen.left : 1;
   if (!isSame) [still.width, still.height] = size;
   context.drawImage(canvas, 0, 0, ...size);
-  frozen = { began: null, left: 1, position: null };
+  frozen = { began: null, left: 1, position: null, zoom };
   showStill();
   changed();
 }
@@ -233,9 +245,10 @@ export function updateStill(now) {
   if (!frozen) return;
   frozen.position = frozen.position || [...camera.position];
   const isSorted = isSortedAs() && distanceOf(sorted.position, frozen.position) < HEADER.speed;
-  if (frozen.began === null && isSorted && isSeen()) frozen.began = now;
+  const isThere = frozen.zoom === null || !HEADER.photographs.length || photographs.isOpaque;
+  if (frozen.began === null && isSorted && isThere && isSeen()) frozen.began = now;
   if (frozen.began !== null) {
-    const t = clamp((now - frozen.began) / FADE_MS, 0, 1);
+    const t = clamp((now - frozen.began) / (frozen.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);
     frozen.left = 1 - t * t * (3 - 2 * t);
     if (t === 1) frozen = null;
   }
@@ -247,13 +260,15 @@ function showStill() {
   const left = coverage();
   still.hidden = !frozen || headset.session !== null;
   still.style.opacity = left;
+  still.style.transform = frozen && frozen.zoom ? `scale(${1 + frozen.zoom * (1 - left)})` : "";
   byId("spots").style.opacity = 1 - left;
 }
 
 // Whether a view of the group at the camera is sorted, or all are empty.
 const isSeen = () => doll.isOn || HEADER.groups[group].some((view) => sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
 
-export const isWaiting = () => frozen !== null && frozen.began === null;
+// Whether nothing moves yet: the Gaussians have not arrived, or an image covers them.
+export const isWaiting = () => !sorted || frozen !== null && frozen.began === null;
 
 // How much of the picture the image covers, or the black in a headset.
 export const coverage = () => frozen ? frozen.left : 0;

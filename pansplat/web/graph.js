@@ -2,7 +2,7 @@
 // pansplat.tours.TourGraph that they name; tests/web/test_browser.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
-// on the way from one (row) to another one (column); the `hysteresis` of a change of edge; and the `reach` around a part,
+// on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; and the `reach` around a part,
 // within which a camera that has jumped is in it. Edges are numbers in `edges`.
 
 export const minus = (a, b) => a.map((value, i) => value - b[i]);
@@ -53,11 +53,15 @@ export function isReachable(graph, edge, node) {
 }
 
 // is_fade
-export const isFade = (graph, from, to) => graph.parts[from] !== graph.parts[to];
+export const isFade = (graph, from, to) => {
+  return graph.parts[from] !== graph.parts[to] || graph.poor.some((edge) => edge.includes(from) && edge.includes(to) && from !== to);
+};
 
 // find_way
 export function findWay(graph, position, node, part = null) {
-  const ways = graph.edges[nearestEdge(graph, position, part)].slice(0, 2).map((start) => {
+  const ends = graph.edges[nearestEdge(graph, position, part)].slice(0, 2), [from, to] = ends.map((end) => distanceOf(graph.positions[end], position));
+  if (isFade(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1];  // no camera flies to the other end
+  const ways = ends.map((start) => {
     const way = [start];
     while (way.at(-1) !== node) way.push(graph.next[way.at(-1)][node]);
     return way;

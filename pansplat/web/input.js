@@ -179,6 +179,7 @@ export function listen() {
   byId("map").onclick = () => plan.toggle();
   byId("doll").onclick = () => doll.toggle();
   byId("doll").hidden = !doll.isPossible;
+  byId("no-doll").hidden = doll.isPossible;
   byId("more").onclick = () => showMore(byId("menu").hidden);
   for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", () => share.savePicture()], ["link", () => share.copyLink()]]) {
     byId(id).onclick = () => {

@@ -1,11 +1,16 @@
-// The data, which arrives in parts while the scene is shown, and failures. docs/web.md describes the data.
+// The data, which arrives in parts while the scene is shown, and failures. docs/web.md describes the data. A page in one file
+// has all views; one with a folder loads those that the camera needs.
 
-import { camera, currentPart, parts } from "./camera.js";
-import { byId } from "./dom.js";
+import { camera, currentPart, edges, group, nodeHere, parts } from "./camera.js";
+import { doll } from "./doll.js";
+import { byId, canvas } from "./dom.js";
+import { flight } from "./flight.js";
 import { onSorted, sorted } from "./loop.js";
 
 export let worker = null, failure = null, partsArrived = 0, arrived = 0;  // parts of the data, views
-export const isComplete = () => arrived === HEADER.loading.length;
+const asked = new Set(), got = new Set();  // views
+let lacks = fail;                          // reports a part that does not arrive
+export const isComplete = () => [...asked].every((view) => got.has(view));
 
 export function fail(error) {
   if (failure) return;
@@ -19,7 +24,7 @@ export function fail(error) {
 
 // A script for each part of the data calls this. In a page of one file the part is the element before: unlike text in a
 // program, it is not kept.
-window.addPart = (text) => {
+window.addPart = (view, isLast, text) => {
   const { currentScript: script } = document;
   if (text === undefined) {
     text = script.previousElementSibling.textContent;
@@ -27,16 +32,37 @@ window.addPart = (text) => {
   }
   script.remove();
   partsArrived += 1;
-  byId("bar").value = partsArrived / HEADER.dataParts;
-  if (!worker) return;
-  worker.postMessage({ text });
-  if (partsArrived === HEADER.dataParts) worker.postMessage({ end: true });
+  byId("bar").value = partsArrived / countParts();
+  if (worker) worker.postMessage({ view, text, isLast });
 };
+
+const countParts = () => [...asked].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
+
+// Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all of the part for the
+// doll's house, and all without edges.
+export function loadAround() {
+  if (asked.size === HEADER.loading.length) return;
+  const nodes = [nodeHere(), ...(flight ? [flight.spot] : [])];
+  const groups = edges.filter(([a, b]) => nodes.includes(a) || nodes.includes(b)).map(([, , each]) => each);
+  const near = new Set([...groups, group].flatMap((each) => HEADER.groups[each]));
+  const isAll = HEADER.folder === null || !edges.length;
+  for (const view of HEADER.loading) {
+    if (asked.has(view) || !(isAll || near.has(view) || doll.isOn && parts[view] === currentPart())) continue;
+    asked.add(view);
+    canvas.ariaBusy = true;
+    for (const file of HEADER.folder === null ? [] : HEADER.views[view].files) {
+      const script = document.createElement("script");
+      Object.assign(script, { src: `${HEADER.folder}/${file}`, async: false });  // in this order
+      script.onerror = () => lacks(new Error("A part of the scene is missing. Copy the whole folder."));
+      document.head.append(script);
+    }
+  }
+}
 
 // Starts the worker; `onView` gets the Gaussians of each view. Returns a promise of the first order.
 export function load(onView) {
   return new Promise((resolve, reject) => {
-    const fails = (error) => sorted ? fail(error) : reject(error);
+    const fails = lacks = (error) => sorted ? fail(error) : reject(error);
     worker = new Worker(URL.createObjectURL(new Blob([WORKER])));
     worker.onmessage = ({ data }) => {
       if (data.error) fails(new Error(`The data of the scene cannot be read: ${data.error}`));
@@ -45,6 +71,7 @@ export function load(onView) {
         resolve();
       } else {
         arrived += 1;
+        got.add(data.view);
         onView(data);
       }
     };
@@ -52,8 +79,10 @@ export function load(onView) {
     const { count, degree, views, loading, harmonicsScale, colorRange } = HEADER;
     const first = { position: [...camera.position], part: currentPart(), ranges: null };
     worker.postMessage({ header: { count, degree, views, loading, parts, harmonicsScale, colorRange, first } });
+    if (HEADER.folder !== null) return;
+    loadAround();
     addEventListener("DOMContentLoaded", () => {
-      if (partsArrived !== HEADER.dataParts) fails(new Error("A part of the scene is missing. Copy the whole folder."));
+      if (partsArrived !== countParts()) fails(new Error("A part of the scene is missing. Copy the whole folder."));
     });
   });
 }

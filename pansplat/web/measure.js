@@ -4,8 +4,10 @@ import { camera } from "./camera.js";
 import { byId, say } from "./dom.js";
 import { distanceOf, minus, plus, scaled } from "./graph.js";
 import { changed, measureAt, rayOf } from "./loop.js";
+import { here } from "./rings.js";
 
 const SVG = byId("marks").namespaceURI;
+const SINGLE_ERROR = 0.35;  // of a distance in a panorama alone: heights of cameras over the floor differ by as much
 const NEAREST = 0.02;  // z of the ends of a line, of the distance of its farther end
 
 export function drawSvg(tag, attributes, text = "") {
@@ -43,8 +45,11 @@ class Measure {
     changed();
   }
 
+  // The scale of a panorama without others in its world is that of a camera of usual height.
   format(distance) {
-    return `${(distance / HEADER.unit).toFixed(2)} m`;
+    const { worlds } = HEADER.plan, isAlone = worlds.filter((world) => world === worlds[here]).length === 1;
+    const [length, error] = [1, SINGLE_ERROR].map((factor) => (factor * distance / HEADER.unit).toFixed(2));
+    return isAlone ? `${length} m ± ${error} m` : `${length} m`;
   }
 
   // Draws the points and their line over the picture. `project`: from the scene to camera axes, and from there to the window.

@@ -5,7 +5,7 @@ import { byId, canvas } from "./dom.js";
 import { embed } from "./embed.js";
 import { flyTo, jumpTo, setPose, setTouring } from "./flight.js";
 import { listen } from "./input.js";
-import { fail, failure, isComplete, load } from "./loading.js";
+import { fail, failure, isComplete, load, loadAround } from "./loading.js";
 import { drawAt, isSettled, isSortedFor, onFrame, redraw, renderer, setRenderer, sorted } from "./loop.js";
 import { makeNotes } from "./notes.js";
 import { photographs } from "./photographs.js";
@@ -54,11 +54,19 @@ async function main() {
     try { makeRenderer(); } catch (error) { fail(error); }
   });
   makeRenderer();
-  await loading;
   while (!renderer) {  // the context is lost
     if (failure) throw failure;
     await wait(50);
   }
+  let isLoaded = false;
+  loading.then(() => { isLoaded = true; }, () => { isLoaded = true; });
+  while (!isLoaded && photographs.isExpected) {  // it can be looked at before the Gaussians arrive
+    photographs.update(1);
+    await wait(5);
+  }
+  loadAround();
+  if (photographs.isOpaque) loading.catch(fail);
+  else await loading;
   showViews(1);
   listen();
   headset.offer();
@@ -66,7 +74,7 @@ async function main() {
   makeList();
   makeNotes();
   embed.listen(canvas, window.pansplat);
-  requestAnimationFrame(onFrame);
+  onFrame(performance.now());
   byId("cover").className = "done";
   setTimeout(() => { byId("cover").hidden = !failure; }, 700);
 }
@@ -94,7 +102,8 @@ window.pansplat = Object.assign(new EventTarget(), {
     await this.ready;
     const place = [...camera.position];
     settleAt(place);
-    while (!renderer || !isComplete() || !isSortedFor(place, currentPart()) || !photographs.isFinal([width, height])) {
+    loadAround();
+    while (!sorted || !renderer || !isComplete() || !isSortedFor(place, currentPart()) || !photographs.isFinal([width, height])) {
       if (failure) throw failure;
       await wait(5);
       photographs.update(1, [width, height]);

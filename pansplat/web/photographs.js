@@ -24,14 +24,15 @@ const FACES = [
 const texts = new Map();            // of a page in one file: base64 of the tiles that have arrived
 const requests = new Map();         // of other pages: what takes the text of a tile
 
-// A script for each tile calls this; in a page of one file, one for all tiles of a photograph, which are in the element before.
+// A script for each tile calls this; in a page of one file, one for the smallest tiles of a photograph and one for the others,
+// which are in the element before.
 window.addTile = (name, number, text) => {
-  if (number !== undefined) {
+  if (text !== undefined) {
     requests.get(`${name}_${number}`)(text);
     return;
   }
   const { currentScript: script } = document, { previousElementSibling: element } = script;
-  element.textContent.split(" ").forEach((each, k) => texts.set(`${name}_${k}`, each));
+  element.textContent.split(" ").forEach((each, k) => texts.set(`${name}_${number + k}`, each));
   element.remove();
   script.remove();
 };
@@ -131,6 +132,12 @@ class Photographs {
   findNode() {
     const node = nodeHere();
     return !doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
+  }
+
+  // Whether the photograph at the camera, which is not shown yet, may arrive.
+  get isExpected() {
+    const node = HEADER.photographs.length ? this.findNode() : null;
+    return node !== null && renderer !== null && !this.isOpaque && this.levelsOf(node)[0].tiles.every(({ state }) => state !== "failed");
   }
 
   // The levels of a photograph that the device can hold, the smallest first.

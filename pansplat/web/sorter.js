@@ -6,17 +6,16 @@ const VIEW_SHIFT = 22;  // of the view in a word of the order; the lower bits ar
 
 // `ranges`: [view, first, count] of Gaussians that are sorted together, and drawn as one layer: the doll's house view.
 function sort({ position, part, ranges }) {
-  const { loading, parts, views: all, order, colors } = scene;
-  const seen = loading.slice(0, arrived), views = seen.filter((view) => parts[view] === part);
-  const end = Math.max(...seen.map((view) => all[view].start + all[view].count));
-  const together = ranges && ranges.filter(([, start, count]) => start + count <= end);
+  const { parts, views: all, order, colors } = scene, views = arrived.filter((view) => parts[view] === part);
+  const isThere = (place) => arrived.some((view) => all[view].start <= place && place < all[view].start + all[view].count);
+  const together = ranges && ranges.filter(([, start]) => isThere(start));
   if (together) sortRanges(together, position, 0);
   for (const view of views) {
     if (!together) sortRanges([[0, all[view].start, all[view].count]], position, all[view].start);
     if (colors) evaluateColors(all[view], position);
   }
   const count = together && together.reduce((sum, range) => sum + range[2], 0);
-  postMessage({ position, part, ranges, count, views, arrived, order, colors: colors && new Uint8Array(colors.buffer) });
+  postMessage({ position, part, ranges, count, views, arrived: arrived.length, order, colors: colors && new Uint8Array(colors.buffer) });
 }
 
 // Writes the Gaussians of some ranges from a place of the order on, farthest first: a stable radix sort of the bits of the squared

@@ -1,14 +1,14 @@
 "use strict";
-// A worker, with sorter.js: decodes the data of the page as its parts arrive, and hands over the Gaussians of one view after
-// the other. docs/web.md describes the data.
+// A worker, with sorter.js: decodes the data of the page as its parts arrive, and hands over the Gaussians of each view when
+// it is complete. docs/web.md describes the data.
 
-let scene = null, arrived = 0, writer = null;  // arrived: number of views
+let scene = null;
+const arrived = [], writers = new Map();  // views, and where their data goes
 let first = null;  // what is sorted as soon as a view of its part has arrived, before the parts that wait
 
 onmessage = ({ data }) => {
   if (data.header) begin(data.header);
-  else if (data.text) writer.write(decode(data.text)).catch(() => {});  // its error is that of the reader
-  else if (data.end) writer.close().catch(() => {});
+  else if (data.text !== undefined) receive(data);
   else sort(data);
 };
 
@@ -17,9 +17,17 @@ function begin(header) {
   const { count, degree } = header, terms = (degree + 1) ** 2 - 1;
   scene = { ...header, terms, means: new Float32Array(3 * count), order: new Uint32Array(count) };
   if (terms) Object.assign(scene, { harmonics: new Int8Array(3 * terms * count), base: new Uint8Array(4 * count), colors: new Uint8ClampedArray(4 * count) });
-  const stream = new DecompressionStream("gzip");
-  writer = stream.writable.getWriter();
-  readViews(stream.readable.getReader()).catch((error) => postMessage({ error: String(error.message || error) }));
+}
+
+function receive({ view, text, isLast }) {
+  if (!writers.has(view)) {
+    const stream = new DecompressionStream("gzip");
+    writers.set(view, stream.writable.getWriter());
+    readView(view, stream.readable.getReader()).catch((error) => postMessage({ error: String(error.message || error) }));
+  }
+  const writer = writers.get(view);
+  writer.write(decode(text)).catch(() => {});  // its error is that of the reader
+  if (isLast) writer.close().catch(() => {});
 }
 
 function decode(base64) {
@@ -28,29 +36,21 @@ function decode(base64) {
   return bytes;
 }
 
-async function readViews(reader) {
-  let chunk = new Uint8Array(0);
-  for (const view of scene.loading) {
-    const planes = new Uint8Array(scene.views[view].count * (23 + 3 * scene.terms));
-    for (let filled = 0; filled < planes.length;) {
-      if (!chunk.length) {
-        const { value, done } = await reader.read();
-        if (done) throw new Error("The data of the scene ends early.");
-        chunk = value;
-      }
-      const taken = chunk.subarray(0, planes.length - filled);
-      planes.set(taken, filled);
-      filled += taken.length;
-      chunk = chunk.subarray(taken.length);
-    }
-    const arrays = unpack(planes, view);
-    arrived += 1;
-    postMessage({ view, ...arrays }, Object.values(arrays).map((array) => array.buffer));
-    if (!first || scene.parts[view] !== first.part || !scene.views[view].count) continue;
-    sort(first);
-    first = null;
+async function readView(view, reader) {
+  const planes = new Uint8Array(scene.views[view].count * (23 + 3 * scene.terms));
+  for (let filled = 0; filled < planes.length;) {
+    const { value, done } = await reader.read();
+    if (done) throw new Error("The data of the scene ends early.");
+    planes.set(value, filled);
+    filled += value.length;
   }
-  if (first) sort(first);
+  const arrays = unpack(planes, view);
+  arrived.push(view);
+  postMessage({ view, ...arrays }, Object.values(arrays).map((array) => array.buffer));
+  const isPart = scene.parts[view] === first?.part && scene.views[view].count, isLast = arrived.length === scene.loading.length;
+  if (!first || !isPart && !isLast) return;
+  sort(first);
+  first = null;
 }
 
 // Planes of bytes to texels (shaders/page.vert), and to the arrays of the worker: the inverse of

@@ -16,7 +16,7 @@ from pansplat.model.feature_pyramid import TransformerConfig
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import load
-from pansplat.system.options import PredictOptions
+from pansplat.prediction_options import PredictOptions
 from pansplat_viewer.scene.loader import LoadOptions, find_entries, load_entry
 
 

@@ -63,7 +63,8 @@ def test_the_named_pair_of_a_folder_is_predicted_or_the_first(tmp_path: Path, wr
     assert "holds 1: hall, 2: kitchen" in refusal(*start, "--pair", "attic")
 
 
-def test_each_surface_is_written_once_and_fitted_to_the_photographs(room: Path, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.usefixtures("refinement_clock")
+def test_each_surface_is_written_once_and_fitted_to_the_photographs(room: Path, tmp_path: Path) -> None:
     """The spheres around both cameras: the part of each inside the other one is nearer to the other camera."""
     command = ["predict", str(room), "--model", "sphere", "--height", "64", "--no-cache", "-o"]
     scenes = {}

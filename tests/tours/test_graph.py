@@ -13,6 +13,7 @@ import pansplat.tours as tours
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.tours import find_tours
+from pansplat.tours.route import plan_route
 
 
 def make_gaussians(count: int) -> Gaussians:
@@ -300,6 +301,18 @@ def test_a_pair_of_a_scene_has_its_panoramas(comb):
     pair = comb.make_pair((1, 4))
     assert pair.name == "p1-p4" and pair.context == (comb.panoramas[1], comb.panoramas[4])
     assert (pair.near, pair.far, pair.targets) == (0.45, 10.0, ())
+
+
+def test_a_poor_edge_is_a_fade_in_its_part_and_ways_around_it_are_better(make_tour):
+    square = make_tour(((0, 0), (0, 2), (2, 2), (2, 0)), ((0, 1), (1, 2), (2, 3), (0, 3)))
+    poor = dataclasses.replace(square, poor=((0, 1),))
+    assert square.find_walk(0, 1) == [0, 1] and poor.find_walk(0, 1) == [0, 3, 2, 1]
+    assert poor.is_fade(0, 1) and poor.is_fade(1, 0) and not poor.is_fade(1, 2) and poor.parts == square.parts
+    row = dataclasses.replace(make_tour(((0, 0), (0, 2), (0, 4)), ((0, 1), (1, 2))), poor=((0, 1),))
+    route = plan_route(row, [0, 1, 2])
+    assert route.fades == (0,) and len(route.jumps) == 1
+    distances = route.positions[:, 2]
+    assert not ((distances > 0.1) & (distances < 1.9)).any() and ((distances > 2.1) & (distances < 3.9)).any()
 
 
 def test_no_flight_leads_through_a_wall_and_places_stay_known(comb):

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from pansplat.errors import InputError
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_written
-from pansplat.system.options import PredictOptions, ReadOptions
 from pansplat_viewer import run
 from pansplat_viewer.app import Options
 from pansplat_viewer.capture import STILLS, Film, compute_flight_pose, compute_panorama_pose

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import sys
 import time
@@ -140,6 +141,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: l
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
         patch.setattr(page_module, "_PART_BYTES", 30_000)
+        patch.setattr(page_module, "find_poor_edges", lambda *_: ())  # surfaces of the scenes do not agree
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
         write_page(house, folder / "house.html")
@@ -148,6 +150,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: l
         write_page(scene, folder / "photos.html", photographs=photographs)
         (folder / "photos").mkdir()
         write_page(scene, folder / "photos" / "index.html", photographs=photographs, split=True)
+        write_page(house, folder / "hosted.html", split=True)
     return folder
 
 
@@ -699,7 +702,7 @@ HOLD = """
     };
     release = () => { isHolding = () => false; held.splice(0).forEach((message) => worker.postMessage(message)); };
 """
-IN_PARTS = "let parts = 0; isHolding = ({ text, end }) => (text && ++parts > 1) || end;"
+IN_PARTS = "let views = new Set(); isHolding = ({ text, view }) => text && views.add(view).size > 1;"
 
 
 @pytest.mark.parametrize("name", ["tour.html", "split.html"])
@@ -726,6 +729,57 @@ def test_the_page_works_when_the_first_view_has_arrived(chromium: Any, folder: P
         page.settle()
         assert page.run("pansplat.setPose({ yaw: 40 }), pansplat.isSettled()") is False
         assert page.run("document.body.textContent.length < 200000 && !document.querySelector('[type=\"text/plain\"]')")
+        assert page.messages == []
+
+
+@pytest.mark.parametrize("name", ["photos.html", "photos/index.html"])
+def test_the_photograph_is_shown_before_any_gaussians_arrive(
+    chromium: Any, folder: Path, photographs: list[Pair], name: str
+) -> None:
+    with opened(chromium, folder / name, script=HOLD + "isHolding = ({ text }) => text;") as page:  # and is ready
+        node, start, level = page.run("HEADER.loading[0]"), page.camera["position"], np.array(page.run("HEADER.level"))
+        page.run("pansplat.setPose({ yaw: 30, pitch: 10 })")
+        page.wait("document.getElementById('cover').hidden")
+        page.page.wait_for_timeout(200)  # for the larger tiles
+        shown = np.asarray(Image.open(io.BytesIO(page.page.screenshot())).convert("RGB"), np.float64) / 255
+        seen = look_at_photograph(photographs[node], level, page.camera)
+        middle = np.s_[60:170, 60:260]  # without buttons
+        assert psnr(shown[middle], seen[middle]) > 25 and psnr(shown[middle][:, ::-1], seen[middle]) < 22
+        page.page.keyboard.press("KeyO")
+        page.page.keyboard.down("KeyW")
+        page.page.keyboard.press("2")
+        page.page.wait_for_timeout(300)
+        page.page.keyboard.up("KeyW")
+        assert page.camera["position"] == start, "nothing leaves the photograph yet"
+        page.run("pansplat.goTo(1, { jump: true }), release()")
+        page.settle()
+        assert psnr(page.draw(), look_at_photograph(photographs[0], level, page.camera)) > 38
+        assert page.messages == []
+
+
+def test_a_folder_loads_the_gaussians_of_the_edges_at_the_camera(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "hosted.html") as page:
+        page.settle()
+        files = page.run("HEADER.views.map(({ files }) => files[0])")
+
+        def list_loaded() -> list[int]:
+            return [view for view, file in enumerate(files) if any(url.endswith(f"/{file}") for url in page.requests)]
+
+        assert list_loaded() == [0, 1] and page.run("document.getElementById('view').ariaBusy") == "false"
+        image = page.draw()
+        page.run("pansplat.goTo(2)")
+        page.settle()
+        assert list_loaded() == [0, 1, 2] and page.messages == []
+        page.run("pansplat.goTo(1).then(() => pansplat.setPose({ yaw: 0, pitch: 0 }))")
+        page.settle()
+        page.page.keyboard.press("KeyR")
+        page.settle()
+        assert psnr(page.draw(), image) > 40
+    with opened(chromium, folder / "hosted.html") as page:
+        page.settle()
+        page.page.keyboard.press("KeyO")
+        page.settle()
+        assert len({url for url in page.requests if url.endswith(".js")}) == 3, "the doll's house has all of the part"
         assert page.messages == []
 
 
@@ -761,12 +815,13 @@ def test_the_graph_of_the_page_is_that_of_the_tour(page: OpenPage) -> None:
     links = {6: (Link("8", 0.0),), 8: (Link("10", 0.0),)}
     panoramas = tuple(Panorama(str(node), Path(), pose, links=links.get(node, ())) for node, pose in enumerate(poses))
     overlaps = {edge: 0.1 + 0.02 * edge[1] for edge in edges}
-    tour = TourGraph("", Path(), panoramas, 0.5, 10.0, (), overlaps)
+    tour = TourGraph("", Path(), panoramas, 0.5, 10.0, (), overlaps, poor=((1, 2), (4, 5)))
     graph = {
         "positions": places.tolist(),
         "parts": tour.parts,
         "edges": edges,
         "next": tour.find_next_nodes(),
+        "poor": tour.poor,
         "hysteresis": EDGE_HYSTERESIS,
         "reach": REACH,
     }
@@ -917,6 +972,37 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         assert 0.8 < away < page.run("HEADER.limits[2]") and steps[-1] < 0.1 * steps.max()
         page.page.click("#home")
         assert page.camera == start
+        assert page.messages == []
+
+
+def test_along_a_poor_edge_the_image_grows_and_fades_fast_into_that_of_the_panorama(
+    chromium: Any, folder: Path
+) -> None:
+    with opened(chromium, folder / "house.html", script=FRAMES) as page:
+        page.settle()
+        spots = page.run("HEADER.spots.map(({ position }) => position)")
+        page.run("HEADER.poor.push([0, 1]); HEADER.spots.forEach((spot) => { spot.blank = 0; }); passed = []")
+        way = np.array(page.run("HEADER.level")).T @ (np.array(spots[1]) - spots[0])
+        page.run("(yaw) => pansplat.setPose({ yaw, pitch: 0 })", math.degrees(math.atan2(way[0], way[2])))
+        page.run("""scales = []; record(); (function follow() {
+            const { transform } = document.getElementById("still").style;
+            scales.push(transform ? Number(transform.slice(6, -1)) : 1);
+            requestAnimationFrame(follow);
+        })()""")
+        assert page.run("pansplat.goTo(2)")
+        page.settle()
+        frames, scales = page.run("passed"), page.run("scales")
+        places = {tuple(np.round(frame["position"], 6) + 0.0) for frame in frames}
+        assert places == {tuple(np.round(spot, 6) + 0.0) for spot in spots[:2]}, "no picture from between"
+        left = [frame["left"] for frame in frames if 0 < frame["left"] < 1]
+        assert 3 <= len(left) <= 6 and left == sorted(left, reverse=True), "half a second, at 100 ms a frame"
+        assert 1.3 < max(scales) <= 1.4 and frames[-1]["yaw"] == pytest.approx(frames[0]["yaw"])
+        assert page.run("pansplat.goTo(3)")
+        between = page.run("(first) => passed.slice(first).map(({ position }) => position)", len(frames))
+        assert len({tuple(place) for place in between}) > 5, "a good edge is flown"
+        page.run("scales = []; passed = []")
+        page.run("pansplat.goTo(2).then(() => pansplat.setPose({ yaw: pansplat.getPose().yaw + 90 }))")
+        assert page.run("pansplat.goTo(1)") and max(page.run("scales")) < 1.05, "it grows on the way ahead only"
         assert page.messages == []
 
 
@@ -1218,6 +1304,11 @@ def test_distances_are_those_of_the_rasterisers_depth(home: OpenPage, scene: Sce
     home.page.mouse.move(140, 100)
     home.page.mouse.up()
     home.wait(f"document.querySelector('#marks circle').cx.baseVal.value > {places[0][0] + 20}")
+    home.run("({ worlds } = HEADER.plan, HEADER.plan.worlds = [0, 1, 1])")  # the panorama here is alone
+    home.page.mouse.click(100, 100)
+    value, error = re.fullmatch(r"([.\d]+) m ± ([.\d]+) m from the camera", home.page.inner_text("#status")).groups()
+    assert float(error) == pytest.approx(0.35 * float(value), abs=0.01)
+    home.run("HEADER.plan.worlds = worlds, 0")
     home.page.keyboard.press("Escape")
     assert home.run("document.getElementById('marks').childElementCount") == 0
     home.page.mouse.click(100, 100)

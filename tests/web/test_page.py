@@ -6,6 +6,7 @@ import math
 import os
 import re
 import warnings
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -25,14 +26,16 @@ from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
+from pansplat.inputs.pairs import Pair
 from pansplat.refinement.budget import merge_to
-from pansplat.tours import find_camera_height, find_rooms, make_graph, select_views
+from pansplat.tours import edges, find_camera_height, find_rooms, make_graph, select_views
 from pansplat.tours.plan import make_plan
 
 
 @pytest.fixture(autouse=True)
 def small_poster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
+    monkeypatch.setattr(edges, "POOR", 9)  # surfaces of the scenes do not agree
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -97,6 +100,28 @@ def test_a_page_starts_with_the_widest_view_unless_it_has_a_start_view(house: Sc
     start = math.atan2(local[0], local[2]), math.asin(local[1])
     write_page(dataclasses.replace(facing, starts=(start, None, None)), tmp_path / "start.html")
     assert math.cos(read_header(tmp_path / "start.html")["start"]["yaw"] - yaw) == pytest.approx(1, abs=1e-5)
+
+
+def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tmp_path: Path) -> None:
+    centers = scene.cam2world[scene.gaussians.views.long(), :3, 3].float()
+    above = scene.gaussians.select(scene.gaussians.means[:, 1] < centers[:, 1])
+    write_page(scene, tmp_path / "floor.html")
+    write_page(dataclasses.replace(scene, gaussians=above), tmp_path / "none.html")
+    headers = [read_header(tmp_path / f"{name}.html") for name in ("floor", "none")]
+    assert headers[0]["doll"] and headers[1]["doll"] is None and headers[1]["plan"]["rooms"] == []
+    assert headers[1]["plan"]["worlds"] == [0, 0, 0]
+
+
+def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good = write_page(house, tmp_path / "good.html")
+    assert (good.num_flights, good.num_fades) == (2, 0) and read_header(tmp_path / "good.html")["jumps"] == []
+    monkeypatch.setattr(edges, "POOR", -9)
+    poor = write_page(house, tmp_path / "poor.html")
+    header = read_header(tmp_path / "poor.html")
+    assert (poor.num_flights, poor.num_fades) == (0, 2) and header["poor"] == [[0, 1], [1, 2]]
+    assert len(header["jumps"]) >= 3 and set(header["parts"]) == {0}, "the route fades from panorama to panorama"
+    joint = dataclasses.replace(house, joint=True, overlaps=())
+    assert write_page(joint, tmp_path / "joint.html").num_fades == 0
 
 
 def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: Path) -> None:
@@ -318,17 +343,32 @@ def test_the_parts_of_a_split_page_replace_the_old_ones(
     second = write_page(scene, tmp_path / "tour.html", split=True, gaussians=1000)
     text = (tmp_path / "tour.html").read_text()
     assert set((tmp_path / "tour_files").iterdir()) == {*second.files[1:], other}
-    assert re.findall(r'<script src="([^"]+)"', text) == [f"tour_files/{file.name}" for file in second.files[1:]]
+    header = read_header(tmp_path / "tour.html")
+    assert header["folder"] == "tour_files" and "<script src" not in text, "they are loaded when they are needed"
+    assert [name for view in header["views"] for name in view["files"]] == [file.name for file in second.files[1:]]
 
 
 @pytest.mark.parametrize("stem", ["room #2", "50%25 done?", "a:b & 'c'", "k\xfcche", os.fsdecode(b"caf\xe9")])
 def test_a_split_page_finds_its_parts_under_any_name(scene: Scene, tmp_path: Path, stem: str) -> None:
     written = write_page(scene, tmp_path / f"{stem}.html", split=True)
-    text = written.files[0].read_text()
-    (source,) = re.findall(r'<script src="([^"]+)"', text)
-    place = urlsplit(urljoin("file:///folder/page.html", source))
-    assert not place.query and not place.fragment
-    assert unquote_to_bytes(place.path) == b"/folder/" + os.fsencode(f"{stem}_files/{written.files[1].name}")
+    header = read_header(written.files[0])
+    for view, file in zip(header["views"], written.files[1:], strict=True):  # one for each view
+        place = urlsplit(urljoin("file:///folder/page.html", f"{header['folder']}/{view['files'][0]}"))
+        assert not place.query and not place.fragment
+        assert unquote_to_bytes(place.path) == b"/folder/" + os.fsencode(f"{stem}_files/{file.name}")
+
+
+def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussians(
+    scene: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path
+) -> None:
+    write_page(scene, tmp_path / "tour.html", photographs=take_photographs(scene, 1024))
+    header = read_header(tmp_path / "tour.html")
+    first, *others = header["loading"]
+    names = [photograph["name"] for photograph in header["photographs"]]
+    calls = re.findall(r"<script>(add\w+\([^<]*\))</script>", (tmp_path / "tour.html").read_text())
+    early = [f'addTile("{names[first]}", 0)', f"addPart({first}, true)", f'addTile("{names[first]}", 6)']
+    assert calls[:3] == early and calls[3:5] == [f"addPart({view}, true)" for view in others]
+    assert calls[5:] == [f'addTile("{names[view]}", {number})' for view in others for number in (0, 6)]
 
 
 def test_a_scene_without_cameras_starts_in_its_middle(scene: Scene, tmp_path: Path) -> None:

@@ -15,12 +15,10 @@ ORIGIN = np.array((100.0, -1.0, 0.0))
 
 def read_planes(packed: PackedGaussians) -> np.ndarray:
     """(plane, Gaussian) bytes."""
-    content = np.frombuffer(gzip.decompress(packed.content), np.uint8)
-    num_planes, blocks, end = len(content) // sum(packed.counts), [], 0
-    for view in packed.order:
-        start, end = end, end + num_planes * packed.counts[view]
-        blocks.append(content[start:end].reshape(num_planes, -1))
-    return np.concatenate(blocks, 1)
+    blocks = [np.frombuffer(gzip.decompress(packed.contents[view]), np.uint8) for view in packed.order]
+    num_planes = sum(map(len, blocks)) // sum(packed.counts)
+    assert [len(block) for block in blocks] == [num_planes * packed.counts[view] for view in packed.order]
+    return np.concatenate([block.reshape(num_planes, -1) for block in blocks], 1)
 
 
 def join(planes: np.ndarray) -> np.ndarray:

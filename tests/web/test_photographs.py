@@ -172,7 +172,7 @@ def test_a_new_page_removes_the_tiles_of_the_old_one(
     first = write_page(plain_scene, tmp_path / "index.html", split=True, photographs=photographs)
     header = json.loads(re.findall(r"^const HEADER = (.*);$", first.files[0].read_text(), flags=re.MULTILINE)[0])
     assert header["folder"] == "index_files" and len(header["photographs"]) == 2
-    assert len(first.files) == 2 + 2 * 6 and all(file.is_file() for file in first.files)
+    assert len(first.files) == 1 + 2 + 2 * 6 and all(file.is_file() for file in first.files)
     second = write_page(plain_scene, tmp_path / "index.html", split=True)
     assert second.photo_height == 0 and set((tmp_path / "index_files").iterdir()) == set(second.files[1:])
 

@@ -253,7 +253,7 @@ class StereoRenderer:
         *,
         wait: bool = True,
     ) -> moderngl.Texture:
-        """As the renderer's `render`; `size` is that of the whole image, `cam2world` is between the eyes."""
+        """Render both eyes; `size` is that of the whole image, `cam2world` is between the eyes."""
         self._stereo = settings.stereo
         if settings.stereo == "mono":
             return self._eyes[0].render(cam2world, size, settings, wait=wait)
@@ -280,11 +280,11 @@ class StereoRenderer:
         """Draw nothing: OpenGL draws a face when it is read."""
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
-        """As the renderer's, of the left eye; `render_image` reads both."""
+        """The colours of the left eye's image; `render_image` reads both."""
         return self._eyes[0].read_color()
 
     def read_depth(self) -> Float[np.ndarray, "height width"]:
-        """As the renderer's, of the left eye."""
+        """The depth of the left eye's image, metres."""
         return self._eyes[0].read_depth()
 
     def release(self) -> None:

@@ -45,7 +45,7 @@ class Camera:
 
     @property
     def cam2world(self) -> Float[np.ndarray, "4 4"]:
-        """The camera's pose."""
+        """The camera-to-world matrix of the camera, OpenCV axes, metres."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = self.position

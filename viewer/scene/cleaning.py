@@ -104,7 +104,7 @@ class MaskPainter:
         self._last, self.is_changed = local, True
 
     def lift(self) -> None:
-        """End the stroke."""
+        """End the stroke of the brush."""
         self._last = None
 
     def clear(self) -> None:
@@ -207,7 +207,7 @@ class Painting:
             action()
 
     def answer(self, answer: MaskAnswer) -> None:
-        """Answer the question."""
+        """Answer the question about an unsaved mask."""
         if self._held is None:
             return
         (action, after_saving, otherwise), self._held = self._held, None

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pansplat.errors import InputError, collect_notes
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_scene_file, make_portable_name
-from pansplat.system.options import PredictOptions, ReadOptions
 from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class LoadedScene:
     Attributes:
         is_final: False for a prediction whose refinement will follow.
         outlines: of a scene of a tour: floor outlines by panorama.
-        walls: of a scene of a tour: edges that it shows to be none.
+        walls, poor: of a scene of a tour: edges that it shows to be none, and those whose flights would be poor.
         outlooks: of a scene of a tour: distances around the horizon by panorama (`measure_outlook`).
     """
 
@@ -105,6 +105,7 @@ class LoadedScene:
     is_final: bool = True
     outlines: "dict[int, FloorOutline]" = field(default_factory=dict)
     walls: "Sequence[Edge]" = ()
+    poor: "Sequence[Edge]" = ()
     outlooks: "dict[int, np.ndarray]" = field(default_factory=dict)
 
 
@@ -237,7 +238,7 @@ def _load_tour_scene(
     The first scene of a window is not refined if it is predicted again with the rest of its part.
     """
     from pansplat import pipeline
-    from pansplat.tours import connect, find_floor_outlines, find_walls, measure_outlook, select_views
+    from pansplat.tours import connect, find_floor_outlines, find_poor_edges, find_walls, measure_outlook, select_views
 
     tour, views, merged, prediction = entry.tour, entry.views, entry.merged, options.prediction
     assert tour is not None
@@ -246,7 +247,8 @@ def _load_tour_scene(
         entry = replace(entry, views=views, start=first)
         outlines = find_floor_outlines(tour, merged, tuple(range(len(tour))))
         outlooks = {node: measure_outlook(merged, node, tour.level_axes) for node in range(len(tour))}
-        return LoadedScene(entry, select_views(merged, views), outlines=outlines, outlooks=outlooks)
+        poor = () if merged.joint else find_poor_edges(merged, range(len(tour)), tour.overlaps)
+        return LoadedScene(entry, select_views(merged, views), outlines=outlines, poor=poor, outlooks=outlooks)
     predictor = pipeline.load_predictor(prediction)
     if not views:
         connected, max_views = connect(tour, progress), pipeline.find_max_views(predictor)
@@ -265,7 +267,8 @@ def _load_tour_scene(
         scene = tour.place(scene, views)
         outlines, walls = find_floor_outlines(tour, scene, views), find_walls(scene, views, tour.overlaps)
         outlooks = {node: measure_outlook(scene, view, tour.level_axes) for view, node in enumerate(views)}
-        return LoadedScene(entry, scene, is_final, outlines, walls, outlooks)
+        poor = find_poor_edges(scene, views, tour.overlaps)
+        return LoadedScene(entry, scene, is_final, outlines, walls, poor, outlooks)
 
     scene = pipeline.predict(
         pair,

@@ -67,7 +67,7 @@ class Ghost:
 
     @property
     def probability(self) -> float:
-        """That it is right."""
+        """The probability that the hypothesis is right."""
         return 1 / (1 + math.exp(-min(max(self.log_odds, -50), 50)))
 
 
@@ -286,7 +286,7 @@ class Placing:
         return replace(events, pressed=events.pressed - {",", ".", "escape"})
 
     def stop(self) -> None:
-        """Place no photograph."""
+        """End placing; the photograph stays where it was saved."""
         self.node = None
         self._worker.cancel()
 

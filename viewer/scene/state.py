@@ -48,7 +48,7 @@ class Glide:
 
     @property
     def camera(self) -> Camera:
-        """The camera now."""
+        """The camera of the flight at this time."""
         part = ease_in_out(self.seconds / GLIDE_SECONDS)
         a, b = self.start, self.end
         x, y, z = (p + part * (q - p) for p, q in zip(a.position, b.position, strict=True))

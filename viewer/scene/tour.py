@@ -141,7 +141,7 @@ class TourScenes:
         return gather
 
     def copy(self) -> TourScenes:
-        """The same scenes in memory, for a film in another thread."""
+        """A copy with the scenes that are in memory, for a film in another thread."""
         memory = self._budget / 2**30
         scenes = TourScenes(self.tour, memory=memory, merged=self._merged, max_views=self._max_views)
         scenes._views, scenes._providers = self._views, self._providers
@@ -192,6 +192,8 @@ class TourScenes:
         self.outlines |= loaded.outlines
         self._outlooks |= loaded.outlooks
         self._block(loaded.walls)
+        if poor := set(loaded.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
+            self.tour = replace(self.tour, poor=(*self.tour.poor, *sorted(poor)))
         if views not in self._predictions:
             self._selected[views] = loaded
             return

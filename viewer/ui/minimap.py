@@ -43,13 +43,15 @@ def describe_panorama(tour: TourGraph, node: int) -> str:
 
 
 def describe_panoramas(tour: TourGraph) -> str:
-    """The number of panoramas with a known, a probable and no known place."""
+    """The number of panoramas with a known, a probable and no known place, and of fades because of poor flights."""
+    flights = sum(a != b for a, b in tour.overlaps) - len(tour.poor)
+    ways = f"; {flights} flights, {len(tour.poor)} fades" if tour.poor else ""
     alone = sum(not tour.is_placed(node) for node in range(len(tour)))
     probable = sum(is_probable(tour, node) for node in range(len(tour)))
     if not alone and not probable:
-        return f"{len(tour)} panoramas"
+        return f"{len(tour)} panoramas{ways}"
     counts = ((len(tour) - alone - probable, "placed"), (probable, "probably"), (alone, "not placed"))
-    return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed")
+    return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed") + ways
 
 
 def is_probable(tour: TourGraph, node: int) -> bool:

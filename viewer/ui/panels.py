@@ -64,7 +64,7 @@ _OPENED_NOTES = 3  # at most, at first
 
 
 class Panels:
-    """Draws the panels.
+    """Draws all panels of the window.
 
     Attributes:
         widgets: has the rectangles of the last frame.

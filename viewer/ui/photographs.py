@@ -37,12 +37,12 @@ class Photographs:
 
     @property
     def panoramas(self) -> tuple[Panorama, ...]:
-        """All photographs."""
+        """The panoramas of all photographs."""
         return self._panoramas
 
     @property
     def names(self) -> list[str]:
-        """Their labels."""
+        """The labels of all photographs."""
         return [panorama.label for panorama in self._panoramas]
 
     @property

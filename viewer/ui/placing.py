@@ -56,7 +56,7 @@ def count_states(placing: Placing) -> str:
 
 
 def draw_photographs(viewer: Viewer, placing: Placing, widgets: Widgets) -> None:
-    """Draw the list."""
+    """Draw the list of photographs with the states of their poses, and buttons to change them."""
     imgui.text_unformatted(count_states(placing))
     gap, column = imgui.get_style().item_spacing.x, _BUTTONS * imgui.get_style().font_scale_dpi
     for node, panorama in enumerate(placing.panoramas):

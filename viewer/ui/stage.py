@@ -29,7 +29,7 @@ _CENTER_REACHES = 4, 16, 64  # pixels around the image centre
 
 
 class Stage:
-    """Draws the image.
+    """Draws the image of the window.
 
     Attributes:
         slots: renderers of a scene and of that which it fades to; the second one is for tours.

@@ -23,7 +23,7 @@ _MAX_RECENT = 10
 
 @dataclass(frozen=True)
 class Preferences:
-    """The remembered values."""
+    """The values that the viewer remembers between runs."""
 
     theme: Theme = "dark"  # colours of the panels
     recent: tuple[str, ...] = ()  # paths that were opened, the last one first

@@ -162,17 +162,17 @@ class DisplayScene:
 
     @property
     def means(self) -> Float[np.ndarray, "n 3"]:
-        """The centres."""
+        """The centres of the Gaussians, metres."""
         return self._rows[:, 0:3]
 
     @property
     def quats(self) -> Float[np.ndarray, "n 4"]:
-        """The rotations, wxyz."""
+        """The rotations of the Gaussians, quaternions wxyz."""
         return self._rows[:, 4:8]
 
     @property
     def scales(self) -> Float[np.ndarray, "n 3"]:
-        """The standard deviations."""
+        """The standard deviations of the Gaussians along their axes, metres."""
         return self._rows[:, 8:11]
 
     def with_colors(self, colors: Float[np.ndarray, "n 3"]) -> "DisplayScene":

@@ -397,7 +397,7 @@ def any_magnitude_reaches(builder, largest, bound):
 
 @_operation(types.float32, f32x8)
 def first_lane(builder, value):
-    """The first lane."""
+    """The number in the first lane of a vector."""
     return builder.extract_element(value, _INT(0))
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.ply import save_ply
-from pansplat.system.options import PredictOptions
+from pansplat.prediction_options import PredictOptions
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import fit_settings

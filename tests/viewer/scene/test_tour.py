@@ -19,6 +19,7 @@ from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import SceneEntry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.tour import CrossFade, TourScenes, find_clicked, find_hotspots, measure_bytes
+from pansplat_viewer.ui.minimap import describe_panoramas
 
 
 @pytest.fixture
@@ -86,6 +87,20 @@ def test_scenes_of_edges_are_selected_from_one_prediction_of_their_part(house, l
     assert scenes.get((0, 1)).scene is not before, "selected from the refined part"
     assert scenes.choose_request([part], None) is None, "nothing is predicted twice"
     assert scenes.copy().loaded == scenes.loaded
+
+
+def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
+    first = SceneEntry(house.name, tour=house, pair=house.make_pair((0, 1)), views=(0, 1), start=1, max_views=64)
+    scenes = TourScenes.start(load_house(first))
+    camera = scenes.tour.cam2world[0].numpy()
+    assert scenes.plan_way(camera, 1).fades == () and "fades" not in describe_panoramas(scenes.tour)
+    (part,) = scenes.list_next(None, 0.0)
+    for _ in range(2):
+        scenes.add(replace(load_house(scenes.make_entry(part)), poor=[(0, 1), (0, 3)]))
+    assert scenes.tour.poor == ((0, 1),), "each edge once, and no others"
+    assert len(scenes.plan_way(camera, 1).fades) == 1
+    edges = sum(a != b for a, b in scenes.tour.overlaps)
+    assert describe_panoramas(scenes.tour).endswith(f"; {edges - 1} flights, 1 fades")
 
 
 def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(house, load_house):
