@@ -42,7 +42,8 @@ _BUNDLE = dict[str, str]  # data by MIME type; pictures in base64
 def show(scene: Scene | str | Path, *, gaussians: int = DISPLAY_GAUSSIANS, height: int = _FRAME_HEIGHT) -> Path | None:
     """Show a scene in the viewer of web pages: below the cell of a notebook, elsewhere in the browser.
 
-    In larger scenes similar Gaussians are merged, without the fit to the photographs of `pansplat.web.write_page`.
+    In larger scenes similar Gaussians are merged, without the fit to the photographs of
+    `pansplat.export.page.write_page`.
 
     Args:
         scene: the scene, or its file.

@@ -177,7 +177,7 @@ def _load_pairs(root: Path, convention: str | None, near: float | None, far: flo
             return single_view_pairs([read_photograph(root)], root.parent, near, far)
         if root.is_file() and root in triplet_files(root.parent):
             collections = [(root.parent, read_triplet(root, convention))]
-        elif root.is_file() and not _is_pose_file(root) and not (root.parent / _POSES).exists():
+        elif root.is_file() and not _is_pose_file(root) and not _is_posed_tour(root):
             return _make_unposed_pairs(root.parent, _read_tour_file(root), near, far)
         else:
             root = root.parent if root.is_file() else root
@@ -202,6 +202,11 @@ def _load_pairs(root: Path, convention: str | None, near: float | None, far: flo
 def _is_pose_file(file: Path) -> bool:
     stated = file.name in (_POSES, _PAIRS, _CAMERA_POSES, LINKS)
     return stated or file in (find_trajectory(file.parent), find_reconstruction(file.parent))
+
+
+def _is_posed_tour(file: Path) -> bool:
+    """Whether a file describes a web tour with a poses.json beside it."""
+    return is_web_tour_file(file) and (file.parent / _POSES).exists() and find_web_tour(file.parent) is not None
 
 
 def list_stated_files(folder: Path) -> list[Path]:

@@ -699,6 +699,7 @@ def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
 
 def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):
     scene, state = user.read_image(), user.state
+    user.viewer.stage.comparer.photographs.wait(0)
     user.click("photographs at panoramas")
     user.draw_frames(1, 1 / 60)
     fading = user.read_screen()
