@@ -98,11 +98,14 @@ class _Mesh:
     """Write a .glb of triangles with the photographs as textures. An .obj always has them."""
     triangles: Count | None = None
     """Largest number of triangles, 2,000,000 by default."""
+    whole: bool = False
+    """Keep what is outside of the rooms of the floor plan, such as what windows and mirrors show."""
 
     def write(self, export: Export) -> None:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
         from pansplat.export.mesh_files import name_mesh_files, save_mesh
+        from pansplat.tours import find_rooms
 
         require_replaceable("--out", name_mesh_files(export.out, 1), export.overwrite)  # before the prediction
         scene, changes, photographs = export.open()
@@ -112,7 +115,10 @@ class _Mesh:
             return pair.load_context(min(pair.image_height, _TEXTURE_HEIGHT)).images[0]
 
         textures: Callable[[int], Tensor] | None = load if photographs else None
-        mesh = make_mesh(scene, triangles=self.triangles or DEFAULT_TRIANGLES, textures=textures)
+        inside = None if self.whole or not len(scene.cam2world) else find_rooms(scene).contains
+        mesh = make_mesh(scene, triangles=self.triangles or DEFAULT_TRIANGLES, textures=textures, inside=inside)
+        if not mesh.parts:
+            raise InputError(f"{export.path}: needed surfaces in rooms, got none; --whole keeps all of them")
         files = save_mesh(mesh, export.out, overwrite=export.overwrite)
         size = sum(file.stat().st_size for file in files)
         beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
@@ -121,6 +127,8 @@ class _Mesh:
             f"{export.out}{beside}: {mesh.num_triangles:,} triangles of {count} panorama{'s' if count > 1 else ''}, "
             f"{size / 1e6:.1f} MB"
         )
+        if inside is not None:
+            print(f"note: {export.out}: without what is outside of the rooms; --whole keeps it", file=sys.stderr)
         _print_changes(changes)
 
 

@@ -34,14 +34,25 @@ Textures = Callable[[int], Float[Tensor, "3 height width"]]
 """The texture of a view, sRGB in [0, 1]."""
 
 
+Inside = Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, "n"]]
+"""Whether places, metres, are to be in a mesh."""
+
+
 @torch.no_grad()
-def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Textures | None = None) -> Mesh:
+def make_mesh(
+    scene: Scene,
+    *,
+    triangles: int = DEFAULT_TRIANGLES,
+    textures: Textures | None = None,
+    inside: Inside | None = None,
+) -> Mesh:
     """The surfaces that the cameras of a scene see, with each place once.
 
     Args:
         scene: with input cameras; of a joint scene all Gaussians are drawn for each.
         triangles: largest number; bounds the rows of the panoramas, of which there are at most 512.
         textures: by default the images of the views' Gaussians at their cameras.
+        inside: chooses the places of a triangle's corners (`pansplat.tours.find_rooms`); by default all.
     """
     count = len(scene.cam2world)
     if not count:
@@ -72,7 +83,11 @@ def make_mesh(scene: Scene, *, triangles: int = DEFAULT_TRIANGLES, textures: Tex
         points = torch.cat((places.reshape(-1, 3), _join_at_pole(places, 0)[None], _join_at_pole(places, -1)[None]))
         points = points @ pose[:3, :3].T + pose[:3, 3]
         is_free = ~_are_seen_nearer(points, view, poses.cpu(), reaches).numpy()
-        triangle = corners[is_free[_find_points(corners, rows)].any(axis=1)]
+        numbers = _find_points(corners, rows)
+        is_kept = is_free[numbers].any(axis=1)
+        if inside is not None:
+            is_kept &= inside(points.numpy())[numbers].all(axis=1)
+        triangle = corners[is_kept]
         draw = partial(_draw, seen[view], pose, scene) if textures is None else partial(textures, view)
         name = scene.names[view] if view < len(scene.names) else f"panorama {view + 1}"
         parts.append(_make_part(name, points.numpy(), triangle, rows, partial(_balance, draw, scene, view)))

@@ -71,6 +71,11 @@ class Rooms:
         keys = list(zip(self.parts, self.storeys, strict=True))
         return tuple(other for other, key in enumerate(keys) if key == keys[view])
 
+    def contains(self, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Whether places in the world are in the rooms, from above, with their walls."""
+        plan = np.asarray(places, np.float64) @ self.level[:, (0, 2)]
+        return shapely.contains_xy(self.shape, plan[:, 0], plan[:, 1])
+
     def find_inside(self, gaussians: Gaussians) -> Bool[Tensor, "n"]:
         """Whether each Gaussian is on a surface in a room, below its ceiling, and its camera is near enough."""
         views, means = gaussians.views.long().cpu(), gaussians.means.cpu()
@@ -87,8 +92,7 @@ class Rooms:
         inside = (down > -_CEILING * ceilings[views]) & (down < _FLOOR * floors[views])
         inside &= offsets.square().sum(dim=1) <= _NEAREST**2 * nearest
         inside &= gaussians.levels.cpu() <= _COARSEST
-        places = (means[inside].double() + origin).numpy() @ self.level[:, (0, 2)]
-        inside[inside.clone()] = torch.from_numpy(shapely.contains_xy(self.shape, places[:, 0], places[:, 1]))
+        inside[inside.clone()] = torch.from_numpy(self.contains((means[inside].double() + origin).numpy()))
         return inside
 
 

@@ -18,6 +18,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
+from pansplat.tours import find_rooms
 
 LOW, HIGH = torch.tensor((-2.0, -1.1, -3.0)), torch.tensor((2.0, 1.5, 3.0))  # y is down
 CENTERS = torch.tensor(((-0.8, 0.0, -1.0), (0.8, 0.1, 1.2)))
@@ -82,6 +83,30 @@ def test_vertices_are_on_the_walls_and_cover_them_once(mesh: Mesh) -> None:
     box_area = 2 * float(size[0] * size[1] + size[1] * size[2] + size[0] * size[2])
     assert _measure_area(mesh) == pytest.approx(box_area, rel=0.05), "closed, and little of it twice"
     assert 0.5 * TRIANGLES < mesh.num_triangles < 0.95 * TRIANGLES
+
+
+def test_what_a_window_shows_is_left_out_of_the_rooms() -> None:
+    """A window of 2.4 x 1.4 m in the right wall shows a fence 5 m behind it."""
+    views = []
+    for view in (0, 1):
+        gaussians, center = _view(view), CENTERS[view]
+        offset = gaussians.means - center
+        at_wall = offset * ((HIGH[0] - center[0]) / offset[:, 0])[:, None] + center
+        in_window = (offset[:, 0] > 0) & (at_wall[:, 1].abs() < 0.7) & (at_wall[:, 2].abs() < 1.2)
+        in_window &= gaussians.means[:, 0] > HIGH[0] - 1e-3
+        factor = torch.where(in_window, (HIGH[0] + 5 - center[0]) / (HIGH[0] - center[0]), 1.0)
+        moved = {"means": center + offset * factor[:, None], "scales": gaussians.scales * factor[:, None]}
+        views.append(dataclasses.replace(gaussians, **moved))
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[:, :3, 3] = CENTERS.double()
+    scene = Scene(Gaussians.cat(views), poses, 0.5, 10.0, names=("a.jpg", "b.jpg"), height=128)
+    whole = make_mesh(scene, triangles=TRIANGLES)
+    cropped = make_mesh(scene, triangles=TRIANGLES, inside=find_rooms(scene).contains)
+    reach = [max(float(part.positions[part.triangles, 0].max()) for part in mesh.parts) for mesh in (whole, cropped)]
+    assert reach[0] > float(HIGH[0]) + 4 and reach[1] < float(HIGH[0]) + 0.5
+    size = (HIGH - LOW).numpy()
+    walls = 2 * float(size[0] * size[1] + size[1] * size[2] + size[0] * size[2]) - 2.4 * 1.4
+    assert _measure_area(cropped) == pytest.approx(walls, rel=0.08), "the room is whole"
 
 
 def test_triangles_face_their_camera(mesh: Mesh) -> None:
