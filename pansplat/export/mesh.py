@@ -33,7 +33,6 @@ _TEXTURE_ROWS = 2048  # of a texture that is drawn; at most those of the photogr
 Textures = Callable[[int], Float[Tensor, "3 height width"]]
 """The texture of a view, sRGB in [0, 1]."""
 
-
 Inside = Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, "n"]]
 """Whether places, metres, are to be in a mesh."""
 

@@ -13,13 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.surfaces import locate_surfaces
+from pansplat.tours.surfaces import locate_ends
 
 POOR = 0.27  # predicted LPIPS-squeeze half-way, above which an edge fades
 _ROWS = 64  # of the depth half-way
 _DISAGREE = 0.1  # of the logarithms of depths
 _NEAR = 0.05  # quantile of the depth around the horizon
-_OPAQUE = 0.5  # least opacity of a surface
 _CONSTANT, _DISAGREEMENT, _NEARNESS = 0.256, 0.345, -0.198  # fitted to flights of generated homes
 
 
@@ -40,14 +39,8 @@ def judge_edges(
         panoramas: the number in the tour of each of the scene's views.
         edges: pairs of panoramas; those with another panorama are left out.
     """
-    view = {panorama: number for number, panorama in enumerate(panoramas)}
-    inside = [(a, b) for a, b in edges if a != b and a in view and b in view]
-    centers = scene.cam2world[:, :3, 3].double().cpu().numpy()
-    surfaces = {
-        node: locate_surfaces(scene, view[node], np.eye(3), min_opacity=_OPAQUE)
-        for node in {node for edge in inside for node in edge}
-    }
-    return {(a, b): _predict(surfaces[a], surfaces[b], centers[view[b]] - centers[view[a]]) for a, b in inside}
+    inside, surfaces, centers = locate_ends(scene, panoramas, edges)
+    return {(a, b): _predict(surfaces[a], surfaces[b], centers[b] - centers[a]) for a, b in inside}
 
 
 def _predict(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "m 3"], way: Float[np.ndarray, "3"]) -> float:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
+
+_OPAQUE = 0.5  # least opacity of the surfaces at the ends of an edge
 
 
 def locate_surfaces(
@@ -25,3 +29,23 @@ def locate_surfaces(
     return (gaussians.means[shown].double().cpu().numpy() - scene.cam2world[view, :3, 3].double().cpu().numpy()).dot(
         level
     )
+
+
+def locate_ends(
+    scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]
+) -> tuple[list[tuple[int, int]], dict[int, Float[np.ndarray, "n 3"]], dict[int, Float[np.ndarray, "3"]]]:
+    """The edges between two of a scene's panoramas, and by panorama its surfaces and its camera.
+
+    Surfaces are in the axes of the world, relative to their camera; cameras are places in the world, metres.
+
+    Args:
+        scene: of some panoramas, with all Gaussians of each.
+        panoramas: the number in the tour of each of the scene's views.
+        edges: pairs of panoramas; those with another panorama are left out.
+    """
+    view = {panorama: number for number, panorama in enumerate(panoramas)}
+    inside = [(a, b) for a, b in edges if a != b and a in view and b in view]
+    ends = {node for edge in inside for node in edge}
+    positions = scene.cam2world[:, :3, 3].double().cpu().numpy()
+    surfaces = {node: locate_surfaces(scene, view[node], np.eye(3), min_opacity=_OPAQUE) for node in ends}
+    return inside, surfaces, {node: positions[view[node]] for node in ends}

@@ -8,12 +8,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.surfaces import locate_surfaces
+from pansplat.tours.surfaces import locate_ends
 
 _COSINE = math.cos(math.radians(3))  # of the Gaussians around the direction of the other camera
 _SHARE = 0.98  # of them on a wall; others are seen beyond a door, or stray
 _DEPTH = 0.95  # of the distance of the other camera, the largest depth of a wall
-_OPAQUE = 0.5  # least opacity of a surface
 
 
 def find_walls(scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -24,16 +23,10 @@ def find_walls(scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int
         panoramas: the number in the tour of each of the scene's views.
         edges: pairs of panoramas; those with another panorama are left out.
     """
-    view = {panorama: number for number, panorama in enumerate(panoramas)}
-    inside = [(a, b) for a, b in edges if a != b and a in view and b in view]
-    centers = scene.cam2world[:, :3, 3].double().cpu().numpy()
-    surfaces = {
-        node: locate_surfaces(scene, view[node], np.eye(3), min_opacity=_OPAQUE)
-        for node in {node for edge in inside for node in edge}
-    }
+    inside, surfaces, centers = locate_ends(scene, panoramas, edges)
 
     def is_blocked(node: int, other: int) -> bool:
-        way = centers[view[other]] - centers[view[node]]
+        way = centers[other] - centers[node]
         distances, length = np.linalg.norm(surfaces[node], axis=1), float(np.linalg.norm(way))
         ahead = distances[surfaces[node] @ way > _COSINE * distances * length]
         return len(ahead) > 0 and bool(np.quantile(ahead, _SHARE) < _DEPTH * length)

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# What a GPU that is lent for a quarter of an hour is used for: tables, training, and a judgement of the new weights.
+# Runs the benchmarks, both trainings and an evaluation of the new weights on a GPU, in a quarter of an hour.
 #
 #   OUT=results bash assets/recipe/homes/gpu.sh [truth|training|judge ...]     all three parts by default
 #
