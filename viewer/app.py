@@ -308,7 +308,7 @@ def _write_film(
         scenes = None if tour is None else TourScenes.start(loaded, options.memory)
         format_, create = options.image_format, lambda: create_renderer(ctx, choice, color_bits=32)
         try:
-            with open_frames(create, loaded.scene, scenes, load, pixels, settings, format_) as frames:
+            with open_frames(create, loaded.scene, loaded.entry, scenes, load, pixels, settings, format_) as frames:
                 if path is not None:
                     assert options.out is not None
                     level, frame = create_level_camera(loaded.scene, tour), loaded.scene.frame

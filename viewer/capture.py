@@ -5,16 +5,22 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
+from pansplat.export.film import FilmPhotographs
+from pansplat.export.page_photographs import list_photographs
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
 from pansplat.images.image_files import write_image
 from pansplat.images.video import VIDEO_SUFFIXES, write_video
+from pansplat.inputs.pairs import Pair
+from pansplat.rendering.image_planes import ImagePlane, image_planes
 from pansplat.tours import FADE_SECONDS, Route, TourGraph, paint_floor_plan
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.stereo import ImageFormat, render_image
@@ -29,6 +35,7 @@ from pansplat_viewer.scene.tour import CrossFade, TourScenes
 _FADING_COST = 0.2  # of a still in the first moment of a fade, as a distance from the panorama, fraction of far
 FILM_SECONDS = 4.0  # of a pair
 STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the flight
+_NO_PHOTOGRAPHS = FilmPhotographs((), torch.zeros(0, 4, 4))
 
 
 def write_screenshot(
@@ -117,13 +124,13 @@ def write_flythrough(
     num_frames = film.count_frames()
     steps = num_frames + len(STILLS) + 1
 
-    def draw(fraction: float) -> np.ndarray:
-        return frames.draw(compute_flight_pose(scene, fraction), film.vertical_fov_degrees, 0.0)[0]
+    def draw(fraction: float, seconds: float) -> np.ndarray:
+        return frames.draw(compute_flight_pose(scene, fraction), film.vertical_fov_degrees, seconds)[0]
 
     for done, fraction in enumerate(STILLS):
         progress("stills", done / steps)
         file = folder / f"view_{round(100 * fraction):03d}.png"
-        write_image(file, draw(fraction))
+        write_image(file, draw(fraction, -1.0 - done))  # seconds apart, and before the film
         show_file(file)
     progress("panorama", len(STILLS) / steps)
     file = folder / f"panorama_{round(100 * film.at):03d}.png"
@@ -134,7 +141,7 @@ def write_flythrough(
     def render_frames() -> Iterator[np.ndarray]:
         for frame in range(num_frames):
             progress("film", (len(STILLS) + 1 + frame) / steps)
-            yield to_bytes(draw(frame / (num_frames - 1)))
+            yield to_bytes(draw(frame / (num_frames - 1), frame / film.fps))
 
     file = folder / "flythrough.mp4"
     write_video(file, render_frames(), film.fps)
@@ -160,10 +167,11 @@ class SceneFrames:
         size: tuple[int, int],
         settings: DrawSettings,
         image_format: ImageFormat | None = None,
+        stops: FilmPhotographs | None = None,
     ) -> None:
-        """Upload the scene; `size` is (width, height) of one eye, pixels."""
+        """Upload the scene; `size` is (width, height) of one eye, pixels; `stops` are photographs that films show."""
         renderer.upload(scene)
-        self._renderer, self._size = renderer, size
+        self._renderer, self._size, self._stops = renderer, size, stops or _NO_PHOTOGRAPHS
         self._settings, self.unit = fit_settings(settings, scene), scene.frame.unit
         self.image_format = image_format or ImageFormat()
 
@@ -172,7 +180,11 @@ class SceneFrames:
     ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
         """Colour of a pose at a time of the film, in seconds, and radial depth in metres if it is asked for."""
         settings = replace(self._settings, vertical_fov_degrees=vertical_fov_degrees)
-        return render_image(self._renderer, pose, self._size, settings, self.image_format, with_depth=with_depth)
+        draw = partial(render_image, self._renderer, pose, self._size, settings, self.image_format)
+        if with_depth:
+            return draw(with_depth=True)
+        plane = _make_plane(self._size, self.image_format, vertical_fov_degrees)
+        return self._stops.mix([(pose, 1.0, lambda: draw()[0])], plane, now), None
 
     def draw_panorama(self, pose: Float[np.ndarray, "4 4"], height: int) -> Float[np.ndarray, "height width 3"]:
         """Colour of all directions from a pose."""
@@ -197,6 +209,7 @@ class TourFrames:
         size: tuple[int, int],
         settings: DrawSettings,
         image_format: ImageFormat | None = None,
+        stops: FilmPhotographs | None = None,
     ) -> None:
         """Prepare the first frame.
 
@@ -207,7 +220,9 @@ class TourFrames:
             size: (width, height) of one eye, pixels.
             settings: draw settings.
             image_format: a perspective image of one eye by default.
+            stops: photographs that are shown at panoramas.
         """
+        self._stops = stops or _NO_PHOTOGRAPHS
         self.image_format, self.tour = image_format or ImageFormat(), scenes.tour
         self._renderers, self._scenes, self._load, self._size = renderers, scenes, load, size
         self._settings = replace(settings, near=NEAR_OF_FAR * scenes.tour.far)
@@ -238,45 +253,73 @@ class TourFrames:
                 self._renderers[slot].upload(loaded.scene)
             fade.show(slot, loaded.scene, now, scenes.part)
         fade.move(pose, scenes.part)
-        weight, color, depth = fade.compute_weight(now), 0.0, None
-        for slot, part in ((1 - fade.front, 1 - weight), (fade.front, weight)):
-            scene, renderer = fade.contents[slot], self._renderers[slot]
-            if isinstance(scene, Scene) and (part > 0 or (with_depth and slot == fade.front)):
-                settings = replace(fit_settings(self._settings, scene), vertical_fov_degrees=vertical_fov_degrees)
-                view = fade.poses[slot]
-                assert view is not None
-                image, image_depth = render_image(
-                    renderer,
-                    view,
-                    self._size,
-                    settings,
-                    self.image_format,
-                    with_depth=with_depth and slot == fade.front,
-                )
-                color, depth = color + part * image, depth if image_depth is None else image_depth
-        return np.asarray(color), depth
+        weight, depth = fade.compute_weight(now), None
+
+        def draw(slot: int, view: np.ndarray, scene: Scene) -> np.ndarray:
+            nonlocal depth
+            settings = replace(fit_settings(self._settings, scene), vertical_fov_degrees=vertical_fov_degrees)
+            needs_depth = with_depth and slot == fade.front
+            image, found = render_image(
+                self._renderers[slot], view, self._size, settings, self.image_format, with_depth=needs_depth
+            )
+            depth = found if needs_depth else depth
+            return image
+
+        frame = [
+            (view, part, partial(draw, slot, view, scene))
+            for slot, part in ((1 - fade.front, 1 - weight), (fade.front, weight))
+            if isinstance(scene := fade.contents[slot], Scene)
+            and (view := fade.poses[slot]) is not None
+            and (part > 0 or (with_depth and slot == fade.front))
+        ]
+        plane = _make_plane(self._size, self.image_format, vertical_fov_degrees)
+        return (_NO_PHOTOGRAPHS if with_depth else self._stops).mix(frame, plane, now), depth
 
 
 @contextlib.contextmanager
 def open_frames(
     create_renderer: Callable[[], FrameRenderer],
     scene: Scene,
+    entry: SceneEntry,
     scenes: TourScenes | None,
     load: Callable[[SceneEntry], LoadedScene],
     size: tuple[int, int],
     settings: DrawSettings,
     image_format: ImageFormat,
 ) -> Iterator[SceneFrames | TourFrames]:
-    """The frames of a film in a scene, or in a tour whose `scenes` are given; the renderers are released at the end."""
+    """The frames of a film in the scene of an entry, or in a tour whose `scenes` are given.
+
+    They show photographs at panoramas. The renderers are released at the end.
+    """
+    stops = _NO_PHOTOGRAPHS
+    if settings.shows_scene and image_format.stereo == "mono" and image_format.projection != "cubemap":
+        stops = _open_photographs(entry, scene)
     renderers = [create_renderer() for _ in range(1 if scenes is None else 2)]
     try:
         if scenes is None:
-            yield SceneFrames(renderers[0], scene, size, settings, image_format)
+            yield SceneFrames(renderers[0], scene, size, settings, image_format, stops)
         else:
-            yield TourFrames(renderers, scenes, load, size, settings, image_format)
+            yield TourFrames(renderers, scenes, load, size, settings, image_format, stops)
     finally:
         for renderer in renderers:
             renderer.release()
+
+
+def _open_photographs(entry: SceneEntry, scene: Scene) -> FilmPhotographs:
+    """The photographs of the panoramas that a scene, or all scenes of a tour, are predicted from."""
+    source = entry.tour or entry.pair
+    if entry.merged is not None or source is None:
+        return _NO_PHOTOGRAPHS
+    panoramas = source.context if isinstance(source, Pair) else source.panoramas
+    gains = scene.gains if scene.joint and entry.tour is None else ()
+    poses = torch.stack([panorama.cam2world for panorama in panoramas])
+    return FilmPhotographs(list_photographs(source, range(len(panoramas))), poses, gains)
+
+
+def _make_plane(size: tuple[int, int], image_format: ImageFormat, vertical_fov_degrees: float) -> ImagePlane:
+    """The image plane of a frame (width, height) of one eye; unused in a film without photographs."""
+    layout = "equirect" if image_format.projection == "equirect" else "pinhole"
+    return image_planes(layout, size[::-1], vertical_fov_degrees=vertical_fov_degrees)[0]
 
 
 def write_tour(

@@ -81,7 +81,9 @@ class Recorder:
             def load(entry: SceneEntry) -> LoadedScene:  # a film that is cancelled does not wait for a prediction
                 return loader.load(entry, lambda task, done: progress())
 
-            with open_frames(lambda: CpuRenderer(None), scene, scenes, load, size, settings, image_format) as frames:
+            with open_frames(
+                lambda: CpuRenderer(None), scene, loaded.entry, scenes, load, size, settings, image_format
+            ) as frames:
                 return write_path_film(frames, path, level, file, fps, progress)
 
         self._jobs.start(FILM_JOB, write, self._report, failure="no film written: ")

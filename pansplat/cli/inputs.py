@@ -60,11 +60,16 @@ class ScenePrediction:
 
     def open(self, path: Path) -> Scene:
         """The scene of a scene file, or the prediction of a pair's folder."""
+        return self.open_scene(path)[0]
+
+    def open_scene(self, path: Path) -> tuple[Scene, Pair | None]:
+        """The scene of a scene file, or the prediction of a pair's folder, and the pair."""
         from pansplat import pipeline
 
         if is_scene_file(path):
-            return pipeline.load(path)
-        return predict_scene(choose_pair(path, self.choice), self.options)
+            return pipeline.load(path), None
+        pair = choose_pair(path, self.choice)
+        return predict_scene(pair, self.options), pair
 
     def open_panoramas(
         self, path: Path, gaussians: int | None = None, *, joint: bool = False

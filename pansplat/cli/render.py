@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
+    from pansplat.export.film import FilmPhotographs
     from pansplat.gaussians.scene import Scene
     from pansplat.predictor import Progress
     from pansplat.tours import Route
@@ -34,8 +36,8 @@ _MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
 
 @dataclass(frozen=True)
 class Render(Writer):
-    """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4,
-    .webm)."""
+    """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4, .webm) that
+    shows the photograph while the camera stands at a panorama."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, or a web tour."""
@@ -75,6 +77,8 @@ class Render(Writer):
         import torch
 
         from pansplat import pipeline
+        from pansplat.export.film import FilmPhotographs
+        from pansplat.export.page_photographs import list_photographs
         from pansplat.images.image_files import write_depth, write_image
         from pansplat.images.video import write_video
 
@@ -84,7 +88,7 @@ class Render(Writer):
             raise InputError(
                 f"{self.pose} holds {len(poses)} poses; write an .mp4 or .webm, or keep one pose in the file"
             )
-        scene = self.prediction.open(self.path)
+        scene, source = self.prediction.open_scene(self.path)
         poses = None if poses is None else [scene.frame.localize(pose) for pose in poses]
         layout = self.layout or ("perspective" if self._is_video and not self.stereo else "equirect")
         options = self._render_options(layout, self.height or self._choose_height(layout, scene))
@@ -92,8 +96,11 @@ class Render(Writer):
         stereo = "top-bottom" if self.stereo else "mono"
         if self._is_video:
             path = self._path_between_cameras(scene) if poses is None else [[(pose, 1.0)] for pose in poses]
+            shows_photographs = source is not None and self.blend is None and not self.stereo
+            photographs = list_photographs(source, range(len(scene.cam2world))) if shows_photographs else ()
+            stops = FilmPhotographs(photographs, scene.cam2world, scene.gains if scene.joint else ())
             with progress_bar() as progress:
-                frames = _render_frames(scene, path, options, progress)
+                frames = self._render_frames(scene, path, options, stops, progress)
                 count = write_video(self.out, frames, self.fps, panorama=layout != "perspective", stereo=stereo)
             print(f"{self.out}: {count} frames of {size}, {layout}")
             return 0
@@ -168,6 +175,28 @@ class Render(Writer):
             return [[(pose, 1.0)] for pose in fly_path(scene.cam2world, fractions)]
         return [[(torch.from_numpy(pose), weight) for pose, weight in route.fade(at)] for at in fractions]
 
+    def _render_frames(
+        self, scene: Scene, frames: list[Frame], options: dict[str, Any], stops: FilmPhotographs, progress: Progress
+    ) -> Iterator[np.ndarray]:
+        """8-bit RGB images of the frames."""
+        import numpy as np
+        import torch
+
+        from pansplat import pipeline
+        from pansplat.rendering.image_planes import image_planes
+
+        layout = "equirect" if options["layout"] == "cubemap" else options["layout"]  # the same directions
+        (plane,) = image_planes(layout, options["size"], vertical_fov_degrees=self.fov)
+
+        @torch.no_grad()
+        def draw(pose: Tensor) -> np.ndarray:
+            return pipeline.render(scene, pose, **options).color.permute(1, 2, 0).cpu().numpy()
+
+        for index, frame in enumerate(frames):
+            progress(f"frame {index + 1} of {len(frames)}", index / len(frames))
+            drawn = [(pose.cpu().numpy(), weight, partial(draw, pose)) for pose, weight in frame]
+            yield (stops.mix(drawn, plane, index / self.fps).clip(0, 1) * 255).round().astype(np.uint8)
+
 
 def _plan_flight(scene: Scene) -> Route | None:
     """The flight through a tour of several parts; None for another scene. Between parts there is nothing to see."""
@@ -202,20 +231,3 @@ def read_poses(path: Path) -> list[Tensor]:
     if len(numbers) == 16 and len(text) < _MAX_MATRIX:
         return [rigid_matrix([numbers[i : i + 4] for i in (0, 4, 8, 12)], str(path))]
     return list(read_trajectory(path).poses)
-
-
-def _render_frames(
-    scene: Scene, frames: list[Frame], options: dict[str, Any], progress: Progress
-) -> Iterator[np.ndarray]:
-    """8-bit RGB images of the frames."""
-    import torch
-
-    from pansplat import pipeline
-
-    for index, frame in enumerate(frames):
-        progress(f"frame {index + 1} of {len(frames)}", index / len(frames))
-        with torch.no_grad():
-            color = torch.stack([weight * pipeline.render(scene, pose, **options).color for pose, weight in frame]).sum(
-                0
-            )
-        yield (color.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()

@@ -138,18 +138,25 @@ def pack_photographs(
 @torch.no_grad()
 def read_photograph(scene: Scene, view: int, photograph: Pair, height: int) -> Float[Tensor, "3 height width"]:
     """A photograph of at most a height, with the exposure of the Gaussians, and without what its masks hide."""
-    views = photograph.load_context(min(height, photograph.image_height))
-    image, mask = views.images[0], views.masks[0] & mask_holes(views.images)[0]
-    del views  # of large photographs gigabytes
+    image, shown = load_photograph(photograph, height)
     if scene.joint and scene.gains:  # the Gaussians of single views have the exposure of their photographs
         image = image / torch.tensor(scene.gains[view]).to(image)[:, None, None]
-    if mask.all():
+    if shown.min() >= 1:
         return image.clamp(0, 1)
     rows = min(scene.height, _HIDDEN_ROWS)
     drawn = pipeline.render(*_select_shown(scene, view), size=(rows, 2 * rows)).color.clamp(0, 1)
     drawn = functional.interpolate(drawn[None].to(image), image.shape[1:], mode="bilinear")[0]
-    shown = torch.from_numpy(_fade_from_hidden(mask.numpy()))
     return torch.where(shown > 0, torch.lerp(drawn, image.clamp(0, 1), shown), drawn)
+
+
+def load_photograph(
+    photograph: Pair, height: int
+) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"]]:
+    """The picture of a pair of one panorama, of at most a height, and where it may be shown: 0 in what masks hide."""
+    views = photograph.load_context(min(height, photograph.image_height))
+    image, mask = views.images[0], views.masks[0] & mask_holes(views.images)[0]
+    shown = torch.ones(1).expand(mask.shape) if mask.all() else torch.from_numpy(_fade_from_hidden(mask.numpy()))
+    return image, shown
 
 
 def _select_shown(scene: Scene, view: int) -> tuple[Scene, Float[Tensor, "4 4"]]:
@@ -168,7 +175,7 @@ def _fade_from_hidden(mask: Bool[np.ndarray, "height width"]) -> Float[np.ndarra
     margin = min(feather + _GUARD, mask.shape[1])
     padded = np.pad(mask.astype(np.uint8), ((0, 0), (margin, margin)), mode="wrap")
     distances = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[:, margin:-margin]
-    return ((distances - _GUARD) / feather).clip(0, 1)
+    return ((distances - _GUARD) / feather).clip(0, 1).astype(np.float32)
 
 
 def _pack(image: Float[Tensor, "3 height width"], rotation: np.ndarray, quality: int) -> PackedPhotograph:

@@ -36,13 +36,15 @@ from pansplat.tours.graph import (
 from pansplat.tours.links import find_link_ring, find_way_along_link
 from pansplat.tours.outlook import choose_heading, find_blank, is_hidden, measure_outlook
 from pansplat.tours.overlap import connect
-from pansplat.tours.route import FADE_SECONDS, Route, find_angles, plan_route
+from pansplat.tours.route import FADE_SECONDS, STOP_REACH, STOP_SECONDS, Route, find_angles, plan_route
 from pansplat.tours.walls import find_walls
 
 __all__ = [
     "EDGE_HYSTERESIS",
     "FADE_SECONDS",
     "MAX_SCENE_VIEWS",
+    "STOP_REACH",
+    "STOP_SECONDS",
     "Edge",
     "FloorOutline",
     "FloorPlan",

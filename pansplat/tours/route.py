@@ -16,6 +16,8 @@ from pansplat.tours.links import find_way_along_link
 from pansplat.tours.outlook import choose_heading
 
 FADE_SECONDS = 1.0
+STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
+STOP_SECONDS = 0.2  # of the fade between scene and photograph
 _FLY_SPEED = 1.0  # metres per second
 _TURN_DEGREES = 45.0  # per second
 _LOOK_AHEAD = 1.5  # metres along the way, the point that the camera looks at

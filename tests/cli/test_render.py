@@ -12,6 +12,8 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
+from pansplat.geometry.equirect import rotate_equirect
+from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import read_depth
 from pansplat.rendering import Rendering
 from pansplat.tours import find_tours
@@ -76,6 +78,21 @@ def test_a_video_moves_between_the_cameras(scene: Path, tmp_path: Path) -> None:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert len(frames) == 4 and frames[0].shape == (18, 32, 3)
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
+
+
+@pytest.mark.parametrize("options", [(), ("--blend", "deferred")])
+def test_a_video_of_panoramas_begins_with_the_photograph(options, room: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.mp4"
+    arguments = ["--model", "sphere", "--predict-height", str(HEIGHT), "--refine", "0", "--layout", "equirect"]
+    arguments += ["--height", str(HEIGHT), "--seconds", "0.5", "--fps", "8", *options]
+    assert run(["render", str(room), "-o", str(out), *arguments]) == 0
+    with av.open(str(out)) as video:
+        frame = next(video.decode(video=0)).to_ndarray(format="rgb24")
+    (pair,) = pipeline.load_pairs(room)
+    pose = fly_pose(torch.stack([view.cam2world for view in pair.context]), 0.0)
+    photograph = rotate_equirect(pair.load_context(HEIGHT).images[0], pose[:3, :3])
+    likeness = np.corrcoef(frame.mean(axis=2).ravel(), photograph.mean(dim=0).ravel())[0, 1]
+    assert (likeness > 0.5) == (not options), "a chosen blend shows the Gaussians"
 
 
 @pytest.mark.parametrize(("layout", "size"), [("perspective", (1080, 1920)), ("equirect", (1440, 2880))])

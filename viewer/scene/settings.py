@@ -120,6 +120,12 @@ class DrawSettings:
         return self.levels, self.opacity_threshold, self.box
 
     @property
+    def shows_scene(self) -> bool:
+        """Whether the colours of the whole scene are shown, to one eye."""
+        is_whole = self.selection == (None, 0.0, None) and set(self.view_weights) <= {1.0}
+        return is_whole and self.display == "color" and self.mode != "view" and self.stereo == "mono"
+
+    @property
     def is_exact(self) -> bool:
         """Whether the preset is `exact`."""
         return self.preset == "exact"

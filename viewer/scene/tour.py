@@ -19,6 +19,7 @@ from pansplat.tours import (
     EDGE_HYSTERESIS,
     FADE_SECONDS,
     MAX_SCENE_VIEWS,
+    STOP_SECONDS,
     Edge,
     FloorOutline,
     Route,
@@ -34,8 +35,6 @@ from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
 
 DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
-STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
-STOP_SECONDS = 0.2  # of the fade between scene and photograph
 _LARGEST_STOP_STEP = 1 / 3  # of this fade in a frame, also after a pause without frames
 _NEXT_SCENES = 3  # that are dropped last
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor

@@ -20,7 +20,7 @@ from pansplat_viewer.scene.loader import LoadedScene
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
 from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot
 from pansplat_viewer.scene.state import ViewerState, adapt_settings, fit_settings
-from pansplat_viewer.scene.tour import STOP_REACH, CrossFade, StopFade
+from pansplat_viewer.scene.tour import CrossFade, StopFade
 from pansplat_viewer.ui.compare import Comparer
 from pansplat_viewer.ui.presenter import PhotographLayer, Presenter
 
@@ -253,9 +253,8 @@ class Stage:
     def _find_stop(self) -> int | None:
         """The panorama at which the camera stands, if its scene is shown as it is."""
         state, settings = self._state, self._state.settings
-        is_plain = settings.display == "color" and settings.mode != "view" and settings.stereo == "mono"
-        is_whole = settings.selection == (None, 0.0, None) and set(settings.view_weights) <= {1.0}
-        if not (state.stops and is_plain and is_whole and state.comparison == "off" and self.photograph is None):
+        is_whole = settings.shows_scene and state.comparison == "off" and self.photograph is None
+        if not (state.stops and is_whole):
             return None
         position, photographs = np.asarray(state.camera.position), self.comparer.photographs
         index = photographs.find_nearest(position)
