@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.constants import MAX_MAGNITUDE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
@@ -18,7 +19,7 @@ from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.columns import rasterize_columns
 from pansplat.rendering.cpu.projection import GaussianArrays, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
-from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
+from pansplat.rendering.cpu.rasterize import VALUE_LANES, SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
 from pansplat.rendering.cpu.records import RECORD_SIZE, PixelTables, tabulate_pixels
 from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, pooled_empty, thread_count
@@ -52,7 +53,10 @@ def rasterize_planes(
     planes: list[ImagePlane],
     options: RasterOptions,
 ) -> RasterSums:
-    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`."""
+    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
+
+    The kernels have three channels: other numbers are rasterised in groups of three.
+    """
     require_exact_kernel(options)
     if gaussians.means.device.type != "cpu":
         raise InputError(
@@ -65,17 +69,33 @@ def rasterize_planes(
             "choose a smaller size, or use backend='torch'"
         )
     shape = (gaussians.quats, gaussians.scales, None) if covariances is None else (None, None, covariances)
-    tensors = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
+    tensors = (gaussians.means, *shape, gaussians.opacities)
     tensors = tuple(None if tensor is None else tensor.to(torch.float32).contiguous() for tensor in tensors)
-    has_grad = any(tensor is not None and tensor.requires_grad for tensor in (*tensors, pose))
+    harmonics = gaussians.harmonics.to(torch.float32)
+    has_grad = any(tensor is not None and tensor.requires_grad for tensor in (*tensors, harmonics, pose))
     if planes[0].eye_offset and has_grad and torch.is_grad_enabled():  # too rare for kernels of its own
         return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
-    statistics = Statistics()
-    sums = _Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors)
+    groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
+    parts = []
+    for group in groups:
+        statistics = Statistics()
+        parts.append(_Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors, group))
+    sums = parts[0]
+    if harmonics.shape[2] != 3:
+        colors = torch.cat([part[:, :3] for part in parts], dim=1)[:, : harmonics.shape[2]]
+        sums = torch.cat((colors, parts[0][:, 3:]), dim=1)
     if options.strict and statistics.dropped:
         raise InputError(not_finite_message(gaussians, covariances, pose, options))
     info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
     return RasterSums(sums.to(gaussians.means.dtype), info)
+
+
+def _split_channels(harmonics: Float[Tensor, "n k channel"]) -> list[Float[Tensor, "n k 3"]]:
+    """The channels in groups of three, the last one with zeros; a Gaussian that is unusable in one is so in all."""
+    usable = (harmonics.abs() <= MAX_MAGNITUDE).all(dim=2).all(dim=1)
+    padded = torch.nn.functional.pad(harmonics, (0, -harmonics.shape[2] % 3 if harmonics.shape[2] else 3))
+    padded = torch.where(usable[:, None, None], padded, torch.nan)
+    return [group.contiguous() for group in padded.split(3, dim=2)]
 
 
 def require_exact_kernel(options: RasterOptions) -> None:
@@ -105,7 +125,7 @@ class _Rasterize(torch.autograd.Function):
             with statistics.timed("project"):
                 projected = project_gaussians(gaussians, camera, workspace, threads)
             view = CameraView(gaussians, camera, projected, options, threads)
-            sums = pooled_empty((len(planes), gaussians.harmonics.shape[2] + 2, *planes[0].size), np.float32)
+            sums = pooled_empty((len(planes), VALUE_LANES + 1, *planes[0].size), np.float32)
             states = [
                 rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
                 for plane, plane_sums in zip(planes, sums, strict=True)
@@ -224,10 +244,10 @@ def _backpropagate_planes(
     With one image plane in one band the slots are those of its intersections; otherwise each Gaussian has one.
     """
     projected, threads = view.projected, view.threads
-    num, num_values = projected.values.shape
+    num = len(projected.values)
     is_single = len(planes) == 1 and states[0].tiles is not None
     total_records = np.zeros((0 if is_single else num, RECORD_SIZE), np.float32)
-    total_values = np.zeros((0 if is_single else num, num_values), np.float32)
+    total_values = np.zeros((0 if is_single else num, VALUE_LANES), np.float32)
     for plane, state, plane_sums, plane_grads in zip(planes, states, sums, grad_sums, strict=True):
         tables = tabulate_pixels(plane)
         bands = [state.tiles] if state.tiles else intersect_tiles(
@@ -241,7 +261,7 @@ def _backpropagate_planes(
                 _rasterize_band(view, tiles, tables, plane_sums, saved)
             band_workspace = workspace if is_single else Workspace()
             grad_records = band_workspace.array((len(tiles.intersections), RECORD_SIZE), np.float32)
-            grad_values = band_workspace.array((len(tiles.intersections), num_values), np.float32)
+            grad_values = band_workspace.array((len(tiles.intersections), VALUE_LANES), np.float32)
             rasterize_backward(
                 projected.records, projected.values, tiles.intersections, tiles.starts, tiles.slots, tables, plane_sums,
                 saved, plane_grads, grad_records, grad_values, first_row=tiles.first_row, threads=threads,

@@ -72,7 +72,7 @@ class GaussianArrays(NamedTuple):
         scales: (n, 3), metres.
         covariances: (n, 3, 3), square metres; in place of `quats` and `scales`.
         opacities: (n,).
-        harmonics: (n, k, channel).
+        harmonics: (n, k, 3).
     """
 
     means: np.ndarray
@@ -145,9 +145,9 @@ def project_gaussians(
     gaussians: GaussianArrays, camera: Camera, workspace: Workspace, threads: int
 ) -> ProjectedGaussians:
     """Project all Gaussians; the arrays belong to the workspace."""
-    num, channels = len(gaussians.means), gaussians.harmonics.shape[2]
+    num = len(gaussians.means)
     records, radii = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array(num, np.float64)
-    values, kept = workspace.array((num, channels + 1), np.float32), workspace.array(num, np.uint8)
+    values, kept = workspace.array((num, 4), np.float32), workspace.array(num, np.uint8)
     num_items = -(-num // GAUSSIANS_PER_ITEM)
     counts = np.zeros((num_items, 2), np.int64)
     harmonic_bits = gaussians.harmonics.reshape(-1).view(np.uint32)
@@ -172,7 +172,7 @@ def _project_gaussians(
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
         may_be_invalid = load_block(means, quats, scales, covariances, opacities, start, count, rows)
-        _validate_harmonics(harmonic_bits, harmonics.shape[1] * harmonics.shape[2], start, count, rows)
+        _validate_harmonics(harmonic_bits, 3 * harmonics.shape[1], start, count, rows)
         if may_be_invalid:
             _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
         for i in range(0, count, LANES):

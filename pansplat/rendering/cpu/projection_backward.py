@@ -110,7 +110,7 @@ def backpropagate_projection(
 
     Args:
         grad_records: (slot, RECORD_SIZE), of the camera's records.
-        grad_values: (slot, channel + 1).
+        grad_values: (slot, 4).
         offsets: (n + 1), where each Gaussian's slots begin.
         gradients: arrays to write; arrays without rows are skipped.
     """
@@ -154,11 +154,10 @@ def _backpropagate_projection(
     value_sums = np.zeros(4 * GAUSSIAN_BLOCK + 4, np.float32)
     soa, kept = np.zeros((layout.RECORD_SIZE, GAUSSIAN_BLOCK), np.float32), np.zeros(GAUSSIAN_BLOCK, np.bool_)
     basis, grad_basis = np.zeros((25, GAUSSIAN_BLOCK), np.float32), np.zeros((25, GAUSSIAN_BLOCK), np.float32)
-    grad_colors = np.zeros((GAUSSIAN_BLOCK, harmonics.shape[2]), np.float32)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
         load_block(means, quats, scales, covariances, opacities, start, count, rows)
-        _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, grad_colors, rows)
+        _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, rows)
         records_to_soa(record_sums, 0, count, soa.reshape(-1), GAUSSIAN_BLOCK)
         _clear_culled(scene_kept, start, count, pose, rows, soa, kept)
         for i in range(0, GAUSSIAN_BLOCK, LANES):
@@ -166,14 +165,10 @@ def _backpropagate_projection(
                 covariances, camera, filter_variance, compensate, near, rows, soa.reshape(-1), grad_pose, i
             )
         if view_dependent is None:
-            backpropagate_constant_colors(harmonics, start, count, values, value_sums, grad_colors, grad_harmonics)
+            backpropagate_constant_colors(start, count, values, value_sums, grad_harmonics)
         else:
-            if harmonics.shape[2] == 3:
-                for i in range(count):
-                    for c in range(3):
-                        grad_colors[i, c] = load_scalar(value_sums, 4 * i + c)
             evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
-            backpropagate_colors(harmonics, start, kept, basis, values, grad_colors, grad_harmonics, grad_basis)
+            backpropagate_colors(harmonics, start, kept, basis, values, value_sums, grad_harmonics, grad_basis)
             accumulate_direction_gradients(
                 rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, grad_basis, _MEAN_GRAD_ROW
             )
@@ -190,41 +185,29 @@ def _backpropagate_projection(
 
 
 @inline_kernel
-def _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, grad_colors, rows):
+def _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, rows):
     """Sum the slots of each Gaussian of a block, in their order; 0 if it has none.
 
     Args:
         grad_records, grad_values: flat.
         record_sums: (RECORD_SIZE GAUSSIAN_BLOCK), written.
-        value_sums: (4 GAUSSIAN_BLOCK + 4), written if there are three channels.
-        grad_colors: (GAUSSIAN_BLOCK, channel), written for other numbers of channels.
+        value_sums: (4 GAUSSIAN_BLOCK + 4), written.
     """
-    channels, zero = grad_colors.shape[1], broadcast(np.float32(0))
+    zero = broadcast(np.float32(0))
     for i in range(count):
         first, end = load_scalar(offsets, start + i), load_scalar(offsets, start + i + 1)
-        low, high, values, radius = zero, zero, zero, np.float32(0)
+        low, high, values = zero, zero, zero
         prefetch(grad_records, layout.RECORD_SIZE * (first + PREFETCH_DISTANCE // 4))
         prefetch(grad_values, 4 * (first + PREFETCH_DISTANCE // 4))
-        if channels == 3:  # the common case has one loop, so that its end is mispredicted once
-            for slot in range(first, end):
-                low = low + load(grad_records, layout.RECORD_SIZE * slot)
-                high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
-                values = values + load_four(grad_values, 4 * slot)
-            store(value_sums, 4 * i, values)
-        else:
-            grad_colors[i] = 0
-            for slot in range(first, end):
-                low = low + load(grad_records, layout.RECORD_SIZE * slot)
-                high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
-                for c in range(channels):
-                    grad_colors[i, c] += load_scalar(grad_values, (channels + 1) * slot + c)
-                radius += load_scalar(grad_values, (channels + 1) * slot + channels)
-            rows[_RADIUS_GRAD_ROW, i] = radius
+        for slot in range(first, end):  # one loop, so that its end is mispredicted once
+            low = low + load(grad_records, layout.RECORD_SIZE * slot)
+            high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
+            values = values + load_four(grad_values, 4 * slot)
+        store(value_sums, 4 * i, values)
         store(record_sums, layout.RECORD_SIZE * i, low)
         store(record_sums, layout.RECORD_SIZE * i + LANES, high)
-    if channels == 3:
-        for i in range(0, GAUSSIAN_BLOCK, LANES):
-            store_row(rows, _RADIUS_GRAD_ROW, i, to_f64(load_aos4(value_sums, 4 * i)[3]))
+    for i in range(0, GAUSSIAN_BLOCK, LANES):
+        store_row(rows, _RADIUS_GRAD_ROW, i, to_f64(load_aos4(value_sums, 4 * i)[3]))
 
 
 @inline_kernel

@@ -89,6 +89,15 @@ def test_sums_and_gradients_equal_the_reference(layout, options, scene, pose):
     _compare(scene, pose, layout, options)
 
 
+def test_a_number_that_is_unusable_in_one_channel_drops_the_gaussian_in_all(make_colored_scene, pose):
+    scene = make_colored_scene(channels=5)
+    scene.harmonics[::3, 0, 4] = torch.nan
+    drawn = rasterize_planes(scene, None, pose, _planes("pinhole"), RasterOptions())
+    kept = scene.select(torch.arange(len(scene)) % 3 > 0)
+    assert drawn.info.dropped == len(scene) - len(kept) > 0
+    assert torch.equal(drawn.sums, rasterize_planes(kept, None, pose, _planes("pinhole"), RasterOptions()).sums)
+
+
 def test_bands_change_no_bit_of_the_sums(scene, pose, monkeypatch):
     whole, gradients = _run(scene, pose, "pinhole")
     monkeypatch.setattr(tiling, "MAX_INTERSECTIONS", 20)
