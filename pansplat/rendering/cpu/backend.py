@@ -68,12 +68,11 @@ def rasterize_planes(
             f"`size` must be at most {LARGEST_SIDE} pixels a side for backend 'numba', got {planes[0].size}; "
             "choose a smaller size, or use backend='torch'"
         )
-    shape = (gaussians.quats, gaussians.scales, None) if covariances is None else (None, None, covariances)
-    tensors = (gaussians.means, *shape, gaussians.opacities)
-    tensors = tuple(None if tensor is None else tensor.to(torch.float32).contiguous() for tensor in tensors)
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    tensors = tuple(tensor.to(torch.float32).contiguous() for tensor in tensors)
     harmonics = gaussians.harmonics.to(torch.float32)
-    has_grad = any(tensor is not None and tensor.requires_grad for tensor in (*tensors, harmonics, pose))
-    if planes[0].eye_offset and has_grad and torch.is_grad_enabled():  # too rare for kernels of its own
+    has_grad = any(tensor.requires_grad for tensor in (*tensors, harmonics, pose)) and torch.is_grad_enabled()
+    if covariances is not None or (planes[0].eye_offset and has_grad):  # too rare for kernels of their own
         return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
     groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
     parts = []
@@ -85,7 +84,7 @@ def rasterize_planes(
         colors = torch.cat([part[:, :3] for part in parts], dim=1)[:, : harmonics.shape[2]]
         sums = torch.cat((colors, parts[0][:, 3:]), dim=1)
     if options.strict and statistics.dropped:
-        raise InputError(not_finite_message(gaussians, covariances, pose, options))
+        raise InputError(not_finite_message(gaussians, None, pose, options))
     info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
     return RasterSums(sums.to(gaussians.means.dtype), info)
 
@@ -115,9 +114,9 @@ class _Rasterize(torch.autograd.Function):
         options: RasterOptions,
         statistics: Statistics,
         grad_enabled: bool,
-        *tensors: Tensor | None,
+        *tensors: Tensor,
     ) -> Tensor:
-        """Sums; `tensors` are the fields of GaussianArrays, or None."""
+        """Sums; `tensors` are the fields of GaussianArrays."""
         gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], options)
         threads, workspace = thread_count(), Workspace()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
