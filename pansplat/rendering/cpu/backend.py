@@ -26,7 +26,6 @@ from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, pool
 from pansplat.rendering.cpu.tiling import (
     LARGEST_SIDE,
     TileIntersections,
-    compute_depths,
     find_bounding_boxes,
     intersect_tiles,
     sort_front_to_back,
@@ -41,7 +40,6 @@ class _PlaneState(NamedTuple):
     """What the backward reads of one image plane; tiles and transmittances only if all tiles fit one band."""
 
     boxes: np.ndarray
-    distances: np.ndarray  # the intersections are sorted by these
     tiles: TileIntersections | None = None
     saved: SavedForBackward | None = None
 
@@ -72,7 +70,8 @@ def rasterize_planes(
     tensors = tuple(tensor.to(torch.float32).contiguous() for tensor in tensors)
     harmonics = gaussians.harmonics.to(torch.float32)
     has_grad = any(tensor.requires_grad for tensor in (*tensors, harmonics, pose)) and torch.is_grad_enabled()
-    if covariances is not None or (planes[0].eye_offset and has_grad):  # too rare for kernels of their own
+    by_depth = options.order == "z" and not planes[0].is_panorama
+    if covariances is not None or by_depth or (planes[0].eye_offset and has_grad):  # too rare for kernels of their own
         return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
     groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
     parts = []
@@ -185,9 +184,7 @@ def rasterize_plane(
     workspace = saved_in or Workspace()
     with statistics.timed("bound"):
         boxes = find_bounding_boxes(projected.records, plane, workspace, threads)
-    with statistics.timed("sort"):
-        distances = find_distances(view, plane, workspace)
-    tables, state = tabulate_pixels(plane), _PlaneState(boxes, distances)
+    tables, state = tabulate_pixels(plane), _PlaneState(boxes)
     bands = intersect_tiles(boxes, plane.size, slots=needs_grad, threads=threads, limit=tiling.MAX_INTERSECTIONS)
     while True:
         with statistics.timed("intersect"):
@@ -195,29 +192,19 @@ def rasterize_plane(
         if tiles is None:
             break
         with statistics.timed("sort"):
-            sort_front_to_back(tiles, distances, threads)
+            sort_front_to_back(tiles, projected.radii, threads)
         is_whole_image = len(tiles.starts) == 1 + math.prod(tables.tiles)
         saved = allocate_saved(tiles.starts, tiles.workspace) if needs_grad and is_whole_image else None
         with statistics.timed("rasterize"):
             _rasterize_band(view, tiles, tables, sums, saved)
         statistics.intersections += len(tiles.intersections)
-        arrays = [] if distances is projected.radii else [distances]
-        arrays += [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
+        arrays = [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
         statistics.bytes = max(statistics.bytes, sum(array.nbytes for array in arrays))
         if saved is not None:
             state = state._replace(tiles=tiles, saved=saved)
         del tiles, arrays  # the next band reuses their memory
     statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
     return state if needs_grad else None
-
-
-def find_distances(view: CameraView, plane: ImagePlane, workspace: Workspace) -> np.ndarray:
-    """The distances that order the Gaussians on an image plane, metres: radial, or depths along its axis."""
-    projected = view.projected
-    if view.options.order != "z" or plane.is_panorama:
-        return projected.radii
-    axis = plane.rotation[:, 2].numpy().copy()
-    return compute_depths(projected.records, projected.radii, axis, workspace, view.threads)
 
 
 def _rasterize_band(
@@ -255,7 +242,7 @@ def _backpropagate_planes(
         for tiles in bands:
             saved = state.saved
             if saved is None:  # rasterise again: the transmittances of all bands would take too much memory
-                sort_front_to_back(tiles, state.distances, threads)
+                sort_front_to_back(tiles, projected.radii, threads)
                 saved = allocate_saved(tiles.starts, tiles.workspace)
                 _rasterize_band(view, tiles, tables, plane_sums, saved)
             band_workspace = workspace if is_single else Workspace()

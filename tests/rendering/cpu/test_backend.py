@@ -17,9 +17,9 @@ _CASES = [
     ("equirect", RasterOptions()),
     ("equirect", RasterOptions(lowpass="3dgs")),
     ("pinhole", RasterOptions()),
-    ("pinhole", RasterOptions(order="z", lowpass="3dgs")),
+    ("pinhole", RasterOptions(lowpass="3dgs")),
     ("cubemap", RasterOptions(lowpass="3dgs")),
-    ("cubemap", RasterOptions(order="z")),
+    ("cubemap", RasterOptions()),
 ]
 
 
