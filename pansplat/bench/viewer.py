@@ -44,7 +44,6 @@ Mode = Literal["joint", "deferred"]
 FOV_DEGREES = 75.0
 RENDERERS = ("cpu", "gl33", "gl43")
 _PANORAMA_SIZE = (1024, 512)  # pixels
-_FACE_SIZE = 326  # pixels
 _MAX_REFERENCE = 1_000_000  # Gaussians; float64 takes a minute beyond
 _VIEWER_PACKAGE = "pansplat_viewer"
 _RATES = (15, 60)  # frames per second, lines of the plot
@@ -57,7 +56,7 @@ class ViewerCase:
     Attributes:
         renderer: `cpu`, `gl33` or `gl43`.
         view: `perspective` moves; `coarse` moves at half the resolution; `look-around` turns and reads cube faces;
-            `panorama` is stitched from six cube faces.
+            `panorama` has all directions; OpenGL stitches it from six cube faces.
         mode: `joint` or `deferred`.
         width, height: of the image, pixels.
     """
@@ -77,7 +76,7 @@ class ViewerCase:
         """The values of the viewer's `DrawSettings`, and the size."""
         values: dict[str, object] = {"mode": self.mode, "size": [self.width, self.height]}
         if self.view == "panorama":
-            return {**values, "layout": "equirect", "face_size": _FACE_SIZE}
+            return {**values, "layout": "equirect"}
         return {**values, "vertical_fov_degrees": FOV_DEGREES, "cached": self.view == "look-around"}
 
 

@@ -1,7 +1,7 @@
 """Compile the numba kernels of rasteriser, viewer and sweep into numba's cache: `python -m pansplat.cli.warm_up`.
 
-setup.sh runs this once, so that later commands do not compile them. Kernels for `covariances` in place of scales and
-rotations, and those of PanSplat and MVSplat, are compiled by the first call that uses them.
+setup.sh runs this once, so that later commands do not compile them. Kernels of PanSplat and MVSplat are compiled by
+the first call that uses them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Gaussians
     from pansplat.rendering.image_planes import Layout
-    from pansplat.rendering.rasterize import Order
 
 
 def main() -> None:
@@ -46,14 +45,14 @@ def compile_kernels(name: str) -> None:
         step()
 
 
-def _rasterize(degree: int, layout: Layout, order: Order) -> None:
+def _rasterize(degree: int, layout: Layout) -> None:
     """Rasterise Gaussians with harmonics of a degree, forward and backward."""
     import torch
 
     from pansplat.rendering.rasterize import rasterize
 
     scene, pose = _make_gaussians(degree), torch.eye(4, dtype=torch.float64)
-    rasterize(scene, pose, size=(16, 32), layout=layout, order=order, backend="numba").color.sum().backward()
+    rasterize(scene, pose, size=(16, 32), layout=layout, backend="numba").color.sum().backward()
 
 
 def _rasterize_stereo() -> None:
@@ -129,8 +128,8 @@ def _predict() -> None:
 STEPS = {
     "sweep and depth network": (_predict,),
     "rasteriser and viewer": (
-        partial(_rasterize, 0, "equirect", "radial"),
-        partial(_rasterize, 1, "pinhole", "z"),
+        partial(_rasterize, 0, "equirect"),
+        partial(_rasterize, 1, "pinhole"),
         _compare,
         _rasterize_stereo,
         _draw_display_image,

@@ -119,9 +119,9 @@ def test_groups_hold_every_choice_of_the_fast_backend_and_the_main_ones_at_full_
 
 
 def test_all_choices_are_all_combinations():
-    for backend, kernels in (("torch", 2), ("triton", 2), ("numba", 1)):
+    for backend, kernels, orders in (("torch", 2, 2), ("triton", 2, 2), ("numba", 1, 1)):
         choices = list_choices(backend, 64, 1)
-        assert len(set(choices)) == len(choices) == 2 + 4 * kernels + kernels
+        assert len(set(choices)) == len(choices) == 2 + 2 * orders * kernels + kernels
         assert {(c.kernel, c.order) for c in choices if c.layout == "equirect"} == {("ray", "radial")}
     official = list_main_choices("torch", 512, 2)[-1]
     choices = (official.kernel, official.order, official.filter, official.face_size, official.stitching)

@@ -155,7 +155,6 @@ def _rasterize_reference(
         **({} if settings.is_exact else {"kernel": "ewa", "order": "z", "lowpass": "3dgs"}),
         background=settings.background,
         near=settings.near,
-        face_size=settings.face_size,
     )
 
 
@@ -204,8 +203,7 @@ def assert_reference(make_renderer, reference, assert_matches) -> Callable[..., 
         assert_matches(make_renderer(scene), cam2world, settings, expected)
         if not settings.is_exact:
             return
-        if settings.face_size is None:  # the processor draws such panoramas directly
-            expected = reference(scene, cam2world, size, settings, "equirect")
+        expected = reference(scene, cam2world, size, settings, "equirect")  # the processor draws panoramas directly
         assert_matches(make_renderer(scene, "cpu"), cam2world, settings, expected)
 
     return check

@@ -36,7 +36,7 @@ from pansplat.rendering.cpu.display import (
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
 from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
-from pansplat.rendering.image_planes import ImagePlane, stitch_faces
+from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.displays import color_by_property
@@ -45,14 +45,13 @@ from pansplat_viewer.draw.layers import Frame, LayerStorage
 from pansplat_viewer.draw.renderer import SplatRenderer, choose_layer_weights, is_software
 from pansplat_viewer.draw.splats import Splats, drop_not_finite
 from pansplat_viewer.scene.background import BackgroundWorker, Report
-from pansplat_viewer.scene.camera import Pinhole, create_face_cameras
+from pansplat_viewer.scene.camera import Pinhole
 from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
 _POLL_SECONDS = (
     0.02  # wait for an image that is drawn without waiting, so that a window does not draw the old one again
 )
-_SMALLER = "use a smaller size or face_size"
 _MAX_FACE_SETS = 5
 _MAX_SELECTIONS = 8
 _MAX_TEXTURES = 4
@@ -180,9 +179,10 @@ class CpuRenderer:
         if settings.stereo != "mono":
             raise InputError(f"the processor draws one eye of a window, got {settings.stereo}; use renderer gl")
         frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
-        largest = max(*frame.size, frame.face_size if settings.layout == "equirect" else 0)
-        if largest > LARGEST_SIDE:
-            raise InputError(f"the image needs {largest} pixels a side, the limit is {LARGEST_SIDE}; {_SMALLER}")
+        if (largest := max(frame.size)) > LARGEST_SIDE:
+            raise InputError(
+                f"the image needs {largest} pixels a side, the limit is {LARGEST_SIDE}; use a smaller size"
+            )
         groups = self._choose_groups(frame)
         if frame.storage == LayerStorage.PADDED_FACES:
             return self._show(self._read_from_faces(frame, groups))
@@ -309,15 +309,13 @@ class CpuRenderer:
     def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
         """Draw the image of a frame."""
         start = time.perf_counter()
-        stages: dict[str, float] = {}
-        drawn = 0
         if frame.settings.layout == "pinhole":
             pinhole = Pinhole(frame.rotation, frame.position, frame.focal, *frame.size)
             layers = self._rasterize(frame, groups, pinhole, self._selected)
-            sums, drawn = layers.sums, layers.statistics.visible
-            _add_stages(stages, layers)
         else:
-            sums, drawn = self._rasterize_panorama(frame, groups, stages)
+            layers = self._rasterize_panorama(frame, groups)
+        sums, drawn = layers.sums, layers.statistics.visible
+        stages = {name: 1e3 * seconds for name, seconds in layers.statistics.seconds.items()}
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
         _write_pixels(frame.settings, groups, sums, pixels, bottom_up=True)
@@ -359,33 +357,18 @@ class CpuRenderer:
             self._colored = name, scene.with_colors(colors)
         return self._colored[1]
 
-    def _rasterize_panorama(
-        self, frame: Frame, groups: _Groups, stages: dict[str, float]
-    ) -> tuple[Float[np.ndarray, "layer 5 height width"], int]:
-        """Rasterise a panorama: directly, or from cube faces of `face_size`."""
-        size, settings = frame.size[::-1], frame.settings
-        if settings.face_size is None:
-            plane = ImagePlane(size, torch.from_numpy(frame.rotation.copy()), 0.0, settings.eye_offset)
-            layers = self._find_scene(settings).rasterize(
-                np.asarray(frame.position),
-                plane,
-                groups.labels,
-                len(groups.weights),
-                RasterOptions(near=settings.near),
-                min_transmittance=self._min_transmittance,
-            )
-            _add_stages(stages, layers)
-            return layers.sums, layers.statistics.visible
-        faces, drawn = [], 0
-        for camera in create_face_cameras(frame.faces_to_world, frame.position, frame.face_size, 0):
-            layers = self._rasterize(frame, groups, camera)
-            faces.append(torch.from_numpy(layers.sums))
-            drawn += layers.statistics.visible
-            _add_stages(stages, layers)
-        before = time.perf_counter()
-        stitched = torch.stack([stitch_faces(torch.stack(layer), size) for layer in zip(*faces, strict=True)])
-        stages["stitch"] = 1e3 * (time.perf_counter() - before)
-        return stitched.numpy(), drawn
+    def _rasterize_panorama(self, frame: Frame, groups: _Groups) -> Layers:
+        """Rasterise a panorama, with a ray for each pixel."""
+        settings = frame.settings
+        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), 0.0, settings.eye_offset)
+        return self._find_scene(settings).rasterize(
+            np.asarray(frame.position),
+            plane,
+            groups.labels,
+            len(groups.weights),
+            RasterOptions(near=settings.near),
+            min_transmittance=self._min_transmittance,
+        )
 
     def _read_from_faces(self, frame: Frame, groups: _Groups) -> _Picture:
         """Read the image from the cube faces of the position; draws those that are missing."""
@@ -548,9 +531,3 @@ def _enlarge(
     enlarge(pixels, large)
     stages["enlarge"] = 1e3 * (time.perf_counter() - start)
     return large
-
-
-def _add_stages(stages: dict[str, float], layers: Layers) -> None:
-    """Add the milliseconds of each stage."""
-    for name, seconds in layers.statistics.seconds.items():
-        stages[name] = stages.get(name, 0.0) + 1e3 * seconds

@@ -85,9 +85,7 @@ class Frame:
 
     @property
     def face_size(self) -> int:
-        """Side of a cube face without border, pixels."""
-        if self.settings.face_size is not None:
-            return self.settings.face_size
+        """Side of a cube face without border, pixels: the resolution of the equator, or of the image's centre."""
         if self.settings.layout == "equirect":
             return max(round(2 * self.size[1] / math.pi), 1)
         return max(math.ceil(2 * self.focal), 1)
@@ -196,7 +194,7 @@ class TargetStore:
         if max(size) > self._max_size:
             raise InputError(
                 f"the image needs a texture of {size[0]}x{size[1]} pixels, this GPU's limit is {self._max_size}; "
-                "use a smaller size or face_size"
+                "use a smaller size"
             )
         target = self._targets.get(name)
         if target is not None:

@@ -56,8 +56,6 @@ class DrawSettings:
             or the left in red and the right in green and blue.
         outside: the doll's house view: Gaussians that show their back to the camera are not drawn (docs/rendering.md,
             section 10).
-        face_size: side of a cube face in pixels. None matches the resolution at the panorama's equator
-            (2 height / pi), or at the centre of a pinhole image that is drawn from cached faces.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
             camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
             would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
@@ -77,12 +75,11 @@ class DrawSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
     near: float = NEAR  # Gaussians whose mean is nearer than this radial distance, metres, are not drawn
     vertical_fov_degrees: float = 90.0  # of layout `pinhole`, in (0, 180)
-    layout: Layout = "pinhole"  # `pinhole`, or `equirect` stitched from six cube faces
+    layout: Layout = "pinhole"  # `pinhole`, or `equirect`, which OpenGL stitches from six cube faces
     eye_offset: float = 0.0
     stereo: Stereo = "mono"
     eye_distance: float = EYE_DISTANCE  # metres
     outside: bool = False
-    face_size: int | None = None
     cached: bool = False
     scale: float = 1.0
 
@@ -102,17 +99,14 @@ class DrawSettings:
             raise InputError(f"`display_max` must be a positive number, got {self.display_max}")
         if not 0 < self.near < math.inf:
             raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
-        if self.eye_offset and (self.layout, self.preset, self.face_size) != ("equirect", "exact", None):
+        if self.eye_offset and (self.layout, self.preset) != ("equirect", "exact"):
             raise InputError(
-                "omni-directional stereo needs layout equirect, preset exact and no face_size, got "
-                f"{self.layout}, {self.preset} and {self.face_size}"
+                f"omni-directional stereo needs layout equirect and preset exact, got {self.layout} and {self.preset}"
             )
         if not 0 < self.scale <= 1:
             raise InputError(f"`scale` must be in (0, 1], got {self.scale}")
         if not abs(self.eye_offset) < math.inf:
             raise InputError(f"`eye_offset` must be a distance in metres, got {self.eye_offset}")
-        if self.face_size is not None and self.face_size < 1:
-            raise InputError(f"`face_size` must be at least 1 pixel, got {self.face_size}")
 
     @property
     def selection(self) -> GaussianChoice:

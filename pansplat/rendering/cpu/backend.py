@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.constants import MAX_MAGNITUDE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
@@ -18,14 +19,13 @@ from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.columns import rasterize_columns
 from pansplat.rendering.cpu.projection import GaussianArrays, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
-from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
+from pansplat.rendering.cpu.rasterize import VALUE_LANES, SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
 from pansplat.rendering.cpu.records import RECORD_SIZE, PixelTables, tabulate_pixels
 from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, pooled_empty, thread_count
 from pansplat.rendering.cpu.tiling import (
     LARGEST_SIDE,
     TileIntersections,
-    compute_depths,
     find_bounding_boxes,
     intersect_tiles,
     sort_front_to_back,
@@ -40,7 +40,6 @@ class _PlaneState(NamedTuple):
     """What the backward reads of one image plane; tiles and transmittances only if all tiles fit one band."""
 
     boxes: np.ndarray
-    distances: np.ndarray  # the intersections are sorted by these
     tiles: TileIntersections | None = None
     saved: SavedForBackward | None = None
 
@@ -52,7 +51,10 @@ def rasterize_planes(
     planes: list[ImagePlane],
     options: RasterOptions,
 ) -> RasterSums:
-    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`."""
+    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
+
+    The kernels have three channels: other numbers are rasterised in groups of three.
+    """
     require_exact_kernel(options)
     if gaussians.means.device.type != "cpu":
         raise InputError(
@@ -64,18 +66,34 @@ def rasterize_planes(
             f"`size` must be at most {LARGEST_SIDE} pixels a side for backend 'numba', got {planes[0].size}; "
             "choose a smaller size, or use backend='torch'"
         )
-    shape = (gaussians.quats, gaussians.scales, None) if covariances is None else (None, None, covariances)
-    tensors = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
-    tensors = tuple(None if tensor is None else tensor.to(torch.float32).contiguous() for tensor in tensors)
-    has_grad = any(tensor is not None and tensor.requires_grad for tensor in (*tensors, pose))
-    if planes[0].eye_offset and has_grad and torch.is_grad_enabled():  # too rare for kernels of its own
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    tensors = tuple(tensor.to(torch.float32).contiguous() for tensor in tensors)
+    harmonics = gaussians.harmonics.to(torch.float32)
+    has_grad = any(tensor.requires_grad for tensor in (*tensors, harmonics, pose)) and torch.is_grad_enabled()
+    by_depth = options.order == "z" and not planes[0].is_panorama
+    if covariances is not None or by_depth or (planes[0].eye_offset and has_grad):  # too rare for kernels of their own
         return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
-    statistics = Statistics()
-    sums = _Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors)
+    groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
+    parts = []
+    for group in groups:
+        statistics = Statistics()
+        parts.append(_Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors, group))
+    sums = parts[0]
+    if harmonics.shape[2] != 3:
+        colors = torch.cat([part[:, :3] for part in parts], dim=1)[:, : harmonics.shape[2]]
+        sums = torch.cat((colors, parts[0][:, 3:]), dim=1)
     if options.strict and statistics.dropped:
-        raise InputError(not_finite_message(gaussians, covariances, pose, options))
+        raise InputError(not_finite_message(gaussians, None, pose, options))
     info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
     return RasterSums(sums.to(gaussians.means.dtype), info)
+
+
+def _split_channels(harmonics: Float[Tensor, "n k channel"]) -> list[Float[Tensor, "n k 3"]]:
+    """The channels in groups of three, the last one with zeros; a Gaussian that is unusable in one is so in all."""
+    usable = (harmonics.abs() <= MAX_MAGNITUDE).all(dim=2).all(dim=1)
+    padded = torch.nn.functional.pad(harmonics, (0, -harmonics.shape[2] % 3 if harmonics.shape[2] else 3))
+    padded = torch.where(usable[:, None, None], padded, torch.nan)
+    return [group.contiguous() for group in padded.split(3, dim=2)]
 
 
 def require_exact_kernel(options: RasterOptions) -> None:
@@ -95,9 +113,9 @@ class _Rasterize(torch.autograd.Function):
         options: RasterOptions,
         statistics: Statistics,
         grad_enabled: bool,
-        *tensors: Tensor | None,
+        *tensors: Tensor,
     ) -> Tensor:
-        """Sums; `tensors` are the fields of GaussianArrays, or None."""
+        """Sums; `tensors` are the fields of GaussianArrays."""
         gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], options)
         threads, workspace = thread_count(), Workspace()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
@@ -105,7 +123,7 @@ class _Rasterize(torch.autograd.Function):
             with statistics.timed("project"):
                 projected = project_gaussians(gaussians, camera, workspace, threads)
             view = CameraView(gaussians, camera, projected, options, threads)
-            sums = pooled_empty((len(planes), gaussians.harmonics.shape[2] + 2, *planes[0].size), np.float32)
+            sums = pooled_empty((len(planes), VALUE_LANES + 1, *planes[0].size), np.float32)
             states = [
                 rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
                 for plane, plane_sums in zip(planes, sums, strict=True)
@@ -166,9 +184,7 @@ def rasterize_plane(
     workspace = saved_in or Workspace()
     with statistics.timed("bound"):
         boxes = find_bounding_boxes(projected.records, plane, workspace, threads)
-    with statistics.timed("sort"):
-        distances = find_distances(view, plane, workspace)
-    tables, state = tabulate_pixels(plane), _PlaneState(boxes, distances)
+    tables, state = tabulate_pixels(plane), _PlaneState(boxes)
     bands = intersect_tiles(boxes, plane.size, slots=needs_grad, threads=threads, limit=tiling.MAX_INTERSECTIONS)
     while True:
         with statistics.timed("intersect"):
@@ -176,29 +192,19 @@ def rasterize_plane(
         if tiles is None:
             break
         with statistics.timed("sort"):
-            sort_front_to_back(tiles, distances, threads)
+            sort_front_to_back(tiles, projected.radii, threads)
         is_whole_image = len(tiles.starts) == 1 + math.prod(tables.tiles)
         saved = allocate_saved(tiles.starts, tiles.workspace) if needs_grad and is_whole_image else None
         with statistics.timed("rasterize"):
             _rasterize_band(view, tiles, tables, sums, saved)
         statistics.intersections += len(tiles.intersections)
-        arrays = [] if distances is projected.radii else [distances]
-        arrays += [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
+        arrays = [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
         statistics.bytes = max(statistics.bytes, sum(array.nbytes for array in arrays))
         if saved is not None:
             state = state._replace(tiles=tiles, saved=saved)
         del tiles, arrays  # the next band reuses their memory
     statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
     return state if needs_grad else None
-
-
-def find_distances(view: CameraView, plane: ImagePlane, workspace: Workspace) -> np.ndarray:
-    """The distances that order the Gaussians on an image plane, metres: radial, or depths along its axis."""
-    projected = view.projected
-    if view.options.order != "z" or plane.is_panorama:
-        return projected.radii
-    axis = plane.rotation[:, 2].numpy().copy()
-    return compute_depths(projected.records, projected.radii, axis, workspace, view.threads)
 
 
 def _rasterize_band(
@@ -224,10 +230,10 @@ def _backpropagate_planes(
     With one image plane in one band the slots are those of its intersections; otherwise each Gaussian has one.
     """
     projected, threads = view.projected, view.threads
-    num, num_values = projected.values.shape
+    num = len(projected.values)
     is_single = len(planes) == 1 and states[0].tiles is not None
     total_records = np.zeros((0 if is_single else num, RECORD_SIZE), np.float32)
-    total_values = np.zeros((0 if is_single else num, num_values), np.float32)
+    total_values = np.zeros((0 if is_single else num, VALUE_LANES), np.float32)
     for plane, state, plane_sums, plane_grads in zip(planes, states, sums, grad_sums, strict=True):
         tables = tabulate_pixels(plane)
         bands = [state.tiles] if state.tiles else intersect_tiles(
@@ -236,12 +242,12 @@ def _backpropagate_planes(
         for tiles in bands:
             saved = state.saved
             if saved is None:  # rasterise again: the transmittances of all bands would take too much memory
-                sort_front_to_back(tiles, state.distances, threads)
+                sort_front_to_back(tiles, projected.radii, threads)
                 saved = allocate_saved(tiles.starts, tiles.workspace)
                 _rasterize_band(view, tiles, tables, plane_sums, saved)
             band_workspace = workspace if is_single else Workspace()
             grad_records = band_workspace.array((len(tiles.intersections), RECORD_SIZE), np.float32)
-            grad_values = band_workspace.array((len(tiles.intersections), num_values), np.float32)
+            grad_values = band_workspace.array((len(tiles.intersections), VALUE_LANES), np.float32)
             rasterize_backward(
                 projected.records, projected.values, tiles.intersections, tiles.starts, tiles.slots, tables, plane_sums,
                 saved, plane_grads, grad_records, grad_values, first_row=tiles.first_row, threads=threads,

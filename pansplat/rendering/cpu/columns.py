@@ -121,8 +121,8 @@ def _find_columns(view: CameraView, plane: ImagePlane, workspace: Workspace) -> 
     near = view.projected.radii < camera.near + abs(plane.eye_offset)
     usable = view.projected.kept.astype(bool) | near
     work = partial(
-        _bound_columns, gaussians.means, gaussians.quats, gaussians.scales, gaussians.covariances, gaussians.opacities,
-        usable, camera.pose, camera.filter_variance, plane.eye_offset, plane.size[1], *ranges,
+        _bound_columns, gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, usable,
+        camera.pose, camera.filter_variance, plane.eye_offset, plane.size[1], *ranges,
     )  # fmt: skip
     parallel_for(work, -(-num // GAUSSIANS_PER_ITEM), view.threads)
     return ranges
@@ -130,7 +130,7 @@ def _find_columns(view: CameraView, plane: ImagePlane, workspace: Workspace) -> 
 
 @kernel
 def _bound_columns(
-    means, quats, scales, covariances, opacities, usable, pose, filter_variance, eye_offset, width, first, counts, item
+    means, quats, scales, opacities, usable, pose, filter_variance, eye_offset, width, first, counts, item
 ):  # fmt: skip
     """Write the columns whose half planes can meet the visible ellipsoid of a Gaussian.
 
@@ -148,17 +148,12 @@ def _bound_columns(
         x = p_x * pose[0, 0] + p_y * pose[1, 0] + p_z * pose[2, 0]
         z = p_x * pose[0, 2] + p_y * pose[1, 2] + p_z * pose[2, 2]
         horizontal, radius = math.hypot(x, z), math.sqrt(p_x * p_x + p_y * p_y + p_z * p_z)
-        if len(covariances) > 0:
-            for i in range(3):
-                for j in range(3):
-                    covariance[i, j] = 0.5 * (covariances[g, i, j] + covariances[g, j, i])
-        else:
-            _fill_rotation(quats[g, 0], quats[g, 1], quats[g, 2], quats[g, 3], rotation)
-            for i in range(3):
-                for j in range(3):
-                    covariance[i, j] = 0.0
-                    for k in range(3):
-                        covariance[i, j] += rotation[i, k] * rotation[j, k] * np.float64(scales[g, k]) ** 2
+        _fill_rotation(quats[g, 0], quats[g, 1], quats[g, 2], quats[g, 3], rotation)
+        for i in range(3):
+            for j in range(3):
+                covariance[i, j] = 0.0
+                for k in range(3):
+                    covariance[i, j] += rotation[i, k] * rotation[j, k] * np.float64(scales[g, k]) ** 2
         kappa = 2 * math.log(max(opacities[g] / ALPHA_CUT, 1.0)) + KAPPA_MARGIN
         reach = 1.001 * math.sqrt(kappa)
         widening = reach * deviation * (radius + offset)
@@ -271,11 +266,7 @@ def _gather(
     """The Gaussian of each pair; its mean is relative to the column's eye."""
     num = len(pairs.gaussians)
     centres = camera.pose[:3, 3] + eyes @ camera.pose[:3, :3].T
-    arrays = []
-    for array in gaussians:
-        given = len(array) > 0 or num == 0
-        gathered = workspace.array((num if given else 0, *array.shape[1:]), np.float32)
-        arrays.append(gathered)
+    arrays = [workspace.array((num, *array.shape[1:]), np.float32) for array in gaussians]
     sources = [array.reshape(-1) for array in gaussians]
     row_sizes = np.array([math.prod(array.shape[1:]) for array in gaussians[1:]])
     work = partial(_gather_rows, *sources, row_sizes, centres, *pairs, *(array.reshape(-1) for array in arrays))
@@ -285,8 +276,8 @@ def _gather(
 
 @kernel
 def _gather_rows(
-    means, quats, scales, covariances, opacities, harmonics, row_sizes, centres, indices, columns,
-    moved, to_quats, to_scales, to_covariances, to_opacities, to_harmonics, item,
+    means, quats, scales, opacities, harmonics, row_sizes, centres, indices, columns,
+    moved, to_quats, to_scales, to_opacities, to_harmonics, item,
 ):  # fmt: skip
     """Copy the Gaussian of each pair; its mean becomes relative to the column's eye."""
     begin, end = item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, len(indices))
@@ -298,18 +289,16 @@ def _gather_rows(
             store_scalar(moved, 3 * i + axis, np.float32(offset))
     _copy_rows(quats, row_sizes[0], indices, begin, end, to_quats)
     _copy_rows(scales, row_sizes[1], indices, begin, end, to_scales)
-    _copy_rows(covariances, row_sizes[2], indices, begin, end, to_covariances)
-    _copy_rows(opacities, row_sizes[3], indices, begin, end, to_opacities)
-    _copy_rows(harmonics, row_sizes[4], indices, begin, end, to_harmonics)
+    _copy_rows(opacities, row_sizes[2], indices, begin, end, to_opacities)
+    _copy_rows(harmonics, row_sizes[3], indices, begin, end, to_harmonics)
 
 
 @inline_kernel
 def _copy_rows(source, row_size, indices, begin, end, copies):
-    if len(copies) > 0:
-        for i in range(begin, end):
-            at = row_size * np.int64(load_scalar(indices, i))
-            for j in range(row_size):
-                store_scalar(copies, row_size * i + j, load_scalar(source, at + j))
+    for i in range(begin, end):
+        at = row_size * np.int64(load_scalar(indices, i))
+        for j in range(row_size):
+            store_scalar(copies, row_size * i + j, load_scalar(source, at + j))
 
 
 @kernel

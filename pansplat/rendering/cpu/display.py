@@ -271,8 +271,7 @@ class DisplayScene:
         outputs = means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, harmonics.reshape(-1)
         rows = self._rows.reshape(-1), self._rows.shape[1], 3 * coefficients
         parallel_for(partial(_copy_marked, edges, marks, positions, *rows, *outputs), len(counts), thread_count())
-        no_covariances = np.empty((0, 3, 3), np.float32)
-        return GaussianArrays(means, quats, scales, no_covariances, opacities, harmonics), ends.tolist()
+        return GaussianArrays(means, quats, scales, opacities, harmonics), ends.tolist()
 
 
 def mark_in_view(

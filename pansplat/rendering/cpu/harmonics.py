@@ -1,4 +1,4 @@
-"""Real spherical harmonics of a block of directions, colours of any number of channels, and their gradients.
+"""Real spherical harmonics of a block of directions, colours, and their gradients.
 
 Convention: order and signs of pansplat.gaussians.harmonics, which has the same polynomials. `view_dependent` is None if
 there is one harmonic; numba does not compile the code for several ones then.
@@ -141,27 +141,23 @@ def accumulate_direction_gradients(rows, direction_row, num, view_dependent, gra
 @inline_kernel
 def evaluate_colors(harmonics, start, count, basis, view_dependent, rows, radius_row, values):
     """Write the colour max(0, 0.5 + sum_k Y_k c_k) and the radius of `count` Gaussians from `start` on into values."""
-    channels, done = harmonics.shape[2], 0
-    if channels == 3:
-        if view_dependent is None:
-            done = _evaluate_constant_rgb(harmonics, start, count, rows, radius_row, values)
-        else:
-            done = _evaluate_rgb(harmonics, start, count, basis, rows, radius_row, values)
+    zero, done = np.float32(0), 0
+    if view_dependent is None:
+        done = _evaluate_constant_colors(harmonics, start, count, rows, radius_row, values)
     for i in range(done, count):
         g = start + i
-        for c in range(channels):
-            values[g, c] = 0.5
+        red, green, blue = np.float32(0.5), np.float32(0.5), np.float32(0.5)
         for k in range(harmonics.shape[1]):
             weight = basis[k, i]
-            for c in range(channels):
-                values[g, c] += weight * harmonics[g, k, c]
-        for c in range(channels):
-            values[g, c] = max(values[g, c], np.float32(0))
-        values[g, channels] = rows[radius_row, i]
+            red += weight * harmonics[g, k, 0]
+            green += weight * harmonics[g, k, 1]
+            blue += weight * harmonics[g, k, 2]
+        values[g, 0], values[g, 1], values[g, 2] = max(red, zero), max(green, zero), max(blue, zero)
+        values[g, 3] = rows[radius_row, i]
 
 
 @inline_kernel
-def _evaluate_constant_rgb(harmonics, start, count, rows, radius_row, values):
+def _evaluate_constant_colors(harmonics, start, count, rows, radius_row, values):
     """Write the colours and radii of whole vectors of Gaussians with one harmonic; return their number."""
     weight, half, zero = broadcast(np.float32(_C0)), broadcast(np.float32(0.5)), broadcast(np.float32(0))
     coefficients, written, whole = harmonics.reshape(-1), values.reshape(-1), count // LANES * LANES
@@ -175,82 +171,60 @@ def _evaluate_constant_rgb(harmonics, start, count, rows, radius_row, values):
 
 
 @inline_kernel
-def _evaluate_rgb(harmonics, start, count, basis, rows, radius_row, values):
-    """Write the colours and radii of Gaussians with several harmonics; return their number."""
-    zero = np.float32(0)
-    for i in range(count):
-        g = start + i
-        red, green, blue = np.float32(0.5), np.float32(0.5), np.float32(0.5)
-        for k in range(harmonics.shape[1]):
-            weight = basis[k, i]
-            red += weight * harmonics[g, k, 0]
-            green += weight * harmonics[g, k, 1]
-            blue += weight * harmonics[g, k, 2]
-        values[g, 0], values[g, 1], values[g, 2] = max(red, zero), max(green, zero), max(blue, zero)
-        values[g, 3] = rows[radius_row, i]
-    return count
-
-
-@inline_kernel
-def backpropagate_colors(harmonics, start, kept, basis, values, grad_colors, grad_harmonics, grad_basis):
+def backpropagate_colors(harmonics, start, kept, basis, values, grad_values, grad_harmonics, grad_basis):
     """Write the gradients of coefficients and harmonics, given those of a block's colours.
 
     Args:
         start: the block's first Gaussian.
         kept: false for culled Gaussians, whose gradients are 0, whether or not their coefficients are finite.
         values: colours of the forward; a channel at 0 has no gradient.
-        grad_colors: a row per Gaussian; overwritten.
+        grad_values: of colours and radius, flat.
         grad_harmonics: no rows if not needed.
         grad_basis: written, a row per harmonic.
     """
-    num, channels, needed = harmonics.shape[1], harmonics.shape[2], grad_harmonics.shape[0] > 0
+    num, needed, grad_color = harmonics.shape[1], grad_harmonics.shape[0] > 0, np.empty(3, np.float32)
     for i in range(len(kept)):
         g = start + i
         if not kept[i]:
             for k in range(num):
                 grad_basis[k, i] = 0
                 if needed and g < harmonics.shape[0]:
-                    for c in range(channels):
+                    for c in range(3):
                         grad_harmonics[g, k, c] = 0
             continue
-        for c in range(channels):
-            grad_colors[i, c] = grad_colors[i, c] if values[g, c] > 0 else np.float32(0)
+        for c in range(3):
+            grad_color[c] = load_scalar(grad_values, 4 * i + c) if values[g, c] > 0 else np.float32(0)
         for k in range(num):
             total, weight = np.float32(0), basis[k, i]
-            for c in range(channels):
-                total += harmonics[g, k, c] * grad_colors[i, c]
+            for c in range(3):
+                total += harmonics[g, k, c] * grad_color[c]
                 if needed:
-                    grad_harmonics[g, k, c] = weight * grad_colors[i, c]
+                    grad_harmonics[g, k, c] = weight * grad_color[c]
             grad_basis[k, i] = total
 
 
 @inline_kernel
-def backpropagate_constant_colors(harmonics, start, count, values, grad_values, grad_colors, grad_harmonics):
+def backpropagate_constant_colors(start, count, values, grad_values, grad_harmonics):
     """Write the gradients of the coefficients of one harmonic, given those of the colours.
 
     Args:
         values: colours of the forward; a channel at 0 has no gradient.
-        grad_values: of three channels and the radius, flat; read if there are three channels.
-        grad_colors: a row per Gaussian; read for other numbers of channels.
+        grad_values: of colours and radius, flat.
         grad_harmonics: no rows if not needed.
     """
-    channels, whole, weight = harmonics.shape[2], 0, np.float32(_C0)
     if grad_harmonics.shape[0] == 0:
         return
-    if channels == 3:
-        whole, factor, zero = count // LANES * LANES, broadcast(weight), broadcast(np.float32(0))
-        forward, written = values.reshape(-1), grad_harmonics.reshape(-1)
-        for i in range(0, whole, LANES):
-            grad_red, grad_green, grad_blue, _ = load_aos4(grad_values, 4 * i)
-            red, green, blue, _ = load_aos4(forward, 4 * (start + i))
-            grad_red = select(red > zero, factor * grad_red, zero)
-            grad_green = select(green > zero, factor * grad_green, zero)
-            grad_blue = select(blue > zero, factor * grad_blue, zero)
-            store_aos3(written, 3 * (start + i), grad_red, grad_green, grad_blue)
-        for i in range(whole, count):
-            for c in range(3):
-                grad_colors[i, c] = load_scalar(grad_values, 4 * i + c)
+    whole, weight = count // LANES * LANES, np.float32(_C0)
+    factor, zero = broadcast(weight), broadcast(np.float32(0))
+    forward, written = values.reshape(-1), grad_harmonics.reshape(-1)
+    for i in range(0, whole, LANES):
+        grad_red, grad_green, grad_blue, _ = load_aos4(grad_values, 4 * i)
+        red, green, blue, _ = load_aos4(forward, 4 * (start + i))
+        grad_red = select(red > zero, factor * grad_red, zero)
+        grad_green = select(green > zero, factor * grad_green, zero)
+        grad_blue = select(blue > zero, factor * grad_blue, zero)
+        store_aos3(written, 3 * (start + i), grad_red, grad_green, grad_blue)
     for i in range(whole, count):
-        for c in range(channels):
-            grad = weight * grad_colors[i, c]
+        for c in range(3):
+            grad = weight * load_scalar(grad_values, 4 * i + c)
             grad_harmonics[start + i, 0, c] = grad if values[start + i, c] > 0 else np.float32(0)

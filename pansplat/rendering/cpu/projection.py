@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pansplat.constants import MAX_MAGNITUDE, MAX_SCALE_RATIO, MIN_COMPENSATION, MIN_EIGENVALUE_RATIO, OPACITY_CUT
+from pansplat.constants import MAX_MAGNITUDE, MAX_SCALE_RATIO, MIN_COMPENSATION, OPACITY_CUT
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.harmonics import evaluate_basis, evaluate_colors
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
@@ -34,7 +34,6 @@ from pansplat.rendering.cpu.simd import (
     aos4_to_soa,
     broadcast,
     load_row,
-    load_scalar,
     mantissa_and_exponent,
     mask_bits,
     popcount,
@@ -54,55 +53,39 @@ GAUSSIANS_PER_ITEM = 8192
 CULLED = -128.0  # log2_peak of a culled Gaussian
 
 _MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # without the sign
-_ROUNDING = -MIN_EIGENVALUE_RATIO
 _DROPPED, _NEAR = 0, 1  # columns of the counts
 
 # Rows of a block: inputs and results.
-MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 12  # the shape is a quaternion and three scales, or a covariance
-DIRECTION_ROW, RADIUS_ROW, VALID_ROW = 13, 16, 17  # world axes; metres; 1, or 0 if a number is unusable
-NUM_ROWS = 18
+MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 10  # the shape is a quaternion and three scales
+DIRECTION_ROW, RADIUS_ROW, VALID_ROW = 11, 14, 15  # world axes; metres; 1, or 0 if a number is unusable
+NUM_ROWS = 16
 
 
 class GaussianArrays(NamedTuple):
-    """Gaussians as arrays; a field that is not given has no rows.
+    """Gaussians as arrays.
 
     Attributes:
         means: (n, 3), metres.
         quats: (n, 4), wxyz, of any length.
         scales: (n, 3), metres.
-        covariances: (n, 3, 3), square metres; in place of `quats` and `scales`.
         opacities: (n,).
-        harmonics: (n, k, channel).
+        harmonics: (n, k, 3).
     """
 
     means: np.ndarray
     quats: np.ndarray
     scales: np.ndarray
-    covariances: np.ndarray
     opacities: np.ndarray
     harmonics: np.ndarray
 
     @classmethod
     def from_tensors(cls, tensors: Sequence[Any]) -> "GaussianArrays":
-        """The arrays of float32 tensors; None becomes an array without rows."""
-        shapes = ((3,), (4,), (3,), (3, 3), (), tensors[-1].shape[1:])
-        return cls(
-            *(
-                np.empty((0, *shape), np.float32) if tensor is None else tensor.detach().numpy()
-                for tensor, shape in zip(tensors, shapes, strict=True)
-            )
-        )
-
-    @property
-    def kernel_arguments(self) -> tuple[np.ndarray | None, ...]:
-        """The arrays, None for those not given: numba does not compile code that depends on a None."""
-        by_covariance = len(self.covariances) > 0
-        shape = (None, None, self.covariances) if by_covariance else (self.quats, self.scales, None)
-        return self.means, *shape, self.opacities, self.harmonics
+        """The arrays of float32 tensors."""
+        return cls(*(tensor.detach().numpy() for tensor in tensors))
 
     @property
     def view_dependent(self) -> bool | None:
-        """True if colours depend on the direction, else None."""
+        """True if colours depend on the direction, else None: numba does not compile code that depends on a None."""
         return True if self.harmonics.shape[1] > 1 else None
 
 
@@ -145,14 +128,14 @@ def project_gaussians(
     gaussians: GaussianArrays, camera: Camera, workspace: Workspace, threads: int
 ) -> ProjectedGaussians:
     """Project all Gaussians; the arrays belong to the workspace."""
-    num, channels = len(gaussians.means), gaussians.harmonics.shape[2]
+    num = len(gaussians.means)
     records, radii = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array(num, np.float64)
-    values, kept = workspace.array((num, channels + 1), np.float32), workspace.array(num, np.uint8)
+    values, kept = workspace.array((num, 4), np.float32), workspace.array(num, np.uint8)
     num_items = -(-num // GAUSSIANS_PER_ITEM)
     counts = np.zeros((num_items, 2), np.int64)
     harmonic_bits = gaussians.harmonics.reshape(-1).view(np.uint32)
     work = partial(
-        _project_gaussians, *gaussians.kernel_arguments, harmonic_bits, *camera, gaussians.view_dependent,
+        _project_gaussians, *gaussians, harmonic_bits, *camera, gaussians.view_dependent,
         records.reshape(-1), values, radii, kept, counts,
     )  # fmt: skip
     parallel_for(work, num_items, threads)
@@ -162,7 +145,7 @@ def project_gaussians(
 
 @kernel
 def _project_gaussians(
-    means, quats, scales, covariances, opacities, harmonics, harmonic_bits,
+    means, quats, scales, opacities, harmonics, harmonic_bits,
     pose, filter_variance, compensate, near, view_dependent, records, values, radii, kept, counts, item,
 ):  # fmt: skip
     align_stack()
@@ -171,12 +154,12 @@ def _project_gaussians(
     num_dropped, num_near, camera = 0, 0, pose_columns(pose)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
-        may_be_invalid = load_block(means, quats, scales, covariances, opacities, start, count, rows)
-        _validate_harmonics(harmonic_bits, harmonics.shape[1] * harmonics.shape[2], start, count, rows)
+        may_be_invalid = load_block(means, quats, scales, opacities, start, count, rows)
+        _validate_harmonics(harmonic_bits, 3 * harmonics.shape[1], start, count, rows)
         if may_be_invalid:
             _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
         for i in range(0, count, LANES):
-            state, is_kept = _compute_records(covariances, camera, filter_variance, compensate, near, rows, i, soa)
+            state, is_kept = _compute_records(camera, filter_variance, compensate, near, rows, i, soa)
             lanes_used = min(LANES, count - i)
             used = np.uint64((1 << lanes_used) - 1)
             num_dropped += popcount(mask_bits(state == 0.0) & used)
@@ -193,12 +176,12 @@ def _project_gaussians(
 
 
 @inline_kernel
-def _compute_records(covariances, pose, filter_variance, compensate, near, rows, i, soa):
+def _compute_records(pose, filter_variance, compensate, near, rows, i, soa):
     """Write the records of eight Gaussians, a row of `soa` per field; return their states and which are kept."""
     unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     n, radius, inverse, state = compute_direction(rows, i, pose, near)
     store_row(rows, RADIUS_ROW, i, radius)
-    u, v, cov, state = compute_tangent_covariance(covariances, rows, i, n, inverse, state)
+    u, v, cov, state = compute_tangent_covariance(rows, i, n, inverse, state)
     state = state * load_row(rows, VALID_ROW, i)
     factors, l_along_a, l_along_b, radial_variance, _, inverse_det = compute_whitening(cov, filter_variance)
     a, b = whitened_axes(u, v, factors)
@@ -244,20 +227,14 @@ def _log2(value):
 
 
 @inline_kernel
-def load_block(means, quats, scales, covariances, opacities, start, count, rows):
+def load_block(means, quats, scales, opacities, start, count, rows):
     """Load the fields of `count` Gaussians from `start` on into rows; return whether a number may be unusable."""
     largest = broadcast(np.float32(0))
     largest = aos3_to_soa(means.reshape(-1), start, count, rows, MEAN_ROW, largest)
     largest = aos1_to_soa(opacities, start, count, rows, OPACITY_ROW, largest)
-    # Two conditions and no `else`: numba removes the branch of a None argument, but not its `else`.
-    if covariances is not None:
-        for i in range(count):
-            for j in range(9):
-                rows[SHAPE_ROW + j, i] = load_scalar(covariances, 9 * (start + i) + j)
-    if quats is not None:
-        largest = aos4_to_soa(quats.reshape(-1), start, count, rows, SHAPE_ROW, largest)
-        largest = aos3_to_soa(scales.reshape(-1), start, count, rows, SHAPE_ROW + 4, largest)
-    return covariances is not None or count % LANES > 0 or any_magnitude_reaches(largest, _MAX_MAGNITUDE_BITS)
+    largest = aos4_to_soa(quats.reshape(-1), start, count, rows, SHAPE_ROW, largest)
+    largest = aos3_to_soa(scales.reshape(-1), start, count, rows, SHAPE_ROW + 4, largest)
+    return count % LANES > 0 or any_magnitude_reaches(largest, _MAX_MAGNITUDE_BITS)
 
 
 @inline_kernel
@@ -333,21 +310,17 @@ def compute_direction(rows, i, pose, near):
 
 
 @inline_kernel
-def compute_tangent_covariance(covariances, rows, i, n, inverse, state):
+def compute_tangent_covariance(rows, i, n, inverse, state):
     """Tangent axes u and v, the covariance, and the state: 0 if the shape is unusable.
 
     Args:
-        covariances: None if the shapes are quaternions and scales.
         n: directions.
         inverse: one over the distance.
         state: of `compute_direction`.
     """
     frame = tangent_frame(n[0], n[1], n[2])
     u, v = (frame[0], frame[1], frame[2]), (frame[3], frame[4], frame[5])
-    if covariances is not None:
-        cov, state = _covariance_of_matrices(rows, i, u, v, n, inverse * inverse, state)
-    else:
-        cov, state = _covariance_of_axes(rows, i, u, n, inverse, state)
+    cov, state = _covariance_of_axes(rows, i, u, n, inverse, state)
     return u, v, cov, state
 
 
@@ -397,43 +370,6 @@ def _covariance_of_axes(rows, i, u, n, inverse, state):
         w0 * (u0 * u0 + v0 * v0) + w1 * (u1 * u1 + v1 * v1) + w2 * (u2 * u2 + v2 * v2),
         s0 * w0,
     ), state
-
-
-@inline_kernel
-def _covariance_of_matrices(rows, i, u, v, n, inverse, state):
-    """The covariance of matrices; minors that are negative by rounding become 0.
-
-    Args:
-        inverse: one over the squared distance.
-    """
-    xx, xy, xz = load_vector(rows, SHAPE_ROW, i)
-    yx, yy, yz = load_vector(rows, SHAPE_ROW + 3, i)
-    zx, zy, zz = load_vector(rows, SHAPE_ROW + 6, i)
-    xx, yy, zz = xx * inverse, yy * inverse, zz * inverse
-    xy, xz, yz = 0.5 * (xy + yx) * inverse, 0.5 * (xz + zx) * inverse, 0.5 * (yz + zy) * inverse
-    usable = _is_covariance(xx, xy, xz, yy, yz, zz)
-    state = select(usable, state, select(state < 0, state, broadcast(0.0)))
-    cu = xx * u[0] + xy * u[1] + xz * u[2], xy * u[0] + yy * u[1] + yz * u[2], xz * u[0] + yz * u[1] + zz * u[2]
-    cv = xx * v[0] + xy * v[1] + xz * v[2], xy * v[0] + yy * v[1] + yz * v[2], xz * v[0] + yz * v[1] + zz * v[2]
-    cn = xx * n[0] + xy * n[1] + xz * n[2], xy * n[0] + yy * n[1] + yz * n[2], xz * n[0] + yz * n[1] + zz * n[2]
-    uu, uv, vv = dot(*u, *cu), dot(*u, *cv), dot(*v, *cv)
-    un, vn, nn = dot(*u, *cn), dot(*v, *cn), max(dot(*n, *cn), 0.0)
-    det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
-    mixed = nn * (uu + vv) - un * un - vn * vn
-    return (uu, uv, vv, un, vn, nn, max(uu * vv - uv * uv, 0.0), max(mixed, 0.0), max(det, 0.0)), state
-
-
-@inline_kernel
-def _is_covariance(xx, xy, xz, yy, yz, zz):
-    """Whether a symmetric matrix over squared distance has no eigenvalue below the bound for rounding."""
-    largest = max(max(xx, yy), zz)
-    bound = (1 + _ROUNDING) * largest
-    bound = bound * bound
-    xx, yy, zz = xx + _ROUNDING * largest, yy + _ROUNDING * largest, zz + _ROUNDING * largest
-    minor = xx * yy - xy * xy
-    det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    small = (xy * xy <= bound) & (xz * xz <= bound) & (yz * yz <= bound) & (largest <= MAX_SCALE_RATIO**2)
-    return small & (largest >= 0) & (xx >= 0) & (minor >= 0) & (det >= 0)
 
 
 @inline_kernel

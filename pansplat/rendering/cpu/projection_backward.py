@@ -80,7 +80,7 @@ _POSE_SIZE = 12  # entries of a pose: its rotation and its centre, by rows
 # Rows of a block, after those of projection.py. All are gradients.
 _RADIUS_GRAD_ROW = NUM_ROWS
 _MEAN_GRAD_ROW = NUM_ROWS + 1  # of n in world axes, then of the mean
-_SHAPE_GRAD_ROW = NUM_ROWS + 4  # of a quaternion and three scales, or a covariance's xx xy xz yy yz zz
+_SHAPE_GRAD_ROW = NUM_ROWS + 4  # of a quaternion and three scales
 _NUM_ROWS = NUM_ROWS + 11
 
 
@@ -90,7 +90,6 @@ class GaussianGradients(NamedTuple):
     means: np.ndarray
     quats: np.ndarray
     scales: np.ndarray
-    covariances: np.ndarray
     opacities: np.ndarray
     harmonics: np.ndarray
     pose: np.ndarray
@@ -110,15 +109,15 @@ def backpropagate_projection(
 
     Args:
         grad_records: (slot, RECORD_SIZE), of the camera's records.
-        grad_values: (slot, channel + 1).
+        grad_values: (slot, 4).
         offsets: (n + 1), where each Gaussian's slots begin.
         gradients: arrays to write; arrays without rows are skipped.
     """
     num_items = -(-len(gaussians.means) // GAUSSIANS_PER_ITEM)
     pose_sums = np.zeros((num_items if len(gradients.pose) > 0 else 0, _POSE_SIZE))
     work = partial(
-        _backpropagate_projection, *gaussians.kernel_arguments, *camera, gaussians.view_dependent, projected.kept,
-        projected.values, grad_records.reshape(-1), grad_values.reshape(-1), offsets, *gradients[:6], pose_sums,
+        _backpropagate_projection, *gaussians, *camera, gaussians.view_dependent, projected.kept,
+        projected.values, grad_records.reshape(-1), grad_values.reshape(-1), offsets, *gradients[:5], pose_sums,
     )  # fmt: skip
     parallel_for(work, num_items, threads)
     if len(gradients.pose) == 0:
@@ -143,9 +142,9 @@ def _accumulate_slots(offsets, slots, totals, item):
 
 @kernel
 def _backpropagate_projection(
-    means, quats, scales, covariances, opacities, harmonics, pose, filter_variance, compensate, near,
+    means, quats, scales, opacities, harmonics, pose, filter_variance, compensate, near,
     view_dependent, scene_kept, values, grad_records, grad_values, offsets,
-    grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums, item,
+    grad_means, grad_quats, grad_scales, grad_opacities, grad_harmonics, pose_sums, item,
 ):  # fmt: skip
     align_stack()
     rows, camera = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK)), pose_columns(pose)
@@ -154,31 +153,24 @@ def _backpropagate_projection(
     value_sums = np.zeros(4 * GAUSSIAN_BLOCK + 4, np.float32)
     soa, kept = np.zeros((layout.RECORD_SIZE, GAUSSIAN_BLOCK), np.float32), np.zeros(GAUSSIAN_BLOCK, np.bool_)
     basis, grad_basis = np.zeros((25, GAUSSIAN_BLOCK), np.float32), np.zeros((25, GAUSSIAN_BLOCK), np.float32)
-    grad_colors = np.zeros((GAUSSIAN_BLOCK, harmonics.shape[2]), np.float32)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
-        load_block(means, quats, scales, covariances, opacities, start, count, rows)
-        _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, grad_colors, rows)
+        load_block(means, quats, scales, opacities, start, count, rows)
+        _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, rows)
         records_to_soa(record_sums, 0, count, soa.reshape(-1), GAUSSIAN_BLOCK)
         _clear_culled(scene_kept, start, count, pose, rows, soa, kept)
         for i in range(0, GAUSSIAN_BLOCK, LANES):
-            _backpropagate_records(
-                covariances, camera, filter_variance, compensate, near, rows, soa.reshape(-1), grad_pose, i
-            )
+            _backpropagate_records(camera, filter_variance, compensate, near, rows, soa.reshape(-1), grad_pose, i)
         if view_dependent is None:
-            backpropagate_constant_colors(harmonics, start, count, values, value_sums, grad_colors, grad_harmonics)
+            backpropagate_constant_colors(start, count, values, value_sums, grad_harmonics)
         else:
-            if harmonics.shape[2] == 3:
-                for i in range(count):
-                    for c in range(3):
-                        grad_colors[i, c] = load_scalar(value_sums, 4 * i + c)
             evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
-            backpropagate_colors(harmonics, start, kept, basis, values, grad_colors, grad_harmonics, grad_basis)
+            backpropagate_colors(harmonics, start, kept, basis, values, value_sums, grad_harmonics, grad_basis)
             accumulate_direction_gradients(
                 rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, grad_basis, _MEAN_GRAD_ROW
             )
         _backpropagate_means(rows, grad_pose)
-        _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities)
+        _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_opacities)
     for j in range(grad_pose.shape[0]):
         total = 0.0
         for i in range(LANES):
@@ -190,41 +182,29 @@ def _backpropagate_projection(
 
 
 @inline_kernel
-def _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, grad_colors, rows):
+def _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, value_sums, rows):
     """Sum the slots of each Gaussian of a block, in their order; 0 if it has none.
 
     Args:
         grad_records, grad_values: flat.
         record_sums: (RECORD_SIZE GAUSSIAN_BLOCK), written.
-        value_sums: (4 GAUSSIAN_BLOCK + 4), written if there are three channels.
-        grad_colors: (GAUSSIAN_BLOCK, channel), written for other numbers of channels.
+        value_sums: (4 GAUSSIAN_BLOCK + 4), written.
     """
-    channels, zero = grad_colors.shape[1], broadcast(np.float32(0))
+    zero = broadcast(np.float32(0))
     for i in range(count):
         first, end = load_scalar(offsets, start + i), load_scalar(offsets, start + i + 1)
-        low, high, values, radius = zero, zero, zero, np.float32(0)
+        low, high, values = zero, zero, zero
         prefetch(grad_records, layout.RECORD_SIZE * (first + PREFETCH_DISTANCE // 4))
         prefetch(grad_values, 4 * (first + PREFETCH_DISTANCE // 4))
-        if channels == 3:  # the common case has one loop, so that its end is mispredicted once
-            for slot in range(first, end):
-                low = low + load(grad_records, layout.RECORD_SIZE * slot)
-                high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
-                values = values + load_four(grad_values, 4 * slot)
-            store(value_sums, 4 * i, values)
-        else:
-            grad_colors[i] = 0
-            for slot in range(first, end):
-                low = low + load(grad_records, layout.RECORD_SIZE * slot)
-                high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
-                for c in range(channels):
-                    grad_colors[i, c] += load_scalar(grad_values, (channels + 1) * slot + c)
-                radius += load_scalar(grad_values, (channels + 1) * slot + channels)
-            rows[_RADIUS_GRAD_ROW, i] = radius
+        for slot in range(first, end):  # one loop, so that its end is mispredicted once
+            low = low + load(grad_records, layout.RECORD_SIZE * slot)
+            high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
+            values = values + load_four(grad_values, 4 * slot)
+        store(value_sums, 4 * i, values)
         store(record_sums, layout.RECORD_SIZE * i, low)
         store(record_sums, layout.RECORD_SIZE * i + LANES, high)
-    if channels == 3:
-        for i in range(0, GAUSSIAN_BLOCK, LANES):
-            store_row(rows, _RADIUS_GRAD_ROW, i, to_f64(load_aos4(value_sums, 4 * i)[3]))
+    for i in range(0, GAUSSIAN_BLOCK, LANES):
+        store_row(rows, _RADIUS_GRAD_ROW, i, to_f64(load_aos4(value_sums, 4 * i)[3]))
 
 
 @inline_kernel
@@ -243,7 +223,7 @@ def _clear_culled(scene_kept, start, count, pose, rows, soa, kept):
         rows[MEAN_ROW, i], rows[MEAN_ROW + 1, i], rows[MEAN_ROW + 2, i] = pose[0, 3], pose[1, 3], pose[2, 3]
         rows[MEAN_ROW, i] += 1 + abs(pose[0, 3])
         rows[OPACITY_ROW, i], rows[_RADIUS_GRAD_ROW, i] = 1.0, 0.0
-        for j in range(9):
+        for j in range(7):
             rows[SHAPE_ROW + j, i] = 1.0 if j % 4 == 0 else 0.0
         for j in range(layout.RECORD_SIZE):
             soa[j, i] = 0.0
@@ -253,17 +233,14 @@ def _clear_culled(scene_kept, start, count, pose, rows, soa, kept):
 
 
 @inline_kernel
-def _backpropagate_records(covariances, pose, filter_variance, compensate, near, rows, soa, grad_pose, i):
+def _backpropagate_records(pose, filter_variance, compensate, near, rows, soa, grad_pose, i):
     """Write the gradients of shapes, opacities, directions and distances, given those of records."""
     n, radius, inverse, state = compute_direction(rows, i, pose, near)
-    u, v, cov, _ = compute_tangent_covariance(covariances, rows, i, n, inverse, state)
+    u, v, cov, _ = compute_tangent_covariance(rows, i, n, inverse, state)
     g_n, parts, g_det = _backpropagate_footprint_rows(
         pose, filter_variance, compensate, u, v, n, cov, soa, i, grad_pose
     )
-    if covariances is not None:
-        g_n, g_radius = _backpropagate_matrices(rows, i, u, v, n, cov, inverse, g_n, parts, g_det)
-    else:
-        g_n, g_radius = _backpropagate_axes(rows, i, u, n, inverse, g_n, parts, g_det)
+    g_n, g_radius = _backpropagate_axes(rows, i, u, n, inverse, g_n, parts, g_det)
     store_row(rows, _RADIUS_GRAD_ROW, i, load_row(rows, _RADIUS_GRAD_ROW, i) + g_radius)
     g_log_peak = (1 / math.log(2)) * _load_field(soa, layout.LOG2_PEAK, i)
     store_row(rows, OPACITY_ROW, i, g_log_peak / load_row(rows, OPACITY_ROW, i))
@@ -365,37 +342,6 @@ def _covariance_gradient(u, v, n, parts):
 
 
 @inline_kernel
-def _backpropagate_matrices(rows, i, u, v, n, cov, inverse, g_n, parts, g):
-    """Write the gradients of covariances; return those of n and the distance.
-
-    Args:
-        inverse: one over the distance.
-        g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and det B.
-    """
-    xx, xy, xz, yy, yz, zz = _covariance_gradient(u, v, n, parts)
-    uu, uv, vv, un, vn = cov[0], cov[1], cov[2], cov[3], cov[4]
-    # det B = uu vv - uv^2; the frame rotates with n.
-    xx = xx + g * (vv * u[0] * u[0] + uu * v[0] * v[0] - 2 * uv * u[0] * v[0])
-    yy = yy + g * (vv * u[1] * u[1] + uu * v[1] * v[1] - 2 * uv * u[1] * v[1])
-    zz = zz + g * (vv * u[2] * u[2] + uu * v[2] * v[2] - 2 * uv * u[2] * v[2])
-    xy = xy + g * (vv * u[0] * u[1] + uu * v[0] * v[1] - uv * (u[0] * v[1] + u[1] * v[0]))
-    xz = xz + g * (vv * u[0] * u[2] + uu * v[0] * v[2] - uv * (u[0] * v[2] + u[2] * v[0]))
-    yz = yz + g * (vv * u[1] * u[2] + uu * v[1] * v[2] - uv * (u[1] * v[2] + u[2] * v[1]))
-    g_n = _add_tangent(g_n, 2 * g * (uv * vn - vv * un), u, 2 * g * (uv * un - uu * vn), v)
-    x_row, y_row = load_vector(rows, SHAPE_ROW, i), load_vector(rows, SHAPE_ROW + 3, i)
-    z_row = load_vector(rows, SHAPE_ROW + 6, i)
-    whole = xx * x_row[0] + yy * y_row[1] + zz * z_row[2]
-    whole = whole + xy * (x_row[1] + y_row[0])
-    whole = whole + xz * (x_row[2] + z_row[0])
-    whole = whole + yz * (y_row[2] + z_row[1])
-    squared = inverse * inverse
-    grads = xx, xy, xz, yy, yz, zz
-    for j in range(6):
-        store_row(rows, _SHAPE_GRAD_ROW + j, i, grads[j] * squared)
-    return g_n, -2 * whole * squared * inverse
-
-
-@inline_kernel
 def _backpropagate_axes(rows, i, u, n, inverse, g_n, parts, g):
     """Write the gradients of quaternions and scales; return those of n and the distance.
 
@@ -460,7 +406,7 @@ def _backpropagate_means(rows, grad_pose):
 
 
 @inline_kernel
-def _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities):
+def _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_opacities):
     if grad_means.shape[0] > 0:
         soa_to_aos3(rows, _MEAN_GRAD_ROW, start, count, grad_means.reshape(-1))
     if grad_opacities.shape[0] > 0:
@@ -469,9 +415,3 @@ def _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, gr
         soa_to_aos4(rows, _SHAPE_GRAD_ROW, start, count, grad_quats.reshape(-1))
     if grad_scales.shape[0] > 0:
         soa_to_aos3(rows, _SHAPE_GRAD_ROW + 4, start, count, grad_scales.reshape(-1))
-    if grad_covariances.shape[0] > 0:
-        for i in range(count):
-            for axis in range(3):
-                for other in range(3):
-                    j = axis + other + (1 if axis > 0 and other > 0 else 0)
-                    grad_covariances[start + i, axis, other] = rows[_SHAPE_GRAD_ROW + j, i]

@@ -78,7 +78,7 @@ LOG2_ZERO = -1000.0  # log2 of an alpha that counts as zero
 MIN_TRANSMITTANCE = TRANSMITTANCE_CUT["numba"]  # a pixel is finished at this transmittance or below
 MIN_PLANAR_COSINE = 0.5  # of the angle to the tile's centre; below it footprint rows have three components
 _HORIZON_MARGIN = 0.1  # in log2 alpha
-VALUE_LANES = 4  # values accumulated together: RGB and the distance
+VALUE_LANES = 4  # values of a Gaussian: RGB and the distance
 TILE_FRAME_SIZE = 15  # see `set_tile_frame`
 
 
@@ -180,11 +180,11 @@ def reset_transmittance(columns, rows, left, top, transmittance):
 @inline_kernel_no_refcount
 def prefetch_slice(records, values, intersections, block, first):
     """Prefetch this block's slice of the chunk that begins at intersection `first`."""
-    num_values, end = values.shape[1], len(intersections) // 2 - 1
+    end = len(intersections) // 2 - 1
     for e in range(first + block * _SLICE_SIZE, first + (block + 1) * _SLICE_SIZE):
         index = np.int64(load_scalar(intersections, 2 * max(min(e, end), 0)))
         prefetch(records, RECORD_SIZE * index)
-        prefetch(values, num_values * index)
+        prefetch(values, VALUE_LANES * index)
 
 
 @inline_kernel_no_refcount
@@ -215,28 +215,21 @@ def load_chunk(records, values, intersections, first, count, frame, is_3d, footp
 
     Args:
         records, intersections: flat.
-        values: (n, value).
+        values: (n, VALUE_LANES).
         first, count: the chunk's intersections.
         frame: of the tile.
         is_3d: whether the tile needs three components.
         footprints: (FOOTPRINT_SIZE CHUNK_SIZE), written; past `count` the last Gaussian is repeated.
-        chunk_values: (CHUNK_SIZE value), written.
+        chunk_values: (CHUNK_SIZE VALUE_LANES), written.
 
     Returns:
         Whether the footprints have three components, because a Gaussian is too far from the tile's centre for two.
     """
-    num_values = values.shape[1]
     while _compute_footprints(records, intersections, first, count, frame, is_3d, footprints):
         is_3d = True
-    if num_values == VALUE_LANES:
-        for s in range(count):
-            g = np.int64(load_scalar(intersections, 2 * (first + s)))
-            copy_four(chunk_values, VALUE_LANES * s, values, VALUE_LANES * g)
-    else:
-        for s in range(count):
-            row = num_values * np.int64(load_scalar(intersections, 2 * (first + s)))
-            for channel in range(num_values):
-                store_scalar(chunk_values, num_values * s + channel, load_scalar(values, row + channel))
+    for s in range(count):
+        g = np.int64(load_scalar(intersections, 2 * (first + s)))
+        copy_four(chunk_values, VALUE_LANES * s, values, VALUE_LANES * g)
     return is_3d
 
 
@@ -365,7 +358,7 @@ def rasterize_forward(
 
     Args:
         records, values, intersections, starts: see records.py; `starts` covers whole rows of tiles.
-        sums: (channel + 2, height, width), written within the band.
+        sums: (VALUE_LANES + 1, height, width), written within the band.
         first_row: first row of tiles of the band.
         saved: written, if given, for the backward.
         min_transmittance: a pixel is finished at this transmittance or below.
@@ -383,12 +376,11 @@ def _rasterize_tiles(
     saved_num_chunks, first_row, min_transmittance, low, high,
 ):  # fmt: skip
     tiles_across = (len(columns) + TILE_SIZE - 1) // TILE_SIZE
-    num_values = values.shape[1]
     offsets, centre = np.empty(3 * TILE_PIXELS, np.float32), np.empty(3)
     frame = np.empty(TILE_FRAME_SIZE, np.float32)
-    transmittance, tile_sums = np.empty(TILE_PIXELS, np.float32), np.empty(num_values * TILE_PIXELS, np.float32)
+    transmittance, tile_sums = np.empty(TILE_PIXELS, np.float32), np.empty(VALUE_LANES * TILE_PIXELS, np.float32)
     footprints = np.empty(FOOTPRINT_SIZE * CHUNK_SIZE, np.float32)
-    chunk_values = np.empty(num_values * CHUNK_SIZE, np.float32)
+    chunk_values = np.empty(VALUE_LANES * CHUNK_SIZE, np.float32)
     masks = np.empty(CHUNK_WORDS * NUM_MASKS, np.uint64)
     log2_alphas, indices = np.empty(2 * BUFFER_SIZE * LANES, np.float32), np.empty(2 * BUFFER_SIZE, np.uint8)
     for tile in range(low, high):
@@ -422,24 +414,17 @@ def _rasterize_tiles(
                         block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin
                     )
                 other = BUFFER_SIZE - begin
-                if ready >= 0 and num_values == VALUE_LANES:
-                    is_unfinished |= _blend_four_values(
+                if ready >= 0:
+                    is_unfinished |= _blend_values(
                         ready, num_ready, log2_alphas, indices, other, chunk_values, transmittance, tile_sums,
                         min_transmittance,
                     )  # fmt: skip
-                elif ready >= 0:
-                    is_unfinished |= _compute_weights(
-                        ready, num_ready, log2_alphas, other, transmittance, min_transmittance
-                    )
-                    _accumulate_values(
-                        ready, num_ready, log2_alphas, indices, other, chunk_values, num_values, tile_sums
-                    )
                 ready, num_ready, begin = block, num_next, other
             if not is_unfinished:
                 break
         if len(saved_transmittance) > 0:
             saved_num_chunks[tile] = num_chunks
-        _write_tile(transmittance, tile_sums, sums, left, top, num_values)
+        _write_tile(transmittance, tile_sums, sums, left, top)
 
 
 @inline_kernel_no_refcount
@@ -518,10 +503,8 @@ def compute_alpha(log2_alpha):
 
 
 @inline_kernel_no_refcount
-def _blend_four_values(
-    block, count, log2_alphas, indices, begin, chunk_values, transmittance, tile_sums, min_transmittance
-):
-    """Composite the Gaussians of a block, four values each; return whether a pixel is unfinished."""
+def _blend_values(block, count, log2_alphas, indices, begin, chunk_values, transmittance, tile_sums, min_transmittance):
+    """Composite the Gaussians of a block; return whether a pixel is unfinished."""
     pixel = block * LANES
     transmitted = load(transmittance, pixel)
     sum0, sum1 = load(tile_sums, pixel), load(tile_sums, TILE_PIXELS + pixel)
@@ -552,56 +535,32 @@ def _blend_four_values(
 
 
 @inline_kernel_no_refcount
-def _compute_weights(block, count, log2_alphas, begin, transmittance, min_transmittance):
-    """Replace log2 alphas by weights; return whether a pixel is unfinished."""
-    transmitted = load(transmittance, block * LANES)
-    for at in range(begin, begin + count):
-        alpha = compute_alpha(load(log2_alphas, at * LANES))
-        store(log2_alphas, at * LANES, alpha * transmitted)
-        transmitted = multiply_add(-alpha, transmitted, transmitted)
-    store(transmittance, block * LANES, transmitted)
-    return any_lane(transmitted > broadcast(min_transmittance))
-
-
-@inline_kernel_no_refcount
-def _accumulate_values(block, count, weights, indices, begin, chunk_values, num_values, tile_sums):
-    """Add a block's weighted values to the sums, for any number of values."""
-    for channel in range(num_values):
-        pixel = channel * TILE_PIXELS + block * LANES
-        total = load(tile_sums, pixel)
-        for at in range(begin, begin + count):
-            value = num_values * np.int64(load_scalar(indices, at)) + channel
-            total = multiply_add(load(weights, at * LANES), load_broadcast(chunk_values, value), total)
-        store(tile_sums, pixel, total)
-
-
-@inline_kernel_no_refcount
-def _write_tile(transmittance, tile_sums, sums, left, top, num_values):
+def _write_tile(transmittance, tile_sums, sums, left, top):
     """Copy a tile's sums into the image; the last one is the sum of the weights, 1 minus the transmittance."""
     width, height = sums.shape[2], sums.shape[1]
     if left + TILE_SIZE > width or top + TILE_SIZE > height:
-        _write_partial_tile(transmittance, tile_sums, sums, left, top, num_values)
+        _write_partial_tile(transmittance, tile_sums, sums, left, top)
         return
     image, one = sums.reshape(-1), broadcast(np.float32(1))
     for block in range(0, NUM_BLOCKS, 2):
         pixel = block * LANES
         corner = (top + block // BLOCKS_ACROSS * BLOCK_HEIGHT) * width + left + block % BLOCKS_ACROSS * BLOCK_WIDTH
-        for channel in range(num_values):
+        for channel in range(VALUE_LANES):
             source, target = channel * TILE_PIXELS + pixel, channel * height * width + corner
             upper, lower = join_halves(load(tile_sums, source), load(tile_sums, source + LANES))
             store(image, target, upper)
             store(image, target + width, lower)
-        target = num_values * height * width + corner
+        target = VALUE_LANES * height * width + corner
         upper, lower = join_halves(one - load(transmittance, pixel), one - load(transmittance, pixel + LANES))
         store(image, target, upper)
         store(image, target + width, lower)
 
 
 @inline_kernel_no_refcount
-def _write_partial_tile(transmittance, tile_sums, sums, left, top, num_values):
+def _write_partial_tile(transmittance, tile_sums, sums, left, top):
     for pixel in range(TILE_PIXELS):
         x, y = image_position(pixel, left, top)
         if x < sums.shape[2] and y < sums.shape[1]:
-            for channel in range(num_values):
+            for channel in range(VALUE_LANES):
                 sums[channel, y, x] = tile_sums[channel * TILE_PIXELS + pixel]
-            sums[num_values, y, x] = np.float32(1) - transmittance[pixel]
+            sums[VALUE_LANES, y, x] = np.float32(1) - transmittance[pixel]

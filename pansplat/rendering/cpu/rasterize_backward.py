@@ -52,7 +52,6 @@ from pansplat.rendering.cpu.simd import (
     LANES,
     any_lane,
     broadcast,
-    first_lane,
     join_halves,
     lane_sums,
     load,
@@ -103,7 +102,7 @@ def rasterize_backward(
         grad_sums: gradient of the sums, of the same shape.
         grad_records: (slot, RECORD_SIZE), written; zeros in DIRECTION_RESIDUAL. Aligned to 32 bytes, for non-temporal
             stores.
-        grad_values: (slot, channel + 1), written.
+        grad_values: (slot, VALUE_LANES), written.
         first_row: first row of tiles of the band.
     """
     assert grad_records.size == 0 or grad_records.ctypes.data % (4 * LANES) == 0
@@ -118,13 +117,11 @@ def _rasterize_tiles_backward(
     saved_rows, saved_num_chunks, grad_sums, grad_records, grad_values, first_row, low, high,
 ):  # fmt: skip
     tiles_across = (len(columns) + TILE_SIZE - 1) // TILE_SIZE
-    num_values = values.shape[1]
-    padded_values = (num_values + VALUE_LANES - 1) // VALUE_LANES * VALUE_LANES
     offsets, centre = np.empty(3 * TILE_PIXELS, np.float32), np.empty(3)
     frame = np.empty(TILE_FRAME_SIZE, np.float32)
-    tile_grads, behind = np.zeros((padded_values + 2) * TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
+    tile_grads, behind = np.empty((VALUE_LANES + 2) * TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
     footprints = np.empty(FOOTPRINT_SIZE * CHUNK_SIZE, np.float32)
-    chunk_values = np.zeros(num_values * CHUNK_SIZE + VALUE_LANES, np.float32)
+    chunk_values = np.empty(VALUE_LANES * CHUNK_SIZE, np.float32)
     # `links` holds the block of each pair and the previous pair of the same Gaussian: a linked list from `heads` on.
     pairs, links = np.empty(_MAX_PAIRS * _PAIR_SIZE, np.float32), np.empty(2 * _MAX_PAIRS, np.int32)
     heads, masks = np.empty(CHUNK_SIZE, np.int32), np.empty(CHUNK_WORDS * NUM_MASKS, np.uint64)
@@ -136,11 +133,11 @@ def _rasterize_tiles_backward(
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE_SIZE, (first_row + tile // tiles_across) * TILE_SIZE
         tile_is_3d, pixels_are_3d = set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame), -1
-        _load_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads)
+        _load_tile_gradients(sums, grad_sums, left, top, tile_grads)
         begin, end, num_chunks = starts[tile], starts[tile + 1], saved_num_chunks[tile]
-        _write_zeros(slots, begin + CHUNK_SIZE * num_chunks, end, num_values, grad_records, grad_values)
+        _write_zeros(slots, begin + CHUNK_SIZE * num_chunks, end, grad_records, grad_values)
         for pixel in range(TILE_PIXELS):
-            behind[pixel] = -tile_grads[(padded_values + 1) * TILE_PIXELS + pixel]
+            behind[pixel] = -tile_grads[(VALUE_LANES + 1) * TILE_PIXELS + pixel]
         for chunk in range(num_chunks - 1, -1, -1):
             first = begin + chunk * CHUNK_SIZE
             count = min(CHUNK_SIZE, end - first)
@@ -156,17 +153,17 @@ def _rasterize_tiles_backward(
                 next_first = end + CHUNK_SIZE * (saved_num_chunks[min(tile + 1, high - 1)] - 1)
             _backpropagate_chunk(
                 records, values, intersections, next_first, is_3d, footprints, chunk_values, masks, offsets,
-                saved_transmittance[saved_rows[tile] + chunk], num_values, padded_values, tile_grads, behind,
-                log2_alphas, indices, alphas, weights, visible, pairs, links, heads,
+                saved_transmittance[saved_rows[tile] + chunk], tile_grads, behind, log2_alphas, indices, alphas,
+                weights, visible, pairs, links, heads,
             )  # fmt: skip
             _write_chunk_gradients(
                 records, intersections, first, count, slots, heads, links, pairs, is_3d, footprints, offsets,
-                tile_grads, num_values, gradient_sums, grad_records, grad_values,
+                tile_grads, gradient_sums, grad_records, grad_values,
             )  # fmt: skip
 
 
 @inline_kernel_no_refcount
-def _load_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads):
+def _load_tile_gradients(sums, grad_sums, left, top, tile_grads):
     """Load a tile's gradients by blocks, 0 outside the image; then write two more rows.
 
     These are the gradient of the sum of the weights minus the dot product of gradients and sums, and this dot
@@ -175,22 +172,22 @@ def _load_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, 
     """
     height, width = grad_sums.shape[1], grad_sums.shape[2]
     if left + TILE_SIZE > width or top + TILE_SIZE > height:
-        _load_partial_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads)
+        _load_partial_tile_gradients(sums, grad_sums, left, top, tile_grads)
         return
     image_grads, image = grad_sums.reshape(-1), sums.reshape(-1)
     for block in range(0, NUM_BLOCKS, 2):
         pixel, first, second = block * LANES, broadcast(np.float32(0)), broadcast(np.float32(0))
         corner = (top + block // BLOCKS_ACROSS * BLOCK_HEIGHT) * width + left + block % BLOCKS_ACROSS * BLOCK_WIDTH
-        for channel in range(num_values + 1):
+        for channel in range(VALUE_LANES + 1):
             at = channel * height * width + corner
             gradient, next_gradient = join_halves(load(image_grads, at), load(image_grads, at + width))
             value, next_value = join_halves(load(image, at), load(image, at + width))
             first = multiply_add(gradient, value, first)
             second = multiply_add(next_gradient, next_value, second)
-            row = (channel if channel < num_values else padded_values) * TILE_PIXELS + pixel
+            row = channel * TILE_PIXELS + pixel
             store(tile_grads, row, gradient)
             store(tile_grads, row + LANES, next_gradient)
-        row = padded_values * TILE_PIXELS + pixel
+        row = VALUE_LANES * TILE_PIXELS + pixel
         store(tile_grads, row, load(tile_grads, row) - first)
         store(tile_grads, row + LANES, load(tile_grads, row + LANES) - second)
         store(tile_grads, row + TILE_PIXELS, first)
@@ -198,25 +195,25 @@ def _load_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, 
 
 
 @inline_kernel_no_refcount
-def _load_partial_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads):
+def _load_partial_tile_gradients(sums, grad_sums, left, top, tile_grads):
     height, width = grad_sums.shape[1], grad_sums.shape[2]
     for pixel in range(TILE_PIXELS):
         x, y = image_position(pixel, left, top)
         total = np.float32(0)
-        for channel in range(num_values + 1):
+        for channel in range(VALUE_LANES + 1):
             gradient = np.float32(0)
             if x < width and y < height:
                 gradient = grad_sums[channel, y, x]
                 total += gradient * sums[channel, y, x]
-            tile_grads[(channel if channel < num_values else padded_values) * TILE_PIXELS + pixel] = gradient
-        tile_grads[padded_values * TILE_PIXELS + pixel] -= total
-        tile_grads[(padded_values + 1) * TILE_PIXELS + pixel] = total
+            tile_grads[channel * TILE_PIXELS + pixel] = gradient
+        tile_grads[VALUE_LANES * TILE_PIXELS + pixel] -= total
+        tile_grads[(VALUE_LANES + 1) * TILE_PIXELS + pixel] = total
 
 
 @inline_kernel_no_refcount
 def _backpropagate_chunk(
     records, values, intersections, next_first, is_3d, footprints, chunk_values, masks, offsets, transmittance,
-    num_values, padded_values, tile_grads, behind, log2_alphas, indices, alphas, weights, visible, pairs, links, heads,
+    tile_grads, behind, log2_alphas, indices, alphas, weights, visible, pairs, links, heads,
 ):  # fmt: skip
     """Compute weights and gradients by log alpha of a chunk's pairs, block by block."""
     heads[:] = -1
@@ -238,8 +235,8 @@ def _backpropagate_chunk(
             )
         if weighted >= 0:
             _backpropagate_block(
-                weighted, num_weighted, alphas, weights, visible, other, chunk_values, num_values, padded_values,
-                tile_grads, behind, pairs, links, heads, pair,
+                weighted, num_weighted, alphas, weights, visible, other, chunk_values, tile_grads, behind, pairs,
+                links, heads, pair,
             )  # fmt: skip
             pair += num_weighted
         weighted, num_weighted, ready, num_ready = ready, num_visible, block if is_unfinished else -1, num_next
@@ -268,29 +265,19 @@ def _compute_block_weights(block, count, log2_alphas, indices, begin, transmitta
 
 @inline_kernel_no_refcount
 def _backpropagate_block(
-    block, count, alphas, weights, visible, begin, chunk_values, num_values, padded_values, tile_grads, behind, pairs,
-    links, heads, pair,
-):  # fmt: skip
+    block, count, alphas, weights, visible, begin, chunk_values, tile_grads, behind, pairs, links, heads, pair
+):
     """Write a block's pairs, back to front: gradients by log alpha, weights, and their links."""
     max_alpha, zero = broadcast(np.float32(MAX_ALPHA)), broadcast(np.float32(0))
     pixel = block * LANES
-    mean_behind, base = load(behind, pixel), load(tile_grads, padded_values * TILE_PIXELS + pixel)
+    mean_behind, base = load(behind, pixel), load(tile_grads, VALUE_LANES * TILE_PIXELS + pixel)
     for at in range(begin + count - 1, begin - 1, -1):
         s = np.int64(load_scalar(visible, at))
         alpha, weight = load(alphas, at * LANES), load(weights, at * LANES)
         grad_weight = base
-        for value in range(0, padded_values, VALUE_LANES):  # padding: finite numbers times 0
-            row, first = value * TILE_PIXELS + pixel, num_values * s + value
-            grad_weight = multiply_add(load(tile_grads, row), load_broadcast(chunk_values, first), grad_weight)
-            grad_weight = multiply_add(
-                load(tile_grads, row + TILE_PIXELS), load_broadcast(chunk_values, first + 1), grad_weight
-            )
-            grad_weight = multiply_add(
-                load(tile_grads, row + 2 * TILE_PIXELS), load_broadcast(chunk_values, first + 2), grad_weight
-            )
-            grad_weight = multiply_add(
-                load(tile_grads, row + 3 * TILE_PIXELS), load_broadcast(chunk_values, first + 3), grad_weight
-            )
+        for value in range(VALUE_LANES):
+            factor = load_broadcast(chunk_values, VALUE_LANES * s + value)
+            grad_weight = multiply_add(load(tile_grads, value * TILE_PIXELS + pixel), factor, grad_weight)
         difference = grad_weight - mean_behind
         store(pairs, pair * _PAIR_SIZE, select(max_alpha > alpha, weight * difference, zero))
         store(pairs, pair * _PAIR_SIZE + LANES, weight)
@@ -303,14 +290,14 @@ def _backpropagate_block(
 
 
 @inline_kernel_no_refcount
-def _write_zeros(slots, first, end, num_values, grad_records, grad_values):
+def _write_zeros(slots, first, end, grad_records, grad_values):
     """Write zero gradients for the Gaussians behind a tile's last composited chunk."""
     for e in range(first, end):
         row = RECORD_SIZE * slots[e]
         store(grad_records, row, broadcast(np.float32(0)))
         store(grad_records, row + LANES, broadcast(np.float32(0)))
-        for value in range(num_values):
-            store_scalar(grad_values, num_values * slots[e] + value, np.float32(0))
+        for value in range(VALUE_LANES):
+            store_scalar(grad_values, VALUE_LANES * slots[e] + value, np.float32(0))
 
 
 # --- gradient sums ---
@@ -319,18 +306,16 @@ def _write_zeros(slots, first, end, num_values, grad_records, grad_values):
 @inline_kernel_no_refcount
 def _write_chunk_gradients(
     records, intersections, first, count, slots, heads, links, pairs, is_3d, footprints, offsets, tile_grads,
-    num_values, gradient_sums, grad_records, grad_values,
+    gradient_sums, grad_records, grad_values,
 ):  # fmt: skip
     """Write the gradients of a chunk's records and values to their slots."""
     last = first + count - 1
     for s in range(count):
-        prefetch_for_write(grad_values, num_values * load_scalar(slots, min(first + s + _WRITE_AHEAD, last)))
+        prefetch_for_write(grad_values, VALUE_LANES * load_scalar(slots, min(first + s + _WRITE_AHEAD, last)))
         _accumulate_gradient_sums(s, heads, links, pairs, is_3d, footprints, offsets, tile_grads, gradient_sums)
-        row = num_values * slots[first + s]
-        for value in range(min(VALUE_LANES, num_values)):
+        row = VALUE_LANES * slots[first + s]
+        for value in range(VALUE_LANES):
             store_scalar(grad_values, row + value, load_scalar(gradient_sums, _NUM_SUMS * s + _VALUE_SUMS + value))
-        for value in range(VALUE_LANES, num_values):
-            store_scalar(grad_values, row + value, _sum_value_gradient(s, heads, links, pairs, tile_grads, value))
     for s in range(0, count, LANES):
         _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, grad_records)
 
@@ -370,18 +355,6 @@ def _accumulate_gradient_sums(s, heads, links, pairs, is_3d, footprints, offsets
     at = _NUM_SUMS * s
     store(gradient_sums, at, lane_sums(xx, xy, yy, sum_x, sum_y, qx, qy, qq))
     store(gradient_sums, at + LANES, lane_sums(sum_gradient, value0, value1, value2, value3, zero, zero, zero))
-
-
-@inline_kernel_no_refcount
-def _sum_value_gradient(s, heads, links, pairs, tile_grads, value):
-    """The gradient of one value of a Gaussian: the sum over its pixels of weight times gradient."""
-    total = zero = broadcast(np.float32(0))
-    pair = np.int64(load_scalar(heads, s))
-    while pair >= 0:
-        pixel = value * TILE_PIXELS + LANES * np.int64(load_scalar(links, 2 * pair))
-        total = multiply_add(load(pairs, pair * _PAIR_SIZE + LANES), load(tile_grads, pixel), total)
-        pair = np.int64(load_scalar(links, 2 * pair + 1))
-    return first_lane(lane_sums(total, zero, zero, zero, zero, zero, zero, zero))
 
 
 @inline_kernel_no_refcount

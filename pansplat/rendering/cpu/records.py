@@ -14,7 +14,7 @@ Only A / L and B / L matter, and a.n = b.n = 0. Gradients of records are those f
 Arrays, all C-contiguous numpy:
 
     records        float32 (n, RECORD_SIZE)  one cache line per Gaussian if aligned to 64 bytes
-    values         float32 (n, channel + 1)  colours, then the radial distance in metres
+    values         float32 (n, 4)            RGB, then the radial distance in metres
     intersections  int32   (e, 2)            index of the Gaussian, and its box within the tile (see `BOX_BITS`)
     starts         int64   (tile + 1)        first intersection of each tile, front to back; tiles row by row
     slots          int32   (e)               row of the gradient arrays that an intersection writes; int64 if needed

@@ -395,12 +395,6 @@ def any_magnitude_reaches(builder, largest, bound):
 # --- movement between lanes ---
 
 
-@_operation(types.float32, f32x8)
-def first_lane(builder, value):
-    """The number in the first lane of a vector."""
-    return builder.extract_element(value, _INT(0))
-
-
 @_operation(f32x8, *[f32x8] * LANES)
 def lane_sums(builder, *rows):
     """The sums over the lanes of eight vectors, in order."""

@@ -542,30 +542,6 @@ _ITEMS_PER_THREAD = 8
 _EMPTY_TILE_COST = 32  # in intersections
 
 
-@kernel
-def _measure_depths(records, radii, axis, depths, item):
-    for g in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, len(radii))):
-        x = np.float64(records[g, 0]) + np.float64(records[g, 3])
-        y = np.float64(records[g, 1]) + np.float64(records[g, 4])
-        z = np.float64(records[g, 2]) + np.float64(records[g, 5])
-        depths[g] = radii[g] * (x * axis[0] + y * axis[1] + z * axis[2])
-
-
-def compute_depths(
-    records: np.ndarray, radii: np.ndarray, axis: np.ndarray, workspace: Workspace, threads: int
-) -> np.ndarray:
-    """Depth of each Gaussian along an axis, (n,) float64, metres.
-
-    Args:
-        radii: radial distances, float64, metres.
-        axis: in the records' axes.
-    """
-    depths = workspace.array(len(radii), np.float64)
-    measure = partial(_measure_depths, records, radii, axis, depths)
-    parallel_for(measure, -(-len(radii) // GAUSSIANS_PER_ITEM), threads)
-    return depths
-
-
 @inline_kernel
 def _read_keys(intersections, slots, keys, begin, count, words, tile_intersections, tile_slots):
     """Copy a tile's intersections and slots, and read its distances as integers of the same order; return the range."""

@@ -116,8 +116,8 @@ class StoredWeights:
     def __init__(self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], size: tuple[int, int]) -> None:
         self._size, self._count, self._threads = size, len(gaussians), thread_count()
         options, (plane,) = RasterOptions(), image_planes("equirect", size)
-        fields = gaussians.means, gaussians.quats, gaussians.scales, None, gaussians.opacities, gaussians.harmonics
-        tensors = tuple(None if field is None else field.detach().contiguous() for field in fields)
+        fields = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.harmonics
+        tensors = tuple(field.detach().contiguous() for field in fields)
         arrays, camera = GaussianArrays.from_tensors(tensors), make_camera(cam2world.double(), plane, options)
         self._workspace, self._tables = Workspace(), tabulate_pixels(plane)
         with announce_compilation():

@@ -44,14 +44,13 @@ def rasterize_planes(
     """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`."""
     device = gaussians.means.device
     _check_device(device)
-    if planes[0].eye_offset:
+    if planes[0].eye_offset or covariances is not None:  # too rare for kernels of their own
         return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
     # Triton launches on torch's current device, not on that of its arguments.
     with torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext():
-        chosen = select_drawable(gaussians, covariances, pose.detach(), options)
+        chosen = select_drawable(gaussians, None, pose.detach(), options)
         projected = project_gaussians(
             chosen.gaussians,
-            chosen.covariances,
             pose,
             filter_variance=options.filter_variance(planes[0].pixel_angle),
             compensate=options.compensate,
@@ -82,7 +81,6 @@ def _check_device(device: torch.device) -> None:
 
 def project_gaussians(
     gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
     cam2world: Float[Tensor, "4 4"],
     *,
     filter_variance: float,
@@ -90,8 +88,7 @@ def project_gaussians(
     exact: bool,
 ) -> ProjectedGaussians:
     """Project Gaussians; see `pansplat.rendering.projection.project_gaussians`."""
-    shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
-    fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
+    fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, gaussians.quats, gaussians.scales)
     return ProjectedGaussians(*_Project.apply(cam2world, filter_variance, compensate, exact, *fields))
 
 

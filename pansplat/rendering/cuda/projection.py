@@ -181,33 +181,6 @@ def rotate_to_frame(c, u, v, n):
     )
 
 
-@triton.jit
-@no_type_check
-def shape_from_covariance(covariances, camera, radius, right, down, direction, index, mask):
-    """Compute the same from world covariances; minors that rounding made negative are set to zero."""
-    world = symmetric_part(load_fields(covariances, index, mask, 9))
-    # Row j of cam2world' is column j of cam2world.
-    x, y, z = (camera[0], camera[4], camera[8]), (camera[1], camera[5], camera[9]), (camera[2], camera[6], camera[10])
-    square = radius * radius
-    c = (
-        bilinear(world, x, x) / square,
-        bilinear(world, x, y) / square,
-        bilinear(world, x, z) / square,
-        bilinear(world, y, y) / square,
-        bilinear(world, y, z) / square,
-        bilinear(world, z, z) / square,
-    )
-    uu, uv, un, vv, vn, nn = rotate_to_frame(c, right, down, direction)
-    det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
-    return c, (
-        tl.maximum(uu * vv - uv * uv, 0.0),
-        tl.maximum(uu + vv, 0.0),
-        tl.maximum(nn, 0.0),
-        tl.maximum(nn * (uu + vv) - un * un - vn * vn, 0.0),
-        tl.maximum(det, 0.0),
-    )
-
-
 # --- spherical harmonics ---
 
 
@@ -302,10 +275,9 @@ def compute_ray_rows(c, right, down, direction, e2, det):
 @triton.jit(do_not_specialize=["num"])
 @no_type_check
 def project_kernel(
-    means, opacities, harmonics, first_shape, second_shape, camera,
+    means, opacities, harmonics, quats, scales, camera,
     directions, radii, covariances, peaks, values, rows, radial_variances, num,
-    DEGREE: tl.constexpr, CHANNELS: tl.constexpr, BY_AXES: tl.constexpr, COMPENSATE: tl.constexpr, EXACT: tl.constexpr,
-    BLOCK: tl.constexpr,
+    DEGREE: tl.constexpr, CHANNELS: tl.constexpr, COMPENSATE: tl.constexpr, EXACT: tl.constexpr, BLOCK: tl.constexpr,
 ):
     """Write the fields of `ProjectedGaussians`. `camera` is cam2world, row by row, then e^2."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -319,10 +291,7 @@ def project_kernel(
     direction = rotate_to_camera(pose, world)
     x, y, z = direction[0], direction[1], direction[2]
     right, down = tangent_frame(direction)
-    if BY_AXES:
-        c, minors = shape_from_axes(first_shape, second_shape, pose, radius, direction, index, mask)
-    else:
-        c, minors = shape_from_covariance(first_shape, pose, radius, right, down, direction, index, mask)
+    c, minors = shape_from_axes(quats, scales, pose, radius, direction, index, mask)
     det = minors[0] + e2 * minors[1] + e2 * e2
     peak = tl.load(opacities + index, mask=mask, other=0.0).to(tl.float64)
     if COMPENSATE:
@@ -360,9 +329,9 @@ def project_forward(
     """Project Gaussians; see `pansplat.rendering.projection.project_gaussians`.
 
     Args:
-        fields: means, opacities, harmonics, then quats and scales or covariances; all contiguous.
+        fields: means, opacities, harmonics, quats, scales; all contiguous.
     """
-    means, opacities, harmonics, *shape = fields
+    means, opacities, harmonics, quats, scales = fields
     count, terms, channels = harmonics.shape
     camera = torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=filter_variance)
     double: Any = dict(dtype=torch.float64, device=means.device)
@@ -377,9 +346,9 @@ def project_forward(
     )
     if count:
         project_kernel[(triton.cdiv(count, _BLOCK_SIZE),)](
-            means, opacities, harmonics, shape[0], shape[-1], camera, out.direction, out.radius,
+            means, opacities, harmonics, quats, scales, camera, out.direction, out.radius,
             out.covariance, out.peak, out.values, out.rows, out.radial_variance, count,
-            DEGREE=round(terms**0.5) - 1, CHANNELS=channels, BY_AXES=len(shape) == 2, COMPENSATE=compensate,
+            DEGREE=round(terms**0.5) - 1, CHANNELS=channels, COMPENSATE=compensate,
             EXACT=exact, BLOCK=_BLOCK_SIZE, num_warps=4,
         )  # fmt: skip
     return out

@@ -19,7 +19,6 @@ from torch import Tensor
 from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.rendering.cuda.projection import (
     MIN_RATIO,
-    bilinear,
     dot,
     load_fields,
     load_numbers,
@@ -29,7 +28,6 @@ from pansplat.rendering.cuda.projection import (
     rotate_to_world,
     rotation_axes,
     shape_from_axes,
-    shape_from_covariance,
     store_fields,
     symmetric_part,
     tangent_frame,
@@ -71,18 +69,12 @@ def backpropagate_rows(grad_rows, frame, c_uvn, e2, det):
 
 @triton.jit
 @no_type_check
-def backpropagate_minors(grad_minors, c_uvn, BY_AXES: tl.constexpr):
+def backpropagate_minors(grad_minors, c_uvn):
     """Gradients of uu, uv, un, vv, vn, nn from those of det B, tr B, g, M and det C."""
     uu, uv, un, vv, vn, nn = c_uvn[0], c_uvn[1], c_uvn[2], c_uvn[3], c_uvn[4], c_uvn[5]
     grad_across, grad_trace, grad_radial_variance = grad_minors[0], grad_minors[1], grad_minors[2]
     grad_mixed, grad_det = grad_minors[3], grad_minors[4]
-    across, mixed = uu * vv - uv * uv, nn * (uu + vv) - un * un - vn * vn
-    if not BY_AXES:  # of given covariances, negative minors were set to zero
-        det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
-        grad_across, grad_trace = tl.where(across >= 0, grad_across, 0.0), tl.where(uu + vv >= 0, grad_trace, 0.0)
-        grad_radial_variance = tl.where(nn >= 0, grad_radial_variance, 0.0)
-        grad_mixed = tl.where(mixed >= 0, grad_mixed, 0.0)
-        grad_det = tl.where(det >= 0, grad_det, 0.0)
+    across = uu * vv - uv * uv
     return (
         grad_across * vv + grad_trace + grad_mixed * nn + grad_det * (vv * nn - vn * vn),
         -2 * grad_across * uv + 2 * grad_det * (un * vn - uv * nn),
@@ -130,19 +122,19 @@ def backpropagate_shape(
         frame: u, v, n.
         opacity: before the filter.
         grad_rows, grad_radial_variance: only read for the exact kernel.
-        SIZES: the kernel's BY_AXES, COMPENSATE, EXACT.
+        SIZES: the kernel's COMPENSATE, EXACT.
     """
     det = minors[0] + e2 * minors[1] + e2 * e2
     zero = det * 0
     g, grad_det, turn_u, turn_v = (zero, zero, zero, zero, zero), zero, zero, zero
     grad_minors = (zero, zero, zero, zero, zero)
-    if SIZES[2]:
+    if SIZES[1]:
         g, grad_det, turn_u, turn_v = backpropagate_rows(grad_rows, frame, c_uvn, e2, det)
         radial_variance = (e2 * e2 * minors[2] + e2 * minors[3] + minors[4]) / det
         grad_s = grad_radial_variance
         grad_minors = (zero, zero, e2 * e2 * grad_s / det, e2 * grad_s / det, grad_s / det)
         grad_det -= grad_s * radial_variance / det
-    if SIZES[1]:
+    if SIZES[0]:
         ratio = minors[0] / det
         root = tl.sqrt(tl.maximum(ratio, MIN_RATIO))
         grad_ratio = tl.where(ratio >= MIN_RATIO, 0.5 * grad_peak * opacity / root, 0.0)
@@ -150,7 +142,7 @@ def backpropagate_shape(
         grad_det -= grad_ratio * ratio / det
         grad_peak = grad_peak * root
     grad_minors = (grad_minors[0] + grad_det, e2 * grad_det, grad_minors[2], grad_minors[3], grad_minors[4])
-    m = backpropagate_minors(grad_minors, c_uvn, SIZES[0])
+    m = backpropagate_minors(grad_minors, c_uvn)
     uu, uv, un, vv, vn, nn = g[0] + m[0], g[1] + m[1], g[2] + m[2], g[3] + m[3], g[4] + m[4], m[5]
     turn_u += 2 * (nn - uu) * c_uvn[2] + un * (c_uvn[0] - c_uvn[5]) + vn * c_uvn[1] - uv * c_uvn[4]
     turn_v += 2 * (nn - vv) * c_uvn[4] + vn * (c_uvn[3] - c_uvn[5]) + un * c_uvn[1] - uv * c_uvn[2]
@@ -203,17 +195,6 @@ def backpropagate_axes(grad_c, quats, scales, grad_quats, grad_scales, pose, rad
 
 @triton.jit
 @no_type_check
-def backpropagate_covariances(grad_c, grad_covariances, pose, radius, index, mask):
-    """Write the gradients of covariances."""
-    x, y, z = (pose[0], pose[1], pose[2]), (pose[4], pose[5], pose[6]), (pose[8], pose[9], pose[10])
-    square = radius * radius
-    xx, yy, zz = bilinear(grad_c, x, x) / square, bilinear(grad_c, y, y) / square, bilinear(grad_c, z, z) / square
-    xy, xz, yz = bilinear(grad_c, x, y) / square, bilinear(grad_c, x, z) / square, bilinear(grad_c, y, z) / square
-    store_fields(grad_covariances, index, mask, (xx, xy, xz, xy, yy, yz, xz, yz, zz), 9)
-
-
-@triton.jit
-@no_type_check
 def backpropagate_pose(out, pose, world, c, grad_n, grad_c, grad_offset, mask):
     """Write a program's gradients of the pose: n = A' w and C = A' (world C) A, the offset is mean - t."""
     rows = ((c[0], c[1], c[2]), (c[1], c[3], c[4]), (c[2], c[4], c[5]))
@@ -231,10 +212,10 @@ def backpropagate_pose(out, pose, world, c, grad_n, grad_c, grad_offset, mask):
 @triton.jit(do_not_specialize=["num"])
 @no_type_check
 def backpropagate_projection_kernel(
-    means, opacities, first_shape, second_shape, camera,
+    means, opacities, quats, scales, camera,
     grad_world_directions, grad_directions, grad_radii, grad_covariances, grad_peaks, grad_rows, grad_radial_variances,
-    grad_means, grad_opacities, grad_first_shape, grad_second_shape, grad_camera, num,
-    BY_AXES: tl.constexpr, COMPENSATE: tl.constexpr, EXACT: tl.constexpr, BLOCK: tl.constexpr,
+    grad_means, grad_opacities, grad_quats, grad_scales, grad_camera, num,
+    COMPENSATE: tl.constexpr, EXACT: tl.constexpr, BLOCK: tl.constexpr,
 ):
     """Write the gradients of the geometry; `grad_world_directions` are those of the colours."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -247,16 +228,13 @@ def backpropagate_projection_kernel(
     world = (offset[0] / radius, offset[1] / radius, offset[2] / radius)
     n = rotate_to_camera(pose, world)
     u, v = tangent_frame(n)
-    if BY_AXES:
-        c, minors = shape_from_axes(first_shape, second_shape, pose, radius, n, index, mask)
-    else:
-        c, minors = shape_from_covariance(first_shape, pose, radius, u, v, n, index, mask)
+    c, minors = shape_from_axes(quats, scales, pose, radius, n, index, mask)
     c_uvn = rotate_to_frame(c, u, v, n)
     grad_shape, turn_u, turn_v, grad_opacity = backpropagate_shape(
         c_uvn, minors, (u, v, n), e2,
         load_fields(opacities, index, mask, 1)[0], load_fields(grad_peaks, index, mask, 1)[0],
         load_fields(grad_rows, index, mask, 9 if EXACT else 0), load_fields(grad_radial_variances, index, mask, 1)[0],
-        (BY_AXES, COMPENSATE, EXACT),
+        (COMPENSATE, EXACT),
     )  # fmt: skip
     tl.store(grad_opacities + index, grad_opacity, mask=mask)
     grad_n = load_fields(grad_directions, index, mask, 3)
@@ -270,12 +248,7 @@ def backpropagate_projection_kernel(
     grad_camera_n = ()
     for k in tl.static_range(3):
         grad_camera_n = grad_camera_n + (grad_n[k] + turn_u * u[k] + turn_v * v[k] - 2 * e2 * widened[k],)
-    if BY_AXES:
-        backpropagate_axes(
-            grad_c, first_shape, second_shape, grad_first_shape, grad_second_shape, pose, radius, index, mask
-        )
-    else:
-        backpropagate_covariances(grad_c, grad_first_shape, pose, radius, index, mask)
+    backpropagate_axes(grad_c, quats, scales, grad_quats, grad_scales, pose, radius, index, mask)
     contracted = c[0] * grad_c[0] + c[3] * grad_c[3] + c[5] * grad_c[5]
     contracted += 2 * (c[1] * grad_c[1] + c[2] * grad_c[2] + c[4] * grad_c[4])
     grad_radius = load_fields(grad_radii, index, mask, 1)[0] - 2 * contracted / radius
@@ -303,11 +276,11 @@ def backpropagate_projection(
 
     Args:
         cam2world: float64.
-        fields: means, opacities, harmonics, then quats and scales or covariances.
+        fields: means, opacities, harmonics, quats, scales.
         grads: of the projected Gaussians.
         filter_variance, compensate, exact: see `pansplat.rendering.projection.project_gaussians`.
     """
-    means, opacities, harmonics, *shape = fields
+    means, opacities, harmonics, quats, scales = fields
     count = len(means)
     grad_camera = cam2world.new_zeros(4, 4)
     grad_fields = [torch.empty_like(field) for field in fields]
@@ -318,13 +291,13 @@ def backpropagate_projection(
     programs = triton.cdiv(count, _BLOCK_SIZE)
     parts = cam2world.new_empty(programs, 3, 4)
     backpropagate_projection_kernel[(programs,)](
-        means, opacities, shape[0], shape[-1],
+        means, opacities, quats, scales,
         torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=filter_variance),
         grad_world_directions, grads.direction.contiguous(), grads.radius + grads.values[:, -1].double(),
         grads.covariance.contiguous(), grads.peak.contiguous(), grads.rows.contiguous(),
         grads.radial_variance.contiguous(),
-        grad_fields[0], grad_fields[1], grad_fields[3], grad_fields[-1], parts, count,
-        BY_AXES=len(shape) == 2, COMPENSATE=compensate, EXACT=exact, BLOCK=_BLOCK_SIZE, num_warps=2,
+        grad_fields[0], grad_fields[1], grad_fields[3], grad_fields[4], parts, count,
+        COMPENSATE=compensate, EXACT=exact, BLOCK=_BLOCK_SIZE, num_warps=2,
     )  # fmt: skip
     grad_camera[:3] = parts.sum(dim=0)
     return grad_camera, *grad_fields

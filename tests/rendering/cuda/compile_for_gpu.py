@@ -27,16 +27,16 @@ from pansplat.rendering.cuda.rasterize import (
 )
 from pansplat.rendering.cuda.tiling import intersect_kernel
 
-_FLOATS = ("means", "opacities", "harmonics", "first_shape", "second_shape", "peaks", "values", "rows")
+_FLOATS = ("means", "opacities", "harmonics", "quats", "scales", "peaks", "values", "rows")
 _FLOATS += ("radial_variances", "records", "centres", "offsets", "sums", "grad_sums", "gradients", "totals")
 _INTEGERS = ("record_ids", "slots", "starts", "stops", "tile_order", "instances", "ranges")
 _FLOATS += ("grad_world_directions", "grad_peaks", "grad_rows", "grad_radial_variances")
-_FLOATS += ("grad_means", "grad_opacities", "grad_first_shape", "grad_second_shape")
+_FLOATS += ("grad_means", "grad_opacities", "grad_quats", "grad_scales")
 _DOUBLES = ("camera", "directions", "radii", "covariances", "grad_directions", "grad_radii")
 _DOUBLES += ("grad_covariances", "grad_camera")
 _TYPES = {"ends": "*i64", "tiles": "i32", **dict.fromkeys(_DOUBLES, "*fp64")}
 _SIZES = ("TINY", "AXES", "CHANNELS", "RECORD", "PEAK", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE")
-_SIZES += ("DEGREE", "BY_AXES", "COMPENSATE", "EXACT", "BLOCK")
+_SIZES += ("DEGREE", "COMPENSATE", "EXACT", "BLOCK")
 
 
 def _type(kernel, name: str) -> str:
@@ -80,12 +80,10 @@ def main() -> None:
         for group, at_once in ((16, 1), (1, 16)):
             sizes = dict(GRADIENT=18, FIELDS=32, GROUP=group, AT_ONCE=at_once)
             _report(f"sum {group} x {at_once}", sum_gradients_kernel, 2, capability, **sizes)
-        for by_axes in (True, False):
-            sizes = dict(DEGREE=4, CHANNELS=3, BY_AXES=by_axes, COMPENSATE=True, EXACT=True, BLOCK=128)
-            name = "scales" if by_axes else "covariances"
-            _report(f"project, degree 4, {name}", project_kernel, 4, capability, **sizes)
-            sizes |= dict(BLOCK=64)
-            _report(f"project backward, {name}", backpropagate_projection_kernel, 2, capability, **sizes)
+        sizes = dict(DEGREE=4, CHANNELS=3, COMPENSATE=True, EXACT=True, BLOCK=128)
+        _report("project, degree 4", project_kernel, 4, capability, **sizes)
+        sizes |= dict(BLOCK=64)
+        _report("project backward", backpropagate_projection_kernel, 2, capability, **sizes)
         _report("intersect", intersect_kernel, 4, capability)
 
 

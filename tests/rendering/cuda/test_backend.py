@@ -29,7 +29,7 @@ _CASES = [
 ]
 
 
-def _gradients(scene: Gaussians, camera: Tensor, dtype: torch.dtype, covariances: Tensor | None, **options):
+def _gradients(scene: Gaussians, camera: Tensor, dtype: torch.dtype, **options):
     """An image and the gradients of a random loss of all of it, by name; `pose` along rigid motions."""
     device = "cuda" if torch.cuda.is_available() and options["backend"] == "triton" else "cpu"
 
@@ -37,8 +37,6 @@ def _gradients(scene: Gaussians, camera: Tensor, dtype: torch.dtype, covariances
         return value.detach().to(device, dtype, copy=True).requires_grad_()
 
     leaves = {name: make_leaf(getattr(scene, name)) for name in _FIELDS}
-    if covariances is not None:
-        options["covariances"] = leaves["covariances"] = make_leaf(covariances)
     leaves["pose"] = make_leaf(camera, camera.dtype)
     leaves["background"] = make_leaf(torch.linspace(0.2, 0.9, scene.harmonics.shape[2]))
     changed = dataclasses.replace(scene.to(device=device), **{name: leaves[name] for name in _FIELDS})
@@ -58,7 +56,6 @@ def _compare(
     dtype: torch.dtype,
     tolerances: tuple[float, float],
     *,
-    covariances: Tensor | None = None,
     invisible: tuple[str, ...] = (),
     **options,
 ):
@@ -68,8 +65,8 @@ def _compare(
         tolerances: largest error of a pixel, and relative error of a gradient by norm.
         invisible: gradients that are too small to compare.
     """
-    expected = _gradients(scene, camera, torch.float64, covariances, backend="torch", **options)
-    got = _gradients(scene, camera, dtype, covariances, backend="triton", **options)
+    expected = _gradients(scene, camera, torch.float64, backend="torch", **options)
+    got = _gradients(scene, camera, dtype, backend="triton", **options)
     assert float((got[0] - expected[0]).abs().max()) < tolerances[0]
     assert got[1].keys() == expected[1].keys()
     for name in expected[1].keys() - set(invisible):
@@ -93,12 +90,11 @@ def test_a_small_image_and_its_gradients_equal_float64_torch(make_scene, pose):
 def test_images_and_gradients_equal_float64_torch(options, dtype, channels, make_scene, pose):
     scene = make_scene(14, scale=0.25, seed=3, degree=1)
     scene = dataclasses.replace(scene, harmonics=scene.harmonics.repeat(1, 1, 2)[:, :, :channels])
-    covariances = scene.covariances if options["lowpass"] == "3dgs" else None
     options = {"size": (18, 36), "vertical_fov_degrees": 80.0, **options}
     tolerances = (2e-6, 1e-5) if dtype == torch.float32 else (1e-13, 1e-12)
-    expected, got = _compare(scene, pose, dtype, tolerances, covariances=covariances, **options)
+    expected, got = _compare(scene, pose, dtype, tolerances, **options)
     assert float(expected[0][channels].mean()) > 0.02
-    assert len(got[1]) == (6 if covariances is not None else 7)
+    assert len(got[1]) == 7
     assert got[2].intersections > 0
 
 
@@ -143,12 +139,12 @@ def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
 
     scene = make_scene(12, scale=0.3, degree=0)
     options = dict(backend="triton", size=(20, 40), layout="equirect")
-    wide = _gradients(scene, pose, torch.float64, None, **options)
+    wide = _gradients(scene, pose, torch.float64, **options)
     with monkeypatch.context() as by_tiles:
         by_tiles.setattr(tiling, "_MAX_TILES", 3)  # indices of tiles are of 16 bits
-        rows = _gradients(scene, pose, torch.float64, None, **options)
+        rows = _gradients(scene, pose, torch.float64, **options)
     monkeypatch.setattr(tiling, "intersect_tiles", functools.partial(tiling.intersect_tiles, limit=1))
-    for narrow in (rows, _gradients(scene, pose, torch.float64, None, **options)):
+    for narrow in (rows, _gradients(scene, pose, torch.float64, **options)):
         assert torch.equal(narrow[0], wide[0]) and narrow[2].intersections == wide[2].intersections
         assert narrow[2].bytes < wide[2].bytes
         for name, expected in wide[1].items():

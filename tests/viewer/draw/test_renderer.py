@@ -60,9 +60,8 @@ def test_each_of_six_faces_equals_the_reference(random_scene, pose, assert_refer
 
 
 @PRESETS
-@pytest.mark.parametrize("face_size", [None, 21])
-def test_stitched_panorama_equals_the_reference(random_scene, pose, assert_reference, preset, face_size):
-    settings = replace(SETTINGS, preset=preset, layout="equirect", face_size=face_size)
+def test_panorama_equals_the_reference(random_scene, pose, assert_reference, preset):
+    settings = replace(SETTINGS, preset=preset, layout="equirect")
     assert_reference(random_scene(seed=2), pose, (96, 48), settings)
 
 
@@ -139,7 +138,7 @@ def test_panorama_error_at_seams_is_not_larger_than_inside_faces(make_renderer, 
     scene = random_scene(200, degree=0, size=0.12, seed=12)
     height, width = 64, 128
     renderer = make_renderer(scene)
-    renderer.render(pose, (width, height), DrawSettings(layout="equirect", face_size=64))
+    renderer.render(pose, (width, height), DrawSettings(layout="equirect"))
     gaussians = scene.gaussians.to(dtype=torch.float64)
     direct = rasterize(gaussians, torch.from_numpy(pose), size=(height, width), layout="equirect")  # without faces
     error = np.abs(renderer.read_color()[..., :3] - direct.color.permute(1, 2, 0).numpy()).mean(axis=-1)
@@ -286,7 +285,6 @@ def test_culling_does_not_change_the_image(make_renderer, random_scene, pose, mo
     [
         ({"preset": "surfel"}, "`preset` must be one of exact, 3dgs, got 'surfel'"),
         ({"vertical_fov_degrees": 180}, "between 0 and 180, got 180"),
-        ({"face_size": 0}, "`face_size` must be at least 1"),
         ({"near": 0.0}, "`near` must be a positive distance"),
     ],
 )
@@ -299,12 +297,10 @@ def test_invalid_settings_are_refused(change, message):
 def test_settings_poses_and_sizes_that_do_not_fit_are_refused(make_renderer, random_scene, pose, tier):
     scene = random_scene()
     renderer = make_renderer(scene, tier)
-    for change, message in (
-        ({"mode": "view", "view": 2}, "`view` must be 0..1 in this scene, got 2"),
-        ({"layout": "equirect", "face_size": 100_000}, "limit is .*; use a smaller size or face_size"),
-    ):
-        with pytest.raises(InputError, match=message):
-            renderer.render(pose, SIZE, replace(SETTINGS, **change))
+    with pytest.raises(InputError, match=r"`view` must be 0\.\.1 in this scene, got 2"):
+        renderer.render(pose, SIZE, replace(SETTINGS, mode="view", view=2))
+    with pytest.raises(InputError, match=r"limit is .*; use a smaller size"):
+        renderer.render(pose, (200_000, 100_000), replace(SETTINGS, layout="equirect"))
     with pytest.raises(InputError, match="finite 4x4"):
         renderer.render(np.full((4, 4), np.nan), SIZE, SETTINGS)
     with pytest.raises(InputError, match="at least 1x1"):

@@ -100,7 +100,7 @@ def test_the_depth_of_both_eyes_is_arranged_as_the_colours_are(renderer, pose):
 def test_omnidirectional_stereo_needs_the_exact_preset(renderer, pose):
     with pytest.raises(InputError, match="needs preset exact, got 3dgs"):
         ImageFormat("equirect", "top-bottom").check((64, 32), "3dgs")
-    with pytest.raises(InputError, match="needs layout equirect, preset exact"):
+    with pytest.raises(InputError, match="needs layout equirect and preset exact"):
         DrawSettings(eye_offset=0.03)
     with pytest.raises(InputError, match="`eye_offset` must be a distance"):
         DrawSettings(layout="equirect", eye_offset=float("nan"))

@@ -37,7 +37,7 @@ def test_lines_have_times_and_the_image_of_the_reference(run_job, random_scene, 
         "folder": str(tmp_path),
         "tiers": ["gl33", "gl43", "cpu"],
         "settings": [
-            {"layout": "equirect", "face_size": 16},
+            {"layout": "equirect", "size": [192, 96]},
             {"mode": "deferred"},
             {"cached": True, "size": [64, 32]},
         ],
@@ -56,7 +56,7 @@ def test_lines_have_times_and_the_image_of_the_reference(run_job, random_scene, 
         difference = np.load(line["image"])[..., :3] - np.load(lines[line["settings"]]["image"])[..., :3]
         assert np.abs(difference).mean() <= 6e-3
     gaussians = scene.gaussians.to(dtype=torch.float64)
-    expected = rasterize(gaussians, torch.from_numpy(pose), size=(24, 48), layout="cubemap", face_size=16)
+    expected = rasterize(gaussians, torch.from_numpy(pose), size=(96, 192), layout="cubemap")
     drawn = np.load(lines[0]["image"])[..., :3].transpose(2, 0, 1)
     assert np.abs(drawn - expected.color.numpy()).max() <= 5e-3
 
