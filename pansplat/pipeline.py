@@ -9,7 +9,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -147,14 +147,15 @@ def load_model(
         compat: for networks: "official" reproduces the official code with its defects; "fixed" corrects them;
             "trained" is the mode of the training, which is "official" for official weights.
         precision: for networks: number type of the convolutions; docs/bench_model.md shows time against error.
-        **options: arguments of `pansplat.sweep.Sweep` or of `pansplat.model.network.load_predictor`.
+        **options: of "sweep", the arguments of `pansplat.sweep.Sweep`; of the weights of a network, those of
+            `pansplat.model.network.load_predictor`; others have none.
     """
     if compat not in get_args(CompatChoice):
         raise InputError(f"`compat` must be one of {', '.join(get_args(CompatChoice))}, got {compat!r}")
+    chosen = {"compat": compat} if compat != "trained" else {}
+    chosen |= {"precision": precision} if precision != "float32" else {}
     if str(name) in _MODELS:
-        for option, value, default in (("compat", compat, "trained"), ("precision", precision, "float32")):
-            if value != default:
-                raise InputError(f"`{option}` is for networks, and {name} is not one; leave it out")
+        _refuse_options(name, chosen if str(name) == "sweep" else chosen | options)
         return _MODELS[str(name)](**options)
     if Path(name).suffix.lower() not in WEIGHTS_SUFFIXES:
         raise InputError(
@@ -165,10 +166,16 @@ def load_model(
     if read_model_name(path) == "depth":
         from pansplat.sweep.guided_sweep import load_guided_sweep
 
+        _refuse_options(name, chosen | options)
         return load_guided_sweep(path, path.stem)
     from pansplat.model.network import load_predictor
 
     return load_predictor(path, compat, precision=precision, **options)
+
+
+def _refuse_options(name: str | Path, options: Iterable[str]) -> None:
+    for option in options:
+        raise InputError(f"`{option}` is for networks, and {name} is not one; leave it out")
 
 
 def load_predictor(options: PredictOptions) -> Predictor:
@@ -202,7 +209,7 @@ def warn_of_single_views(tour: TourGraph, predictor: Predictor) -> None:
     if count and _find_min_views(predictor) > 1:
         warnings.warn(
             f"{tour.name}: {count} single view{'s are' if count > 1 else ' is'} predicted by default, because "
-            f"{predictor.name} needs {_find_min_views(predictor)} or more panoramas of one place.",
+            f"{predictor.name} needs {_find_min_views(predictor)} or more panoramas of one room.",
             InputWarning,
             stacklevel=3,
         )
@@ -229,7 +236,7 @@ def _require_views(source: Pair | Views, predictor: Predictor) -> None:
         names = [str(view.image) for view in source.context] if isinstance(source, Pair) else source.names
         raise InputError(
             f"{', '.join(names) or 'the input'}: {predictor.name} needed {_find_min_views(predictor)} or more "
-            f"panoramas of one place, got {count}; choose the model default, which accepts a single one, or add one."
+            f"panoramas of one room, got {count}; choose the model default, which accepts a single one, or add one."
         )
 
 

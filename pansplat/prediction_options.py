@@ -22,7 +22,7 @@ class ReadOptions:
 
     # The names are those of the keywords of `pansplat.load_pairs`.
     convention: str | None = None
-    """Pose convention, if the folder does not state it: "cam2world opencv", "cam2world opengl",
+    """Pose convention; overrides that of the files: "cam2world opencv", "cam2world opengl",
     "world2cam opencv" or "world2cam opengl" (Habitat and Blender use opengl)."""
     near: Depth | None = None
     """Nearest depth to search, metres; by default the folder's."""

@@ -420,7 +420,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
 
 def test_a_photograph_alone_is_refused_by_a_model_that_needs_two(pair_folder: Path, weights: Path) -> None:
     (single,) = load_pairs(pair_folder / "left.png")
-    message = r"left\.png: pansplat needed 2 or more panoramas of one place, got 1; choose the model default"
+    message = r"left\.png: pansplat needed 2 or more panoramas of one room, got 1; choose the model default"
     for run_prediction in (predict, lambda pair, model: predict_to_file(pair, pair_folder / "x.ply", model)):
         with pytest.raises(InputError, match=message):
             run_prediction(single, weights)

@@ -243,14 +243,14 @@ def estimate_poses(
     cache_folder: Path | None = None,
     progress: Progress | None = None,
 ) -> PoseEstimate:
-    """Camera poses of two or more equirectangular panoramas of one place.
+    """Camera poses of two or more equirectangular panoramas of one home or site.
 
     Args:
         images: files, 2:1; one that is repeated is used once.
         masks: the mask file of each image, if it has one; by default those beside the images (docs/input.md).
         links: for an image, the yaw at which a tour shows the way to other images, radians to the right of the centre.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
-        baseline: two of the images and their distance in metres, instead of the camera's height.
+        baseline: two of the images of the largest group and their distance in metres, instead of the camera's height.
         seed: of the random samples.
         cache_folder: folder whose cache keeps features and relative poses, so that a further panorama costs its own
             only; none by default.
@@ -273,7 +273,7 @@ def estimate_poses(
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     if baseline is not None:
-        ends = {_find_file(name, paths) for name in baseline[:2]}
+        ends = {_find_file(name, paths, "the images") for name in baseline[:2]}
         if len(ends) < 2 or not 0 < baseline[2] < _MAX_BASELINE:
             raise InputError(
                 f"`baseline` must be two different images and a distance above 0 to {_MAX_BASELINE:g} metres, got "
@@ -655,7 +655,7 @@ def _find_scale(
     """Metres per unit of the poses, and how it was found."""
     centres = poses[:, :3, 3]
     if baseline is not None:
-        ends = [_find_file(name, files) for name in baseline[:2]]
+        ends = [_find_file(name, files, "the largest group of images with poses") for name in baseline[:2]]
         distance = float(np.linalg.norm(centres[ends[0]] - centres[ends[1]]))
         if distance == 0:
             raise InputError(f"`baseline` must be two images with a distance, got two from the same place: {baseline}")
@@ -670,9 +670,9 @@ def _find_scale(
     return camera_height / height, source
 
 
-def _find_file(name: Path | str, files: Sequence[Path]) -> int:
+def _find_file(name: Path | str, files: Sequence[Path], which: str) -> int:
     for n, file in enumerate(files):
         if str(name) in (str(file), file.name, file.stem):
             return n
-    placed = ", ".join(file.name for file in files)
-    raise InputError(f"`baseline` must name two of the images that have a pose ({placed}), got {name}")
+    listed = ", ".join(file.name for file in files)
+    raise InputError(f"`baseline` must name two of {which} ({listed}), got {name}")

@@ -40,14 +40,15 @@ POOR_FIT = 0.25  # quality below which a place is doubtful
 _LEAST_OVERLAP = 0.01  # of a comparison that counts
 _LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind
 _LINK_REACH = 1.0, 4.0  # camera heights, of a place by a link
+_MOST_SUGGESTIONS = 4  # of a pair
 _NEIGHBOURS = 4  # nearest panoramas that a place is compared with
 
 
 class Place(NamedTuple):
-    """A place on a floor plan.
+    """The place of a camera on a floor plan, or relative to another one.
 
     Attributes:
-        right, forward: of the camera, metres.
+        right, forward: metres; of a `Suggestion` heights of the camera (`add` has its unit).
         yaw: heading, radians to the right of the plan's forward axis.
     """
 
@@ -71,7 +72,7 @@ class Place(NamedTuple):
         return Place(-cosine * self.right + sine * self.forward, -sine * self.right - cosine * self.forward, -self.yaw)
 
     def distance(self, other: Place) -> float:
-        """Between the cameras, metres."""
+        """Between the cameras, in the unit of both."""
         return math.hypot(self.right - other.right, self.forward - other.forward)
 
     def turn_between(self, other: Place) -> float:
@@ -95,12 +96,13 @@ def list_suggestions(
         relation: of the pair.
         upright: axes of both upright cameras in the cameras' frames, as columns (`DepthMap.rotation`).
     """
-    found = []
-    for candidate in relation.candidates:
-        centre = upright[0].T @ (-candidate.rotation.T @ candidate.translation)
-        forward = upright[0].T @ candidate.rotation.T @ upright[1][:, 2]
-        place = Place(float(centre[0]), float(centre[2]), math.atan2(forward[0], forward[2]))
-        found.append(Suggestion(place, candidate.log_odds))
+    found, poses = [], relation.hypotheses
+    for n in np.argsort(-poses.log_odds, kind="stable")[:_MOST_SUGGESTIONS]:
+        if poses.log_odds[n] > -math.inf:
+            centre = upright[0].T @ (-poses.rotations[n].T @ poses.ways[n])
+            forward = upright[0].T @ poses.rotations[n].T @ upright[1][:, 2]
+            place = Place(float(centre[0]), float(centre[2]), math.atan2(forward[0], forward[2]))
+            found.append(Suggestion(place, float(poses.log_odds[n])))
     return tuple(found)
 
 

@@ -86,7 +86,6 @@ class _Support:
 # Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
 _NEEDED = _Support(32, 80, 20)
 _COMPARED = 16  # best hypotheses whose panoramas are compared
-_CANDIDATES = 4  # hypotheses of the highest odds that are kept for placing by hand
 # Logarithm of the odds of a hypothesis against none, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the way), whether it is
 # that of a comparison (docs/poses.md).
@@ -497,15 +496,6 @@ def _pick_distinct(essential: Float[Array, "n 3 3"], scores: Float[Array, "n"], 
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """A hypothesis x2 = R x1 + t with t in camera heights, and the logarithm of the odds that it is right."""
-
-    rotation: Rotation
-    translation: Vector
-    log_odds: float
-
-
-@dataclass(frozen=True, eq=False)
 class Hypotheses:
     """Relative poses of two panoramas, of which at most one is right.
 
@@ -550,17 +540,6 @@ class RelativePose:
     log_odds: float = -math.inf
     problem: str | None = None
     hypotheses: Hypotheses = Hypotheses()
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """The hypotheses of the highest odds, with or without problems, best first."""
-        best = np.argsort(-self.hypotheses.log_odds, kind="stable")[:_CANDIDATES].tolist()
-        poses = self.hypotheses
-        return tuple(
-            Candidate(poses.rotations[n], poses.ways[n], float(poses.log_odds[n]))
-            for n in best
-            if poses.log_odds[n] > -math.inf
-        )
 
     @property
     def is_matched(self) -> bool:

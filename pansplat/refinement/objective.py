@@ -20,7 +20,10 @@ _BLOCKS = 32  # rows of held-out blocks
 
 @dataclass(frozen=True, eq=False)
 class PixelWeights:
-    """Weights of an image's pixels and of its gradients to the right and downwards, each with a sum of about 1."""
+    """Weights of an image's pixels and of its gradients to the right and downwards: solid angles over the sphere's.
+
+    The sum of each is about the share that is not masked.
+    """
 
     pixels: Float[Tensor, "height width"]
     right: Float[Tensor, "height width"]

@@ -89,7 +89,7 @@ class RasterInfo:
     Attributes:
         total: Gaussians given.
         dropped: Gaussians with a number that is not finite or too large, or a covariance that is not positive.
-        near: Gaussians nearer than `near`.
+        near: Gaussians nearer than `near`; with an eye offset, to the point between the eyes.
         visible: Gaussians that can reach the alpha cut in the image; summed over the faces of a cubemap, and
             over the columns of a panorama with an eye offset.
         intersections: pairs of a Gaussian and a raster tile.

@@ -115,9 +115,10 @@ def _rasterize_columns(
     """Rasterise each column of a panorama from its own eye: section 9, literally; kernel "ray" only."""
     (height, width), directions = plane.size, plane.directions()
     columns, visible, intersections = [], 0, 0
+    counted, _ = _select_and_project(gaussians, covariances, pose, plane, options)
     for column, eye in enumerate(plane.column_eyes()):
         moved = torch.cat((pose[:, :3], (pose[:, 3] + pose[:, :3] @ eye)[:, None]), dim=1)
-        chosen, projected = _select_and_project(gaussians, covariances, moved, plane, options)
+        _, projected = _select_and_project(gaussians, covariances, moved, plane, options)
         footprints, boxes = compute_footprints(projected, plane, options)
         # A box may wrap around: count the columns from its left edge on.
         after_left = torch.remainder(column + 0.5 - boxes[:, 0], width)
@@ -135,7 +136,7 @@ def _rasterize_columns(
         sums = torch.cat(bands).reshape(-1, TILE_SIZE, TILE_SIZE, bands[0].shape[-1])[:, :, 0].flatten(0, 1)
         columns.append(sums[:height].T)
         visible += len(reached)
-    info = RasterInfo(chosen.total, chosen.dropped, chosen.near, visible, intersections)
+    info = RasterInfo(counted.total, counted.dropped, counted.near, visible, intersections)
     return RasterSums(torch.stack(columns, dim=2)[None], info)
 
 

@@ -140,7 +140,9 @@ class PriorEstimator:
         self._priors: list[list[DepthPrior]] = [[] for _ in self._turns]
 
     def sharpen(self, limits: tuple[float, float]) -> list[np.ndarray]:
-        """Log-depth (h, w) of each view by itself, with a usual camera height, for views that cannot be matched.
+        """Sharpened log-depth (h, w) of each view by itself, in the unit of the poses for a usual camera height.
+
+        The search bends it to the matches, and uses it as it is where nothing can be matched.
 
         Args:
             limits: smallest and largest inverse height of the cameras over the floor.

@@ -271,7 +271,7 @@ class _SearchLevel:
         slopes = [np.ones(shape, np.float32)] + [np.abs(r).astype(np.float32) for r in self.rays[view]]
         sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
         penalties = [np.zeros((2, count), np.float32) for _ in slopes]
-        if self.surfaces:  # the first pass has no priors, so that other shapes are found too
+        if self.surfaces:  # in the first pass nothing supports a plane yet
             penalties[0] += self.config.sphere_prior
             for axis in range(3):
                 penalties[axis + 1] = self.config.plane_prior * (

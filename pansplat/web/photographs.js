@@ -56,7 +56,7 @@ async function readTile(key) {
   return image;
 }
 
-// One size of a photograph. `states` of its tiles: undefined, or "reading", "ready" or "failed".
+// One size of a photograph. `state` of a tile: null, or "reading", "ready" or "failed".
 class Level {
   constructor(name, rotation, first, [size, step]) {
     Object.assign(this, { size, texture: null, isFresh: true, tiles: [] });

@@ -30,6 +30,7 @@ from pansplat.model.network import (
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import WeightsFile, pack_weights, save_weights
 from pansplat.pipeline import load_model
+from pansplat.sweep.guided_sweep import default_weights
 
 SMALL_MVSPLAT = MVSplatConfig(channels=16, candidates=8, width=32, transformer=TransformerConfig(channels=16, blocks=2))
 _PER_VIEW = sum(lattice_size(128 >> level) for level in range(4))
@@ -271,6 +272,10 @@ def test_invalid_choices_are_refused(file: Path, unchecked: None) -> None:
         load_model(file, compat="broken")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="`compat` is for networks, and sweep is not one"):
         load_model("sweep", compat="fixed")
+    with pytest.raises(InputError, match="`config` is for networks, and default is not one"):
+        load_model("default", config=None)
+    with pytest.raises(InputError, match=r"`precision` is for networks, and .*model\.safetensors is not one"):
+        load_model(default_weights(), precision="bfloat16")
     with pytest.raises(InputError, match="got no file"):
         load_model(file.with_name("other.safetensors"))
     with pytest.raises(InputError, match=r"a file of weights \(\.safetensors, \.ckpt, \.pt, \.pth\), got .*scene\.ply"):

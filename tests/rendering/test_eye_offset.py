@@ -88,13 +88,14 @@ def test_gradients_are_those_of_the_reference(balls):
 
 def test_unusable_gaussians_are_left_out_and_counted(make_scene):
     scene = make_scene(30).to(dtype=torch.float32)
+    scene.means[5] = torch.tensor((-0.06, 0.0, 0.0))  # nearer than 0.05 m to the eye of the last column only
     broken = dataclasses.replace(scene, means=scene.means.clone(), harmonics=scene.harmonics.clone())
     broken.means[3, 0], broken.harmonics[7, 1, 2] = math.nan, math.inf
     kept = torch.tensor([i not in (3, 7) for i in range(30)])
     for backend in ("numba", "torch"):
         rendering = rasterize(broken, ORIGIN, size=(12, 24), eye_offset=0.1, backend=backend)
         expected = rasterize(scene.select(kept), ORIGIN, size=(12, 24), eye_offset=0.1, backend=backend)
-        assert rendering.info is not None and rendering.info.dropped == 2
+        assert rendering.info is not None and (rendering.info.dropped, rendering.info.near) == (2, 0)
         assert torch.equal(rendering.color, expected.color)
     empty = rasterize(scene.select(kept & False), ORIGIN, size=(12, 24), eye_offset=0.1)
     assert not empty.alpha.any()
