@@ -12,7 +12,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")"
 
 CPU_WHEELS=https://download.pytorch.org/whl/cpu
 GL_PACKAGES=(libegl1 libgl1 libgl1-mesa-dri libgles2 libx11-6 libxcursor1 libxext6 libxi6 libxinerama1 libxkbcommon0 libxrandr2)
-DEV_PACKAGES=(xvfb xdotool libosmesa6 chromium)
+DEV_PACKAGES=(xvfb xdotool libosmesa6 chromium libatomic1) # libatomic1: for the node of playwright
 IWER=iwer@2.5.0 # npm package: the emulated headset of the tests
 IWER_SHA256=23d8640949f19db4b1e70398b30e084e4aa555f3a81e4329da3fac1a70b39542 # of iwer.min.js
 
