@@ -19,8 +19,9 @@ from pansplat.system.files import is_written, require_replaceable
 OWN = b"of the user"
 SPHERE = ["--model", "sphere", "--refine", "0"]
 EXPORT = ["export", *SPHERE, "--predict-height", "64"]
+COARSE = ["--triangles", "4000"]  # of a mesh
 COMMANDS = {
-    "scene.ply": ["predict", "{room}", "--model", "sphere", "--height", "64"],
+    "scene.ply": ["predict", "{room}", *SPHERE, "--height", "64"],
     "again.ply": ["refine", "{room}", "--model", "sphere", "--height", "64", "--steps", "1"],
     "view.png": ["render", "{scene}", "--height", "16"],
     "view.jpg": ["render", "{scene}", "--height", "16", "--layout", "perspective"],
@@ -35,8 +36,8 @@ COMMANDS = {
     "points.ply": [*EXPORT, "{room}", "--points"],
     "page.html": [*EXPORT, "{room}"],
     "plan.png": [*EXPORT, "{room}"],
-    "mesh.obj": [*EXPORT, "{room}"],
-    "mesh.glb": [*EXPORT, "{room}", "--mesh"],
+    "mesh.obj": [*EXPORT, "{room}", *COARSE],
+    "mesh.glb": [*EXPORT, "{room}", "--mesh", *COARSE],
 }
 
 
@@ -70,15 +71,15 @@ def test_files_beside_a_mesh_are_checked_before_the_first_is_written(
     out = tmp_path / "my_house" / "house.obj"
     for name in ("house_0.jpg", "house_1.jpg", "house.mtl"):
         own = write_own(out.with_name(name))
-        assert f"got {own}, which pansplat did not write" in refusal(*EXPORT, room, "-o", out)
+        assert f"got {own}, which pansplat did not write" in refusal(*EXPORT, room, *COARSE, "-o", out)
         assert list(out.parent.iterdir()) == [own] and own.read_bytes() == OWN
         own.unlink()
     write_own(out.with_name("house_0.jpg"))
     write_own(out.with_name("house_2.jpg"))
-    assert run([*EXPORT, str(room), "-o", str(out), "--overwrite"]) == 0
+    assert run([*EXPORT, str(room), *COARSE, "-o", str(out), "--overwrite"]) == 0
     assert all(is_written(out.with_name(name)) for name in ("house.obj", "house.mtl", "house_0.jpg", "house_1.jpg"))
     assert out.with_name("house_2.jpg").read_bytes() == OWN, "two panoramas have two textures"
-    assert run([*EXPORT, str(room), "-o", str(out)]) == 0
+    assert run([*EXPORT, str(room), *COARSE, "-o", str(out)]) == 0
 
 
 def test_the_folder_of_a_split_page_keeps_files_of_the_user(scene: Path, tmp_path: Path) -> None:
