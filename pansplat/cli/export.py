@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -105,29 +105,43 @@ class _Mesh:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
         from pansplat.export.mesh_files import name_mesh_files, save_mesh
-        from pansplat.tours import find_rooms
+        from pansplat.tours import find_rooms, make_graph, select_views
 
         require_replaceable("--out", name_mesh_files(export.out, 1), export.overwrite)  # before the prediction
         scene, changes, photographs = export.open()
 
-        def load(number: int) -> Tensor:
-            pair = photographs[number]
+        def load(view: int) -> Tensor:
+            pair = photographs[view]
             return pair.load_context(min(pair.image_height, _TEXTURE_HEIGHT)).images[0]
 
-        textures: Callable[[int], Tensor] | None = load if photographs else None
-        inside = None if self.whole or not len(scene.cam2world) else find_rooms(scene).contains
-        mesh = make_mesh(scene, triangles=self.triangles or DEFAULT_TRIANGLES, textures=textures, inside=inside)
-        if not mesh.parts:
+        places = sorted(make_graph(scene).list_parts(), key=len, reverse=True) if scene.overlaps else []
+        meshes = {}
+        for number, views in enumerate(places or [list(range(len(scene.cam2world)))], 1):
+            part = select_views(scene, views) if len(places) > 1 else scene
+            inside = None if self.whole or not views else find_rooms(part).contains
+            limit = (self.triangles or DEFAULT_TRIANGLES) * len(views) // max(len(scene.cam2world), 1)
+            textures = (lambda view, views=views: load(views[view])) if photographs else None
+            mesh = make_mesh(part, triangles=limit, textures=textures, inside=inside)
+            name = export.out.name if number == 1 else f"{export.out.stem}_{number}{export.out.suffix}"
+            if mesh.parts:
+                meshes[export.out.with_name(name)] = mesh
+        if not meshes:
             raise InputError(f"{export.path}: needed surfaces in rooms, got none; --whole keeps all of them")
-        files = save_mesh(mesh, export.out, overwrite=export.overwrite)
-        size = sum(file.stat().st_size for file in files)
-        beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
-        count = len(mesh.parts)
-        print(
-            f"{export.out}{beside}: {mesh.num_triangles:,} triangles of {count} panorama{'s' if count > 1 else ''}, "
-            f"{size / 1e6:.1f} MB"
-        )
-        if inside is not None:
+        for file, mesh in meshes.items():
+            require_replaceable("--out", name_mesh_files(file, len(mesh.parts)), export.overwrite)
+        for file, mesh in meshes.items():
+            files = save_mesh(mesh, file, overwrite=export.overwrite)
+            size = sum(written.stat().st_size for written in files)
+            beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
+            count, names = len(mesh.parts), ", ".join(part.name for part in mesh.parts)
+            whose = names if file != export.out else f"{count} panorama{'s' if count > 1 else ''}"
+            print(f"{file}{beside}: {mesh.num_triangles:,} triangles of {whose}, {size / 1e6:.1f} MB")
+        if len(meshes) > 1:
+            print(
+                f"note: {export.out}: what is not placed relative to each other is in {len(meshes)} files",
+                file=sys.stderr,
+            )
+        if not self.whole and len(scene.cam2world):
             print(f"note: {export.out}: without what is outside of the rooms; --whole keeps it", file=sys.stderr)
         _print_changes(changes)
 

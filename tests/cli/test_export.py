@@ -225,6 +225,30 @@ def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
     assert '"groups": [[0]]' in (tmp_path / "photo.html").read_text()
 
 
+def test_the_mesh_of_a_panorama_without_a_pose_is_a_file_of_its_own(
+    tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = pipeline.load_pairs(write_tour(tmp_path / "house", height=64))
+    alone = dataclasses.replace(second.context[1], world=1, title="Attic")
+    pairs = [dataclasses.replace(second, context=(alone,)), first]
+    monkeypatch.setattr(pipeline, "load_pairs", lambda *args, **options: pairs)
+    command = ["export", str(tmp_path / "house"), "--model", "sphere", "--refine", "0", "--predict-height", "64"]
+    command += ["--mesh", "--whole", "--triangles", "6000", "-o", str(tmp_path / "home.glb")]
+    (tmp_path / "home_2.glb").write_text("mine")
+    assert run(command) == 2 and not (tmp_path / "home.glb").exists(), "nothing is written beside a user's file"
+    (tmp_path / "home_2.glb").unlink()
+    assert run(command) == 0
+    printed = capsys.readouterr()
+    assert "triangles of 2 panoramas" in printed.out and "triangles of Attic" in printed.out
+    assert "is in 2 files" in printed.err
+    names = "home.glb", "home_2.glb"
+    placed, (single,) = (list(trimesh.load(tmp_path / n, process=False).geometry.values()) for n in names)
+    photograph = np.asarray(Image.open(alone.image).convert("RGB"), float)
+    assert len(placed) == 2 and sum(len(part.faces) for part in placed) <= 4000 and len(single.faces) <= 2000
+    texture = np.asarray(single.visual.material.baseColorTexture, float)
+    assert np.abs(texture - photograph).mean() < 60, "random pixels, as JPEG; another photograph differs by 85"
+
+
 def test_a_floor_plan_needs_a_floor(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     message = refusal("export", scene, "-o", tmp_path / "plan.png", "--min-opacity", "0.95")
     assert "needed a floor below at least one of the 2 input cameras" in message
