@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
+from pansplat.tours import STOP_REACH
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
 from pansplat_viewer.draw.stereo import WindowRenderer, create_window_renderer, get_eye_size
 from pansplat_viewer.scene import camera as cameras
