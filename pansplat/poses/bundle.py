@@ -9,6 +9,7 @@ Source: B. Triggs et al., Bundle adjustment - a modern synthesis, 1999.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,6 +19,9 @@ from pansplat.poses.solvers import rotation_exp, skew
 
 _STEPS = 30
 _DISTANCE_NOISE = 0.015  # of a known distance, relative
+_DOWN_NOISE = 0.01  # of the cameras' down directions, radians
+_CAUCHY = 2.0  # residual at which the loss has half of its weight, in the noise's unit
+_BEHIND = 1e6  # squared residual of a point behind its camera
 _LARGEST_DAMPING = 1e8
 _CONVERGED = 1e-6  # relative decrease of the cost
 
@@ -31,7 +35,7 @@ class Problem:
         points: homogeneous unit vectors in the world.
         camera, point: indices for each observation.
         bearings: observed unit directions in the camera's frame.
-        axes: for each camera the down direction in its frame; NaN where it is unknown.
+        downs: for each camera the down direction in its frame; NaN where it is unknown.
         down: in the world.
         pairs, distances: cameras whose distance is known independently of the points.
     """
@@ -42,7 +46,7 @@ class Problem:
     camera: Int[Array, "observation"]
     point: Int[Array, "observation"]
     bearings: Float[Array, "observation 3"]
-    axes: Float[Array, "camera 3"]
+    downs: Float[Array, "camera 3"]
     down: Float[Array, "3"]
     pairs: Int[Array, "pair 2"] = field(default_factory=lambda: np.empty((0, 2), np.int64))
     distances: Float[Array, "pair"] = field(default_factory=lambda: np.empty(0))
@@ -101,11 +105,24 @@ def _camera_points(problem: Problem) -> Float[Array, "observation 3"]:
     return np.einsum("nji,nj->ni", problem.rotations[problem.camera], offset)
 
 
-def _evaluate(problem: Problem, noise: float, axis_noise: float) -> tuple[float, Array, Array, Array, Array]:
-    """Cost, residuals (n 2), weights (n), tangent vectors (n 2 3) and scaled camera points (n 3).
+class _State(NamedTuple):
+    """The cost of a problem, and what its derivatives need of each observation.
 
     The loss is Cauchy's; the residual is the part of the point's direction across the bearing.
+
+    Attributes:
+        residual: in the noise's unit, along two tangents of the bearing.
+        local: scaled points in the camera's frame.
     """
+
+    cost: float
+    residual: Float[Array, "observation 2"]
+    weight: Float[Array, "observation"]
+    tangents: Float[Array, "observation 2 3"]
+    local: Float[Array, "observation 3"]
+
+
+def _evaluate(problem: Problem, noise: float) -> _State:
     q = _camera_points(problem)
     length = np.linalg.norm(q, axis=1)
     unit = q / np.maximum(length, 1e-12)[:, None]
@@ -115,12 +132,12 @@ def _evaluate(problem: Problem, noise: float, axis_noise: float) -> tuple[float,
     tangents = np.stack((first, np.cross(problem.bearings, first)), axis=1)
     residual = np.einsum("nki,ni->nk", tangents, unit) / noise
     behind = (unit * problem.bearings).sum(axis=1) < 0
-    squared = np.where(behind, 1e6, (residual**2).sum(axis=1))
-    cost = float(2 * np.log1p(squared / 4).sum() * 2)
-    weight = np.where(behind, 0.0, 1 / (1 + squared / 4))
-    tilt = _tilts(problem) / axis_noise
+    squared = np.where(behind, _BEHIND, (residual**2).sum(axis=1)) / _CAUCHY**2
+    cost = float(_CAUCHY**2 * np.log1p(squared).sum())
+    weight = np.where(behind, 0.0, 1 / (1 + squared))
+    tilt = _tilts(problem) / _DOWN_NOISE
     cost += float((tilt**2).sum()) + float((_stretches(problem) ** 2).sum())
-    return cost, residual, weight, tangents, q
+    return _State(cost, residual, weight, tangents, q)
 
 
 def _stretches(problem: Problem) -> Float[Array, "pair"]:
@@ -131,45 +148,55 @@ def _stretches(problem: Problem) -> Float[Array, "pair"]:
 
 def _tilts(problem: Problem) -> Float[Array, "camera 3"]:
     """The cross product of each camera's down direction with the world's; zero where it is unknown."""
-    known = np.isfinite(problem.axes).all(axis=1)
-    axes = np.where(known[:, None], problem.axes, 0.0)
-    return np.cross(np.einsum("nij,nj->ni", problem.rotations, axes), problem.down)
+    return np.cross(_world_downs(problem), problem.down)
 
 
-def adjust(problem: Problem, noise: float, axis_noise: float = 0.01, steps: int = _STEPS) -> Problem:
+def _world_downs(problem: Problem) -> Float[Array, "camera 3"]:
+    """Each camera's down direction in the world; zero where it is unknown."""
+    known = np.isfinite(problem.downs).all(axis=1)
+    return np.einsum("nij,nj->ni", problem.rotations, np.where(known[:, None], problem.downs, 0.0))
+
+
+def adjust(problem: Problem, noise: float, steps: int = _STEPS) -> Problem:
     """Minimise the robust cost over all cameras and points. The gauge is left to the damping.
 
     Args:
         noise: standard deviation of a bearing, radians.
-        axis_noise: standard deviation of the cameras' down directions, radians.
         steps: largest number of steps.
     """
     damping = 1e-3
-    state = _evaluate(problem, noise, axis_noise)
+    state = _evaluate(problem, noise)
     for _ in range(steps):
-        cost = state[0]
-        reduced = _normal_equations(problem, state, noise, axis_noise)
+        equations = _normal_equations(problem, state, noise)
         while damping < _LARGEST_DAMPING:
-            moved = _step(problem, reduced, damping)
-            trial = None if moved is None else _evaluate(moved, noise, axis_noise)
-            if moved is not None and trial is not None and trial[0] < cost:
+            moved = _step(problem, equations, damping)
+            trial = None if moved is None else _evaluate(moved, noise)
+            if moved is not None and trial is not None and trial.cost < state.cost:
                 break
             damping *= 6
         else:
             return problem
         assert moved is not None and trial is not None
-        problem, state = moved, trial
+        cost, problem, state = state.cost, moved, trial
         damping = max(damping / 4, 1e-9)
-        if cost - state[0] < _CONVERGED * cost:
+        if cost - state.cost < _CONVERGED * cost:
             break
     return problem
 
 
-def _normal_equations(problem: Problem, state: tuple, noise: float, axis_noise: float) -> tuple:
-    """Blocks of the normal equations.
+class _Equations(NamedTuple):
+    """Blocks of the normal equations; `bases` are of the points' tangents, `stretched` is by known distances."""
 
-    Cameras (c 6 6), points (p 3 3), both (n 6 3), gradients, point bases (p 4 3), known distances (c 3 c 3).
-    """
+    cameras: Float[Array, "camera 6 6"]
+    points: Float[Array, "point 3 3"]
+    both: Float[Array, "observation 6 3"]
+    camera_gradient: Float[Array, "camera 6"]
+    point_gradient: Float[Array, "point 3"]
+    bases: Float[Array, "point 4 3"]
+    stretched: Float[Array, "camera 3 camera 3"]
+
+
+def _normal_equations(problem: Problem, state: _State, noise: float) -> _Equations:
     _, residual, weight, tangents, q = state
     rotation = problem.rotations[problem.camera]
     x = problem.points[problem.point]
@@ -192,25 +219,24 @@ def _normal_equations(problem: Problem, state: tuple, noise: float, axis_noise: 
     np.add.at(camera_gradient, problem.camera, (weighted_camera * residual[:, :, None]).sum(axis=1))
     np.add.at(point_gradient, problem.point, (weighted_point * residual[:, :, None]).sum(axis=1))
     both = weighted_camera.transpose(0, 2, 1) @ by_point
-    known = np.isfinite(problem.axes).all(axis=1)
-    world_axes = np.einsum("nij,nj->ni", problem.rotations, np.where(known[:, None], problem.axes, 0.0))
+    downs = _world_downs(problem)
     # (w x a) x d = a (w . d) - w (a . d)
-    jacobian = world_axes[:, :, None] * problem.down - (world_axes @ problem.down)[:, None, None] * np.eye(3)
-    jacobian /= axis_noise
+    jacobian = downs[:, :, None] * problem.down - (downs @ problem.down)[:, None, None] * np.eye(3)
+    jacobian /= _DOWN_NOISE
     cameras[:, :3, :3] += jacobian.transpose(0, 2, 1) @ jacobian
-    camera_gradient[:, :3] += np.einsum("nki,nk->ni", jacobian, _tilts(problem) / axis_noise)
+    camera_gradient[:, :3] += np.einsum("nki,nk->ni", jacobian, _tilts(problem) / _DOWN_NOISE)
     stretched = np.zeros((len(cameras), 3, len(cameras), 3))  # of the centres, by known distances
     for (i, j), distance, value in zip(problem.pairs, problem.distances, _stretches(problem), strict=True):
-        offset = problem.centres[i] - problem.centres[j]
-        slope = offset / max(float(np.linalg.norm(offset)), 1e-12) / distance / _DISTANCE_NOISE
+        baseline = problem.centres[i] - problem.centres[j]
+        slope = baseline / max(float(np.linalg.norm(baseline)), 1e-12) / distance / _DISTANCE_NOISE
         for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             stretched[a, :, b] += sign * np.outer(slope, slope)
         camera_gradient[i, 3:] += slope * value
         camera_gradient[j, 3:] -= slope * value
-    return cameras, points, both, camera_gradient, point_gradient, bases, stretched
+    return _Equations(cameras, points, both, camera_gradient, point_gradient, bases, stretched)
 
 
-def _step(problem: Problem, equations: tuple, damping: float) -> Problem | None:
+def _step(problem: Problem, equations: _Equations, damping: float) -> Problem | None:
     cameras, points, both, camera_gradient, point_gradient, bases, stretched = equations
     count = len(cameras)
     cameras = cameras + damping * _diagonal(cameras)

@@ -44,7 +44,7 @@ from pansplat.poses.learned import (
 )
 from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
 from pansplat.poses.pose_cache import PoseCache, hash_parts
-from pansplat.poses.tour import Group, Pair, build_tour
+from pansplat.poses.tour import Group, IndexPair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.ways import NO_WAYS, Ways
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
@@ -60,23 +60,23 @@ _HEIGHT = 1024  # pixels; larger panoramas are reduced
 _MIN_HEIGHT = 256
 _QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared thoroughly
 _THOROUGH = 6  # pairs of each panorama that are compared with all features, at most
-_FEW = 3  # up to this number of panoramas, all pairs are compared with all features
-_SUFFICIENT = 3  # certain pairs of a panorama; more are not looked for within a group
+_ALL_PAIRS_UP_TO = 3  # panoramas, of which all pairs are compared with all features
+_NEEDED_PAIRS = 3  # certain pairs of a panorama; more are not looked for within a group
 _LEAST_BATCH = 4  # pairs that are compared before others are chosen
-_CHANCE = 25.0  # expected matches by `_quick_overlap`, below which pairs of one group are not compared
+_CHANCE_MATCHES = 25.0  # expected ones by `_quick_overlap`, below which pairs of one group are not compared
 _PAIR_TIME = 1.3  # of a comparison, over that of the features of a panorama
-_MOST = 0.6  # of the panoramas whose common mask is kept when others are added
+_MASK_KEPT_SHARE = 0.6  # of the panoramas whose common mask is kept when others are added
 _BLANK_BRIGHTNESS = 8.0  # mean grey value of an image that shows nothing
 _LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
 _SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
 _ENOUGH_SIFT_MATCHES = 100.0  # expected number of right matches by SIFT, above which the learned matcher is not asked
-_LIKELY = 0.3  # prior probability of the matches that count for it
+_COUNTED_PRIOR = 0.3  # probability of the matches that count for it
 _LEARNED_PRIOR, _LEARNED_NOISE = 0.7, 1.6e-3  # largest prior, as matches of one pair of faces depend; radians
 _LEARNED_SIZE = 7.0  # pixels
 _MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
 _MIRROR_RATIO = 1.5  # of that number to the one with the picture itself; symmetric things match either way
 _MAX_BASELINE = 1e9  # metres
-_LARGEST_NEAR = 0.6  # metres; the depth range is not narrower than that of rooms
+_LEAST_NEAR, _LARGEST_NEAR = 0.1, 0.6  # metres; the depth range is not narrower than that of rooms
 _MIN_FAR = 6.0
 
 
@@ -126,8 +126,8 @@ class PoseEstimate:
     images: tuple[Path, ...]
     groups: tuple[PoseGroup, ...]
     unplaced: dict[Path, str]
-    relations: dict[Pair, RelativePose]
-    rejected: tuple[Pair, ...] = ()
+    relations: dict[IndexPair, RelativePose]
+    rejected: tuple[IndexPair, ...] = ()
     suggestions: Suggestions = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -140,7 +140,7 @@ class PoseEstimate:
 
     @property
     def apart(self) -> dict[Path, str]:
-        """For each file of a smaller group, with which others it has a pose."""
+        """For each file of a smaller group, a sentence that names the others of its group."""
         return {
             image: f"it has a pose with {', '.join(other.name for other in group.poses if other != image)} only"
             for group in self.groups[1:]
@@ -193,7 +193,7 @@ class _View:
         axes: gravity and walls.
         small: grey, for the search of the floor.
         surroundings: all that it shows, with estimated depth.
-        stem, key: hashes of the panorama, and of all that this was computed from.
+        picture_hash, key: hashes of the grey panorama, and of all that this was computed from.
     """
 
     features: Features
@@ -202,7 +202,7 @@ class _View:
     axes: SceneAxes
     small: Float[Array, "height width"]
     surroundings: Surroundings
-    stem: str = ""
+    picture_hash: str = ""
     key: str = ""
 
     @functools.cached_property
@@ -330,7 +330,7 @@ def estimate_poses(
     )
 
 
-def _suggest(views: Sequence[_View], relations: Mapping[Pair, RelativePose], files: Sequence[Path]) -> Suggestions:
+def _suggest(views: Sequence[_View], relations: Mapping[IndexPair, RelativePose], files: Sequence[Path]) -> Suggestions:
     """The suggestions of all pairs that have some."""
     found = {}
     for (i, j), relation in relations.items():
@@ -353,7 +353,7 @@ def _finish_group(
     near, far = depth_range(group.depths * scale) or (NEAR, FAR)
     return PoseGroup(
         dict(zip(files, poses, strict=True)),
-        min(max(near, 0.1), _LARGEST_NEAR),
+        min(max(near, _LEAST_NEAR), _LARGEST_NEAR),
         max(far, _MIN_FAR),
         float(np.degrees(np.median(group.angles))) if len(group.angles) else 0.0,
         source,
@@ -439,14 +439,15 @@ def _describe_views(
 ) -> list[_View]:
     headings = {hints[n].heading for n in kept} - {None}
     is_compass = len(headings) > 1  # one value for all pictures is a program's default
-    stems = {n: hash_parts(pixels[n]) for n in kept}
-    static = _find_scene_mask([paths[n] for n in kept], [stems[n] for n in kept], cache)
+    hashes = {n: hash_parts(pixels[n]) for n in kept}
+    static = _find_scene_mask([paths[n] for n in kept], list(hashes.values()), cache)
     matcher = _load_matcher()
 
     def look_up(n: int) -> _View:
         mask = masks.get(paths[n])
         scene = static if mask is None else read_mask(mask, _HEIGHT).numpy()
         grey = pixels[n]
+        # Read again: a float image has 25 MB, too many to keep those of all panoramas.
         pixels_of_view, opaque = read_panorama(paths[n], len(grey))
         if not opaque.all():
             scene = scene & (cv2.resize(opaque.numpy().astype(np.uint8), scene.shape[::-1]) > 0)
@@ -454,7 +455,7 @@ def _describe_views(
         heading = hints[n].heading if is_compass else None
         stated = f"{hints[n].down} {heading} {matcher is None}"
         key = hash_parts(image, np.packbits(scene), stated)
-        return cache.get(f"view-{stems[n]}", key, lambda: describe(n, key, scene, image, heading))
+        return cache.get(f"view-{hashes[n]}", key, lambda: describe(n, key, scene, image, heading))
 
     def describe(n: int, key: str, scene: Array, image: Array, heading: float | None) -> _View:
         grey = pixels[n]
@@ -467,7 +468,7 @@ def _describe_views(
         shown = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
         depth = estimate_depth(shown, axes.axes[0] if axes.has_down else None)
         surroundings = Surroundings(shown, depth)
-        return _View(detect_features(grey, scene), turned, learned, axes, small, surroundings, stems[n], key)
+        return _View(detect_features(grey, scene), turned, learned, axes, small, surroundings, hashes[n], key)
 
     views = []
     with worker_threads() as pool:
@@ -482,18 +483,18 @@ class _SceneMask:
     """Where panoramas show the scene and not what is fixed to the camera.
 
     Attributes:
-        stems: hashes of the panoramas.
+        hashes: of the grey panoramas.
         bits: the mask, packed.
     """
 
-    stems: tuple[str, ...]
+    hashes: tuple[str, ...]
     bits: UInt8[Array, "byte"]
 
 
 _CACHED = (_View, _SceneMask, Features, LearnedFeatures, SceneAxes, Surroundings, DepthMap, RelativePose, Hypotheses)
 
 
-def _find_scene_mask(paths: Sequence[Path], stems: Sequence[str], cache: PoseCache) -> Bool[Array, "height width"]:
+def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: PoseCache) -> Bool[Array, "height width"]:
     """Where the panoramas show the scene; as found before, if most of them are those of before.
 
     So the features of these stay when others are added.
@@ -501,26 +502,26 @@ def _find_scene_mask(paths: Sequence[Path], stems: Sequence[str], cache: PoseCac
 
     def detect() -> _SceneMask:
         mask = scene_mask_of_files(tuple(paths), _HEIGHT).numpy()
-        return _SceneMask(tuple(stems), np.packbits(mask))
+        return _SceneMask(tuple(hashes), np.packbits(mask))
 
-    earlier = [mask for mask in cache.list_values("scene-") if set(mask.stems) <= set(stems)]
-    best = max(earlier, key=lambda mask: len(mask.stems), default=None)
-    if best is None or len(best.stems) < _MOST * len(stems):
-        best = cache.get(f"scene-{hash_parts(*stems)}", "", detect)
+    earlier = [mask for mask in cache.list_values("scene-") if set(mask.hashes) <= set(hashes)]
+    best = max(earlier, key=lambda mask: len(mask.hashes), default=None)
+    if best is None or len(best.hashes) < _MASK_KEPT_SHARE * len(hashes):
+        best = cache.get(f"scene-{hash_parts(*hashes)}", "", detect)
     return np.unpackbits(best.bits, count=2 * _HEIGHT**2).reshape(_HEIGHT, 2 * _HEIGHT).astype(bool)
 
 
 def _relate_views(
-    views: Sequence[_View], ways: Mapping[Pair, Ways], seed: int, cache: PoseCache, report: Progress
-) -> dict[Pair, RelativePose]:
+    views: Sequence[_View], ways: Mapping[IndexPair, Ways], seed: int, cache: PoseCache, report: Progress
+) -> dict[IndexPair, RelativePose]:
     """Relative poses of the pairs that have most in common, and of those that links connect.
 
     Pairs are compared in the order of what they have in common. Those within a group that certain pairs connect are
     left out if both panoramas have enough of them, or if both have no more in common than by chance.
     """
     pairs = list(itertools.combinations(range(len(views)), 2))
-    overlap: dict[Pair, float] = {}
-    if len(views) > _FEW:
+    overlap: dict[IndexPair, float] = {}
+    if len(views) > _ALL_PAIRS_UP_TO:
         report("comparing all pairs", 0.0)
         with worker_threads() as pool:
             quick = pool.map(lambda pair: _quick_overlap(views[pair[0]].features, views[pair[1]].features), pairs)
@@ -533,7 +534,7 @@ def _relate_views(
 
     matcher = None if views[0].learned is None else load_matcher()
 
-    def relate(pair: Pair) -> RelativePose:
+    def relate(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
         matches = _match(first, second, matcher)
         prior = RotationPrior(first.axes, second.axes)
@@ -548,20 +549,20 @@ def _relate_views(
         every = matches.joined(further.shifted(len(first.matched), len(second.matched)))
         return polish_relative_pose(relation, first.joined, second.joined, every, prior)
 
-    def look_up(pair: Pair) -> RelativePose:
+    def look_up(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
         key = hash_parts(first.key, second.key, f"{ways[pair]} {seed}")
-        return cache.get(f"pair-{hash_parts(first.stem, second.stem)}", key, lambda: relate(pair))
+        return cache.get(f"pair-{hash_parts(first.picture_hash, second.picture_hash)}", key, lambda: relate(pair))
 
     groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
 
-    def is_needed(pair: Pair) -> bool:
+    def is_needed(pair: IndexPair) -> bool:
         i, j = pair
         if groups[i] != groups[j] or ways[pair] != NO_WAYS:
             return True
-        return min(counts[i], counts[j]) < _SUFFICIENT and overlap.get(pair, math.inf) >= _CHANCE
+        return min(counts[i], counts[j]) < _NEEDED_PAIRS and overlap.get(pair, math.inf) >= _CHANCE_MATCHES
 
-    relations: dict[Pair, RelativePose] = {}
+    relations: dict[IndexPair, RelativePose] = {}
     with worker_threads() as pool:
         size = max(len(views) // 2, _LEAST_BATCH)  # the same one for any number of threads
         for start in range(0, len(pairs), size):
@@ -590,7 +591,7 @@ def _match(first: _View, second: _View, matcher: Matcher | None) -> Matches:
     matches = match_features(first.features, second.features)
     if matcher is None or first.learned is None or second.learned is None:
         return matches
-    if matches.prior[matches.prior > _LIKELY].sum() > _ENOUGH_SIFT_MATCHES:
+    if matches.prior[matches.prior > _COUNTED_PRIOR].sum() > _ENOUGH_SIFT_MATCHES:
         return matches
     found = match_learned(matcher, first.learned, second.learned)
     learned = Matches(found.indices, np.minimum(found.probability, _LEARNED_PRIOR))

@@ -34,7 +34,7 @@ MODEL = "matcher"
 _FACES = 4  # the horizontal ones; floor and ceiling have few keypoints, and no upright direction
 _KEYPOINTS = 640  # of a face
 _STRIDE = 32  # pixels; the sides of an image are multiples of it
-_FACE_PAIRS = 6  # that LightGlue matches
+_FACE_PAIRS = 6  # that LightGlue matches: those with most distinctive descriptors in common
 _DISTINCT_RATIO = 0.85  # largest ratio of distances to the nearest and the second nearest descriptor
 _MIN_SCORE, _MAX_SCORE = 0.1, 0.9995  # of a match that is used; in the calibration
 _CONFIDENT = 0.3  # score of matches that count for their pair of faces
@@ -175,16 +175,10 @@ def detect_learned(
     )
 
 
-def match_learned(
-    matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures, *, face_pairs: int = _FACE_PAIRS
-) -> LearnedMatches:
-    """Matches of two panoramas.
-
-    Args:
-        face_pairs: number of pairs of faces that are matched, those with most distinctive descriptors in common.
-    """
+def match_learned(matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures) -> LearnedMatches:
+    """Matches of two panoramas."""
     common = count_common(first, second)
-    order = np.argsort(-common, axis=None, kind="stable")[:face_pairs]
+    order = np.argsort(-common, axis=None, kind="stable")[:_FACE_PAIRS]
     found = []
     for i, j in np.stack(np.unravel_index(order, common.shape), axis=1).tolist():
         with torch.inference_mode():

@@ -38,7 +38,7 @@ SNAP_RADIUS, SNAP_ANGLE = 0.35, math.radians(12)  # metres and radians, to a sug
 WALL_ANGLE = math.radians(6)  # to parallel walls
 POOR_FIT = 0.25  # quality below which a place is doubtful
 _LEAST_OVERLAP = 0.01  # of a comparison that counts
-_LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind
+_LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind (docs/poses.md)
 _LINK_REACH = 1.0, 4.0  # camera heights, of a place by a link
 _MOST_SUGGESTIONS = 4  # of a pair
 _NEIGHBOURS = 4  # nearest panoramas that a place is compared with
@@ -99,7 +99,7 @@ def list_suggestions(
     found, poses = [], relation.hypotheses
     for n in np.argsort(-poses.log_odds, kind="stable")[:_MOST_SUGGESTIONS]:
         if poses.log_odds[n] > -math.inf:
-            centre = upright[0].T @ (-poses.rotations[n].T @ poses.ways[n])
+            centre = upright[0].T @ (-poses.rotations[n].T @ poses.translations[n])
             forward = upright[0].T @ poses.rotations[n].T @ upright[1][:, 2]
             place = Place(float(centre[0]), float(centre[2]), math.atan2(forward[0], forward[2]))
             found.append(Suggestion(place, float(poses.log_odds[n])))
@@ -189,8 +189,8 @@ def read_piece(image: Path) -> Piece:
 
 
 @dataclass(frozen=True, eq=False)
-class Floor:
-    """The floor plan of a world.
+class PlanFrame:
+    """The axes and the unit of a floor plan in a world.
 
     Attributes:
         level: right, down and forward of the plan in the world, as columns.
@@ -201,13 +201,13 @@ class Floor:
     unit: float
 
     @staticmethod
-    def of_world(poses: Float[Array, "view 4 4"], unit: float) -> Floor:
+    def of_world(poses: Float[Array, "view 4 4"], unit: float) -> PlanFrame:
         """The plan of posed cameras; it looks along the first one. y is down if the cameras agree with that."""
         matrices = torch.from_numpy(np.asarray(poses, np.float64))
         up = up_direction(matrices)
         if float(-up[1]) > math.cos(_UPRIGHT):
             up = torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64)
-        return Floor(level_pose(matrices[0], up)[:3, :3].numpy(), unit)
+        return PlanFrame(level_pose(matrices[0], up)[:3, :3].numpy(), unit)
 
     def find_place(self, pose: Float[Array, "4 4"], upright: Float[Array, "3 3"]) -> Place:
         """The place of a camera."""
@@ -230,12 +230,12 @@ class Snapped(NamedTuple):
 
     Attributes:
         suggestion: number of the suggestion that it is at; None for none.
-        has_walls: whether only its walls snapped.
+        is_aligned: whether only its walls were turned parallel to the plan's.
     """
 
     place: Place
     suggestion: int | None = None
-    has_walls: bool = False
+    is_aligned: bool = False
 
 
 def snap(

@@ -23,7 +23,7 @@ from pansplat.poses.features import Features
 from pansplat.poses.solvers import rotation_angle
 from pansplat.poses.two_view import RelativePose
 
-Pair = tuple[int, int]
+IndexPair = tuple[int, int]
 
 _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
 _LARGEST_GAP = 0.15  # of the way around it, relative to its length
@@ -67,14 +67,14 @@ class Tour:
     """
 
     groups: tuple[Group, ...]
-    confirmed: dict[Pair, RelativePose]
-    rejected: tuple[Pair, ...]
+    confirmed: dict[IndexPair, RelativePose]
+    rejected: tuple[IndexPair, ...]
     unplaced: dict[int, tuple[str, int | None]]
 
 
 def build_tour(
     features: Sequence[Features],
-    relations: Mapping[Pair, RelativePose],
+    relations: Mapping[IndexPair, RelativePose],
     downs: Float[Array, "view 3"],
     noise: float,
 ) -> Tour:
@@ -102,7 +102,7 @@ def build_tour(
 
 
 def _place_groups(
-    features: Sequence[Features], relations: Mapping[Pair, RelativePose], downs: Array, noise: float
+    features: Sequence[Features], relations: Mapping[IndexPair, RelativePose], downs: Array, noise: float
 ) -> list[Group]:
     """The groups of panoramas that relations connect."""
     groups = []
@@ -116,7 +116,7 @@ _Part = dict[int, Float[Array, "4 4"]]
 """Poses of panoramas, cam2world, in a world of their own; its unit is the cameras' height."""
 
 
-def _join_parts(groups: Sequence[Group], relations: Mapping[Pair, RelativePose], count: int) -> list[_Part]:
+def _join_parts(groups: Sequence[Group], relations: Mapping[IndexPair, RelativePose], count: int) -> list[_Part]:
     """The groups and single panoramas, joined where that is probable, the most probable junction first."""
     parts: list[_Part] = [dict(zip(group.placed, group.poses, strict=True)) for group in groups]
     placed = {view for part in parts for view in part}
@@ -135,12 +135,12 @@ def _join_parts(groups: Sequence[Group], relations: Mapping[Pair, RelativePose],
     return [part for part in parts if part]
 
 
-def _pairs_of(count: int) -> list[Pair]:
+def _pairs_of(count: int) -> list[IndexPair]:
     return list(itertools.combinations(range(count), 2))
 
 
 def _find_junction(
-    first: _Part, second: _Part, relations: Mapping[Pair, RelativePose]
+    first: _Part, second: _Part, relations: Mapping[IndexPair, RelativePose]
 ) -> tuple[float, Float[Array, "4 4"]]:
     """The most probable motion from the world of the second part to that of the first, and the logarithm of its odds.
 
@@ -174,10 +174,11 @@ def _find_junction(
 
 def _hypotheses(relation: RelativePose) -> tuple[Float[Array, "n 4 4"], Float[Array, "n"]]:
     """Motions from the first camera's frame to the second one's, and the logarithms of their odds."""
-    likely = relation.hypotheses.log_odds > _LEAST_ODDS
+    known = relation.hypotheses
+    likely = known.log_odds > _LEAST_ODDS
     motions = np.tile(np.eye(4), (int(likely.sum()), 1, 1))
-    motions[:, :3, :3], motions[:, :3, 3] = relation.hypotheses.rotations[likely], relation.hypotheses.ways[likely]
-    return motions, relation.hypotheses.log_odds[likely]
+    motions[:, :3, :3], motions[:, :3, 3] = known.rotations[likely], known.translations[likely]
+    return motions, known.log_odds[likely]
 
 
 def _agree(
@@ -191,7 +192,7 @@ def _agree(
     return (cosine > math.cos(turn)) & (distance < np.maximum(gap[0], gap[1] * length))
 
 
-def _confirm(parts: Sequence[_Part], relations: Mapping[Pair, RelativePose]) -> dict[Pair, RelativePose]:
+def _confirm(parts: Sequence[_Part], relations: Mapping[IndexPair, RelativePose]) -> dict[IndexPair, RelativePose]:
     """The doubtful relations by matches that agree with the poses of their part."""
     confirmed = {}
     for part in parts:
@@ -218,7 +219,9 @@ def _assemble(part: _Part, groups: Sequence[Group]) -> Group:
     return Group(placed, np.stack([poses[view] for view in placed]), np.concatenate(depths), np.concatenate(angles))
 
 
-def _closes(relations: Mapping[Pair, RelativePose], relation: RelativePose, pair: Pair, k: int) -> bool | None:
+def _closes(
+    relations: Mapping[IndexPair, RelativePose], relation: RelativePose, pair: IndexPair, k: int
+) -> bool | None:
     """Whether a relation agrees with the way by a third panorama; None if the way is not known."""
     first, second = _motion_between(relations, pair[0], k), _motion_between(relations, k, pair[1])
     if first is None or second is None:
@@ -230,7 +233,7 @@ def _closes(relations: Mapping[Pair, RelativePose], relation: RelativePose, pair
     return turn < _LARGEST_LOOP and gap < _LARGEST_GAP * length
 
 
-def _connect(count: int, relations: Mapping[Pair, RelativePose]) -> list[set[int]]:
+def _connect(count: int, relations: Mapping[IndexPair, RelativePose]) -> list[set[int]]:
     """The sets of two or more panoramas that relations connect."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -243,7 +246,7 @@ def _connect(count: int, relations: Mapping[Pair, RelativePose]) -> list[set[int
 
 def _place_group(
     features: Sequence[Features],
-    relations: Mapping[Pair, RelativePose],
+    relations: Mapping[IndexPair, RelativePose],
     downs: Float[Array, "view 3"],
     noise: float,
 ) -> Group:
@@ -260,7 +263,7 @@ def _place_group(
     return Group(tuple(int(placed[i]) for i in order), poses[order], point_depths(problem), residual_angles(problem))
 
 
-def _describe_failure(view: int, relations: Mapping[Pair, RelativePose]) -> tuple[str, int | None]:
+def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) -> tuple[str, int | None]:
     """Why a panorama has no pose: the problem of its best pair."""
     own = [(pair, relation) for pair, relation in relations.items() if view in pair]
     if not own:
@@ -269,13 +272,13 @@ def _describe_failure(view: int, relations: Mapping[Pair, RelativePose]) -> tupl
     return best.problem or "its pose contradicts those of others", pair[0] if pair[1] == view else pair[1]
 
 
-def _find_contradictions(relations: Mapping[Pair, RelativePose]) -> tuple[Pair, ...]:
+def _find_contradictions(relations: Mapping[IndexPair, RelativePose]) -> tuple[IndexPair, ...]:
     """Pairs that contradict two better pairs of a triangle more often than they agree, by rotation or by the way.
 
     A pair is compared with its triangles in the order of the odds and scores, so that a wrong one does not discredit
     others.
     """
-    kept: dict[Pair, RelativePose] = {}
+    kept: dict[IndexPair, RelativePose] = {}
     rejected = []
     for pair in sorted(relations, key=lambda p: (-relations[p].log_odds, -relations[p].score)):
         others = {view for other in kept for view in other} - set(pair)
@@ -289,7 +292,7 @@ def _find_contradictions(relations: Mapping[Pair, RelativePose]) -> tuple[Pair, 
 
 
 def _motion_between(
-    kept: Mapping[Pair, RelativePose], i: int, j: int
+    kept: Mapping[IndexPair, RelativePose], i: int, j: int
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]] | None:
     """Rotation and translation, camera heights, from one camera to another one."""
     if (i, j) in kept:
@@ -309,7 +312,7 @@ class _Observations:
     bearing: Float[Array, "observation 3"]
 
 
-def _make_tracks(features: Sequence[Features], relations: Mapping[Pair, RelativePose]) -> _Observations:
+def _make_tracks(features: Sequence[Features], relations: Mapping[IndexPair, RelativePose]) -> _Observations:
     """Features that matches connect; tracks with two features of one panorama are dropped."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -342,7 +345,7 @@ class _GrowingGroup:
     def __init__(
         self,
         observations: _Observations,
-        relations: Mapping[Pair, RelativePose],
+        relations: Mapping[IndexPair, RelativePose],
         downs: Float[Array, "view 3"],
         noise: float,
     ) -> None:
@@ -410,8 +413,8 @@ class _GrowingGroup:
         point, camera, bearing = point.reshape(-1), position[observations.view[kept]], observations.bearing[kept]
         rotation, centre = np.stack(rotations), np.stack(centres)
         points = triangulate(rotation, centre, camera, point, bearing, len(tracks))
-        axes = self._downs[self.placed]
-        world = np.einsum("nij,nj->ni", rotation, axes)
+        downs = self._downs[self.placed]
+        world = np.einsum("nij,nj->ni", rotation, downs)
         known = np.isfinite(world).all(axis=1)
         down = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
-        self.problem = Problem(rotation, centre, points, camera, point, bearing, axes, down / np.linalg.norm(down))
+        self.problem = Problem(rotation, centre, points, camera, point, bearing, downs, down / np.linalg.norm(down))

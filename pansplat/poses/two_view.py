@@ -42,7 +42,7 @@ from pansplat.poses.solvers import (
 )
 from pansplat.poses.ways import NO_WAYS, Ways
 
-_WIDE_SHARE, _WIDE = 0.3, 3.0  # of right matches with larger errors; their standard deviation in that of the others
+_WIDE_SHARE, _WIDE = 0.3, 3.0  # share of right matches of larger error, and how many times larger
 _MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
 _DISTORTION, _DISTORTION_LENGTH = 1e-3, 0.15  # of stitched panoramas: deviation and correlation length, radians
 _TAIL = 2.0  # degrees of freedom of the distribution of a match's own error
@@ -50,10 +50,11 @@ _MAX_POLISHED, _MIN_POLISHED, _MIN_PROBABILITY = 1000, 8, 0.2  # matches of the 
 _POLISH_SIZE = 7.0  # pixels; of a feature with 1.4 times the noise of a small one
 _POLISH_WINDOW = 0.035  # largest residual, radians; what lies beyond the noise gives the density of wrong matches
 _POLISH_FACTORS, _POLISH_STEPS = (4, 2, 1), 4  # of the noise; steps with each
+_SHARE_STEPS = 4  # of expectation and maximisation, for the shares of right matches
 _POLISH_PRIORS = np.array((0.667, 0.45, 0.15, 0.06, 0.02, 0.0125))  # limits of the groups of matches
 _POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # of right matches in the window, a priori
 _POLISH_WEIGHT = 4.0  # of these shares, in matches
-_CALIBRATION = 1.5, 80.0  # factor of formal standard deviations: least one; that times the number of places
+_CALIBRATION = 1.5, 80.0  # formal standard deviations are multiplied by the larger of 1.5 and 80 / places
 _MIN_MATCHES, _MAX_MATCHES = 8, 2500
 _TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
 _SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
@@ -67,11 +68,15 @@ _FACTORS, _PARALLEL_FACTORS = (2, 1), (4, 2, 1)  # of the noise, in the optimisa
 _DEPTH_FACTORS = (24, 6, 2, 1)  # of the noise, in their optimisation
 _EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
+_SAME_ESSENTIAL = 0.998  # cosine of two essential matrices as vectors, above which they are equal: 3.6 degrees
+_LOOKED_THROUGH = 2000  # best essential matrices among which different ones are looked for
+# Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
+_NEEDED_PLACES, _NEEDED_SCORE, _NEEDED_MARGIN = 32, 80, 20
 
 
 @dataclass(frozen=True)
 class _Support:
-    """How many places, which score and which margin of it support a pose; or the least that passes the check."""
+    """How much the matches support a pose; see `RelativePose`."""
 
     places: float
     score: float
@@ -80,11 +85,9 @@ class _Support:
     @property
     def suffices(self) -> bool:
         """Whether the matches alone support the pose."""
-        return self.places >= _NEEDED.places and self.score >= _NEEDED.score and self.margin >= _NEEDED.margin
+        return self.places >= _NEEDED_PLACES and self.score >= _NEEDED_SCORE and self.margin >= _NEEDED_MARGIN
 
 
-# Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
-_NEEDED = _Support(32, 80, 20)
 _COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds of a hypothesis against none, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the way), whether it is
@@ -176,8 +179,8 @@ class _Evidence:
         likelihood = np.where(angle < _MAX_ANGLE * _WIDE * self.noise, _density(angle, self.noise), 0.0)
         points = two_view_depths(self.a, self.b, rotation, translation)
         parallax = angle_between(self.a @ rotation.T, self.b)
-        behind = (points < 0).any(axis=1) & (parallax > 3 * self.noise)
-        ratio, is_proposed = np.where(behind, 0.0, 2 * likelihood), distance is not None
+        ratio = np.where(_are_behind(points, parallax, self.noise), 0.0, 2 * likelihood)
+        is_proposed = distance is not None
         if self.depths is not None:
             weight = np.where((points > 0).all(axis=1), self.prior * ratio / (1 - self.prior + self.prior * ratio), 0.0)
             distance = self.depths.find_distance(points, weight) if distance is None else distance
@@ -205,12 +208,9 @@ class _Evidence:
         return best
 
 
-def _are_behind(
-    a: Bearings, b: Bearings, rotation: Rotation, translation: Vector, noise: float | Array
-) -> Bool[Array, "match"]:
-    """Whether the rays of each match meet behind a camera; parallel rays do not."""
-    depths = two_view_depths(a, b, rotation, translation)
-    return (depths < 0).any(axis=1) & (angle_between(a @ rotation.T, b) > 3 * noise)
+def _are_behind(points: Float[Array, "match 2"], parallax: Float[Array, "match"], noise: Array) -> Bool[Array, "match"]:
+    """Whether the rays of each match meet behind a camera, by `two_view_depths`; parallel rays do not."""
+    return (points < 0).any(axis=1) & (parallax > 3 * noise)
 
 
 def _gauss_newton(
@@ -348,14 +348,14 @@ def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> tuple[l
     free, parallel = _sample_essentials(evidence, rng)
     found = [_optimise(essential, evidence, _FACTORS) for essential in _choose_best(free, evidence, _KEPT)]
     agreed, alike = _propose_by_depth(evidence, rng)
-    ways = [(rotation, t / max(float(np.linalg.norm(t)), 1e-9)) for rotation, t in (*agreed, *alike)]
-    found += [_optimise(skew(way) @ rotation, evidence, _DEPTH_FACTORS) for rotation, way in ways]
+    directions = [(rotation, t / max(float(np.linalg.norm(t)), 1e-9)) for rotation, t in (*agreed, *alike)]
+    found += [_optimise(skew(unit) @ rotation, evidence, _DEPTH_FACTORS) for rotation, unit in directions]
     if len(parallel):  # inexact: compared among themselves, with a larger tolerance
         chosen = _choose_best(parallel, evidence.with_noise(2), _KEPT_PARALLEL)
         found += [_optimise(essential, evidence, _PARALLEL_FACTORS) for essential in chosen]
     proposed = [
-        evidence.evaluate(rotation, way, float(np.linalg.norm(t)))
-        for (rotation, t), (_, way) in zip(alike, ways[len(agreed) :], strict=True)
+        evidence.evaluate(rotation, unit, float(np.linalg.norm(t)))
+        for (rotation, t), (_, unit) in zip(alike, directions[len(agreed) :], strict=True)
     ]
     return _merge_same(found, evidence.axes), proposed
 
@@ -486,26 +486,26 @@ def _pick_distinct(essential: Float[Array, "n 3 3"], scores: Float[Array, "n"], 
     """Indices of the best hypotheses whose essential matrices differ."""
     picked: list[int] = []
     norm = np.linalg.norm(essential, axis=(1, 2))
-    for index in np.argsort(-scores)[:2000]:
+    for index in np.argsort(-scores)[:_LOOKED_THROUGH]:
         if len(picked) == kept:
             break
         similarity = [abs((essential[index] * essential[p]).sum()) / (norm[index] * norm[p]) for p in picked]
-        if not similarity or max(similarity) < 0.998:
+        if not similarity or max(similarity) < _SAME_ESSENTIAL:
             picked.append(int(index))
     return picked
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Relative poses of two panoramas, of which at most one is right.
+    """Relative poses of two panoramas, of which at most one is right: a row for each compared `Hypothesis`.
 
     Attributes:
-        rotations, ways: x2 = R x1 + t, camera heights.
+        rotations, translations: x2 = R x1 + t, camera heights.
         log_odds: logarithm of the odds of each against none.
     """
 
     rotations: Float[Array, "n 3 3"] = field(default_factory=lambda: np.empty((0, 3, 3)))
-    ways: Float[Array, "n 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    translations: Float[Array, "n 3"] = field(default_factory=lambda: np.empty((0, 3)))
     log_odds: Float[Array, "n"] = field(default_factory=lambda: np.empty(0))
 
 
@@ -594,7 +594,8 @@ def estimate_relative_pose(
     compared = [*found[:_COMPARED], *proposed]
     odds = np.array([_log_odds(h, evidence) for h in compared])
     best, log_odds = _choose_compared(compared, odds)
-    if _find_support(found[0], found, evidence).suffices:  # depths of a camera on stairs are wrong
+    # Matches that suffice decide alone: the odds also use estimated depths, which are wrong for a camera on stairs.
+    if _find_support(found[0], found, evidence).suffices:
         best = found[0]
     hypotheses = Hypotheses(
         np.stack([h.rotation for h in compared]), np.stack([h.distance * h.translation for h in compared]), odds
@@ -764,11 +765,13 @@ class _LocalWeights:
         """The probabilities under a pose, with `factor` times the noise."""
         noise = factor * self.noise
         angle = np.abs(epipolar_angles(self.a, self.b, rotation, translation))
-        inside = ~_are_behind(self.a, self.b, rotation, translation, noise) & (angle < _POLISH_WINDOW)
+        points = two_view_depths(self.a, self.b, rotation, translation)
+        behind = _are_behind(points, angle_between(self.a @ rotation.T, self.b), noise)
+        inside = ~behind & (angle < _POLISH_WINDOW)
         ratio = _density(angle, noise) * _POLISH_WINDOW
         count = np.bincount(self.group[inside], minlength=len(self.shares))
         probability = np.zeros(len(angle))
-        for _ in range(_POLISH_STEPS):
+        for _ in range(_SHARE_STEPS):
             share = self.shares[self.group]
             probability = np.where(inside, share * ratio / (share * ratio + 1 - share), 0.0)
             right = np.bincount(self.group[inside], probability[inside], len(self.shares))

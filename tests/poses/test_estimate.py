@@ -232,7 +232,7 @@ def test_a_linked_pair_is_compared_among_many(monkeypatch: pytest.MonkeyPatch) -
 
 def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatch: pytest.MonkeyPatch) -> None:
     """Panoramas 0 to 7 are one home and 8 to 10 another one, in which no pair is certain."""
-    views = [replace(_view(_no_features(1), np.zeros((4, 8), np.float32)), stem=str(n)) for n in range(11)]
+    views = [replace(_view(_no_features(1), np.zeros((4, 8), np.float32)), picture_hash=str(n)) for n in range(11)]
     numbers = {id(view.features): n for n, view in enumerate(views)}
 
     def quick(first: Features, second: Features) -> float:
@@ -240,7 +240,7 @@ def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatc
         return 10.0 + (i > 7) if j > 7 or (i, j) == (0, 7) else 100.0 - i - j
 
     def relate(first: _View, second: _View, *_: object) -> RelativePose:
-        return _relation(math.inf) if int(second.stem) < 8 else _relation(0.0, "nothing in common")
+        return _relation(math.inf) if int(second.picture_hash) < 8 else _relation(0.0, "nothing in common")
 
     monkeypatch.setattr("pansplat.poses.estimate._quick_overlap", quick)
     monkeypatch.setattr("pansplat.poses.estimate._estimate_pair", relate)

@@ -13,9 +13,9 @@ from pansplat.poses.placing import (
     SNAP_ANGLE,
     SNAP_RADIUS,
     WALL_ANGLE,
-    Floor,
     Piece,
     Place,
+    PlanFrame,
     find_wall_yaw,
     list_suggestions,
     measure_fit,
@@ -49,7 +49,7 @@ def test_a_place_and_its_inverse_cancel():
 def test_a_pose_of_a_place_has_this_place_whatever_the_tilt(tilt):
     world = np.eye(4)
     world[:3, :3] = rotation_exp(np.array((0.4, 1.0, 0))) @ _upright(0.5)
-    floor = Floor.of_world(world[None], 1.5)
+    floor = PlanFrame.of_world(world[None], 1.5)
     upright = rotation_exp(np.array((tilt, 0, -tilt)))
     pose = floor.make_pose(Place(2.0, 1.0, 0.8), upright, -0.3)
     _assert_same(floor.find_place(pose, upright), Place(2.0, 1.0, 0.8))
@@ -60,14 +60,14 @@ def test_a_pose_of_a_place_has_this_place_whatever_the_tilt(tilt):
 def test_y_is_down_if_the_cameras_are_nearly_upright():
     pose = np.eye(4)
     pose[:3, :3] = rotation_exp(np.array((0.05, 0, 0.02)))
-    assert np.allclose(Floor.of_world(pose[None], 1.0).level[:, 1], (0, 1, 0))
+    assert np.allclose(PlanFrame.of_world(pose[None], 1.0).level[:, 1], (0, 1, 0))
 
 
 def test_suggestions_are_where_the_second_camera_of_a_candidate_is():
     """The second camera is 2 camera heights to the right of the first one and 1 ahead, and is turned by 0.6 radians."""
     uprights = rotation_exp(np.array((0.1, 0, 0.05))), rotation_exp(np.array((-0.05, 0, 0.1)))
-    first = Floor(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3), uprights[0], 0.0)
-    second = Floor(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3).add(Place(2, 1, 0.6)), uprights[1], 0.0)
+    first = PlanFrame(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3), uprights[0], 0.0)
+    second = PlanFrame(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3).add(Place(2, 1, 0.6)), uprights[1], 0.0)
     motion = np.linalg.inv(second) @ first
     rotations, ways = np.stack((motion[:3, :3], np.eye(3))), np.stack((motion[:3, 3], np.zeros(3)))
     hypotheses = Hypotheses(rotations, ways, np.array((-1.0, -4.0)))
@@ -92,7 +92,7 @@ def test_walls_snap_to_multiples_of_a_quarter_turn(quarters):
     exact = target - own + quarters * QUARTER
     for error in (-0.9 * WALL_ANGLE, 0.9 * WALL_ANGLE):
         snapped = snap(Place(1, 2, exact + error), [], own, target)
-        assert snapped.has_walls and snapped.place.turn_between(Place(0, 0, exact)) < 1e-9
+        assert snapped.is_aligned and snapped.place.turn_between(Place(0, 0, exact)) < 1e-9
         assert snapped.place[:2] == (1, 2)
     place = Place(1, 2, exact + 1.1 * WALL_ANGLE)
     assert snap(place, [], own, target) == snap(place, []) == (place, None, False)
@@ -124,7 +124,7 @@ def test_the_fit_is_best_at_the_right_pose(look_around):
     poses = [np.eye(4) for _ in views]
     for pose, yaw, centre in zip(poses, yaws, centres, strict=True):
         pose[:3, :3], pose[:3, 3] = _upright(yaw), centre
-    floor = Floor.of_world(np.stack(poses[:2]), 1.35)
+    floor = PlanFrame.of_world(np.stack(poses[:2]), 1.35)
     others = list(zip(views[:2], poses[:2], strict=True))
     place = floor.find_place(poses[2], views[2].upright)
 

@@ -8,7 +8,7 @@ import pytest
 
 from pansplat.poses.features import Features
 from pansplat.poses.solvers import rotation_angle, rotation_exp
-from pansplat.poses.tour import Group, Pair, Tour, build_tour
+from pansplat.poses.tour import Group, IndexPair, Tour, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose
 
 CENTRES = np.array(((0.0, 0, 0), (1.0, 0, 0.2), (1.4, 0, 1.5), (-0.8, 0, 1.1), (0.2, 0, 2.0)))  # camera heights
@@ -16,7 +16,7 @@ ROTATIONS = rotation_exp(np.array(((0, 0, 0), (0, 0.5, 0), (0, -0.8, 0), (0, 2.0
 COUNT = 60  # points of a pair
 
 
-def relate(pair: Pair, indices: np.ndarray) -> RelativePose:
+def relate(pair: IndexPair, indices: np.ndarray) -> RelativePose:
     """The right relation of two cameras."""
     i, j = pair
     way = ROTATIONS[j].T @ (CENTRES[i] - CENTRES[j])
@@ -34,7 +34,7 @@ def relate(pair: Pair, indices: np.ndarray) -> RelativePose:
     )
 
 
-def build(*pairs: Pair, shared: bool = False, views: int = 3, misleading: int = 0, **changes) -> Tour:
+def build(*pairs: IndexPair, shared: bool = False, views: int = 3, misleading: int = 0, **changes) -> Tour:
     """The tour by the given pairs, each with own points unless all cameras share them.
 
     Args:
@@ -157,7 +157,7 @@ def test_a_doubtful_pair_alone_places_nothing() -> None:
     assert not tour.confirmed and tour.groups[0].placed == (0, 1) and set(tour.unplaced) == {2}
 
 
-def suggest(pair: Pair, *log_odds: float, turn: float = 0.0, problem: str | None = "too little in common"):
+def suggest(pair: IndexPair, *log_odds: float, turn: float = 0.0, problem: str | None = "too little in common"):
     """A relation without matches; the first of its hypotheses is the right pose, turned by an angle, radians."""
     right = relate(pair, np.empty((0, 2), np.int64))
     rotation = rotation_exp(np.array((0, turn, 0))) @ right.rotation
@@ -168,7 +168,7 @@ def suggest(pair: Pair, *log_odds: float, turn: float = 0.0, problem: str | None
     return replace(right, rotation=rotation, log_odds=max(log_odds), problem=problem, hypotheses=hypotheses)
 
 
-def join(*suggested: tuple[Pair, RelativePose]) -> Tour:
+def join(*suggested: tuple[IndexPair, RelativePose]) -> Tour:
     """The tour of two cameras with matches, and of others without."""
     rng = np.random.default_rng(0)
     world = rng.uniform(-4, 4, (COUNT, 3))

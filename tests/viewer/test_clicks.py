@@ -1147,7 +1147,7 @@ def test_alt_disables_snapping_and_the_knob_turns_the_piece(placing_user):
     knob = window._find_knob(placing, 1.0)
     x, y = window.view.to_pixels(np.array(placing.shown.place[:2])) + window.corner
     user.drag(knob, (x + 60, y + 2))  # to the right of the camera
-    assert placing.shown.has_walls and placing.shown.place.yaw == pytest.approx(np.pi / 2)
+    assert placing.shown.is_aligned and placing.shown.place.yaw == pytest.approx(np.pi / 2)
 
 
 # --- tours ---

@@ -22,9 +22,9 @@ from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import (
     POOR_FIT,
     Fit,
-    Floor,
     Piece,
     Place,
+    PlanFrame,
     Snapped,
     Suggestion,
     find_wall_yaw,
@@ -114,7 +114,7 @@ class Placing:
         self.node: int | None = None
         self.with_group, self.targets = False, ()
         self._world: int | None = None
-        self.floor = Floor(np.eye(3), 1.0)
+        self.floor = PlanFrame(np.eye(3), 1.0)
         self.places: dict[int, Place] = {}
         self.ghosts: list[Ghost] = []
         self._raw = Place(0, 0, 0)
@@ -271,7 +271,7 @@ class Placing:
             self.error, self.node = str(error), None
             return
         poses = np.stack([self._get_pose(target) for target in self.targets])
-        self.floor = Floor.of_world(poses, unit or first.camera_height)
+        self.floor = PlanFrame.of_world(poses, unit or first.camera_height)
         self.places, self.ghosts, self.fit, self._measured, self._is_moved = {}, [], None, (), False
         self._step, self._doubted = 0.0, None
         self._start_reading()
@@ -539,8 +539,8 @@ class Placing:
             return {self.node: pose}
         old, is_inside = self._get_pose(self.node), self._is_in_world(self.node)
         others = np.stack([self._get_pose(other) for other in self.group_of(self.node)])
-        level = self.floor.level if is_inside else Floor.of_world(others, self.floor.unit).level
-        before = Floor(level, self.floor.unit).find_place(old, upright)
+        level = self.floor.level if is_inside else PlanFrame.of_world(others, self.floor.unit).level
+        before = PlanFrame(level, self.floor.unit).find_place(old, upright)
         down = float(level[:, 1] @ old[:3, 3]) if is_inside else self._find_down(place)
         motion, turn = np.eye(4), place.yaw - before.yaw
         cosine, sine = math.cos(turn), math.sin(turn)

@@ -247,7 +247,7 @@ class PlacingWindow:
         for node in reversed(placing.moved) if placing.node is not None else ():
             outline = placing.outline(node)
             if outline is not None:
-                line = _SNAPPED if placing.shown.suggestion is not None or placing.shown.has_walls else _PIECE
+                line = _SNAPPED if placing.shown.suggestion is not None or placing.shown.is_aligned else _PIECE
                 points = self._to_screen(outline)
                 canvas.add_concave_poly_filled(points, _color(_PIECE_FLOOR))
                 _draw_line(canvas, points, line, 2 * scale)

@@ -186,7 +186,7 @@ def test_walls_of_the_piece_become_parallel_to_those_of_the_plan_unless_alt_is_h
     parallel = _true_place(started).yaw + math.pi / 2
     started.move(3.0, 0.0, free=True)
     started.turn_to(parallel + 0.7 * WALL_ANGLE)
-    assert started.shown.has_walls
+    assert started.shown.is_aligned
     assert math.remainder(started.shown.place.yaw - parallel, math.tau) == pytest.approx(0, abs=1e-6)
     started.turn_to(parallel + 0.7 * WALL_ANGLE, free=True)
     assert math.remainder(started.shown.place.yaw - parallel, math.tau) == pytest.approx(0.7 * WALL_ANGLE)
