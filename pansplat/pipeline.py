@@ -30,7 +30,7 @@ from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs import folders
 from pansplat.inputs.pairs import Pair
-from pansplat.inputs.views import CAMERA_HEIGHT, Views
+from pansplat.inputs.views import CAMERA_HEIGHT, ONE_POSITION, Views
 from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
@@ -82,10 +82,9 @@ Drawing = Literal["exact", "original"]
 _DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
 _MAX_CACHED_HEIGHT = 512  # of predictions of networks; taller ones are written tile by tile
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
-_GAUSSIANS_OF_ROWS = 0.75  # of a panorama, over the square of its height
-_ONE_PLACE = 1e-3  # of the distance of cameras, relative to near
+_GAUSSIANS_PER_SQUARE = 0.75  # of a panorama, over the square of its height; about those of the default model
 _BRIGHTEST = 1.5  # value of an image in [0, 1], after any filter
-_MAX_MERGERS = 4  # Gaussians that become one on average
+_MAX_MERGED = 4  # Gaussians that become one on average
 
 
 @with_progress_bar
@@ -119,12 +118,8 @@ def load_pairs(
     try:
         pairs = folders.load_pairs(path, convention=convention, near=near, far=far)
     except folders.UnposedPanoramasError as error:
-        unposed = error.folder, error.panoramas
-    else:
-        return [_with_camera_height(pair, camera_height) for pair in pairs]
-    pairs = estimate_pairs(
-        *unposed, near=near, far=far, camera_height=camera_height, progress=progress, on_unposed=on_unposed
-    )
+        options = {"near": near, "far": far, "camera_height": camera_height}
+        pairs = estimate_pairs(error.folder, error.panoramas, **options, progress=progress, on_unposed=on_unposed)
     return [_with_camera_height(pair, camera_height) for pair in pairs]
 
 
@@ -257,7 +252,7 @@ def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.in
     height = options.height
     if height is None:
         height = max(MIN_HEIGHT, min(pair.image_height, _TOUR_HEIGHT))
-        while height >= 2 * MIN_HEIGHT and _GAUSSIANS_OF_ROWS * height**2 > _MAX_MERGERS * gaussians:
+        while height >= 2 * MIN_HEIGHT and _GAUSSIANS_PER_SQUARE * height**2 > _MAX_MERGED * gaussians:
             height //= 2
     count = None if math.isinf(gaussians) else max(int(gaussians * len(pair.context)), 1)
     seconds = choose_refine_seconds(None) if options.refine_seconds is None else options.refine_seconds
@@ -312,7 +307,7 @@ class _Task:
         height = self.options.height or 0
         views = self.source if isinstance(self.source, Views) else self.source.load_context(height)
         centres = views.cam2world[:, :3, 3]
-        if len(centres) > 1 and float(torch.pdist(centres).max()) < _ONE_PLACE * views.near:
+        if len(centres) > 1 and float(torch.pdist(centres).max()) < ONE_POSITION * views.near:
             warnings.warn(
                 f"{', '.join(views.names)}: the cameras are at one place, so that depth is that of each photograph "
                 "alone; check the poses.",
@@ -348,8 +343,8 @@ def predict(
         compat, precision: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
-        refine_seconds: time limit of the refinement; by default 0, for none. None is `choose_refine_seconds`. A single
-            view is not refined.
+        refine_seconds: time limit of the refinement. By default 0, for none; commands have None, which is
+            `choose_refine_seconds`. A single view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it.
         joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without
             a refinement, only the colours are fitted.
@@ -537,7 +532,7 @@ def predict_tour(
     predictor = _choose_model(model, settings)
     tour = _load_only_tour(tour, progress) if isinstance(tour, (str, Path)) else tour
     warn_of_single_views(tour, predictor)
-    max_views, is_refined = find_max_views(predictor), settings.joint and settings.refine_seconds
+    max_views, is_refined = find_max_views(predictor), bool(settings.joint and settings.refine_seconds)
     total = len(tour.choose_sources(max_views))
     part = math.inf if settings.gaussians is None else settings.gaussians / len(tour)  # of a panorama
     counter, predicted = itertools.count(), 0.5 if is_refined else 1.0

@@ -28,7 +28,7 @@ class ReadOptions:
     """Nearest depth to search, metres; by default the folder's."""
     far: Depth | None = None
     """Farthest depth to search, metres; by default the folder's."""
-    camera_height: Positive = 1.5
+    camera_height: Positive = 1.5  # `inputs.views.CAMERA_HEIGHT`, whose module imports torch
     """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
 
 

@@ -46,7 +46,11 @@ def select_item(value: float | Tensor, n: int) -> float | Tensor:
 
 @runtime_checkable
 class Predictor(Protocol):
-    """A callable from posed panoramas to Gaussians."""
+    """A callable from posed panoramas to Gaussians.
+
+    Optional attributes, which `pipeline` reads: `min_views` (1), `max_views` of a tour at once (3), `default_height`
+    (512), and `stream`, with the arguments of a call, which yields the Gaussians tile by tile.
+    """
 
     name: str
     """Name in messages and scene files."""

@@ -36,7 +36,6 @@ from pansplat.sweep.surface import (
     consistency_mask,
     for_point_ranges,
     guided_upsample,
-    list_others,
     locate,
     locate_pixel,
     nearest_pixel,
@@ -59,7 +58,7 @@ class LiftConfig:
     """Settings of the Gaussians' sizes, opacities and levels."""
 
     surface_height: int = 512
-    """Least height of the surface of a panorama of twice this height or more."""
+    """Panoramas of twice this height or more have surfaces of a half, a quarter ... of their height, not below this."""
     footprint: float = 0.7
     """Standard deviation of a disc, in lattice spacings."""
     fine_footprint: float = 0.6
@@ -80,6 +79,9 @@ class LiftConfig:
     """Largest number of a view's points on the finer lattices; a larger error is allowed where they do not suffice."""
     discontinuity: float = 0.15
     """Relative change of inverse depth between pixels at a discontinuity."""
+    tolerance: float = 0.15
+    """Relative difference of depth up to which another view confirms a point, and beyond which it may remove it: more
+    than in `consistency_mask`, which decides whose word counts."""
     consistent_opacity: float = 0.95
     """Where another view is consistent."""
     single_view_opacity: float = 0.9
@@ -89,18 +91,13 @@ class LiftConfig:
 
 
 def lift(
-    posed: PosedImages,
-    surfaces: list[Surface],
-    config: LiftConfig,
-    neighbours: Sequence[Sequence[int]] | None = None,
+    posed: PosedImages, surfaces: list[Surface], config: LiftConfig, neighbours: Sequence[Sequence[int]]
 ) -> Gaussians:
     """The Gaussians of all views and levels, ordered by level, then view, then lattice (finest first) and point.
 
     Args:
-        neighbours: the other views whose surfaces confirm or contradict those of each view; by default all.
+        neighbours: the other views whose surfaces confirm or contradict those of each view.
     """
-    if neighbours is None:
-        neighbours = list_others(len(surfaces))
     photographs, heights = posed.images, _lattice_heights(posed.images.shape[1], config.surface_height)
     posed = posed.resize(heights[-1])
     if surfaces[0].height != heights[-1]:
@@ -308,7 +305,7 @@ def _background_layer(
     height = image.shape[0] >> level
     far = _background_inverse_depth(inverse, covered, level, config)
     # Colours of the pixels at or behind the layer, extrapolated over the gaps between them.
-    behind = mask & (inverse <= 1.15 * resize_sphere(far, image.shape[0]))
+    behind = mask & (inverse <= (1 + config.discontinuity) * resize_sphere(far, image.shape[0]))
     weight = resize_sphere(behind.astype(np.float32), height)
     color = resize_sphere(image * behind[..., None], height)
     filled_color, filled_weight = color.copy(), weight.copy()
@@ -338,7 +335,7 @@ def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> t
         certain = scene.consistent[other] & posed.masks[other]
         pose = np.ascontiguousarray(posed.cam2world[other], np.float64)
         inverse = scene.surfaces[other].inverse_depth
-        limits = config.discontinuity, _MIN_DISTANCE * posed.near
+        limits = config.tolerance, _MIN_DISTANCE * posed.near
         for_point_ranges(partial(_count_judgements, points, inverse, certain, pose, *limits, counts), len(points))
     confirmed, contradicted, doubtful, near = counts
     opacity = np.where(doubtful > 0, np.float32(config.uncertain_opacity), np.float32(config.single_view_opacity))

@@ -95,14 +95,15 @@ class Sweep:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
         _check_inputs(images, cam2world, low, high, masks)
         images, masks = fit_panoramas(images, masks, _MULTIPLE)
-        # Holes of scans are fitted too: Gaussians next to a hole then do not reach into it. A single view fills them.
-        visible = torch.ones_like(images[:, 0], dtype=torch.bool) if masks is None else masks
-        shown = visible.cpu() & mask_holes(images)
-        visible = shown if len(images) == 1 else visible.cpu()
+        # Holes of scans are not matched, but fitted, so that Gaussians beside a hole do not reach into it; in a single
+        # view, whose background layer continues there, they are not.
+        given = torch.ones(images[:, 0].shape, dtype=torch.bool) if masks is None else masks.cpu()
+        matched = given & mask_holes(images)
+        fitted = matched if len(images) == 1 else given
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
             cam2world=cam2world.detach().cpu().double().numpy(),
-            masks=shown.numpy(),
+            masks=matched.numpy(),
             near=low,
             far=high,
         )
@@ -118,7 +119,7 @@ class Sweep:
         report("fitting colours", 0.8)
         # Colours (n, 1, 3) with which the Gaussians of each view draw its photograph.
         poses = torch.from_numpy(posed.cam2world)
-        gaussians = fit_colors(gaussians, images.detach().cpu(), poses, visible, config.colors)
+        gaussians = fit_colors(gaussians, images.detach().cpu(), poses, fitted, config.colors)
         report("done", 1.0)
         return gaussians.to(device=images.device)
 

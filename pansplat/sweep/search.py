@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from pansplat.inputs.views import ONE_POSITION
 from pansplat.predictor import Progress, part_of
 from pansplat.rendering.cpu.runtime import thread_count
 from pansplat.sweep.bend import BendConfig, bend_surfaces
@@ -51,13 +52,12 @@ from pansplat.sweep.surface import (
     guided_upsample,
     list_best_pairs,
     measure_distances,
+    resize_keeping_edges,
     resize_mask,
-    resize_nearest,
     resize_sphere,
 )
 
 _DETECTION_HEIGHT = 96  # pixels; planes are detected at this size
-_MIN_BASELINE = 1e-3  # largest distance of cameras at one place, relative to near
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class SearchConfig:
     """The largest depth of the search, relative to `far`: rooms are often larger than the range that was given."""
     narrow_candidates: tuple[int, int] = (16, 8)
     """Hypotheses of a set at the two finer levels."""
-    plane_prior: float = 0.3
+    unsupported_plane_penalty: float = 0.3
     """Penalty of a plane without support in the scene."""
-    sphere_prior: float = 0.18
+    sphere_penalty: float = 0.18
     """Penalty of spheres relative to supported planes."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
@@ -132,7 +132,7 @@ def observe(
         report("estimating depth", 0.02)
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
     neighbours = choose_nearest(posed.cam2world, config.max_neighbours, 1 / high)
-    if posed.measure_baseline(range(len(posed.images))) < _MIN_BASELINE * posed.near:
+    if posed.measure_baseline(range(len(posed.images))) < ONE_POSITION * posed.near:
         return ObservedScene(posed, config, depths, neighbours, estimator=estimator)
     if estimator is not None:
         neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
@@ -181,7 +181,7 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         if estimator is not None and surfaces:
-            priors = estimator.estimate_from_surfaces(surfaces)
+            priors = estimator.estimate_from_surfaces(surfaces, neighbours)
         rows = heights[0] if n == config.coarse_passes - 1 else min(heights[0], config.first_height)
         level = _SearchLevel(scene, rows, _upsample(surfaces, posed.images, rows))
         surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
@@ -225,7 +225,8 @@ def _place_unmatched(scene: ObservedScene, height: int) -> list[Surface]:
         inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far))
     else:
         sharp = scene.estimator.sharpen((scene.depths.low, scene.depths.high))
-        inverse = np.stack([np.exp(-resize_nearest(values, height)) for values in sharp]).clip(*scene.depths.limits)
+        inverse = np.stack([np.exp(-resize_keeping_edges(log_depth, height)) for log_depth in sharp])
+        inverse = inverse.clip(*scene.depths.limits)
     return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
 
 
@@ -272,15 +273,16 @@ class _SearchLevel:
         sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
         penalties = [np.zeros((2, count), np.float32) for _ in slopes]
         if self.surfaces:  # in the first pass nothing supports a plane yet
-            penalties[0] += self.config.sphere_prior
+            penalties[0] += self.config.sphere_penalty
             for axis in range(3):
-                penalties[axis + 1] = self.config.plane_prior * (
+                penalties[axis + 1] = self.config.unsupported_plane_penalty * (
                     1 - self.planes[view].support(axis, self.posed.cam2world[view], inverse)
                 )
         sets = [
             HypothesisSet(low * slope, step * slope, penalty.astype(np.float32), side)
             for slope, penalty, side in zip(slopes, penalties, sides, strict=True)
         ]
+        # Factor and offset from each set's hypothesis number to a depth slot that all share (`aggregate_costs`).
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
         cost = self._compute_cost(view, lambda other: self._mark_separating_planes(view, other, sets, inverse))
         if priors:
@@ -307,6 +309,7 @@ class _SearchLevel:
         penalty = np.zeros((2, count), np.float32)
         sets = [HypothesisSet((c - step * (count // 2)).astype(np.float32), steps, penalty, side) for c in centres]
         slots = 2 * count
+        # Far beyond the slots an offset has no meaning, and must fit an integer.
         starts = np.stack([np.clip((c - known) / step, -4 * slots, 4 * slots) + count / 2 for c in centres], axis=2)
         slot_map = np.stack((np.ones_like(starts), starts), axis=-1).astype(np.float32)
         cost = self._compute_cost(view, lambda other: sets)

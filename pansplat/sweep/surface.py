@@ -16,6 +16,11 @@ import numpy as np
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 
+CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
+_RANGE = 1 << 14  # points that a thread processes together
+_SMOOTH = 0.03  # largest relative change of inverse depth that is interpolated bilinearly
+_CONSISTENCY = 0.06  # largest relative difference of depth of two views' surfaces that are consistent
+
 
 @functools.lru_cache(maxsize=4)
 def ray_grid(height: int) -> np.ndarray:
@@ -80,7 +85,7 @@ def resize_sphere(image: np.ndarray, height: int) -> np.ndarray:
     return np.ascontiguousarray(large[scaled:-scaled, scaled:-scaled])
 
 
-def resize_nearest(values: np.ndarray, height: int) -> np.ndarray:
+def resize_keeping_edges(values: np.ndarray, height: int) -> np.ndarray:
     """A panorama (h, w) at another height: the nearest pixel when smaller, so that edges stay, bilinear when larger."""
     if height >= len(values):
         return resize_sphere(values, height)
@@ -90,12 +95,6 @@ def resize_nearest(values: np.ndarray, height: int) -> np.ndarray:
 def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:
     """A panorama (h, w) of bool at another height, by the nearest pixel."""
     return cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
-
-
-_RANGE = 1 << 14  # points that a thread processes together
-_SMOOTH = 0.03  # largest relative change of inverse depth that is interpolated bilinearly
-
-CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,24 +180,19 @@ def measure_distances(cam2world: np.ndarray) -> np.ndarray:
     return np.linalg.norm(centres[:, None] - centres[None], axis=-1)
 
 
-def list_others(count: int) -> list[list[int]]:
-    """The other views of each of some views."""
-    return [[other for other in range(count) if other != view] for view in range(count)]
-
-
 def list_best_pairs(neighbours: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
     """Each view and its best neighbour, the smaller number first."""
     return [(min(view, others[0]), max(view, others[0])) for view, others in enumerate(neighbours)]
 
 
 def consistency_mask(
-    surfaces: Sequence[Surface], cam2world: np.ndarray, view: int, others: Sequence[int], tolerance: float = 0.06
+    surfaces: Sequence[Surface], cam2world: np.ndarray, view: int, others: Sequence[int]
 ) -> np.ndarray:
     """Pixels (h, w) of a view whose surface is consistent with the surface of at least one of the other views."""
     points = world_points(surfaces[view], cam2world[view])
     consistent = np.zeros(points.shape[:2], bool)
     for other in others:
-        consistent |= classify_visibility(points, surfaces[other], cam2world[other], tolerance) == CONSISTENT
+        consistent |= classify_visibility(points, surfaces[other], cam2world[other], _CONSISTENCY) == CONSISTENT
     return consistent
 
 

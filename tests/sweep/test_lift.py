@@ -12,8 +12,15 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import interpolate_poses, quats_from_rotations, rotations_from_quats
 from pansplat.rendering import blend, blend_weights, rasterize
-from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces, _write_quat, lift
+from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces, _write_quat
+from pansplat.sweep.lift import lift as lift_views
 from pansplat.sweep.surface import PosedImages, Surface
+
+
+def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gaussians:
+    """Lift each view with all others as its neighbours."""
+    views = range(len(surfaces))
+    return lift_views(posed, surfaces, config, [[other for other in views if other != view] for view in views])
 
 
 @pytest.fixture(scope="module")

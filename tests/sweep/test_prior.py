@@ -7,7 +7,7 @@ from pansplat.sweep import prior as prior_module
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, apply_prior_cost
 from pansplat.sweep.search import SearchConfig, observe, search
-from pansplat.sweep.surface import Surface, list_others, ray_grid, resize_sphere
+from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
 _DOWN = np.array((0.0, 1.0, 0.0))
@@ -72,7 +72,8 @@ def _estimate(room, poses, model_type=TrueDepth):
     model = model_type(room, upright)
     limits = (1 / 8, 1 / 0.3)
     estimator = PriorEstimator(model, images, np.stack(poses), _DOWN, PriorConfig())
-    priors = estimator.estimate_by_matching(views, list_others(len(views)), limits, MatchingConfig())
+    others = [[other for other in range(len(views)) if other != view] for view in range(len(views))]
+    priors = estimator.estimate_by_matching(views, others, limits, MatchingConfig())
     assert {len(own) for own in priors} == {len(model.starts)}
     return model, priors, estimator
 
@@ -143,7 +144,7 @@ def test_surfaces_give_one_more_prior(make_room, turn):
     model, priors, estimator = _estimate(room, poses)
     depths = [1.3 * room.cast(pose, 64)[1] for pose in poses]
     surfaces = [Surface((1 / depth).astype(np.float32), np.zeros(depth.shape, np.uint8)) for depth in depths]
-    more = estimator.estimate_from_surfaces(surfaces)
+    more = estimator.estimate_from_surfaces(surfaces, [[1], [0]])
     assert model.iterations == 1
     for before, after, depth in zip(priors, more, depths, strict=True):
         assert after[:-1] == before
