@@ -293,6 +293,9 @@ class PredictKeywords(TypedDict, total=False):
     cache: bool
 
 
+_UNREFINED: PredictKeywords = {"refine_seconds": 0.0}  # by default; commands refine
+
+
 @dataclass(frozen=True)
 class _Task:
     """What is predicted and how; `options` has no defaults that are still to be chosen."""
@@ -364,7 +367,7 @@ def _prepare(
     progress: Progress | None,
 ) -> _Task:
     """The task of `predict`; what cannot be predicted is refused."""
-    settings = _make_options(options)
+    settings = PredictOptions(**(_UNREFINED | options))
     RefineConfig(gaussians=settings.gaussians)
     seconds = settings.refine_seconds
     if seconds is not None and not 0 <= seconds < math.inf:
@@ -379,12 +382,6 @@ def _prepare(
     height = pair.images.shape[-2] if isinstance(pair, Views) else settings.height or choose_height(pair, predictor)
     chosen = replace(settings, height=height, refine_seconds=0.0 if is_single else seconds, joint=joint)
     return _Task(pair, predictor, chosen)
-
-
-def _make_options(options: PredictKeywords) -> PredictOptions:
-    """The options of keywords; without a time limit, there is no refinement."""
-    defaults: PredictKeywords = {"refine_seconds": 0.0}
-    return PredictOptions(**(defaults | options))
 
 
 def _choose_model(model: str | Path | Predictor, options: PredictOptions) -> Predictor:
@@ -526,7 +523,7 @@ def predict_tour(
             a refinement; without one the scene may have more.
         joint: see `predict`; the refinement is then that of each part of the tour as a whole, and not cached.
     """
-    settings = _make_options(options)
+    settings = PredictOptions(**(_UNREFINED | options))
     if settings.refine_seconds is None:
         settings = replace(settings, refine_seconds=choose_refine_seconds(None, joint=settings.joint))
     predictor = _choose_model(model, settings)

@@ -106,20 +106,13 @@ def _camera_points(problem: Problem) -> Float[Array, "observation 3"]:
 
 
 class _State(NamedTuple):
-    """The cost of a problem, and what its derivatives need of each observation.
-
-    The loss is Cauchy's; the residual is the part of the point's direction across the bearing.
-
-    Attributes:
-        residual: in the noise's unit, along two tangents of the bearing.
-        local: scaled points in the camera's frame.
-    """
+    """The cost by Cauchy's loss. A residual is a point's direction across its bearing, in the noise's unit."""
 
     cost: float
     residual: Float[Array, "observation 2"]
     weight: Float[Array, "observation"]
     tangents: Float[Array, "observation 2 3"]
-    local: Float[Array, "observation 3"]
+    local: Float[Array, "observation 3"]  # the points in the frame of the camera, scaled
 
 
 def _evaluate(problem: Problem, noise: float) -> _State:
@@ -170,13 +163,11 @@ def adjust(problem: Problem, noise: float, steps: int = _STEPS) -> Problem:
         equations = _normal_equations(problem, state, noise)
         while damping < _LARGEST_DAMPING:
             moved = _step(problem, equations, damping)
-            trial = None if moved is None else _evaluate(moved, noise)
-            if moved is not None and trial is not None and trial.cost < state.cost:
+            if moved is not None and (trial := _evaluate(moved, noise)).cost < state.cost:
                 break
             damping *= 6
         else:
             return problem
-        assert moved is not None and trial is not None
         cost, problem, state = state.cost, moved, trial
         damping = max(damping / 4, 1e-9)
         if cost - state.cost < _CONVERGED * cost:
@@ -184,19 +175,11 @@ def adjust(problem: Problem, noise: float, steps: int = _STEPS) -> Problem:
     return problem
 
 
-class _Equations(NamedTuple):
-    """Blocks of the normal equations; `bases` are of the points' tangents, `stretched` is by known distances."""
+def _normal_equations(problem: Problem, state: _State, noise: float) -> tuple[Array, ...]:
+    """Blocks of the normal equations.
 
-    cameras: Float[Array, "camera 6 6"]
-    points: Float[Array, "point 3 3"]
-    both: Float[Array, "observation 6 3"]
-    camera_gradient: Float[Array, "camera 6"]
-    point_gradient: Float[Array, "point 3"]
-    bases: Float[Array, "point 4 3"]
-    stretched: Float[Array, "camera 3 camera 3"]
-
-
-def _normal_equations(problem: Problem, state: _State, noise: float) -> _Equations:
+    Cameras (c 6 6), points (p 3 3), both (n 6 3), gradients, point bases (p 4 3), known distances (c 3 c 3).
+    """
     _, residual, weight, tangents, q = state
     rotation = problem.rotations[problem.camera]
     x = problem.points[problem.point]
@@ -233,10 +216,10 @@ def _normal_equations(problem: Problem, state: _State, noise: float) -> _Equatio
             stretched[a, :, b] += sign * np.outer(slope, slope)
         camera_gradient[i, 3:] += slope * value
         camera_gradient[j, 3:] -= slope * value
-    return _Equations(cameras, points, both, camera_gradient, point_gradient, bases, stretched)
+    return cameras, points, both, camera_gradient, point_gradient, bases, stretched
 
 
-def _step(problem: Problem, equations: _Equations, damping: float) -> Problem | None:
+def _step(problem: Problem, equations: tuple[Array, ...], damping: float) -> Problem | None:
     cameras, points, both, camera_gradient, point_gradient, bases, stretched = equations
     count = len(cameras)
     cameras = cameras + damping * _diagonal(cameras)

@@ -219,11 +219,9 @@ def _assemble(part: _Part, groups: Sequence[Group]) -> Group:
     return Group(placed, np.stack([poses[view] for view in placed]), np.concatenate(depths), np.concatenate(angles))
 
 
-def _closes(
-    relations: Mapping[IndexPair, RelativePose], relation: RelativePose, pair: IndexPair, k: int
-) -> bool | None:
+def _closes(kept: Mapping[IndexPair, RelativePose], relation: RelativePose, pair: IndexPair, k: int) -> bool | None:
     """Whether a relation agrees with the way by a third panorama; None if the way is not known."""
-    first, second = _motion_between(relations, pair[0], k), _motion_between(relations, k, pair[1])
+    first, second = _motion_between(kept, pair[0], k), _motion_between(kept, k, pair[1])
     if first is None or second is None:
         return None
     turn = float(rotation_angle(second[0] @ first[0] @ relation.rotation.T))

@@ -68,8 +68,7 @@ _FACTORS, _PARALLEL_FACTORS = (2, 1), (4, 2, 1)  # of the noise, in the optimisa
 _DEPTH_FACTORS = (24, 6, 2, 1)  # of the noise, in their optimisation
 _EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
-_SAME_ESSENTIAL = 0.998  # cosine of two essential matrices as vectors, above which they are equal: 3.6 degrees
-_LOOKED_THROUGH = 2000  # best essential matrices among which different ones are looked for
+_SAME_ESSENTIAL, _COMPARED_ESSENTIALS = 0.998, 2000  # cosine of equal ones as vectors (3.6 degrees); best ones
 # Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
 _NEEDED_PLACES, _NEEDED_SCORE, _NEEDED_MARGIN = 32, 80, 20
 
@@ -486,7 +485,7 @@ def _pick_distinct(essential: Float[Array, "n 3 3"], scores: Float[Array, "n"], 
     """Indices of the best hypotheses whose essential matrices differ."""
     picked: list[int] = []
     norm = np.linalg.norm(essential, axis=(1, 2))
-    for index in np.argsort(-scores)[:_LOOKED_THROUGH]:
+    for index in np.argsort(-scores)[:_COMPARED_ESSENTIALS]:
         if len(picked) == kept:
             break
         similarity = [abs((essential[index] * essential[p]).sum()) / (norm[index] * norm[p]) for p in picked]

@@ -138,6 +138,7 @@ class PriorEstimator:
             if turn is not None:
                 pose[:3, :3] = pose[:3, :3] @ turn
         self._priors: list[list[DepthPrior]] = [[] for _ in self._turns]
+        self._neighbours: Sequence[Sequence[int]] = []
 
     def sharpen(self, limits: tuple[float, float]) -> list[np.ndarray]:
         """Sharpened log-depth (h, w) of each view by itself, in the unit of the poses for a usual camera height.
@@ -196,6 +197,7 @@ class PriorEstimator:
             neighbours: the other views that each view is compared with.
             limits: smallest and largest inverse height of the cameras over the floor.
         """
+        self._neighbours = neighbours
         first = self._turn_back(self._observed.priors)
         by_pair = {}  # by the best neighbour: the model errs by another factor in each room
         pairs = list_best_pairs(neighbours)
@@ -210,28 +212,23 @@ class PriorEstimator:
         heights = [[by_pair[nodes][kind][nodes.index(view)] for view, nodes in enumerate(pairs)] for kind in range(2)]
         if np.abs(np.log(np.divide(*heights))).max() < _SAME_HEIGHT:
             heights.pop()
-        iterations = self._config.iterations
-        refined = [self._refine(_scale_depth(self._observed.priors, h), neighbours, iterations) for h in heights]
+        refined = [self._refine(_scale_depth(self._observed.priors, h), self._config.iterations) for h in heights]
         self._priors = [list(own) for own in zip(*refined, strict=True)]
         return self._priors
 
-    def estimate_from_surfaces(
-        self, surfaces: Sequence[Surface], neighbours: Sequence[Sequence[int]]
-    ) -> list[list[DepthPrior]]:
+    def estimate_from_surfaces(self, surfaces: Sequence[Surface]) -> list[list[DepthPrior]]:
         """The priors of `estimate_by_matching`, called before, and one of each view refined once from its surface."""
         estimates = []
         for surface, own, turn in zip(surfaces, self._priors, self._turns, strict=True):
             inverse = resize_sphere(surface.inverse_depth, len(own[0].scale))
             start = DepthPrior(-np.log(np.maximum(inverse, 1e-6)), own[0].scale)
             estimates.append(start if turn is None else start.rotate(turn))
-        refined = self._refine(estimates, neighbours, 1)
+        refined = self._refine(estimates, 1)
         return [[*own, last] for own, last in zip(self._priors, refined, strict=True)]
 
-    def _refine(
-        self, estimates: Sequence[DepthPrior], neighbours: Sequence[Sequence[int]], iterations: int
-    ) -> list[DepthPrior]:
+    def _refine(self, estimates: Sequence[DepthPrior], iterations: int) -> list[DepthPrior]:
         """Estimates of the upright panoramas, refined and turned back."""
-        return self._turn_back(self._observed.refine(estimates, self._upright_poses, neighbours, iterations))
+        return self._turn_back(self._observed.refine(estimates, self._upright_poses, self._neighbours, iterations))
 
     def _turn_back(self, priors: Sequence[DepthPrior]) -> list[DepthPrior]:
         """Priors of the upright panoramas as ones of the panoramas."""

@@ -52,8 +52,8 @@ from pansplat.sweep.surface import (
     guided_upsample,
     list_best_pairs,
     measure_distances,
-    resize_keeping_edges,
     resize_mask,
+    resize_sharp,
     resize_sphere,
 )
 
@@ -181,7 +181,7 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         if estimator is not None and surfaces:
-            priors = estimator.estimate_from_surfaces(surfaces, neighbours)
+            priors = estimator.estimate_from_surfaces(surfaces)
         rows = heights[0] if n == config.coarse_passes - 1 else min(heights[0], config.first_height)
         level = _SearchLevel(scene, rows, _upsample(surfaces, posed.images, rows))
         surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
@@ -225,8 +225,7 @@ def _place_unmatched(scene: ObservedScene, height: int) -> list[Surface]:
         inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far))
     else:
         sharp = scene.estimator.sharpen((scene.depths.low, scene.depths.high))
-        inverse = np.stack([np.exp(-resize_keeping_edges(log_depth, height)) for log_depth in sharp])
-        inverse = inverse.clip(*scene.depths.limits)
+        inverse = np.stack([np.exp(-resize_sharp(values, height)) for values in sharp]).clip(*scene.depths.limits)
     return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
 
 

@@ -85,7 +85,7 @@ def resize_sphere(image: np.ndarray, height: int) -> np.ndarray:
     return np.ascontiguousarray(large[scaled:-scaled, scaled:-scaled])
 
 
-def resize_keeping_edges(values: np.ndarray, height: int) -> np.ndarray:
+def resize_sharp(values: np.ndarray, height: int) -> np.ndarray:
     """A panorama (h, w) at another height: the nearest pixel when smaller, so that edges stay, bilinear when larger."""
     if height >= len(values):
         return resize_sphere(values, height)

@@ -144,7 +144,7 @@ def test_surfaces_give_one_more_prior(make_room, turn):
     model, priors, estimator = _estimate(room, poses)
     depths = [1.3 * room.cast(pose, 64)[1] for pose in poses]
     surfaces = [Surface((1 / depth).astype(np.float32), np.zeros(depth.shape, np.uint8)) for depth in depths]
-    more = estimator.estimate_from_surfaces(surfaces, [[1], [0]])
+    more = estimator.estimate_from_surfaces(surfaces)
     assert model.iterations == 1
     for before, after, depth in zip(priors, more, depths, strict=True):
         assert after[:-1] == before
