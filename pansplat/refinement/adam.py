@@ -60,8 +60,8 @@ class ParameterGroup:
 
         Args:
             factor: of the step size.
-            rows: mask of the rows of each parameter that move, with their averages. Else rows that have a gradient in
-                few steps would go on along each for many. By default all.
+            rows: mask of the rows of each parameter that move; all by default. Others keep their averages, whose
+                momentum would move a Gaussian for many steps after the last one that saw it.
         """
         moved = [parameter for parameter in self.parameters if parameter.grad is not None]
         for parameter in moved:

@@ -25,8 +25,8 @@ from pansplat.geometry.pose import interpolate_poses, nearest_views, quats_from_
 from pansplat.rendering.weights import compute_blending_weights
 
 DROP_ERROR = 5e-3  # largest mean absolute change of an image by all Gaussians that are dropped
-MAX_OTHERS = 3  # cameras of other views that a view is rasterised at
-_MAX_OPACITY = 0.99  # of a merged Gaussian; larger ones make it wider
+MAX_OTHERS = 3  # cameras of other views that a view is rasterised at, here and in the steps of a refinement
+_MAX_MERGED_OPACITY = 0.99  # of a merged Gaussian; larger ones make it wider
 _DIRECTION_BITS = 15  # of half a component of a direction, in the cells of a Z-order curve
 _SEARCHED = 8  # Gaussians before and after a Gaussian along the curve
 _BASE_COST = 0.008  # cost of a merger between equal Gaussians, as a difference of colours
@@ -215,11 +215,11 @@ def _merge_pairs(first: _Parts, second: _Parts) -> _Parts:
     opacities = total / _area(covariances)
     # Pairs that overlap have more opacity than fits into their covariance, which alone would leave gaps. Half of the
     # surplus, in logarithms, becomes area (docs/refinement.md).
-    covariances = covariances * (opacities / _MAX_OPACITY).clamp_min(1).sqrt()[:, None, None]
+    covariances = covariances * (opacities / _MAX_MERGED_OPACITY).clamp_min(1).sqrt()[:, None, None]
     merged = dataclasses.replace(
         a,
         means=average(a.means, b.means, share).float(),
-        opacities=opacities.clamp_max(_MAX_OPACITY).float(),
+        opacities=opacities.clamp_max(_MAX_MERGED_OPACITY).float(),
         harmonics=average(a.harmonics, b.harmonics, share[:, :, None]).float(),
     )
     return _Parts(merged, covariances, torch.ones_like(first.is_merged))

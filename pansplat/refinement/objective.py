@@ -72,7 +72,7 @@ class Photograph:
 
 
 def image_difference(error: Float[Tensor, "3 height width"], weights: PixelWeights) -> Float[Tensor, ""]:
-    """Mean absolute error of the colours plus that of their gradients."""
+    """Mean absolute error of the colours, plus the mean of those of the gradients to the right and downwards."""
     if error.device.type == "cpu" and error.dtype == torch.float32:
         from pansplat.refinement.difference import Difference  # not at the top: a GPU needs no numba
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import invert_pose, multiply_quats, quats_from_rotations, rotations_from_quats
 
-_MIN_OPACITY, _MAX_OPACITY = 1e-3, 0.999  # whose logit is refined
+_MIN_REFINED_OPACITY, _MAX_REFINED_OPACITY = 1e-3, 0.999  # whose logit is refined
 _MAX_LOG_DISTANCE = 1.0  # largest change of a logarithm of distance
 _MAX_LOG_SCALE = 3.0  # largest change of a logarithm of scale
 _MIN_SCALE = 1e-9  # relative to the distance
@@ -68,7 +68,7 @@ class ViewParameters:
         scales = torch.maximum(gaussians.scales, _MIN_SCALE * distances[:, None])
         self._initial_log_scales = scales.log()
         quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
-        opacities = gaussians.opacities.clamp(_MIN_OPACITY, _MAX_OPACITY)
+        opacities = gaussians.opacities.clamp(_MIN_REFINED_OPACITY, _MAX_REFINED_OPACITY)
         color, harmonics = gaussians.harmonics.split((1, gaussians.harmonics.shape[1] - 1), dim=1)
         values = (torch.zeros_like(distances), self._initial_log_scales, quats, opacities.logit(), color, harmonics)
         self.tensors = {
@@ -117,7 +117,7 @@ class ViewParameters:
         self.tensors["distance"].clamp_(-_MAX_LOG_DISTANCE, _MAX_LOG_DISTANCE)
         limits = self._initial_log_scales - _MAX_LOG_SCALE, self._initial_log_scales + _MAX_LOG_SCALE
         self.tensors["scale"].clamp_(*limits)
-        bound = torch.tensor(_MAX_OPACITY).logit()
+        bound = torch.tensor(_MAX_REFINED_OPACITY).logit()
         self.tensors["opacity"].clamp_(-bound, bound)
 
 

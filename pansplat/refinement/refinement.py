@@ -55,8 +55,8 @@ _DAMPING = 0.2
 _COLORS = ColorFitConfig()
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
-# Of a run with a limit of Gaussians, because merged ones that are not fitted look like dots; for each photograph of a
-# scene for joint drawing, because few large steps leave it worse than before.
+# Of a timed run: with a limit of Gaussians (merged ones that are not fitted look like dots), and for each photograph in
+# joint drawing (few large steps leave the scene worse than before).
 _MIN_STEPS = 8
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
@@ -171,7 +171,7 @@ class Refinement:
         if scene.joint:
             self._layers = [_Layer(tuple(self._views), tuple(range(len(scene.cam2world))))]
         self._cameras = CameraParameters(scene.cam2world.to(device), correct_poses=self.config.poses)
-        self._groups = self._group_parameters()
+        self._groups, self._view_groups = self._group_parameters()
         self._steps = self._splits = 0
         self._seen: list[Tensor] = []
         self._result: Scene | None = None
@@ -180,15 +180,16 @@ class Refinement:
         """Images (n, c, h, w) at the size of the comparison, by area average."""
         return images if images.shape[-2:] == self._size else functional.interpolate(images, self._size, mode="area")
 
-    def _group_parameters(self) -> list[ParameterGroup]:
+    def _group_parameters(self) -> tuple[list[ParameterGroup], list[ParameterGroup]]:
+        """All groups, and those of them that hold the Gaussians: one for each of `ViewParameters.NAMES`."""
         rates, betas = dataclasses.asdict(self.config.rates), _POSE_BETAS if self.config.poses else _BETAS
         groups = [ParameterGroup([self._cameras.log_gains], rates["gain"], betas)]
         if self.config.poses:
             groups.append(ParameterGroup([self._cameras.twists], rates["pose"], betas))
-        for name in ViewParameters.NAMES if self._views else ():
-            tensors = [view.tensors[name] for view in self._views.values()]
-            groups.append(ParameterGroup(tensors, rates[name], betas))
-        return groups
+        views = self._views.values()
+        names = ViewParameters.NAMES if views else ()
+        of_views = [ParameterGroup([view.tensors[name] for view in views], rates[name], betas) for name in names]
+        return groups + of_views, of_views
 
     def step(self, fraction: float) -> None:
         """Rasterise and compare each view once, or in joint drawing all views, and move the Gaussians.
@@ -202,7 +203,7 @@ class Refinement:
             self._split()
         for group in self._groups:
             group.clear_gradients()
-        rows: Sequence[Tensor] = ()
+        rows: Sequence[Tensor] = ()  # those that move, of the only layer of joint drawing; all in others
         for layer in self._layers:
             target = self._choose_target(layer)
             photograph = self._photographs[target]
@@ -222,8 +223,7 @@ class Refinement:
             group.clean_gradients()
             if not self._steps:
                 group.set_damping(_DAMPING * pixels)
-            is_of_views = group in self._groups[-len(ViewParameters.NAMES) :]
-            group.step(_cosine_fall(fraction), rows if is_of_views else ())
+            group.step(_cosine_fall(fraction), rows if group in self._view_groups else ())
         for parameters in self._views.values():
             parameters.clamp()
         self._steps += 1
@@ -264,7 +264,7 @@ class Refinement:
         for parameters, part in zip(self._views.values(), is_split.split(counts), strict=True):
             parameters.split(part)
         self._seen.clear()
-        for group, name in zip(self._groups[-len(ViewParameters.NAMES) :], ViewParameters.NAMES, strict=True):
+        for group, name in zip(self._view_groups, ViewParameters.NAMES, strict=True):
             group.replace([parameters.tensors[name] for parameters in self._views.values()])
 
     def _errors(self, layer: _Layer) -> Tensor:
@@ -345,11 +345,11 @@ class Refinement:
 
         Args:
             seconds: time limit since this object was made; the result depends on the speed of the machine. With a limit
-                of Gaussians, a run has at least `_MIN_STEPS` steps, and mergers do not count; in joint drawing it has
-                as many for each photograph.
+                of Gaussians, a run has at least 8 steps, and mergers do not count; in joint drawing it has 8 for each
+                photograph.
             steps: number of steps; the result is the same in every run on one machine.
             progress: called with a description and the completed fraction.
-            should_stop: checked before each step; True ends the run and keeps the state.
+            should_stop: checked before each step; True ends the run early, with the better of both scenes as always.
         """
         min_steps = 0 if self.config.gaussians is None else _MIN_STEPS
         if self._start.joint:
@@ -409,6 +409,7 @@ class Refinement:
         self._views.clear()
         self._layers.clear()
         self._groups.clear()
+        self._view_groups.clear()
 
     def _end_cost(self) -> float:
         """Approximate duration of the contributions and the fit of colours, in steps."""

@@ -222,8 +222,7 @@ def rasterize(
         vertical_fov_degrees: of a pinhole image.
         face_size: of a cubemap's faces, pixels; by default with the panorama's resolution at the equator.
         eye_offset: of layout "equirect": radius of the viewing circle of omni-directional stereo, metres, half the
-            distance of the eyes. Positive for the right eye, negative for the left. The
-            gradients are those of "torch" then.
+            distance of the eyes. Positive for the right eye, negative for the left. The gradients are those of "torch".
         background: one number for each channel; the default is black for any number of channels.
         covariances: world covariances in place of those of `scales` and `quats`, square metres.
         backend: "torch" is the reference, "numba" is fast on a CPU (kernel "ray" only), "triton" on CUDA; "auto"
@@ -270,12 +269,12 @@ def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> Rast
         fast: Backend = "numba" if on_cpu else "triton"
         name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
     if name == "numba":
-        from pansplat.rendering.cpu import rasterize_planes as rasterize
+        from pansplat.rendering.cpu import rasterize_planes
     elif name == "triton":
-        from pansplat.rendering.cuda import rasterize_planes as rasterize
+        from pansplat.rendering.cuda import rasterize_planes
     else:
-        from pansplat.rendering.reference import rasterize_planes as rasterize
-    return rasterize
+        from pansplat.rendering.reference import rasterize_planes
+    return rasterize_planes
 
 
 def get_triton_version() -> tuple[int, ...]:

@@ -413,8 +413,8 @@ def _composite_block(
     """Compute the transmittance behind a block of Gaussians, and the block's contribution to the sums."""
     alpha = _evaluate_alphas(record, (point - centres[:, None]).to(record.dtype), offsets, exact=exact)
     behind = _zero_up_to(torch.cumprod(1 - alpha, dim=1), _MIN_TRANSMITTANCE)
-    ahead = torch.cat((torch.ones_like(behind[:, :1]), behind[:, :-1]), dim=1)
-    weights = alpha * ahead * through[:, None]
+    in_front = torch.cat((torch.ones_like(behind[:, :1]), behind[:, :-1]), dim=1)
+    weights = alpha * in_front * through[:, None]
     values = torch.cat((record[..., _VALUES:], torch.ones_like(record[..., :1])), dim=2)
     return _zero_up_to(through * behind[:, -1], _MIN_TRANSMITTANCE), weights.transpose(1, 2) @ values
 
@@ -444,12 +444,12 @@ def _evaluate_alphas(
     if not exact:
         return _clamp_alpha(peak * torch.exp(-0.5 * q))
     # The bound has an effect only near the plane L = 0; it keeps gradients finite there.
-    ahead = 1 + front[0]
-    bounded = ahead.clamp_min(torch.finfo(record.dtype).eps ** 0.5)
+    plane_distance = 1 + front[0]
+    bounded = plane_distance.clamp_min(torch.finfo(record.dtype).eps ** 0.5)
     alpha = _clamp_alpha(peak * torch.exp(-0.5 * q / (bounded * bounded + record[..., 9, None] * q)))
-    if bool(ahead.detach().amin() > 0):  # in nearly every block
+    if bool(plane_distance.detach().amin() > 0):  # in nearly every block
         return alpha
-    return alpha * (ahead > 0)
+    return alpha * (plane_distance > 0)
 
 
 def _clamp_alpha(alpha: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from pansplat.constants import MAX_MAGNITUDE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
-from pansplat.rendering.cpu import tiling
+from pansplat.rendering.cpu import tiling  # tests lower its MAX_INTERSECTIONS
 from pansplat.rendering.cpu.columns import rasterize_columns
 from pansplat.rendering.cpu.projection import GaussianArrays, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
@@ -131,7 +131,7 @@ class _Rasterize(torch.autograd.Function):
         statistics.dropped, statistics.near = projected.dropped, projected.near
         statistics.bytes += sums.nbytes + sum(array.nbytes for array in projected[:4])
         result = torch.from_numpy(sums)
-        if needs_grad:
+        if needs_grad:  # the workspace is kept because it owns the arrays of `projected` and `states`
             ctx.save_for_backward(*tensors, pose, result)
             ctx.saved = planes, options, projected, states, workspace, threads
         return result
