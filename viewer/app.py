@@ -21,7 +21,7 @@ from pansplat_viewer.scene.loader import (
     Progress,
     SceneEntry,
     SceneLoader,
-    Show,
+    ShowEntries,
     choose_entry,
     find_entries,
     load_entry,
@@ -210,7 +210,7 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
     def create_loader() -> SceneLoader:
         return SceneLoader(lambda entry, progress, show: load_entry(entry, load_options, progress, show))
 
-    def find(path: Path, progress: Progress, show: Show) -> list[SceneEntry]:
+    def find(path: Path, progress: Progress, show: ShowEntries) -> list[SceneEntry]:
         found = find_entries(path, load_options, progress, show)
         choose_entry(found, options.pair if path == source else None)
         return found

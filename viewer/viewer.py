@@ -189,7 +189,7 @@ class Viewer:
 
     @property
     def reduced(self) -> int | None:
-        """Number of Gaussians that are offered in place of a scene that did not fit; None if there is none."""
+        """See the attributes of the class."""
         return None if self._too_large is None else self._too_large[1]
 
     @property

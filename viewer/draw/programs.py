@@ -141,7 +141,7 @@ class Programs:
         self.project_compute()
 
     def splat(self) -> moderngl.Program:
-        """Records to pixels of a layer."""
+        """The program that draws records into a layer."""
         return self._compile_pair("splat.vert", "splat.frag", PARTS=1)
 
     def accumulate(self, storage: int) -> moderngl.Program:

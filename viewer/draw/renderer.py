@@ -167,6 +167,7 @@ class SplatRenderer:
         bind(bound)
         self._unread = settings, 1e3 * (time.perf_counter() - start)
         known = self._read_times() if waits else before
+        # Tier gl33 counts while it draws, gl43 on the GPU: `known` has its count, without `waits` of the frame before.
         drawn = self.stats.drawn + known.drawn
         self.stats = dataclasses.replace(
             self.stats, settled=settled, drawn=drawn, frame_ms=known.frame_ms, timed=known.timed

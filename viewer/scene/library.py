@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from pansplat.errors import InputError
+from pansplat_viewer.scene.file_watch import FileWatch
 from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader, choose_entry
-from pansplat_viewer.window.file_watch import FileWatch
 
 
 class Library:
@@ -46,7 +46,7 @@ class Library:
         self.loader.search(path, self._find)
 
     def expect(self, path: Path, name: str | None = None) -> None:
-        """The search of the loader is for this path, to show the entry of a name or number, else the first one."""
+        """Remember what to show of a search that has begun: the entry of a name or number, else the first one."""
         self._wanted = path, name
 
     def choose_found(self, found: list[SceneEntry]) -> tuple[int, Path]:
@@ -63,7 +63,7 @@ class Library:
         self.watch.start(entries[index].files)
 
     def keep(self) -> None:
-        """The current entry is shown."""
+        """Remember the list and its current entry, which is shown, for `restore`."""
         self._shown = self.entries, self.current, self.path
 
     def restore(self) -> None:

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 
 Progress = Callable[[str, float], None]  # task, fraction done
-Show = Callable[[list["SceneEntry"]], None]
-Find = Callable[[Path, Progress, Show], list["SceneEntry"]]
+ShowEntries = Callable[[list["SceneEntry"]], None]
+Find = Callable[[Path, Progress, ShowEntries], list["SceneEntry"]]
 
 
 _WAIT = 0.01  # seconds between looks at a search
@@ -118,7 +118,7 @@ class LoadOptions:
 
 
 def find_entries(
-    path: Path, options: LoadOptions, progress: Progress | None = None, show: Show | None = None
+    path: Path, options: LoadOptions, progress: Progress | None = None, show: ShowEntries | None = None
 ) -> list[SceneEntry]:
     """Return all scenes at `path`: tours first, then pairs and single views, then scene files.
 
@@ -233,8 +233,9 @@ def load_entry(
 def _load_tour_scene(
     entry: SceneEntry, options: LoadOptions, progress: Progress, show: Callable[[LoadedScene], None] | None
 ) -> LoadedScene:
-    """Predict and refine one prediction of a tour, with its floor outlines; the first one after its graph is connected.
+    """The scene of `entry.views` of a tour, predicted and refined, with its floor outlines.
 
+    Without views, the graph is connected first, and the scene is that of the panorama in which the walk starts.
     The first scene of a window is not refined if it is predicted again with the rest of its part.
     """
     from pansplat import pipeline
@@ -362,6 +363,7 @@ class SceneLoader:
     def refinement(self) -> float | None:
         """Fraction of the refinement that is done; None if no scene is being refined."""
         progress = self._loading.progress
+        # A refinement is the second half of `pipeline.predict`.
         return max(2 * progress[1] - 1, 0.0) if progress and self._request and self._request.is_shown else None
 
     def poll(self) -> LoadedScene | list[SceneEntry] | BaseException | None:

@@ -602,11 +602,6 @@ class PlanView:
         scale = self.pixels_per_metre
         return (np.asarray(places) - self.middle) * (scale, -scale) + np.array(self.size) / 2
 
-    def to_metres(self, pixels: tuple[float, float]) -> tuple[float, float]:
-        """The place at a pixel."""
-        right, down = (np.array(pixels) - np.array(self.size) / 2) / self.pixels_per_metre
-        return self.middle[0] + float(right), self.middle[1] - float(down)
-
     def contains(self, points: Float[np.ndarray, "n 2"]) -> bool:
         """Whether points are inside."""
         pixels = self.to_pixels(points)

@@ -34,7 +34,7 @@ _WAIT_SECONDS = 0.05  # as the window waits for an image
 
 @dataclass(frozen=True)
 class LoopTimes:
-    """Medians of a mode."""
+    """Medians over the frames of one mode of drawing."""
 
     moving_ms: float  # time of a frame of a flight
     moving_size: tuple[int, int]  # (width, height) at which its images are drawn, pixels

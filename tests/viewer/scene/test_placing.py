@@ -352,13 +352,13 @@ def test_poses_of_other_formats_are_listed_as_not_changeable(folder: Path):
     assert placing.node is None and placing.error == placing.problem
 
 
-def test_a_view_of_a_plan_has_all_points_and_converts_both_ways():
+def test_a_view_of_a_plan_has_all_points_and_one_scale():
     points = np.array(((-3.0, 1.0), (5.0, 4.0)))
     view = PlanView.of_points(points, (400, 300))
     assert view.contains(points) and not view.contains(points + 50)
-    x, y = view.to_pixels(np.array((1.0, 3.0)))
-    assert view.to_metres((x, y)) == pytest.approx((1.0, 3.0))
-    assert view.to_pixels(np.array((1.0, 4.0)))[1] < y  # forward is up
+    middle, moved = np.array(view.middle), view.pixels_per_metre * np.array((2, -3))
+    assert view.to_pixels(middle) == pytest.approx((200, 150))
+    assert view.to_pixels(middle + np.array((2, 3))) - (200, 150) == pytest.approx(moved)  # forward is up
 
 
 @pytest.mark.slow

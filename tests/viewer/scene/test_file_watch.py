@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from pansplat.inputs.folders import load_pairs
+from pansplat_viewer.scene.file_watch import FileWatch
 from pansplat_viewer.scene.loader import SceneEntry
-from pansplat_viewer.window.file_watch import FileWatch
 
 
 def _write_cube(folder: Path, name: str) -> None:
@@ -54,7 +54,7 @@ def test_a_changed_web_tour_and_a_new_panorama_are_noticed(tmp_path: Path) -> No
 
 
 def test_many_files_are_looked_at_one_part_a_frame(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("pansplat_viewer.window.file_watch._FILES", 2)
+    monkeypatch.setattr("pansplat_viewer.scene.file_watch._FILES", 2)
     files = [tmp_path / str(number) for number in range(5)]
     watch = FileWatch()
     watch.start(files)
