@@ -16,6 +16,7 @@ import { photographs } from "./photographs.js";
 import { headset } from "./xr.js";
 
 const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
+const NEAR = HEADER.speed;          // metres: a second's walk
 const DIRECTIONS = 24;              // of the bits of `blank`
 const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
@@ -146,7 +147,7 @@ function pointAlong(path, distance) {
 export let route = null;
 function startRoute() {
   const distances = HEADER.route.map((sample) => distanceOf(sample.slice(0, 3), camera.position));
-  const least = Math.min(...distances) + 0.02 * HEADER.speed;
+  const least = Math.min(...distances) + 0.02 * NEAR;
   const first = distances.findIndex((distance) => distance <= least), sample = HEADER.route[first];
   const offset = minus([...camera.position, camera.yaw, camera.pitch], sample);
   offset[3] -= 2 * Math.PI * Math.round(offset[3] / (2 * Math.PI));
@@ -198,7 +199,7 @@ export function goHome() {
 
 // Goes to another camera; the image fades, unless the order of the Gaussians is right there too.
 function goToPose(pose) {
-  const isFar = distanceOf(pose.position, camera.position) > HEADER.speed;
+  const isFar = distanceOf(pose.position, camera.position) > NEAR;
   const isElsewhere = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
   if (isFar || isElsewhere || headset.session) freeze();
   place(pose);
@@ -244,7 +245,7 @@ export function freeze(zoom = null) {
 export function updateStill(now) {
   if (!frozen) return;
   frozen.position = frozen.position || [...camera.position];
-  const isSorted = isSortedAs() && distanceOf(sorted.position, frozen.position) < HEADER.speed;
+  const isSorted = isSortedAs() && distanceOf(sorted.position, frozen.position) < NEAR;
   const isThere = frozen.zoom === null || !HEADER.photographs.length || photographs.isOpaque;
   if (frozen.began === null && isSorted && isThere && isSeen()) frozen.began = now;
   if (frozen.began !== null) {

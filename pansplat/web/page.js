@@ -1,4 +1,5 @@
-// The page: starts when the first views are there, and answers scripts. docs/web.md describes it.
+// The page: starts when the first views are there, and answers scripts. docs/web.md describes it. HEADER, SHADERS and
+// WORKER of all modules are constants that export/page.py writes before them.
 
 import { camera, cameraFor, currentPart, settleAt, shown, showViews, tallOf } from "./camera.js";
 import { byId, canvas } from "./dom.js";
