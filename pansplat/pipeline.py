@@ -9,7 +9,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -147,10 +147,9 @@ def load_model(
     """
     if compat not in get_args(CompatChoice):
         raise InputError(f"`compat` must be one of {', '.join(get_args(CompatChoice))}, got {compat!r}")
-    chosen = {"compat": compat} if compat != "trained" else {}
-    chosen |= {"precision": precision} if precision != "float32" else {}
+    of_networks = [*(["compat"] if compat != "trained" else []), *(["precision"] if precision != "float32" else [])]
     if str(name) in _MODELS:
-        _refuse_options(name, chosen if str(name) == "sweep" else chosen | options)
+        _refuse_options(name, of_networks if str(name) == "sweep" else [*of_networks, *options])
         return _MODELS[str(name)](**options)
     if Path(name).suffix.lower() not in WEIGHTS_SUFFIXES:
         raise InputError(
@@ -161,16 +160,16 @@ def load_model(
     if read_model_name(path) == "depth":
         from pansplat.sweep.guided_sweep import load_guided_sweep
 
-        _refuse_options(name, chosen | options)
+        _refuse_options(name, [*of_networks, *options])
         return load_guided_sweep(path, path.stem)
     from pansplat.model.network import load_predictor
 
     return load_predictor(path, compat, precision=precision, **options)
 
 
-def _refuse_options(name: str | Path, options: Iterable[str]) -> None:
-    for option in options:
-        raise InputError(f"`{option}` is for networks, and {name} is not one; leave it out")
+def _refuse_options(name: str | Path, options: Sequence[str]) -> None:
+    if options:
+        raise InputError(f"`{options[0]}` is for networks, and {name} is not one; leave it out")
 
 
 def load_predictor(options: PredictOptions) -> Predictor:

@@ -382,6 +382,7 @@ class Export(Writer):
             joint: whether each surface is kept once.
             gaussians: of a page; see `pansplat.predict_tour`.
         """
+        from pansplat import pipeline
         from pansplat.export.page_photographs import list_photographs
         from pansplat.refinement import fuse_views
 
@@ -393,7 +394,7 @@ class Export(Writer):
             if len(edited.cam2world) < len(known):  # a crop leaves others out
                 views = [known.index(pose) for pose in edited.cam2world.tolist()]
             return edited, changes, list_photographs(source, views)
-        scene = self.prediction.open(self.path)
+        scene = pipeline.load(self.path)
         if not joint or scene.joint or len(scene.cam2world) < 2:
             return (*self._edit(scene), [])
         print(

@@ -58,11 +58,7 @@ class ScenePrediction:
     options: _SceneOptions = field(default_factory=_SceneOptions)
     choice: PairChoice = field(default_factory=PairChoice)
 
-    def open(self, path: Path) -> Scene:
-        """The scene of a scene file, or the prediction of a pair's folder."""
-        return self.open_scene(path)[0]
-
-    def open_scene(self, path: Path) -> tuple[Scene, Pair | None]:
+    def open(self, path: Path) -> tuple[Scene, Pair | None]:
         """The scene of a scene file, or the prediction of a pair's folder, and the pair."""
         from pansplat import pipeline
 

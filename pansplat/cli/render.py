@@ -88,7 +88,7 @@ class Render(Writer):
             raise InputError(
                 f"{self.pose} holds {len(poses)} poses; write an .mp4 or .webm, or keep one pose in the file"
             )
-        scene, source = self.prediction.open_scene(self.path)
+        scene, source = self.prediction.open(self.path)
         poses = None if poses is None else [scene.frame.localize(pose) for pose in poses]
         layout = self.layout or ("perspective" if self._is_video and not self.stereo else "equirect")
         options = self._render_options(layout, self.height or self._choose_height(layout, scene))

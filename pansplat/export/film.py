@@ -66,26 +66,23 @@ class FilmPhotographs:
             seconds: time of the frame in the film.
         """
         step, self._seconds = abs(seconds - self._seconds) / STOP_SECONDS, seconds
-        weights: dict[int, float] = {}
+        last, self._weights = self._weights, {}
         mixed: Any = 0.0
         for pose, share, draw in frame:
             distances = np.linalg.norm(self._poses[:, :3, 3].numpy() - pose[:3, 3], axis=1)
-            index = int(distances.argmin()) if len(distances) else None
-            shown = None
-            if index is not None:
-                target = float(distances[index] <= STOP_REACH)
-                last = self._weights.get(index, target)
-                weights[index] = last + min(max(target - last, -step), step)
-                if weights[index] > 0:
-                    photograph, shown = self._draw(index, pose, plane)
-                    shown = shown * weights[index]
-            if shown is None:
-                mixed += share * draw()
-            elif shown.min() > 0.999:  # rounding of samples
-                mixed += share * photograph
+            index, nearest = int(distances.argmin()) if len(distances) else -1, distances.min(initial=np.inf)
+            weight = float(nearest <= STOP_REACH)
+            if index in last:
+                weight = last[index] + min(max(weight - last[index], -step), step)
+            self._weights[index] = weight
+            if weight > 0:
+                photograph, shown = self._draw(index, pose, plane)
+                shown = weight * shown
+                is_whole = shown.min() > 0.999  # samples are rounded
+                image = photograph if is_whole else draw() * (1 - shown) + photograph * shown
             else:
-                mixed += share * (draw() * (1 - shown) + photograph * shown)
-        self._weights = weights
+                image = draw()
+            mixed += share * image
         return mixed
 
     def _draw(
