@@ -1,11 +1,13 @@
-"""Screenshots and films that a user writes from the window."""
+"""Screenshots and films that a user writes from the window.
+
+`pansplat_viewer.capture` is imported when one is written, because with all that films need it takes .4 s.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
-from pansplat_viewer.capture import find_free_name, open_frames, write_path_film, write_screenshot
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.stereo import choose_format, render_image
 from pansplat_viewer.scene.background import Jobs, Report
@@ -41,6 +43,8 @@ class Recorder:
             suffix: `png`, or `exr` with depth in metres.
             panorama: whether all directions are shown.
         """
+        from pansplat_viewer.capture import write_screenshot
+
         stage, settings = self._stage, self._state.draw_settings
         image_format = choose_format("equirect" if panorama else "perspective", settings)
         size = (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT) if panorama else stage.eye_size
@@ -67,6 +71,8 @@ class Recorder:
 
     def start_film(self, loaded: LoadedScene, tour: TourScenes | None, loader: SceneLoader) -> None:
         """Write the film of the path in a worker thread, drawn on the processor, so that the window stays free."""
+        from pansplat_viewer.capture import find_free_name, open_frames, write_path_film
+
         state, scene, settings = self._state, self._stage.slot.scene, self._state.draw_settings
         path, level, fps, scenes = state.path, state.camera, state.film_fps, None if tour is None else tour.copy()
         image_format = choose_format(state.film_projection, settings)

@@ -114,6 +114,7 @@ class PageFiles:
         embed: origins of the pages that may frame it and exchange messages with it.
         photo_height: of its photographs, pixels; 0 without photographs.
         num_flights, num_fades: edges along which it flies, and those along which it fades.
+        num_rough: panoramas whose surfaces are too rough for the doll's house.
     """
 
     files: tuple[Path, ...]
@@ -124,6 +125,7 @@ class PageFiles:
     photo_height: int = 0
     num_flights: int = 0
     num_fades: int = 0
+    num_rough: int = 0
 
 
 @with_progress_bar
@@ -212,7 +214,8 @@ def write_page(
         ]
     if rooms is not None and cameras is not None:
         header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
-    return _write_files(path, header, packed.contents, pictures, poster, split, title or path.stem)
+    files = _write_files(path, header, packed.contents, pictures, poster, split, title or path.stem)
+    return dataclasses.replace(files, num_rough=0 if rooms is None else rooms.is_clear.count(False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -512,7 +515,9 @@ def _describe_plan(
 
 
 def _find_cameras(scene: Scene, rooms: Rooms) -> Int[np.ndarray, "n"]:
-    """The camera that saw each Gaussian in a room, -1 for others; the nearest in a joint scene, which has no labels.
+    """The camera that saw each Gaussian in a room, -1 for those outside and on storeys that are not clear.
+
+    In a joint scene, which has no labels, it is the nearest camera.
 
     Args:
         scene: of `_prepare`.
@@ -522,7 +527,7 @@ def _find_cameras(scene: Scene, rooms: Rooms) -> Int[np.ndarray, "n"]:
     cameras = gaussians.views.long()
     if len(scene.cam2world) > 1 and not cameras.any():
         cameras = torch.cdist(gaussians.means.double(), scene.cam2world[:, :3, 3]).argmin(dim=1)
-    inside = rooms.find_inside(dataclasses.replace(gaussians, views=cameras))
+    inside = rooms.find_inside(dataclasses.replace(gaussians, views=cameras)) & torch.tensor(rooms.is_clear)[cameras]
     return torch.where(inside, cameras, -1).numpy()
 
 

@@ -2,7 +2,7 @@
 // describes it. The rooms are those of the part and the storey of the panorama that the camera leaves.
 
 import { camera, nearestNode, parts, tangentOf } from "./camera.js";
-import { byId, calm } from "./dom.js";
+import { byId, calm, say } from "./dom.js";
 import { ease, freeze, isWaiting, jump, jumpTo, lookOn, setTouring } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
 import { changed, measureAt, rayOf, sorted } from "./loop.js";
@@ -46,6 +46,10 @@ class DollHouse {
     if (!this.isPossible || headset.session || !sorted) return;
     setTouring(false);
     this.node = nearestNode(camera.position);
+    if (!HEADER.doll.boxes.some((box, view) => box && this.shows(view))) {
+      say("There is no doll's house of these rooms, because the surfaces that were found are too rough");
+      return;
+    }
     freeze();
     this.setOn(true);
     camera.roll = 0;

@@ -11,6 +11,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.tours import find_fronts, find_rooms, fit_box
+from pansplat.tours.doll_house import measure_roughness
 
 LOW, HIGH = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0))  # of the room around the first camera: x, y down, z
 
@@ -59,6 +60,22 @@ def test_floor_and_walls_are_inside_and_ceiling_garden_and_coarse_levels_are_not
     coarse = dataclasses.replace(room.gaussians, levels=torch.full_like(room.gaussians.levels, 2))
     assert not rooms.find_inside(coarse).any()
     assert rooms.list_level(1) == (0, 1) and rooms.list_level(2) == (2,)
+
+
+def test_surfaces_of_a_storey_that_scatter_are_not_clear(room: Scene) -> None:
+    random = torch.Generator().manual_seed(0)
+    means, views = room.gaussians.means, room.gaussians.views
+    centers = room.cam2world[views, :3, 3].float()
+    factors = torch.where(views < 2, torch.exp(0.1 * torch.randn(len(means), generator=random)), 1.0)
+    heap = dataclasses.replace(room.gaussians, means=centers + factors[:, None] * (means - centers))
+    assert find_rooms(room).is_clear == (True, True, True)
+    assert find_rooms(dataclasses.replace(room, gaussians=heap)).is_clear == (False, False, True)
+
+
+@pytest.mark.parametrize(("thickness", "expected"), [(0.0, 0.0), (1.0, 0.8)])
+def test_a_plane_is_smooth_and_a_heap_is_rough(thickness: float, expected: float) -> None:
+    places = np.random.default_rng(0).random((20_000, 3)) * (1, 1, thickness) + (3, -2, 5)
+    assert measure_roughness(places) == pytest.approx(expected, abs=0.1)
 
 
 def test_what_a_camera_saw_from_far_is_left_to_a_nearer_camera(room: Scene) -> None:

@@ -499,7 +499,7 @@ def test_a_pinned_image_keeps_its_settings_beside_other_scenes(app):
 
 
 def test_a_screenshot_without_memory_is_reported(app, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.recorder.write_screenshot", Mock(side_effect=MemoryError("no memory")))
+    monkeypatch.setattr("pansplat_viewer.capture.write_screenshot", Mock(side_effect=MemoryError("no memory")))
     app.press("p")
     assert app.viewer.error == "no screenshot written: the memory is exhausted (MemoryError: no memory)"
     assert app.viewer.recorder.files == []
@@ -756,7 +756,9 @@ def test_a_scene_without_rooms_has_a_message(app, small_scene):
     app.show(SceneEntry("empty"))
     app.viewer.toggle_doll_house()
     app.settle()
-    assert not app.state.doll_house and (app.state.message == "no room is known here" or app.viewer.error)
+    assert not app.state.doll_house and (
+        app.state.message.startswith("no doll's house: no surfaces") or app.viewer.error
+    )
 
 
 def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titles(tour_app):

@@ -315,6 +315,9 @@ def test_the_dolls_house_is_the_picture_of_the_fronts_in_the_rooms_and_a_click_g
     assert (after["yaw"], after["pitch"]) == pytest.approx((before["yaw"], before["pitch"])), (
         "closing keeps the heading"
     )
+    home.run("HEADER.doll.boxes = HEADER.doll.boxes.map(() => null)")  # of rough surfaces
+    home.page.keyboard.press("KeyO")
+    assert "too rough" in home.page.inner_text("#status") and home.camera["fov"] != 45
     home.page.emulate_media(reduced_motion="no-preference")
 
 

@@ -28,7 +28,7 @@ from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.inputs.pairs import Pair
 from pansplat.refinement.budget import merge_to
-from pansplat.tours import edges, find_camera_height, find_rooms, make_graph, select_views
+from pansplat.tours import doll_house, edges, find_camera_height, find_rooms, make_graph, select_views
 from pansplat.tours.plan import make_plan
 
 
@@ -110,6 +110,16 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
     headers = [read_header(tmp_path / f"{name}.html") for name in ("floor", "none")]
     assert headers[0]["doll"] and headers[1]["doll"] is None and headers[1]["plan"]["rooms"] == []
     assert headers[1]["plan"]["worlds"] == [0, 0, 0]
+
+
+def test_a_rough_storey_has_no_dolls_house(flat: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    views = torch.unique(flat.gaussians.views).tolist()
+    monkeypatch.setattr(doll_house, "_is_clear", lambda inside, views: 2 not in views)
+    page = write_page(flat, tmp_path / "page.html")
+    doll = read_header(page.files[0])["doll"]
+    assert page.num_rough == 1 and doll["boxes"][2] is None and all(doll["boxes"][view] for view in {*views} - {2})
+    monkeypatch.setattr(doll_house, "_is_clear", lambda inside, views: False)
+    assert write_page(flat, page.files[0]).num_rough == 4 and read_header(page.files[0])["doll"] is None
 
 
 def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

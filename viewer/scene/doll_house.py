@@ -49,12 +49,12 @@ class DollHouse:
 
     @staticmethod
     def make(scene: Scene, labels: Sequence[str], node: int) -> DollHouse | None:
-        """The rooms of the part and the storey of a panorama; None if nothing of them is known."""
+        """The rooms of the part and the storey of a panorama; None if they are not known or not clear."""
         rooms = find_rooms(scene)
         nodes = rooms.list_level(node)
         gaussians = scene.gaussians
         shown = rooms.find_inside(gaussians) & torch.isin(gaussians.views, torch.tensor(nodes).to(gaussians.views))
-        if not shown.any():
+        if not (shown.any() and rooms.is_clear[node]):
             return None
         joint = replace(scene, gaussians=gaussians.select(shown), overlaps=(), links=(), starts=(), joint=True)
         return DollHouse(joint, rooms, nodes, labels)
@@ -157,7 +157,7 @@ class DollHouseView:
         """Show what was made, and fly out of the rooms."""
         state = self._state
         if house is None:
-            state.show_message("no room is known here")
+            state.show_message("no doll's house: no surfaces of rooms were found here, or they are too rough")
         elif self._stage.show_outside(house.scene):
             self.house, self._inside = house, state.camera
             self._first = house.frame(state.camera, self._stage.eye_size)

@@ -21,7 +21,6 @@ from typing import Annotated
 import numpy as np
 import torch
 from msgspec import Meta, Struct
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from pansplat.errors import InputError
@@ -84,6 +83,8 @@ class CameraPath:
             level: a camera with the scene's level axes.
             tour: that the path is in.
         """
+        from scipy.interpolate import PchipInterpolator  # .1 s, of a window that opens too
+
         frames = self.key_frames if tour is None else self._select_part(seconds, tour)
         times = np.array([frame.seconds for frame in frames])
         cameras = [_place(frame, level) for frame in frames]
