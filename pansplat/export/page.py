@@ -34,6 +34,7 @@ from torch import Tensor
 
 from pansplat import constants, pipeline
 from pansplat.errors import InputError, InputWarning
+from pansplat.export.film import FilmPhotographs
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 from pansplat.export.page_photographs import PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
@@ -43,6 +44,7 @@ from pansplat.inputs.views import Views
 from pansplat.predictor import Progress
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.rendering.image_planes import image_planes
 from pansplat.shaders import load_shader
 from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
@@ -188,7 +190,7 @@ def write_page(
     cameras = None if rooms is None else _find_cameras(scene, rooms)
     packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree, cameras)
     report("drawing the poster", 0.7)
-    poster = _draw_poster(scene, flights.start)
+    poster = _draw_poster(scene, flights.start, photographs if has_pictures else ())
     pictures: list[PackedPhotograph] = []
     if has_pictures:
         left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - sum(map(len, packed.contents)) - len(poster)
@@ -391,17 +393,18 @@ def _choose_degree(scene: Scene, num_bytes: float) -> int:
     return next((degree for degree in degrees if count_bytes(count, degree) * 4 / 3 <= num_bytes), 0)
 
 
-def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"]) -> bytes:
-    """A JPEG of the first view of the page."""
+def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence[Pair]) -> bytes:
+    """A JPEG of the first view of the page; at a panorama it shows the photograph, if there is one."""
+    fov = math.degrees(2 * math.atan(_TALLEST * math.tan(math.radians(_START_FOV / 2))))
+
+    def draw() -> Float[np.ndarray, "height width 3"]:
+        options = {"size": _POSTER_SIZE, "layout": "pinhole", "vertical_fov_degrees": fov}
+        return pipeline.render(scene, pose, **options).color.clamp(0, 1).permute(1, 2, 0).numpy()
+
+    (plane,) = image_planes("pinhole", _POSTER_SIZE, vertical_fov_degrees=fov)
     with torch.no_grad():
-        color = pipeline.render(
-            scene,
-            pose,
-            size=_POSTER_SIZE,
-            layout="pinhole",
-            vertical_fov_degrees=math.degrees(2 * math.atan(_TALLEST * math.tan(math.radians(_START_FOV / 2)))),
-        ).color
-    pixels = (color.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+        image = FilmPhotographs(photographs, scene.cam2world).mix([(pose.numpy(), 1.0, draw)], plane, 0.0)
+    pixels = (image * 255).round().clip(0, 255).astype(np.uint8)
     with io.BytesIO() as file:
         Image.fromarray(pixels).save(file, "JPEG", quality=80, optimize=True)
         return file.getvalue()

@@ -98,6 +98,19 @@ def pack(scene: Scene, photographs: list[Pair], **options: Any) -> list[PackedPh
     return pack_photographs(scene, photographs, progress=lambda what, fraction: None, **arguments)
 
 
+def test_the_poster_shows_the_photograph_where_the_page_begins(
+    scene: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path
+) -> None:
+    photographs = take_photographs(scene, 512)
+    Image.new("RGB", (1024, 512), PURPLE).save(photographs[0].context[0].image)
+    shares = []
+    for height in (None, 0):
+        write_page(scene, tmp_path / "page.html", photographs=photographs, photo_height=height)
+        poster = next(image for image in decode_page(tmp_path / "page.html") if image.shape == (27, 32, 3))
+        shares.append(count_purple(poster) / poster[..., 0].size)
+    assert shares[0] == 1 and shares[1] < 0.1
+
+
 def test_the_tiles_of_the_largest_level_are_the_photograph(
     scene: Scene, take_photographs: Callable[..., list[Pair]]
 ) -> None:
