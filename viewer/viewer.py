@@ -7,6 +7,7 @@ Keys and panels change `state` at once, and queue all other actions, which are d
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -23,8 +24,10 @@ from imgui_bundle import imgui
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
+from pansplat.inputs.photographs import LINKS, write_notes
+from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import find_scene_suffix, require_replaceable
-from pansplat.tours import list_starts, plan_route
+from pansplat.tours import find_angles, list_starts, plan_route
 from pansplat_viewer.recorder import Recorder
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.background import Jobs
@@ -47,6 +50,7 @@ from pansplat_viewer.window.input import apply_input, read_input
 from pansplat_viewer.window.preferences import Theme, read_preferences, write_preferences
 
 _MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
+_NOTE_COSINE = math.cos(math.radians(5))  # of the angle within which a note is at the middle of the image
 _REDUCTION = 4  # a scene that does not fit is offered with this fraction of its Gaussians
 
 
@@ -625,6 +629,25 @@ class Viewer:
         if self.loaded is not None and self.stage.photograph is not None:
             self.state.show_message("there is no scene of this place yet")
         return self.loaded is not None and self.stage.photograph is None
+
+    def put_note(self, text: str) -> None:
+        """State a note at the middle of the image, in place of one that is there; without a text remove that one."""
+        photographs, camera, folder = self.stage.comparer.photographs, self.state.camera, self.library.folder
+        index = photographs.find_stop(np.asarray(camera.position))
+        if index is None or folder is None:
+            self.state.show_message("a note is put at a panorama of a folder; open the folder of this one")
+            return
+        away = photographs.pose(index)[:3, :3].T @ camera.rotation[:, 2]
+        kept = photographs.list_notes(index)
+        angles = [away @ find_direction(torch.eye(4), note.yaw, note.pitch).numpy() for note in kept]
+        kept = tuple(note for note, cosine in zip(kept, angles, strict=True) if cosine < _NOTE_COSINE)
+        yaw, pitch = find_angles(away)
+        notes = (*kept, make_note((yaw, -pitch), text)) if text.strip() else kept
+        with self._showing_errors():
+            write_notes(photographs.panoramas[index], notes, folder)
+            photographs.change_notes(index, notes)
+            self.library.watch_again()
+            self.state.show_message(f"wrote {folder / LINKS}")
 
     def save_path(self, text: str) -> None:
         """Write the key frames of the camera path."""

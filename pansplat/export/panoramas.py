@@ -1,4 +1,4 @@
-"""The panoramas of a tour as 2:1 photographs with titles, links and start views: out of tiles and cube faces."""
+"""The panoramas of a tour as 2:1 photographs with titles, links, notes and start views: out of tiles and cube faces."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from pansplat.images.image_files import read_height, read_mask, read_panorama, write_image
 from pansplat.inputs.pairs import Panorama
-from pansplat.inputs.photographs import LINKS
+from pansplat.inputs.photographs import LINKS, describe_notes
 from pansplat.predictor import Progress
 
 
@@ -48,5 +48,6 @@ def _describe(view: Panorama) -> dict[str, object]:
         {"to": f"{link.target}.jpg", "yaw": link.yaw, "pitch": link.pitch} | ({"text": link.text} if link.text else {})
         for link in view.links
     ]
-    entry: dict[str, object] = {"title": view.title, "start": view.start, "links": links}
+    notes = describe_notes(view.notes)
+    entry: dict[str, object] = {"title": view.title, "start": view.start, "links": links, "notes": notes}
     return {key: value for key, value in entry.items() if value}

@@ -227,7 +227,7 @@ def _read_tour_file(file: Path) -> list[Panorama]:
             f"{file}: needed a panorama, a folder of panoramas, its file of poses, or a web tour, got another file; "
             "give the folder."
         )
-    return read_web_tour(file)
+    return add_links(read_web_tour(file), file.parent)
 
 
 def _list_unposed(root: Path) -> list[Panorama]:
@@ -235,7 +235,7 @@ def _list_unposed(root: Path) -> list[Panorama]:
     source, problem = find_web_tour(root), None
     if source is not None:
         try:
-            panoramas = read_web_tour(source)
+            panoramas = add_links(read_web_tour(source), source.parent)
         except InputError as error:
             problem = error
         else:

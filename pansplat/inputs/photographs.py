@@ -1,8 +1,9 @@
-"""Panoramas without poses: the pictures of a folder, and the links and titles of its links.json."""
+"""Panoramas without poses: the pictures of a folder, and the links, titles and notes of its links.json."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import warnings
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -16,8 +17,9 @@ from pansplat.geometry.path import wrap_angle
 from pansplat.images.cube_faces import find_layout, group_faces
 from pansplat.images.cube_images import CubeImage, write_cube
 from pansplat.images.image_files import is_two_to_one, read_size, require_complete, require_two_to_one
-from pansplat.inputs.pairs import Link, Panorama, find_mask, list_panorama_files
-from pansplat.inputs.web_tours.entries import Number, plain_text, read_direction, resolve_links
+from pansplat.inputs.pairs import Link, Note, Panorama, find_mask, list_panorama_files
+from pansplat.inputs.web_tours.entries import Number, make_note, plain_text, read_direction, resolve_links
+from pansplat.system.atomic import replacing
 from pansplat.system.files import is_written
 from pansplat.system.strict_json import convert, read_field, read_json
 
@@ -130,9 +132,10 @@ def _make_panorama(name: str, picture: Path | CubeImage, folder: Path) -> Panora
 
 
 def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
-    """The panoramas with the links, titles and start views of the folder's links.json, if it has one.
+    """The panoramas with the links, titles, notes and start views of the folder's links.json, if it has one.
 
-    Warns about entries and links that cannot be used, or about a file that cannot be read.
+    What an entry does not state stays. Warns about entries and links that cannot be used, or about a file that cannot
+    be read.
     """
     source = folder / LINKS
     if not source.is_file():
@@ -162,16 +165,48 @@ def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
 
 
 def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Path) -> Panorama:
-    """The panorama with the content of its entry: a list of links, or {"title", "start", "links"}."""
+    """The panorama with the content of its entry: a list of links, or {"title", "start", "links", "notes"}."""
     content = convert({"links": entry} if isinstance(entry, list) else entry, dict[str, Any], source)
     links = [
         Link(str(link.get("to")), *read_direction({"yaw": None, **link}, source), plain_text(link.get("text")))
         for link in read_field(content, "links", list[dict[str, Any]], source, [])
     ]
+    notes = [
+        make_note(
+            read_direction(note, source), str(note.get("text", "")), read_field(note, "addresses", list, source, [])
+        )
+        for note in read_field(content, "notes", list[dict[str, Any]], source, [])
+    ]
     start = read_field(content, "start", tuple[Number, Number], source)
     return dataclasses.replace(
         panorama,
         title=plain_text(content.get("title")) or panorama.title,
-        links=resolve_links(links, names, panorama.name, source),
-        start=start and (wrap_angle(start[0]), start[1]),
+        links=resolve_links(links, names, panorama.name, source) if "links" in content else panorama.links,
+        notes=tuple(note for note in notes if note.text or note.addresses) if "notes" in content else panorama.notes,
+        start=(wrap_angle(start[0]), start[1]) if start else panorama.start,
     )
+
+
+def describe_notes(notes: Sequence[Note]) -> list[dict[str, Any]]:
+    """Notes as in links.json."""
+    described = [{"yaw": round(note.yaw, 5), "pitch": round(note.pitch, 5), "text": note.text} for note in notes]
+    return [
+        entry | ({"addresses": note.addresses} if note.addresses else {})
+        for entry, note in zip(described, notes, strict=True)
+    ]
+
+
+def write_notes(panorama: Panorama, notes: Sequence[Note], folder: Path) -> None:
+    """Replace the notes of a panorama in the links.json of its folder, which keeps all else that it states.
+
+    Raises:
+        InputError: links.json cannot be read.
+    """
+    source = folder / LINKS
+    content = read_json(source, dict[str, Any]) if source.exists() else {}
+    key = panorama.image.name if panorama.image.name in content else panorama.name
+    entry = content.get(key, {})
+    entry = {"links": entry} if isinstance(entry, list) else convert(entry, dict[str, Any], source)
+    content[key] = entry | {"notes": describe_notes(notes)}
+    with replacing(source) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), "utf-8")

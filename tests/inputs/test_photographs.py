@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from pansplat.images.image_files import read_panorama
-from pansplat.inputs.pairs import Link
-from pansplat.inputs.photographs import list_photographs
+from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.photographs import list_photographs, write_notes
 
 
 def test_panoramas_faces_and_strips_of_a_folder_are_listed_by_name(
@@ -84,6 +84,29 @@ def test_links_titles_and_start_views_are_read(rooms: Path) -> None:
     assert two.links == (Link("p01", -1.0),)
 
 
+def test_notes_are_read_and_written_and_all_else_stays(rooms: Path) -> None:
+    links, note = [{"to": "p02.jpg", "yaw": 0.5}], Note(0.1, -0.2, "1 < 2 % <b>", ("https://example.com/a",))
+    stated = {
+        "yaw": 0.1,
+        "pitch": -0.2,
+        "text": "1 < 2 % <b>\n\n",
+        "addresses": ["https://example.com/a", "file:///b", 3],
+    }
+    one, two = _link(
+        rooms, {"p01.jpg": links, "p02": {"title": "Bad", "notes": [stated, {"yaw": 1}], "colour": "blue"}}
+    )
+    assert one.notes == () and two.notes == (note,)
+    write_notes(one, [note], rooms)
+    write_notes(two, [*two.notes, Note(3, 0, "window")], rooms)
+    one, two = list_photographs(rooms)
+    assert one.notes == (note,) and one.links == (Link("p02", 0.5),)
+    assert two.notes == (note, Note(3, 0, "window")) and two.title == "Bad"
+    write_notes(two, [], rooms)
+    content = json.loads((rooms / "links.json").read_text("utf-8"))
+    assert content["p02"] == {"title": "Bad", "notes": [], "colour": "blue"} and content["p01.jpg"]["links"] == links
+    assert list_photographs(rooms)[1].notes == ()
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -95,6 +118,7 @@ def test_links_titles_and_start_views_are_read(rooms: Path) -> None:
         ({"p01.jpg": [{"to": "p02.jpg"}]}, "links of p01 are left out: .*yaw: needed a number, got None"),
         ({"p01.jpg": [{"to": "p02.jpg", "yaw": "right"}]}, "links of p01 are left out: .*yaw: needed a number"),
         ({"p01.jpg": 5}, "links of p01 are left out: .* needed an object"),
+        ({"p01.jpg": {"notes": [{"yaw": "left", "text": "a"}]}}, "links of p01 are left out: .*yaw: needed a number"),
         ({"p01.jpg": {"start": [1]}}, "links of p01 are left out: .*start: needed a list of length 2"),
         ("<html>", r"links are left out: .*links\.json: needed JSON"),
         ([], r"links are left out: .*links\.json: needed an object"),

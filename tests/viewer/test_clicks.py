@@ -76,6 +76,7 @@ OTHER_WIDGETS = {
     *get_args(Display), *get_args(Comparison),
     "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
     "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
+    "Notes in the picture",
 }  # fmt: skip
 
 
@@ -884,6 +885,34 @@ def tour_user(user, house, small_pacing) -> User:
     return user
 
 
+def test_a_note_is_typed_shown_and_removed(tour_user, house, monkeypatch):
+    user, file, center = tour_user, house.folder / "links.json", tour_user.state.camera
+    aside = replace(center, yaw_radians=center.yaw_radians - 0.3, pitch_radians=0.15)
+    monkeypatch.setattr(user.viewer.library, "path", house.folder)
+
+    def look_aside() -> np.ndarray:  # the panels cover the middle
+        user.state.camera, user.state.message = aside, ""
+        image = user.read_image()[450:].astype(int)
+        user.state.camera = center
+        return image
+
+    before = look_aside()
+    user.click("Notes in the picture")
+    user.click("note")
+    for character in "oak":
+        imgui.get_io().add_input_character(ord(character))
+    user.draw_frames(2)
+    user.click("Put at the middle")
+    assert json.loads(file.read_text())["room0"]["notes"][0]["text"] == "oak"
+    changed = np.abs(look_aside() - before).max(axis=2) > 20
+    assert 100 < changed.sum() < 600, "its mark"
+    user.click("Remove at the middle")
+    user.click("Notes in the picture")
+    assert json.loads(file.read_text())["room0"]["notes"] == []
+    assert not (np.abs(look_aside() - before) > 20).any()
+    file.unlink()
+
+
 def fly(user: User, seconds: float = 1 / 5) -> list[float]:
     """Draw frames until the flight ends; returns the mean change from each frame to the next."""
     user.viewer.stage.resolution.budget_ms = 1e-3  # coarse images save time
@@ -1231,7 +1260,7 @@ def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
 def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
     user, films = path_user, []
     monkeypatch.setattr(
-        "pansplat_viewer.recorder.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
+        "pansplat_viewer.capture.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
     )
     user.slide("frames per second", 0.6)
     for suffix, projection in ((".webm", "equirect"), (".exr", "cubemap"), (".mp4", "perspective")):

@@ -19,7 +19,9 @@ from pansplat.errors import InputError
 from pansplat.export.cleanup import find_floaters
 from pansplat.gaussians.formats import load_scene
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import read_blur_mask, write_image
+from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
@@ -771,6 +773,33 @@ def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titl
     app.press("4")
     app.until(lambda: not app.state.doll_house, "end of the flight", 1 / 5)
     assert app.node == 3
+
+
+def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
+    app = make_app()
+    app.viewer.show([SceneEntry(house.name, tour=house)], 0, house.folder)
+    app.settle()
+    photographs, file = app.viewer.stage.comparer.photographs, house.folder / "links.json"
+    app.state.camera = replace(app.state.camera, yaw_radians=0.4, pitch_radians=0.2)
+    app.viewer.put_note("  sofa\nof 1960 ")
+    app.state.camera = replace(app.state.camera, yaw_radians=-1.0)
+    app.viewer.put_note("door")
+    index = photographs.find_stop(np.asarray(app.state.camera.position))
+    assert [note.text for note in photographs.list_notes(index)] == ["sofa\nof 1960", "door"]
+    app.state.camera = replace(app.state.camera, yaw_radians=0.43)
+    app.viewer.put_note("")
+    (note,) = load_panoramas(house.folder)[index].notes
+    expected = replace(app.state.camera, yaw_radians=-1.0).rotation[:, 2]
+    assert note.text == "door" and photographs.list_notes(index)[0].text == "door"
+    assert find_direction(house.panoramas[index].cam2world, note.yaw, note.pitch).numpy() == pytest.approx(
+        expected, abs=1e-4
+    )
+    assert not app.library.watch.changed
+    written = file.read_bytes()
+    app.state.camera = replace(app.state.camera, position=(0.0, 0.0, 0.4))
+    app.viewer.put_note("between")
+    assert file.read_bytes() == written and "at a panorama" in app.state.message
+    file.unlink()
 
 
 # --- tours ---

@@ -31,6 +31,7 @@ from pansplat_viewer.scene.state import (
 from pansplat_viewer.scene.tour import TourScenes
 from pansplat_viewer.ui.cleaning import CleaningSection, draw_mask
 from pansplat_viewer.ui.minimap import SIZE, Minimap, describe_panorama, describe_panoramas, is_probable
+from pansplat_viewer.ui.notes import NotesSection, draw_notes
 from pansplat_viewer.ui.overlays import (
     FIXED,
     MARGIN,
@@ -72,12 +73,13 @@ class Panels:
         minimap: the plan of a tour.
         placing: the window in which a photograph is placed.
         cleaning: the section "Clean up".
+        notes: the section "Notes in the picture".
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.widgets = Widgets()
         self.minimap, self.placing = Minimap(ctx), PlacingWindow(ctx, self.widgets)
-        self.cleaning = CleaningSection(self.widgets)
+        self.cleaning, self.notes = CleaningSection(self.widgets), NotesSection(self.widgets)
         self.path, self.path_file = "", "path.json"
         self._is_reset = False  # whether the default layout was chosen in this frame
 
@@ -100,6 +102,7 @@ class Panels:
             draw_points(state)
         if state.overlay and state.hotspots:
             draw_hotspots(viewer.hotspots)
+            draw_notes(viewer)
         if state.overlay and viewer.tour is not None:
             self._draw_tour(viewer, viewer.tour)
         if state.overlay and placing is not None and placing.node is not None and self.placing.draw(placing):
@@ -173,6 +176,8 @@ class Panels:
         if placing is not None and placing.is_listed:
             opened = any(view.placement.state != "placed" for view in placing.panoramas)
             section("Photographs", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
+        if len(viewer.stage.comparer.photographs):
+            section("Notes in the picture", partial(self.notes.draw, viewer), opened=False)
         if viewer.stage.renderer.stats.total:
             section("Gaussians", partial(self._draw_gaussians, viewer.state))
         section("Display", partial(self._draw_display, viewer.state))

@@ -12,7 +12,8 @@ from jaxtyping import Float, UInt8
 
 from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.pairs import Note, Panorama
+from pansplat.tours import STOP_REACH
 
 MAX_HEIGHT = 2048  # pixels; sharper than the image at fields of view above 65 degrees on 720 rows
 _MAX_TEXTURES = 4  # 25 MB each
@@ -30,6 +31,7 @@ class Photographs:
         self._positions: Float[np.ndarray, "photograph 3"] = np.zeros((0, 3))
         self._reading: dict[int, Future[UInt8[np.ndarray, "height width 3"]]] = {}
         self._failed: set[int] = set()
+        self._notes: dict[int, tuple[Note, ...]] = {}  # of panoramas whose notes were changed
         self._textures: OrderedDict[int, moderngl.Texture] = OrderedDict()
 
     def __len__(self) -> int:
@@ -67,6 +69,20 @@ class Photographs:
         if not len(self):
             return None
         return int(np.argmin(np.linalg.norm(self._positions - position, axis=1)))
+
+    def find_stop(self, position: Float[np.ndarray, "3"]) -> int | None:
+        """The photograph at whose camera a position is, within `STOP_REACH`; None if there is none."""
+        index = self.find_nearest(position)
+        is_near = index is not None and np.linalg.norm(self._positions[index] - position) <= STOP_REACH
+        return index if is_near else None
+
+    def list_notes(self, index: int) -> tuple[Note, ...]:
+        """The notes of a photograph."""
+        return self._notes.get(index, self._panoramas[index].notes)
+
+    def change_notes(self, index: int, notes: tuple[Note, ...]) -> None:
+        """Replace the notes of a photograph until it is read again."""
+        self._notes[index] = notes
 
     def get(self, index: int) -> moderngl.Texture | None:
         """The texture of a photograph, top row first; None while it is being read, or if it cannot be read."""
@@ -112,6 +128,7 @@ class Photographs:
             texture.release()
         self._reading.clear()
         self._failed.clear()
+        self._notes.clear()
         self._textures.clear()
 
 

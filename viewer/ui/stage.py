@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import STOP_REACH
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
 from pansplat_viewer.draw.stereo import WindowRenderer, create_window_renderer, get_eye_size
 from pansplat_viewer.scene import camera as cameras
@@ -257,11 +256,7 @@ class Stage:
         is_whole = settings.shows_scene and state.comparison == "off" and self.photograph is None
         if not (state.stops and is_whole):
             return None
-        position, photographs = np.asarray(state.camera.position), self.comparer.photographs
-        index = photographs.find_nearest(position)
-        if index is None or np.linalg.norm(photographs.pose(index)[:3, 3] - position) > STOP_REACH:
-            return None
-        return index
+        return self.comparer.photographs.find_stop(np.asarray(state.camera.position))
 
     def _plan_resolution(self) -> ResolutionPlan:
         """The plan of the frame, from the movement since the last one."""

@@ -168,8 +168,13 @@ def read_note(direction: tuple[float, float], texts: Sequence[Any], addresses: S
     for text in texts:
         parser.feed(f"{text[:_MAX_HTML]}\n" if isinstance(text, str) else "")
     parser.close()
-    lines = (plain_text(line) for line in "".join(parser.parts).splitlines())
-    kept = dict.fromkeys(each for each in (*parser.addresses, *addresses) if _is_address(each))
+    return make_note(direction, "".join(parser.parts), (*parser.addresses, *addresses))
+
+
+def make_note(direction: tuple[float, float], text: str, addresses: Sequence[Any] = ()) -> Note:
+    """A note of plain text, without empty lines and without what is no address of a web page."""
+    lines = (plain_text(line) for line in text.splitlines())
+    kept = dict.fromkeys(each for each in addresses if _is_address(each))
     return Note(*direction, "\n".join(line for line in lines if line)[:_MAX_NOTE], tuple(kept)[:_MAX_ADDRESSES])
 
 

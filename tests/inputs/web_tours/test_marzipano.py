@@ -112,6 +112,8 @@ def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Exp
 def test_a_tour_comes_out_of_its_tiles_as_photographs(export: Export, check_colors, tmp_path_factory, capsys) -> None:
     spot = {"yaw": 3.0, "pitch": 0.25, "target": "1-kitchen"}
     folder = export(_scene("0-hall", linkHotspots=[spot]), _scene("1-kitchen", name="Küche"))
+    own = {"0-hall": {"notes": [{"yaw": 1.0, "pitch": 0.1, "text": "sofa"}]}}
+    (folder / "links.json").write_text(json.dumps(own))
     out = tmp_path_factory.mktemp("photos") / "panoramas"
     assert run(["export", str(folder), "-o", str(out), "--photos"]) == 0
     assert "2 photographs" in capsys.readouterr().out
@@ -121,6 +123,8 @@ def test_a_tour_comes_out_of_its_tiles_as_photographs(export: Export, check_colo
     before, after = load_panoramas(folder), load_panoramas(out)
     for old, new in zip(before, after, strict=True):
         assert (new.name, new.title, new.start, new.links) == (old.name, old.title, old.start, old.links)
+        assert new.notes == old.notes
+    assert before[0].links and before[0].notes == (Note(1.0, 0.1, "sofa"),), "links.json adds to what the tour states"
     assert run(["export", str(folder), "-o", str(out), "--photos"]) == 2
     assert "new or empty folder" in capsys.readouterr().err
     assert run(["export", str(folder), "-o", str(out / "a"), "--photos", "--split"]) == 2
