@@ -391,7 +391,7 @@ class Viewer:
             self.show(result, *self.library.choose_found(result))
         elif isinstance(result, LoadedScene):
             loaded = self.loaded
-            if loaded is not None and self.tour is not None and result.entry.tour is self.tour.tour:
+            if loaded is not None and self.tour is not None and self.tour.is_of(result.entry):
                 self.tour.add(result)
             elif loaded is not None and loaded.entry is result.entry and result.is_final and not loaded.is_final:
                 self._refined = result.scene
@@ -403,7 +403,7 @@ class Viewer:
             known = isinstance(result, (InputError, OSError))  # else a defect, or out of memory
             self.show_error(str(result) if known else f"{type(result).__name__}: {result}")
             has_failed = requested is not None and loader.entry is None  # else the search
-            if has_failed and self.tour is not None and requested.tour is self.tour.tour:
+            if has_failed and self.tour is not None and self.tour.is_of(requested):
                 self.tour.fail(requested.views)
             self.library.restore()
 

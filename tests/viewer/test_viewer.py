@@ -775,6 +775,31 @@ def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titl
     assert app.node == 3
 
 
+@pytest.mark.parametrize("found", [{"poor": [(1, 2)]}, {"walls": [(1, 2)]}])
+def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(make_app, house, load_house, found):
+    app, go = make_app(), threading.Event()
+
+    def load(entry: SceneEntry, progress: object, show: Callable[..., None]) -> LoadedScene:
+        if not entry.views:
+            return load_house(replace(entry, views=(0, 1), pair=house.make_pair((0, 1)), max_views=64))
+        loaded = replace(load_house(entry), **found)
+        if len(entry.views) == 4:
+            show(replace(loaded, is_final=False))
+            assert go.wait(300)
+        return loaded
+
+    app.load = load
+    app.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    app.until(
+        lambda: app.viewer.tour is not None and (app.viewer.tour.tour.poor or app.viewer.tour.tour.walls), "edges"
+    )
+    tour, edges = app.viewer.tour, app.viewer.tour.tour
+    go.set()
+    app.settle()
+    assert app.viewer.tour is tour and tour.tour is edges and app.viewer.error is None
+    assert len(tour.loaded) == tour.num_scenes
+
+
 def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     app = make_app()
     app.viewer.show([SceneEntry(house.name, tour=house)], 0, house.folder)

@@ -70,6 +70,7 @@ class TourScenes:
             max_views: of the predictor (`TourGraph.choose_predictions`).
         """
         self.tour, self._merged, self._max_views = tour, merged, max_views
+        self._graphs = [tour]  # also those before poor edges and walls were found, which pending entries have
         self.edge: Edge = next(iter(tour.overlaps))
         self._is_placed = False  # whether the camera has been at the edge
         self.outlines: dict[int, FloorOutline] = {}
@@ -192,7 +193,7 @@ class TourScenes:
         self._outlooks |= loaded.outlooks
         self._block(loaded.walls)
         if poor := set(loaded.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
-            self.tour = replace(self.tour, poor=(*self.tour.poor, *sorted(poor)))
+            self._change(replace(self.tour, poor=(*self.tour.poor, *sorted(poor))))
         if views not in self._predictions:
             self._selected[views] = loaded
             return
@@ -204,12 +205,20 @@ class TourScenes:
             del self._selected[scene]
         self._drop(views)
 
+    def is_of(self, entry: SceneEntry) -> bool:
+        """Whether an entry is a prediction of this tour, also one that was requested before its graph changed."""
+        return any(entry.tour is graph for graph in self._graphs)
+
+    def _change(self, tour: TourGraph) -> None:
+        self.tour = tour
+        self._graphs.append(tour)
+
     def _block(self, walls: Sequence[Edge]) -> None:
         """Put walls in place of edges. A panorama without another edge keeps the scene of its first one."""
         blocked = [edge for edge in walls if edge in self.tour.overlaps]
         if not blocked:
             return
-        self.tour = self.tour.with_walls(blocked)
+        self._change(self.tour.with_walls(blocked))
         of_node = {node: views for edge, views in self._views.items() for node in edge}
         self._views = {edge: self._views.get(edge, of_node[edge[0]]) for edge in self.tour.overlaps}
         if self.edge in blocked:
