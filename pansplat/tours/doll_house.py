@@ -128,7 +128,7 @@ def find_rooms(scene: Scene) -> Rooms:
     """
     tour, gaussians = make_graph(scene), scene.gaussians
     level, count = tour.level_axes, len(tour)
-    step = max(len(gaussians) // (_SAMPLES * max(count, 1)), 1)
+    step = max(len(gaussians) // (_SAMPLES * max(len(gaussians.views.unique()), 1)), 1)
     gaussians = gaussians.select(torch.arange(0, len(gaussians), step)).to(device="cpu")
     gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
     scene = dataclasses.replace(scene, gaussians=gaussians)
