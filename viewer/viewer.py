@@ -568,6 +568,10 @@ class Viewer:
                     state.route = tour.plan_route(pose, state.route.walk[state.route.leg(state.flight) + 1 :])
                     state.flight = 0.0
             state.target = None
+            if state.playing:  # photographs are read before they are shown
+                leg = state.route.leg(state.flight)
+                for node in state.route.walk[leg + 1 : leg + 3]:
+                    self.stage.comparer.get_photograph(state, node)
         advance_flight(state, seconds)
 
     # --- actions of keys and panels ---

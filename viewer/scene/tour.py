@@ -36,6 +36,7 @@ from pansplat_viewer.scene.picking import project_point
 
 DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
 _LARGEST_STOP_STEP = 1 / 3  # of this fade in a frame, also after a pause without frames
+_FIRST_STOP_WEIGHT = 0.01  # of a photograph after a cut
 _NEXT_SCENES = 3  # that are dropped last
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor
 _MIN_HOTSPOT_PIXELS = 14.0
@@ -422,14 +423,18 @@ class CrossFade:
 class StopFade:
     """The photograph of the panorama at which the camera stands; it fades in and out for `STOP_SECONDS`.
 
+    After a cut from one panorama to another it fades from photograph to photograph for `FADE_SECONDS`.
+
     Attributes:
         index: number of the photograph; None if none is shown.
-        weight: of the photograph over the scene, 0 to 1.
+        before: that of the panorama before the cut; None if the photograph fades from or to the scene.
+        weight: of the photograph over that one or the scene, 0 to 1.
     """
 
     def __init__(self) -> None:
         """No photograph is shown."""
         self.index: int | None = None
+        self.before: int | None = None
         self.weight = 0.0
         self._last = 0.0
 
@@ -438,12 +443,17 @@ class StopFade:
 
         With `at_once` its photograph is shown already and does not fade in.
         """
-        step = min(max(now - self._last, 0.0) / STOP_SECONDS, _LARGEST_STOP_STEP)
+        seconds = STOP_SECONDS if self.before is None else FADE_SECONDS
+        step = min(max(now - self._last, 0.0) / seconds, _LARGEST_STOP_STEP)
         self._last = now
         if self.weight <= 0 or at_once:
             self.index = index
+        elif index is not None and index != self.index:
+            self.before, self.index, self.weight, step = self.index, index, _FIRST_STOP_WEIGHT, 0.0
         is_here = index is not None and index == self.index
         self.weight = 1.0 if is_here and at_once else min(max(self.weight + (step if is_here else -step), 0.0), 1.0)
+        if not is_here or self.weight >= 1:
+            self.before = None
 
 
 @dataclass(frozen=True)

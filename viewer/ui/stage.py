@@ -61,7 +61,8 @@ class Stage:
         self.presenter = Presenter(ctx)
         self.comparer = Comparer(ctx, lambda: create_window_renderer(ctx, choice), show_error)
         self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
-        self._stop_layer = PhotographLayer(self.presenter)
+        self._stop_layer, self._cut_layer = PhotographLayer(self.presenter), PhotographLayer(self.presenter)
+        self._stop_camera = state.camera  # of the last frame before a cut
         self.resolution = self._create_resolution()
         self.size: tuple[int, int] = (1, 1)
         self.image_size: tuple[int, int] = (1, 1)
@@ -209,8 +210,8 @@ class Stage:
             milliseconds = self._render(self.outside, state.camera.cam2world, state.draw_settings, plan)
             image = self.outside.image
         else:
-            stop, milliseconds = self._draw_stop(), 0.0
-            if stop is None or self.stop.weight < 1 or not plan.moving:
+            (stop, before), milliseconds = self._draw_stop(), 0.0
+            if stop is None or (self.stop.weight < 1 and before is None) or not plan.moving:
                 weight = self.fade.compute_weight(state.now)
                 image, milliseconds = self._draw_content(self.fade.front, plan)
                 if weight < 1:
@@ -219,7 +220,8 @@ class Stage:
                 if image is None:  # the first one of a large scene is not finished
                     image, fading = fading, None
             if stop is not None:
-                image, fading, weight = stop, image if self.stop.weight < 1 else None, self.stop.weight
+                below = None if self.stop.weight >= 1 else image if before is None else before
+                image, fading, weight = stop, below, self.stop.weight
         self._record_time(plan, milliseconds)
         if image is None:
             photograph = self.comparer.get_photograph(state) if self.outside is None else None
@@ -238,17 +240,23 @@ class Stage:
         right = self.comparer.get_right_side(state, draw_pinned) if can_compare else None
         self.presenter.draw(image, target, state.camera, right=right, fading=fading, weight=weight)
 
-    def _draw_stop(self) -> moderngl.Texture | None:
-        """The photograph of the panorama at which the camera stands, or stood until now; None if none is shown."""
+    def _draw_stop(self) -> tuple[moderngl.Texture | None, moderngl.Texture | None]:
+        """The photograph of the panorama at which the camera stands, or stood until now, and the one before a cut."""
         state, fade = self._state, self.fade
         index = self._find_stop()
         photograph = None if index is None else self.comparer.get_photograph(state, index)
         was_shown = fade.compute_weight(state.now) < 1 and fade.contents[1 - fade.front] == index
         self.stop.update(None if photograph is None else index, state.now, at_once=was_shown)
         if self.stop.weight <= 0 or self.stop.index is None:
-            return None
+            return None, None
         photograph = photograph if self.stop.index == index else self.comparer.get_photograph(state, self.stop.index)
-        return None if photograph is None else self._stop_layer.draw(photograph, state.camera, self.size)
+        if photograph is None:
+            return None, None
+        before = None if self.stop.before is None else self.comparer.get_photograph(state, self.stop.before)
+        if before is None:
+            self._stop_camera = state.camera
+        below = before and self._cut_layer.draw(before, self._stop_camera, self.size)
+        return self._stop_layer.draw(photograph, state.camera, self.size), below
 
     def _find_stop(self) -> int | None:
         """The panorama at which the camera stands, if its scene is shown as it is."""
@@ -315,7 +323,7 @@ class Stage:
     def release(self) -> None:
         """Stop the threads and free every GL object."""
         self.preparer.close()
-        for layer in (*self._layers, self._stop_layer):
+        for layer in (*self._layers, self._stop_layer, self._cut_layer):
             layer.release()
         self.presenter.release()
         self.comparer.release()

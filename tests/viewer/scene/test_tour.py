@@ -18,7 +18,7 @@ from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import SceneEntry
 from pansplat_viewer.scene.settings import DrawSettings
-from pansplat_viewer.scene.tour import CrossFade, TourScenes, find_clicked, find_hotspots, measure_bytes
+from pansplat_viewer.scene.tour import CrossFade, StopFade, TourScenes, find_clicked, find_hotspots, measure_bytes
 from pansplat_viewer.ui.minimap import describe_panoramas
 
 
@@ -101,6 +101,28 @@ def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
     assert len(scenes.plan_way(camera, 1).fades) == 1
     edges = sum(a != b for a, b in scenes.tour.overlaps)
     assert describe_panoramas(scenes.tour).endswith(f"; {edges - 1} flights, 1 fades")
+
+
+def test_after_a_cut_a_photograph_fades_from_the_one_before_and_not_from_the_scene():
+    stop, weights = StopFade(), []
+    for frame in range(10):
+        stop.update(3, 0.1 * frame)
+    assert (stop.index, stop.before, stop.weight) == (3, None, 1)
+    for frame in range(10, 40):
+        stop.update(5, 0.1 * frame)
+        assert stop.index == 5 and stop.before == (3 if stop.weight < 1 else None)
+        weights.append(stop.weight)
+    assert weights[0] < 0.02 and weights.index(1) == pytest.approx(10 * FADE_SECONDS, abs=1)
+    assert np.diff(weights[:10]).min() > 0.05
+    stop.update(None, 4.0)
+    assert (stop.index, stop.before) == (5, None) and stop.weight < 1, "into the scene"
+
+
+def test_a_cut_to_a_photograph_that_is_left_at_once_ends_in_the_scene():
+    stop = StopFade()
+    for time, index in ((0.0, 3), (1.0, 3), (1.5, 3), (2.0, 5), (2.1, None), (3.0, None), (4.0, None)):
+        stop.update(index, time)
+    assert (stop.before, stop.weight) == (None, 0)
 
 
 def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(house, load_house):
