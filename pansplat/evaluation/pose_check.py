@@ -91,7 +91,9 @@ class PoseCheck:
 def check_pair(pair: Pair) -> PoseCheck:
     """Check the poses of a pair's context views against their images; takes seconds."""
     if len(pair.context) < 2:
-        raise InputError(f"{pair.name}: needed two or more views to check their poses, got one; choose another pair, or state poses.")
+        raise InputError(
+            f"{pair.name}: needed two or more views to check their poses, got one; choose another pair, or state poses."
+        )
     return check_views(pair.load_context(_HEIGHT), pair.name)
 
 
