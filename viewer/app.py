@@ -163,8 +163,11 @@ def _run(options: Options) -> int:
         problem = _run_window(options, pixels if options.size else _WINDOW_SIZE, path)
         if problem is None:
             return 0
-        print(f"{problem}: writing a fly-through instead")
+        if path is None:
+            print(f"{problem}: writing a fly-through instead")
         require_output_folder("the folder", Path("renders"))
+    if path is not None and options.out is None:
+        raise InputError("--path without a window needs --out; add --out FILE")
     with progress_bar() as progress:  # of poses, which take minutes for a tour without them
         entries = find_entries(expand_home(options.path), options.load_options, progress)
     show_all = options.pair == "all"

@@ -18,6 +18,7 @@ from pansplat.cli.inputs import Out, Writer
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import print_message, progress_bar
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
 from pansplat.system.options import Count, Positive, Threads
 
@@ -80,8 +81,9 @@ class Batch(Writer):
             finally:
                 if self.scheduler is None:
                     batch.remove_unfinished(items, out)
+        counted = describe_count(len(items), "item")
         print(
-            f"{self.out}: {len(items):,} items: {count['done']:,} done, {count['skipped']:,} already there, "
+            f"{self.out}: {counted}: {count['done']:,} done, {count['skipped']:,} already there, "
             f"{count['failed']:,} failed, in {seconds:.1f} s; {self.out / batch.REPORT_NAME}"
         )
         if problem is not None:

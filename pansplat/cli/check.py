@@ -41,5 +41,6 @@ class Check:
         if check.likely_mistake:
             console.print(f"likely mistake: {check.likely_mistake}", style="bold red", markup=False, soft_wrap=True)
             return 1
-        print("no other interpretation of the poses fits far better")
+        if check.can_judge:
+            print("no other interpretation of the poses fits far better")
         return 0

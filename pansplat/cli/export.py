@@ -18,6 +18,7 @@ from tyro.conf import Positional
 from pansplat.cli.inputs import Out, ScenePrediction, Writer
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import (
     SCENE_SUFFIXES,
     find_scene_suffix,
@@ -198,7 +199,9 @@ class _Page:
                 progress=progress,
             )
         beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if split else ""
-        pictures = f" {len(photographs)} photographs of {page.photo_height} rows," if has_photographs else ""
+        pictures = (
+            f" {describe_count(len(photographs), 'photograph')} of {page.photo_height} rows," if has_photographs else ""
+        )
         print(
             f"{out}{beside}: {page.num_gaussians:,} Gaussians,{pictures} {page.num_bytes / 1e6:.1f} MB; open it in a "
             "browser"
@@ -313,7 +316,7 @@ class _Photographs:
         panoramas = load_panoramas(export.path)
         with replacing_folder(export.out) as folder, progress_bar() as progress:
             size = write_panoramas(folder, panoramas, progress)
-        print(f"{export.out}: {len(panoramas)} photographs, {size / 1e6:.1f} MB")
+        print(f"{export.out}: {describe_count(len(panoramas), 'photograph')}, {size / 1e6:.1f} MB")
         notes = sum(len(panorama.notes) for panorama in panoramas)
         if notes:
             print(f"note: {export.out}: {notes} notes of hot spots are left out", file=sys.stderr)

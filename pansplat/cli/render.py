@@ -43,7 +43,7 @@ class Render(Writer):
     """A scene file, one panorama, a folder of panoramas, or a web tour."""
     out: Out
     """The file to write; its suffix chooses the format."""
-    at: Annotated[float, Meta(ge=-1000, le=1000)] | None = None
+    at: Annotated[float, Meta(ge=0, le=1)] | None = None
     """Camera position between the first (0) and the last (1) input camera, or on the flight through a tour of several
     parts; 0.5 by default."""
     pose: Path | None = None

@@ -189,7 +189,7 @@ def error_image(
 _COLUMNS = (
     Column("case", "name"),
     Column("WS-PSNR", "ws_psnr", ".2f"),
-    Column("masked", "masked_ws_psnr", ".2f"),
+    Column("unmasked", "masked_ws_psnr", ".2f"),
     Column("PSNR", "psnr", ".2f"),
     Column("SSIM", "ssim", ".4f"),
     Column("LPIPS", "lpips", ".4f"),

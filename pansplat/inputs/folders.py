@@ -57,7 +57,7 @@ from pansplat.inputs.reconstructions import find_reconstruction, read_reconstruc
 from pansplat.inputs.stated_files import find_inside, locate_inside
 from pansplat.inputs.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.inputs.web_tours.entries import plain_text
-from pansplat.system.files import expand_home, is_written, read_file
+from pansplat.system.files import expand_home, is_scene_file, is_written, read_file
 from pansplat.system.strict_json import read_field, read_json
 
 _POSES, _PAIRS = "poses.json", "pairs.json"
@@ -135,7 +135,7 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
         used |= {mask.resolve() for mask in (view.mask, *list_masks(image, check=True)) if mask is not None}
         names[fold_name(view.name)] = places[-1]
     listed = ((folder, name) for folder in folders for name in sorted(next(os.walk(folder), ("", [], []))[2]))
-    files = [folder / name for folder, name in listed if not name.startswith(".")]
+    files = [folder / name for folder, name in listed if not (name.startswith(".") or is_scene_file(name))]
     masks = {file: name for file in files if (name := split_mask_name(file)) and file.resolve() not in used}
     pictures = [file for file in files if file.suffix.lower() in _PICTURES and not split_mask_name(file)]
     names |= {fold_name(picture.stem): picture for picture in pictures}

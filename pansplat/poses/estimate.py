@@ -176,7 +176,7 @@ class PoseEstimate:
         groups = f" in {len(self.groups)} groups" if len(self.groups) > 1 else ""
         residual = max(group.residual for group in self.groups)
         return (
-            f"{placed} of {len(self.images)} panoramas have a pose{groups}, by {len(used)} pairs"
+            f"{placed} of {len(self.images)} panoramas have a pose{groups}, by {describe_count(len(used), 'pair')}"
             + (f", of which {probable} are probable only" if probable else "")
             + f"; residual {residual:.2f} degrees; scale: {self.groups[0].scale_source}"
         )

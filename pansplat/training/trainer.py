@@ -41,7 +41,7 @@ from pansplat.training.optimization import ExponentialMovingAverage, one_cycle_r
 from pansplat.training.rendering import TargetRenderer
 from pansplat.training.step import LOSS_TERMS, TrainingStep, accumulate_gradients
 from pansplat.training.stopping import StopRequest
-from pansplat.training.validation import MEASURES, validate
+from pansplat.training.validation import MEASURES, describe_measures, validate
 
 _EXTRA_STEPS = 10  # of the learning-rate schedule beyond the last step, as in the official code
 _COLUMNS = (*LOSS_TERMS, "rate", "gradient_norm", "seconds")
@@ -218,10 +218,7 @@ class Trainer:
         logs.scores.add(self.step, {"height": height, **measures})
         logs.board.add(self.step, measures, "validation")
         plot_run(self.config.out)
-        progress.print(
-            f"step {self.step}: PSNR {measures['psnr']:.2f} dB, SSIM {measures['ssim']:.3f}, "
-            f"relative depth error {100 * measures['depth_error']:.1f} %, mean of {settings.samples} samples"
-        )
+        progress.print(f"step {self.step}: {describe_measures(measures)}, mean of {settings.samples} samples")
 
     @contextmanager
     def _averaged_weights(self) -> Iterator[None]:

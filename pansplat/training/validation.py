@@ -56,6 +56,13 @@ def validate(
     return {measure: fmean(values[measure]) if values[measure] else math.nan for measure in MEASURES}
 
 
+def describe_measures(measures: dict[str, float]) -> str:
+    """PSNR, SSIM and, where depth is known, its error, as a line for people."""
+    text = f"PSNR {measures['psnr']:.2f} dB, SSIM {measures['ssim']:.3f}"
+    error = measures["depth_error"]
+    return text if math.isnan(error) else f"{text}, relative depth error {100 * error:.1f} %"
+
+
 def _measure(network: Network, sample: Sample, renderer: TargetRenderer, tiles: int) -> tuple[dict[str, float], Tensor]:
     """Measures of a sample's first target, without the error of depth if no depth is known; and its rendering."""
     parameter = next(network.parameters())

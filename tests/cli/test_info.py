@@ -1,7 +1,10 @@
 """The output of `pansplat info` and `pansplat check`."""
 
+import json
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from pansplat.cli import run
@@ -23,3 +26,16 @@ def test_check_exits_with_1_if_the_convention_is_wrong(shared: Path, capsys: pyt
     assert "as given" in capsys.readouterr().out
     assert run(["check", pair, "--convention", "cam2world opencv"]) == 1
     assert "likely mistake" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_check_draws_no_conclusion_from_unrelated_panoramas(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    generator = np.random.default_rng(0)
+    poses = {}
+    for i, name in enumerate(("left.png", "right.png")):
+        cv2.imwrite(str(tmp_path / name), generator.integers(0, 256, (64, 128, 3), np.uint8))
+        poses[name] = [[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    (tmp_path / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    assert run(["check", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "the check cannot judge these poses" in out and "no other interpretation" not in out

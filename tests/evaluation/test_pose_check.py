@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, PoseCheck, _describe_mistake, check_pair, check_views
+from pansplat.evaluation.pose_check import (
+    _ADVICE,
+    AS_GIVEN,
+    PoseCheck,
+    _can_judge,
+    _describe_mistake,
+    check_pair,
+    check_views,
+)
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import invert_pose, rotations_from_quats
 from pansplat.inputs.folders import load_pairs
@@ -77,7 +85,7 @@ def _best(check: PoseCheck) -> str:
 def test_right_poses_fit_best() -> None:
     check = check_views(_views(*_TILTED), "box")
     assert _best(check) == AS_GIVEN
-    assert check.likely_mistake is None and not check.warnings
+    assert check.likely_mistake is None and check.can_judge and not check.warnings
     assert check.error < 0.8 * sorted(check.errors.values())[1]
     assert check.baseline == pytest.approx(float((_TILTED[0] - _TILTED[1])[:3, 3].norm()))
 
@@ -95,6 +103,17 @@ def test_each_wrong_convention_is_named(mistake: str) -> None:
 def test_a_nearly_perfect_fit_is_no_mistake() -> None:
     assert _describe_mistake({"inverse": 0.001, AS_GIVEN: 0.004}) is None
     assert _describe_mistake({"inverse": 0.201, AS_GIVEN: 0.304}) is not None
+
+
+def test_an_interpretation_that_stands_out_little_is_no_mistake() -> None:
+    errors = {"inverse": 0.435, "opengl axes": 0.470, "swapped views": 0.485, AS_GIVEN: 0.500}
+    assert _describe_mistake(errors) is None and not _can_judge(errors)
+    assert _describe_mistake(errors | {"opengl axes": 0.490, "swapped views": 0.499}) is not None
+
+
+def test_right_poses_far_apart_are_judged_by_how_much_better_they_fit() -> None:
+    assert _can_judge({AS_GIVEN: 0.508, "inverse": 0.596, "opengl axes": 0.668})
+    assert not _can_judge({AS_GIVEN: 0.574, "inverse": 0.588, "opengl axes": 0.600})
 
 
 _SIDE_BY_SIDE = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
@@ -136,7 +155,7 @@ def test_unrelated_images_give_a_warning() -> None:
     views = _views(*_TILTED)
     noise = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(0))
     check = check_views(dataclasses.replace(views, images=noise))
-    assert check.likely_mistake is None
+    assert check.likely_mistake is None and not check.can_judge
     assert any("overlap too little" in warning for warning in check.warnings)
 
 

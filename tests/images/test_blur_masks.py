@@ -356,6 +356,13 @@ def test_masks_that_poses_state_have_any_name(tmp_path: Path) -> None:
     assert not load_pairs(folder)[0].load_context(HEIGHT).masks.all()
 
 
+def test_a_scene_file_is_no_mask(tmp_path: Path) -> None:
+    folder = _write_pair(tmp_path / "pair", 1)
+    for name in ("blur.ply", "mask.compressed.ply", "left_blur.spz"):
+        (folder / name).write_bytes(b"")
+    assert len(load_pairs(folder)) == 1
+
+
 @pytest.mark.parametrize("source", ["file", "poses.json", "pose", "pose folder"])
 def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
     folder = _write_pair(tmp_path / "pair", 1)

@@ -165,7 +165,7 @@ def test_the_summary_names_groups_and_probable_pairs() -> None:
     )
     assert estimate.poses == groups[0].poses
     alone = PoseEstimate(tuple(files[:3]), tuple(groups[:1]), {}, {(0, 1): _relation(3.0)})
-    assert alone.summary == "3 of 3 panoramas have a pose, by 1 pairs; residual 0.10 degrees; scale: a test"
+    assert alone.summary == "3 of 3 panoramas have a pose, by 1 pair; residual 0.10 degrees; scale: a test"
 
 
 def test_without_the_learned_matcher_poses_are_estimated_by_sift_alone(

@@ -20,7 +20,7 @@ from pansplat.training.logs import read_table
 from pansplat.training.network import read_weights
 from pansplat.training.rendering import TargetRenderer
 from pansplat.training.trainer import Trainer
-from pansplat.training.validation import validate
+from pansplat.training.validation import describe_measures, validate
 
 
 def curve(folder: Path) -> list[tuple[str, str, str]]:
@@ -111,7 +111,9 @@ def test_a_sample_without_known_depth_is_left_out_of_the_depth_error(micro_run: 
     first, both = measure(1), measure(2)
     assert both["depth_error"] == first["depth_error"] and both["psnr"] != first["psnr"]
     known = set()
-    assert math.isnan(measure(2)["depth_error"])
+    unknown = measure(2)
+    assert math.isnan(unknown["depth_error"])
+    assert "depth error" in describe_measures(first) and "depth error" not in describe_measures(unknown)
 
 
 def test_validation_writes_measures_and_images(micro_run: Callable) -> None:

@@ -128,6 +128,15 @@ def test_the_film_of_a_path_has_a_frame_for_each_time(room):
     assert [path.name for path in sorted(Path().glob("*.exr"))] == [f"walk_{i:04d}.exr" for i in range(6)]
 
 
+@pytest.mark.parametrize("arguments", [[], ["--offscreen", "out"]])
+def test_a_path_without_a_window_and_a_file_for_its_film_is_refused(room, capsys, arguments):
+    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.5)]
+    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
+    assert run([str(room), "--path", "walk.json", "--size", "64x32", "--seconds", "0.2", *arguments]) == 2
+    assert "--path without a window needs --out" in capsys.readouterr().err
+    assert not Path("renders").exists() and not Path("out").exists(), "nothing is written"
+
+
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
