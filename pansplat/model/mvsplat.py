@@ -237,6 +237,7 @@ class ResidualBlock(nn.Module):
             self.shortcut = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride=stride), nn.InstanceNorm2d(outputs))
 
     def forward(self, maps: Maps) -> Float[Tensor, "image c h w"]:
+        """Maps of `outputs` channels; their sides are divided by the stride."""
         inner = relu(instance_norm(self.conv1(maps)))
         inner = relu(instance_norm(self.conv2(inner)))
         return relu(self.shortcut(maps) + inner)

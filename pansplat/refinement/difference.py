@@ -15,6 +15,7 @@ from torch import Tensor
 from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for, pooled_empty, thread_count
 
 _ROWS_PER_ITEM = 16  # of an image, for one thread
+_CHANNELS = 3
 
 
 class Difference(torch.autograd.Function):
@@ -56,7 +57,7 @@ def _compare_rows(error, pixels, right, below, gradient, totals, item):
         total = 0.0
         for x in range(width):
             total += terms[x]
-        totals[y] = total / len(error)
+        totals[y] = total / _CHANNELS
 
 
 @inline_kernel_no_refcount
@@ -69,7 +70,7 @@ def _compare_pixel(rows, weights, before, x, after, gradient, terms):
     terms[x] += pixels[x] * abs(here) + half * (right[x] * abs(across) + below[x] * abs(down))
     slope = right[before] * _sign(left) - right[x] * _sign(across)
     slope += below_upper[x] * _sign(up) - below[x] * _sign(down)
-    gradient[x] = (pixels[x] * _sign(here) + half * slope) * np.float32(1 / 3)
+    gradient[x] = (pixels[x] * _sign(here) + half * slope) * np.float32(1 / _CHANNELS)
 
 
 @inline_kernel_no_refcount

@@ -417,7 +417,8 @@ class Refinement:
         views = photographs if self._start.joint else layers
         others = sum(max(len(layer.photographs) - 1, 1) for layer in self._layers)
         pixels = self._images[0, 0].numel() / math.prod(self._size)
-        gradient = 1.7  # duration of a backward pass relative to its image
+        # Durations relative to that of an image.
+        gradient = 1.7  # of a backward pass
         weights, product = 1.2, 0.5  # of blending weights, and of a product with them
         contributions = (others + views) * (weights + product)
         steps = _COLORS.steps_at(self._images.shape[-2])

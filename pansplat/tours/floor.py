@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
-from pansplat.tours.graph import TourGraph, Views, make_graph
+from pansplat.tours.graph import TourGraph, ViewNumbers, make_graph
 from pansplat.tours.route import Route
 from pansplat.tours.surfaces import locate_surfaces
 
@@ -243,7 +243,7 @@ def draw_floor_plan(
     return plan
 
 
-def find_floor_outlines(tour: TourGraph, scene: Scene, views: Views) -> dict[int, FloorOutline]:
+def find_floor_outlines(tour: TourGraph, scene: Scene, views: ViewNumbers) -> dict[int, FloorOutline]:
     """The floor outlines of a scene's views that show a floor, by panorama."""
     outlines = {node: find_floor_outline(scene, view, tour.level_axes) for view, node in enumerate(views)}
     return {node: outline for node, outline in outlines.items() if outline is not None}

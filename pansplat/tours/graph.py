@@ -28,7 +28,7 @@ from pansplat.tours.walls import find_walls
 Edge = tuple[int, int]
 """Indices of two panoramas, the smaller one first; a panorama without another one has a self-edge, twice its index."""
 
-Views = tuple[int, ...]
+ViewNumbers = tuple[int, ...]
 """The panoramas of a scene, by their number in the tour."""
 
 EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
@@ -139,7 +139,7 @@ class TourGraph:
         graph = dataclasses.replace(self, overlaps={(a, b): overlap for a, b, overlap in overlaps}, walls=())
         return graph.with_walls((a, b) for a, b, overlap in overlaps if a != b and overlap == 0)
 
-    def list_parts(self) -> list[Views]:
+    def list_parts(self) -> list[ViewNumbers]:
         """The nodes of each part."""
         numbers = np.array(self.parts)
         return [tuple(np.flatnonzero(numbers == part).tolist()) for part in range(max(self.parts) + 1)]
@@ -177,7 +177,7 @@ class TourGraph:
         """The nodes of an edge, and those that share an edge with one of them."""
         return {*edge, *(node for end in edge for node in self.neighbours(end))}
 
-    def choose_scene_views(self) -> dict[Edge, Views]:
+    def choose_scene_views(self) -> dict[Edge, ViewNumbers]:
         """The panoramas of the scene of each edge: two, or three that overlap with each other; one of a self-edge.
 
         Edges share scenes where they can, so that fewer scenes are predicted and exchanged.
@@ -185,7 +185,7 @@ class TourGraph:
         around = {node: set(self.neighbours(node)) for node in range(len(self))}
         triangles = [(a, b, c) for a, b in self.overlaps for c in sorted(around[a] & around[b]) if c > b]
         triangles.sort(key=lambda nodes: (-self._weakest_overlap(nodes), nodes))
-        scenes: dict[Edge, Views] = {}
+        scenes: dict[Edge, ViewNumbers] = {}
         for needed in (2, 1):
             for nodes in triangles:
                 free = [edge for edge in itertools.combinations(nodes, 2) if edge not in scenes]
@@ -196,7 +196,7 @@ class TourGraph:
                 scenes[edge] = self._add_baseline(edge)
         return scenes
 
-    def choose_sources(self, max_views: int = MAX_SCENE_VIEWS) -> dict[Views, tuple[int, ...]]:
+    def choose_sources(self, max_views: int = MAX_SCENE_VIEWS) -> dict[ViewNumbers, tuple[int, ...]]:
         """The scenes that one scene of all panoramas is made of, and the panoramas whose Gaussians each provides.
 
         They are the parts, if the predictor takes as many views. Else they are scenes of `choose_scene_views`, those of
@@ -211,7 +211,7 @@ class TourGraph:
         scenes = sorted(
             set(self.choose_scene_views().values()), key=lambda nodes: (-self._weakest_overlap(nodes), nodes)
         )
-        sources: dict[Views, tuple[int, ...]] = {}
+        sources: dict[ViewNumbers, tuple[int, ...]] = {}
         missing = set(range(len(self)))
         for views in scenes:
             provided = tuple(node for node in views if node in missing)
@@ -220,7 +220,7 @@ class TourGraph:
                 missing -= set(provided)
         return sources
 
-    def choose_predictions(self, max_views: int) -> dict[int, Views]:
+    def choose_predictions(self, max_views: int) -> dict[int, ViewNumbers]:
         """The panoramas that each panorama is predicted with, so that scenes of edges are parts of few predictions.
 
         They are its part. A part of more than 16 panoramas is cut into pieces of its walk; the best neighbour of each
@@ -231,7 +231,7 @@ class TourGraph:
         """
         if max_views <= MAX_SCENE_VIEWS:
             return {}
-        predictions: dict[int, Views] = {}
+        predictions: dict[int, ViewNumbers] = {}
         walk = dict.fromkeys(self.plan_walk())
         for part in range(max(self.parts) + 1):
             nodes = [node for node in walk if self.parts[node] == part]
@@ -241,12 +241,12 @@ class TourGraph:
                 predictions |= dict.fromkeys(members, tuple(sorted({*members, *neighbours})))
         return predictions
 
-    def _weakest_overlap(self, nodes: Views) -> float:
+    def _weakest_overlap(self, nodes: ViewNumbers) -> float:
         """The smallest overlap of the edges between the panoramas of a scene."""
         edges = itertools.combinations_with_replacement(nodes, 2)
         return min(self.overlaps[edge] for edge in edges if edge in self.overlaps)
 
-    def _add_baseline(self, edge: Edge) -> Views:
+    def _add_baseline(self, edge: Edge) -> ViewNumbers:
         """The edge's panoramas, with the best neighbour of either if they are too close together for depth."""
         if edge[0] == edge[1]:
             return edge[:1]
@@ -292,7 +292,7 @@ class TourGraph:
         target = (self.originals or self.panoramas)[node]
         return dataclasses.replace(pair, name=target.name, targets=(target,))
 
-    def place(self, scene: Scene, views: Views) -> Scene:
+    def place(self, scene: Scene, views: ViewNumbers) -> Scene:
         """The scene of `make_pair` in the world of the tour."""
         if not self.originals or self.panoramas[views[0]] is self.originals[views[0]]:
             return scene
@@ -513,7 +513,7 @@ def _list_images(pair: Pair) -> set[Path]:
     return {panorama.image for panorama in pair.context}
 
 
-def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene], max_views: int = MAX_SCENE_VIEWS) -> Scene:
+def merge_scenes(tour: TourGraph, load: Callable[[ViewNumbers], Scene], max_views: int = MAX_SCENE_VIEWS) -> Scene:
     """One scene of all panoramas. The Gaussians of each panorama are those of one scene (`TourGraph.choose_sources`).
 
     Args:
@@ -523,7 +523,7 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene], max_views: int
     """
     parts: dict[int, Gaussians] = {}
     names: dict[int, str] = {}
-    gains: dict[Views, Gains] = {}
+    gains: dict[ViewNumbers, Gains] = {}
     scene = None
     for views, provided in tour.choose_sources(max_views).items():
         scene = tour.place(load(views), views)
@@ -559,7 +559,7 @@ def list_starts(panoramas: Sequence[Panorama]) -> Starts:
     return starts if any(starts) else ()
 
 
-def _join_gains(gains: dict[Views, Gains], parts: Sequence[int]) -> Gains:
+def _join_gains(gains: dict[ViewNumbers, Gains], parts: Sequence[int]) -> Gains:
     """Gains of all panoramas from those of scenes, each of which are relative to the mean of the scene's photographs.
 
     Panoramas that scenes have in common give the ratios of these means, by least squares. Scenes without gains count
@@ -588,7 +588,7 @@ def _join_gains(gains: dict[Views, Gains], parts: Sequence[int]) -> Gains:
     return tuple(map(tuple, np.exp(logs).tolist()))
 
 
-def select_views(scene: Scene, views: Views) -> Scene:
+def select_views(scene: Scene, views: ViewNumbers) -> Scene:
     """The scene of some panoramas of a scene that `merge_scenes` made."""
     chosen = list(views)
     index = torch.full((len(scene.cam2world),), -1)

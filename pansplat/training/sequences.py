@@ -89,13 +89,15 @@ def _longest_gap(count: int) -> int:
 
 @runtime_checkable
 class FrameSequence(Protocol):
-    """A sequence of posed panoramas; `poses` are cam2world, OpenCV axes, metres."""
+    """A sequence of posed panoramas."""
 
     @property
     def name(self) -> str: ...
 
     @property
-    def poses(self) -> Sequence[Float[Tensor, "4 4"]]: ...
+    def poses(self) -> Sequence[Float[Tensor, "4 4"]]:
+        """Camera to world of each frame, OpenCV axes, metres."""
+        ...
 
     def read(self, frames: Sequence[int], height: int) -> Views:
         """The given frames at (height, 2 height), in the order of `frames`."""

@@ -9,7 +9,7 @@ import { onSorted, sorted } from "./loop.js";
 
 export let worker = null, failure = null, partsArrived = 0, arrived = 0;  // parts of the data, views
 const asked = new Set(), got = new Set();  // views
-let lacks = fail;                          // reports a part that does not arrive
+let onMissing = fail;                      // reports a part that does not arrive
 export const isComplete = () => [...asked].every((view) => got.has(view));
 
 export function fail(error) {
@@ -53,7 +53,7 @@ export function loadAround() {
     for (const file of HEADER.folder === null ? [] : HEADER.views[view].files) {
       const script = document.createElement("script");
       Object.assign(script, { src: `${HEADER.folder}/${file}`, async: false });  // in this order
-      script.onerror = () => lacks(new Error("A part of the scene is missing. Copy the whole folder."));
+      script.onerror = () => onMissing(new Error("A part of the scene is missing. Copy the whole folder."));
       document.head.append(script);
     }
   }
@@ -62,7 +62,8 @@ export function loadAround() {
 // Starts the worker; `onView` gets the Gaussians of each view. Returns a promise of the first order.
 export function load(onView) {
   return new Promise((resolve, reject) => {
-    const fails = lacks = (error) => sorted ? fail(error) : reject(error);
+    const fails = (error) => sorted ? fail(error) : reject(error);
+    onMissing = fails;
     worker = new Worker(URL.createObjectURL(new Blob([WORKER])));
     worker.onmessage = ({ data }) => {
       if (data.error) fails(new Error(`The data of the scene cannot be read: ${data.error}`));

@@ -20,6 +20,10 @@ import { placeRings, showPlace } from "./rings.js";
 import { headset, SORT_DISTANCE } from "./xr.js";
 
 const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
+const SLOW_MS = 45, FAST_MS = 25;   // of a frame: above, the resolution falls; below, it rises
+const PAUSE_MS = 1000;              // a longer frame is not measured
+const REST_MS = 200;                // after a change, until the full resolution is drawn
+const LEAST_SCALE = 0.25;           // of the resolution
 const scales = [1, 1];              // of the resolution while it moves: of Gaussians, and of photographs
 
 export let renderer = null, sorted = null, sorting = false, dirty = true, drawnScale = 0, lastChange = 0, lastFrame = 0;
@@ -114,9 +118,9 @@ export function onFrame(now) {
   walkByKeys(seconds);
   advance(now, seconds);
   if (sorted) requestSort();
-  const moving = now - lastChange < 200;
+  const moving = now - lastChange < REST_MS;
   const kind = Number(photographs.isOpaque);
-  if (moving && drawnScale && elapsed < 1000) scales[kind] = clamp(scales[kind] * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);
+  if (moving && drawnScale && elapsed < PAUSE_MS) scales[kind] = clamp(scales[kind] * (elapsed > SLOW_MS ? 0.85 : elapsed < FAST_MS ? 1.05 : 1), LEAST_SCALE, 1);
   const wanted = moving ? scales[kind] : 1;
   if (!renderer || !(sorted || photographs.isOpaque) || !(dirty || wanted > drawnScale)) return;
   dirty = false;

@@ -65,6 +65,9 @@ class Glide:
 class ViewerState:
     """Everything that a user can change, and the scene's cameras and levels.
 
+    The camera moves in three ways without input: along the flight between panoramas (`flight`, in a tour along
+    `route`), along the path of key frames (`path`), and out of the rooms and back (`glide`).
+
     Attributes:
         overlay, help: whether panels and key help are shown.
         context: poses of the input cameras; empty for a file without cameras. Of a tour, of all panoramas.
@@ -78,8 +81,8 @@ class ViewerState:
     doll_house: bool = False  # whether the rooms are seen from outside; the camera orbits then
     glide: Glide | None = None  # the flight out of the rooms or into one, which input does not stop
     settings: DrawSettings = field(default_factory=DrawSettings)  # draw settings; the field of view is the camera's
-    flight: float = 0.0  # fraction of the flight between the panoramas in [0, 1]; `playing` while it is played
-    playing: bool = False
+    flight: float = 0.0  # fraction of the flight between the panoramas, in [0, 1]
+    playing: bool = False  # whether this flight goes on
     overlay: bool = True
     help: bool = False
     comparison: Comparison = "off"  # what is shown right of the divider at `split` (fraction of the width)
@@ -98,8 +101,8 @@ class ViewerState:
     minimap: bool = True
     hotspots: bool = True
     path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
-    path_seconds: float = 0.0  # time on the path that the panel shows; `path_playing` while it is played
-    path_playing: bool = False
+    path_seconds: float = 0.0  # time on the path that the panel shows
+    path_playing: bool = False  # whether the camera moves along the path
     film_suffix: str = ".mp4"
     film_fps: float = 24.0
     film_projection: Projection = "perspective"

@@ -24,7 +24,7 @@ from pansplat.tours import (
     FloorOutline,
     Route,
     TourGraph,
-    Views,
+    ViewNumbers,
     choose_camera_height,
     find_link_ring,
     plan_route,
@@ -88,11 +88,13 @@ class TourScenes:
         }
         self._predictions = {source for sources in self._sources.values() for source in sources}
         self._budget = memory * 2**30
-        self._loaded: OrderedDict[Views, LoadedScene] = OrderedDict()  # predictions
-        self._selected: OrderedDict[Views, LoadedScene] = OrderedDict()  # scenes from predictions, and the first one
-        self._known: set[Views] = set()  # predictions that have been loaded
-        self._failed: set[Views] = set()
-        self._following: tuple[Edge, list[Views]] | None = None
+        self._loaded: OrderedDict[ViewNumbers, LoadedScene] = OrderedDict()  # predictions
+        self._selected: OrderedDict[ViewNumbers, LoadedScene] = (
+            OrderedDict()
+        )  # scenes from predictions, and the first one
+        self._known: set[ViewNumbers] = set()  # predictions that have been loaded
+        self._failed: set[ViewNumbers] = set()
+        self._following: tuple[Edge, list[ViewNumbers]] | None = None
         if merged is not None:
             self._loaded[everything] = LoadedScene(SceneEntry(tour.name, tour=tour, views=everything), merged)
 
@@ -151,7 +153,7 @@ class TourScenes:
         return scenes
 
     @property
-    def views(self) -> Views:
+    def views(self) -> ViewNumbers:
         """The panoramas of the scene that the camera needs."""
         return self._views[self.edge]
 
@@ -166,19 +168,19 @@ class TourScenes:
         return len(self._sources)
 
     @property
-    def loaded(self) -> list[Views]:
+    def loaded(self) -> list[ViewNumbers]:
         """The scenes that need no prediction."""
         return [views for views in self._sources if views in self._selected or self._has_sources(views)]
 
     @property
-    def missing(self) -> list[Views]:
+    def missing(self) -> list[ViewNumbers]:
         """The predictions that the scene of the camera needs and that are not in memory."""
         return [source for source in self._sources[self.views] if source not in self._loaded]
 
-    def _has_sources(self, views: Views) -> bool:
+    def _has_sources(self, views: ViewNumbers) -> bool:
         return all(source in self._loaded for source in self._sources[views])
 
-    def make_entry(self, views: Views) -> SceneEntry:
+    def make_entry(self, views: ViewNumbers) -> SceneEntry:
         """The prediction of these panoramas as an entry for the loader."""
         pair = self.tour.make_pair(views)
         name = pair.name if len(views) <= MAX_SCENE_VIEWS else f"{len(views)} panoramas"
@@ -226,7 +228,7 @@ class TourScenes:
             self.edge = self.tour.find_edge(self.edge[0])
         self._following = None
 
-    def _drop(self, newest: Views) -> None:
+    def _drop(self, newest: ViewNumbers) -> None:
         """Drop what was not used for the longest time, until the memory is not exceeded."""
         total = sum(measure_bytes(each.scene) for each in (*self._loaded.values(), *self._selected.values()))
         needed = {newest, self.views, *self._sources[self.views]}
@@ -236,11 +238,11 @@ class TourScenes:
                     break
                 total -= measure_bytes(scenes.pop(other).scene)
 
-    def fail(self, views: Views) -> None:
+    def fail(self, views: ViewNumbers) -> None:
         """Do not request a prediction again, because it could not be loaded or refined."""
         self._failed.add(views)
 
-    def get(self, views: Views) -> LoadedScene | None:
+    def get(self, views: ViewNumbers) -> LoadedScene | None:
         """The scene of an edge if it is in memory; it becomes the most recently used."""
         if views in self._predictions:
             loaded = self._loaded.get(views)
@@ -255,7 +257,7 @@ class TourScenes:
                     scenes.move_to_end(each)
         return loaded
 
-    def _select(self, views: Views) -> LoadedScene:
+    def _select(self, views: ViewNumbers) -> LoadedScene:
         """The scene of these panoramas, from the predictions that have their Gaussians."""
         parts: list[Gaussians] = []
         for source in self._sources[views]:
@@ -279,13 +281,13 @@ class TourScenes:
         """The end of the edge that is nearer to a position: another panorama may be behind a wall."""
         return min(self.edge, key=lambda node: float(np.linalg.norm(self.tour.positions[node] - position)))
 
-    def is_inside(self, position: Float[np.ndarray, "3"], views: Views) -> bool:
+    def is_inside(self, position: Float[np.ndarray, "3"], views: ViewNumbers) -> bool:
         """Whether the scene of some panoramas is good at a position: they are of its edge, or one of them is there."""
         node = self.find_nearest(position)
         is_there = bool(np.linalg.norm(self.tour.positions[node] - position) <= EDGE_HYSTERESIS)
         return set(self.edge) <= set(views) or (node in views and is_there)
 
-    def list_next(self, route: Route | None, fraction: float) -> list[Views]:
+    def list_next(self, route: Route | None, fraction: float) -> list[ViewNumbers]:
         """All predictions, the most urgent first: those that the camera needs, then those that are next.
 
         These are the next ones of a route; then those around the nearest panorama, those of its part by distance, and
@@ -297,7 +299,7 @@ class TourScenes:
         scenes = [self.views, *ahead, *self._following[1]]
         return list(dict.fromkeys(source for views in scenes for source in self._sources[views]))
 
-    def _list_following(self) -> list[Views]:
+    def _list_following(self) -> list[ViewNumbers]:
         tour, here = self.tour, set(self.edge)
         middle = tour.positions[list(self.edge)].mean(axis=0)
         inside = [edge for edge in self._views if tour.parts[edge[0]] == self.part]
@@ -307,7 +309,7 @@ class TourScenes:
         outside = [tour.find_edge(node) for node in (*linked, *following) if tour.parts[node] != self.part]
         return [self._views[edge] for edge in dict.fromkeys((*inside, *outside, *self._views))]
 
-    def choose_request(self, wanted: Sequence[Views], current: SceneEntry | None) -> SceneEntry | None:
+    def choose_request(self, wanted: Sequence[ViewNumbers], current: SceneEntry | None) -> SceneEntry | None:
         """The entry to load now, or None to let the loader continue with `current` (None: it is idle).
 
         Predictions come before refinements. A refinement ends if a prediction that the camera needs is missing; a
