@@ -116,7 +116,7 @@ class PageFiles:
         embed: origins of the pages that may frame it and exchange messages with it.
         photo_height: of its photographs, pixels; 0 without photographs.
         num_flights, num_fades: edges along which it flies, and those along which it fades.
-        num_rough: panoramas whose surfaces are too rough for the doll's house.
+        num_rough: panoramas without doll's house and distances, because their surfaces are too rough.
     """
 
     files: tuple[Path, ...]
@@ -204,6 +204,7 @@ def write_page(
     report("writing", 0.95)
     header = _describe_scene(scene, packed, origin, flights, tour)
     header |= {"embed": embed, "doll": None, "photographs": [picture.describe() for picture in pictures]}
+    header["rough"] = [] if rooms is None else [view for view, clear in enumerate(rooms.is_clear) if not clear]
     header["plan"] = _describe_plan(None if rooms is None else rooms.plan, tour, origin, flights.level)
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
         spot["notes"] = [
@@ -217,7 +218,7 @@ def write_page(
     if rooms is not None and cameras is not None:
         header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
     files = _write_files(path, header, packed.contents, pictures, poster, split, title or path.stem)
-    return dataclasses.replace(files, num_rough=0 if rooms is None else rooms.is_clear.count(False))
+    return dataclasses.replace(files, num_rough=len(header["rough"]))
 
 
 @dataclass(frozen=True, eq=False)

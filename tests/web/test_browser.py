@@ -318,6 +318,12 @@ def test_the_dolls_house_is_the_picture_of_the_fronts_in_the_rooms_and_a_click_g
     home.run("HEADER.doll.boxes = HEADER.doll.boxes.map(() => null)")  # of rough surfaces
     home.page.keyboard.press("KeyO")
     assert "too rough" in home.page.inner_text("#status") and home.camera["fov"] != 45
+    home.run("HEADER.rough = HEADER.spots.map((spot, node) => node)")
+    home.page.click("#more")
+    home.page.click("#measure")
+    assert "no distances" in home.page.inner_text("#status")
+    assert home.page.get_attribute("#measure", "aria-pressed") != "true"
+    home.run("HEADER.rough = []")
     home.page.emulate_media(reduced_motion="no-preference")
 
 
