@@ -211,7 +211,10 @@ class _Page:
             print(f"note: {out}: {counts}, because the surfaces of their panoramas disagree", file=sys.stderr)
         if page.num_rough:
             views = f"{page.num_rough} panorama{'s' if page.num_rough > 1 else ''}"
-            print(f"note: {out}: without doll's house and distances of {views}, whose surfaces are too rough", file=sys.stderr)
+            print(
+                f"note: {out}: without doll's house and distances of {views}, whose surfaces are too rough",
+                file=sys.stderr,
+            )
         if photographs and not shows_all:
             print(f"note: {out}: without photographs, which would show what is left out", file=sys.stderr)
         panoramas = max(len(scene.cam2world), 1)

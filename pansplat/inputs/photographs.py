@@ -173,7 +173,9 @@ def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Pa
     ]
     notes = [
         make_note(
-            read_direction(note, source), str(note.get("text", "")), read_field(note, "addresses", list, source, [])
+            read_direction(note, source),
+            read_field(note, "text", str, source, ""),
+            read_field(note, "addresses", list, source, []),
         )
         for note in read_field(content, "notes", list[dict[str, Any]], source, [])
     ]

@@ -118,6 +118,7 @@ def test_notes_are_read_and_written_and_all_else_stays(rooms: Path) -> None:
         ({"p01.jpg": [{"to": "p02.jpg"}]}, "links of p01 are left out: .*yaw: needed a number, got None"),
         ({"p01.jpg": [{"to": "p02.jpg", "yaw": "right"}]}, "links of p01 are left out: .*yaw: needed a number"),
         ({"p01.jpg": 5}, "links of p01 are left out: .* needed an object"),
+        ({"p01.jpg": {"notes": [{"yaw": 0, "text": 5}]}}, "links of p01 are left out: .*text: needed a text, got"),
         ({"p01.jpg": {"notes": [{"yaw": "left", "text": "a"}]}}, "links of p01 are left out: .*yaw: needed a number"),
         ({"p01.jpg": {"start": [1]}}, "links of p01 are left out: .*start: needed a list of length 2"),
         ("<html>", r"links are left out: .*links\.json: needed JSON"),

@@ -118,7 +118,12 @@ def test_a_rough_storey_has_no_dolls_house(flat: Scene, tmp_path: Path, monkeypa
     page = write_page(flat, tmp_path / "page.html")
     header = read_header(page.files[0])
     doll = header["doll"]
-    assert page.num_rough == 1 and header["rough"] == [2] and doll["boxes"][2] is None and all(doll["boxes"][view] for view in {*views} - {2})
+    assert (
+        page.num_rough == 1
+        and header["rough"] == [2]
+        and doll["boxes"][2] is None
+        and all(doll["boxes"][view] for view in {*views} - {2})
+    )
     monkeypatch.setattr(doll_house, "_is_clear", lambda inside, views: False)
     assert write_page(flat, page.files[0]).num_rough == 4 and read_header(page.files[0])["doll"] is None
 

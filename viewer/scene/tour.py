@@ -89,9 +89,7 @@ class TourScenes:
         self._predictions = {source for sources in self._sources.values() for source in sources}
         self._budget = memory * 2**30
         self._loaded: OrderedDict[ViewNumbers, LoadedScene] = OrderedDict()  # predictions
-        self._selected: OrderedDict[ViewNumbers, LoadedScene] = (
-            OrderedDict()
-        )  # scenes from predictions, and the first one
+        self._selected: OrderedDict[ViewNumbers, LoadedScene] = OrderedDict()  # from predictions, and the first one
         self._known: set[ViewNumbers] = set()  # predictions that have been loaded
         self._failed: set[ViewNumbers] = set()
         self._following: tuple[Edge, list[ViewNumbers]] | None = None
