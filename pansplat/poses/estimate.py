@@ -61,9 +61,8 @@ _MIN_HEIGHT = 256
 _QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared thoroughly
 _THOROUGH = 6  # pairs of each panorama that are compared with all features, at most
 _ALL_PAIRS_UP_TO = 3  # panoramas, of which all pairs are compared with all features
-_NEEDED_PAIRS = 3  # certain pairs of a panorama; more are not looked for within a group
+_NEEDED_PAIRS = 4  # certain pairs of a panorama; more are not looked for within a group
 _LEAST_BATCH = 4  # pairs that are compared before others are chosen
-_CHANCE_MATCHES = 25.0  # expected ones by `_quick_overlap`, below which pairs of one group are not compared
 _PAIR_TIME = 1.3  # of a comparison, over that of the features of a panorama
 _MASK_KEPT_SHARE = 0.6  # of the panoramas whose common mask is kept when others are added
 _BLANK_BRIGHTNESS = 8.0  # mean grey value of an image that shows nothing
@@ -517,7 +516,7 @@ def _relate_views(
     """Relative poses of the pairs that have most in common, and of those that links connect.
 
     Pairs are compared in the order of what they have in common. Those within a group that certain pairs connect are
-    left out if both panoramas have enough of them, or if both have no more in common than by chance.
+    left out if both panoramas have enough of them.
     """
     pairs = list(itertools.combinations(range(len(views)), 2))
     overlap: dict[IndexPair, float] = {}
@@ -560,7 +559,7 @@ def _relate_views(
         i, j = pair
         if groups[i] != groups[j] or ways[pair] != NO_WAYS:
             return True
-        return min(counts[i], counts[j]) < _NEEDED_PAIRS and overlap.get(pair, math.inf) >= _CHANCE_MATCHES
+        return min(counts[i], counts[j]) < _NEEDED_PAIRS
 
     relations: dict[IndexPair, RelativePose] = {}
     with worker_threads() as pool:
