@@ -187,22 +187,16 @@ class SpherePredictor:
         self.name, self.fingerprint, self.calls = "sphere", fingerprint, 0
 
     def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None) -> Any:
-        from pansplat.gaussians.scene import Gaussians  # after the import hook
+        from synthetic_scenes import make_balls  # after the import hook
+
         from pansplat.geometry.equirect import pixel_directions
 
         self.calls += 1
         view, _, height, width = images.shape
         directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
-        count = len(directions)
-        return Gaussians(
-            means=torch.cat([2 * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world.double()]).float(),
-            scales=torch.full((view * count, 3), 2 * 3.2 / height),
-            quats=torch.tensor([1.0, 0, 0, 0]).repeat(view * count, 1),
-            opacities=torch.full((view * count,), 0.9),
-            harmonics=((images.flatten(2).transpose(1, 2).reshape(-1, 1, 3) - 0.5) / 0.28209479).contiguous(),
-            levels=torch.zeros(view * count, dtype=torch.int64),
-            views=torch.arange(view).repeat_interleave(count),
-        )
+        means = torch.cat([2 * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world.double()])
+        color, views = images.flatten(2).transpose(1, 2).reshape(-1, 3), torch.arange(view)
+        return make_balls(means, 6.4 / height, color=color, views=views.repeat_interleave(len(directions)))
 
 
 def _write_pair(folder: Path, *, height: int = 16, seed: int = 0) -> Path:

@@ -15,6 +15,7 @@ import pytest
 import torch
 from IPython.core.formatters import DisplayFormatter
 from PIL import Image
+from synthetic_scenes import make_balls, place_cameras
 from torch import Tensor
 
 import pansplat
@@ -31,17 +32,8 @@ from pansplat.system import console
 def scene() -> Scene:
     """400 Gaussians on a sphere of 2 m around two cameras."""
     directions = fibonacci_directions(400).float()
-    gaussians = Gaussians(
-        means=2 * directions,
-        scales=torch.full((400, 3), 0.1),
-        quats=torch.tensor((1.0, 0.0, 0.0, 0.0)).expand(400, 4),
-        opacities=torch.full((400,), 0.9),
-        harmonics=directions[:, None],
-        levels=torch.zeros(400, dtype=torch.int64),
-        views=torch.arange(400) % 2,
-    )
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[1, 0, 3] = 0.5
+    gaussians = make_balls(2 * directions, 0.1, harmonics=directions[:, None], views=torch.arange(400) % 2)
+    poses = place_cameras((0, 0, 0), (0.5, 0, 0))
     return Scene(gaussians, poses, 0.5, 10.0, ("left", "right"), height=64)
 
 

@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 import torch
 from packaging.requirements import Requirement
+from synthetic_scenes import make_balls
 
 import pansplat
 from pansplat.gaussians.ply import save_ply
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.images.video import open_video
 from pansplat.system.source_hash import hash_sources
@@ -165,15 +166,7 @@ def test_an_installed_wheel_needs_its_dependencies_only(installed: Path, tmp_pat
     foreign = find_foreign_modules()
     assert {"pytest", "beartype", "distributed"} <= set(foreign) and not {"torch", "llvmlite", "PIL"} & set(foreign)
     directions = fibonacci_directions(200).float()
-    gaussians = Gaussians(
-        means=2 * directions,
-        scales=torch.full((200, 3), 0.1),
-        quats=torch.tensor((1.0, 0.0, 0.0, 0.0)).expand(200, 4),
-        opacities=torch.full((200,), 0.9),
-        harmonics=directions[:, None],
-        levels=torch.zeros(200, dtype=torch.int64),
-        views=torch.zeros(200, dtype=torch.int64),
-    )
+    gaussians = make_balls(2 * directions, 0.1, harmonics=directions[:, None])
     save_ply(
         Scene(gaussians, torch.eye(4, dtype=torch.float64)[None], 0.5, 10.0, ("a",), "", 32), tmp_path / "scene.ply"
     )

@@ -12,7 +12,7 @@ import cv2
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.images.cube_images import MAX_SIZE, CubeImage, CubeLevel, measure_seams
-from pansplat.images.image_files import read_pixels, read_size, require_complete
+from pansplat.images.image_files import read_pixels, read_size, require_complete, require_two_to_one
 
 # Endings of file names for each face, in the order front, right, back, left, up, down. The axes are those of OpenGL's
 # cube maps: seen from inside, +x is to the right of +z.
@@ -135,6 +135,18 @@ def find_gap(level: CubeLevel, folder: Path) -> str | None:
         except InputError:
             return f"{file} is damaged"
     return None
+
+
+def read_picture(image: Path) -> Path | CubeImage:
+    """A 2:1 picture as it is, or the cube in a picture that holds all six faces; an error for another picture."""
+    width, height = read_size(image)
+    if width == 2 * height:
+        require_complete(image)
+        return image
+    layout = find_layout(image)
+    if layout is None:
+        require_two_to_one(image, width, height)
+    return layout
 
 
 def find_layout(image: Path) -> CubeImage | None:

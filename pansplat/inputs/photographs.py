@@ -14,9 +14,9 @@ import torch
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
-from pansplat.images.cube_faces import find_layout, group_faces
+from pansplat.images.cube_faces import group_faces, read_picture
 from pansplat.images.cube_images import CubeImage, write_cube
-from pansplat.images.image_files import is_two_to_one, read_size, require_complete, require_two_to_one
+from pansplat.images.image_files import is_two_to_one
 from pansplat.inputs.pairs import Link, Note, Panorama, find_mask, list_panorama_files
 from pansplat.inputs.web_tours.entries import Number, make_note, plain_text, read_direction, resolve_links
 from pansplat.system.atomic import replacing
@@ -28,7 +28,7 @@ LINKS = "links.json"
 
 def read_photograph(image: Path) -> Panorama:
     """A 2:1 picture, or one that holds six cube faces, as a panorama at the origin of a world of its own."""
-    return _make_panorama(image.stem, _read_picture(image), image.parent)
+    return _make_panorama(image.stem, read_picture(image), image.parent)
 
 
 def list_photographs(folder: Path) -> list[Panorama]:
@@ -109,21 +109,10 @@ def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama]
     for image in rest:
         name = image.stem if repeated[image.stem] == 1 and image.stem not in cubes else image.name.replace(".", "_")
         try:
-            pictures[name] = _read_picture(image)
+            pictures[name] = read_picture(image)
         except InputError as error:
             problems.append(str(error))
     return [_make_panorama(name, pictures[name], folder) for name in sorted(pictures)], problems
-
-
-def _read_picture(image: Path) -> Path | CubeImage:
-    width, height = read_size(image)
-    if width == 2 * height:
-        require_complete(image)
-        return image
-    layout = find_layout(image)
-    if layout is None:
-        require_two_to_one(image, width, height)
-    return layout
 
 
 def _make_panorama(name: str, picture: Path | CubeImage, folder: Path) -> Panorama:

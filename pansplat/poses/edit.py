@@ -20,7 +20,7 @@ from numpy import ndarray as Array
 
 from pansplat.errors import InputError
 from pansplat.images.image_files import list_pictures
-from pansplat.inputs.folders import MATRIX_KEYS
+from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pansplat.inputs.folders import MATRIX_KEYS
+from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.placements import is_by_hand
 from pansplat.poses.estimate import PoseEstimate, PoseGroup, Suggestions
 

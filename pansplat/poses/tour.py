@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
-from pansplat.poses.bundle import Problem, adjust, point_depths, residual_angles, triangulate
+from pansplat.poses.bundle import Bundle, adjust, point_depths, residual_angles, triangulate
 from pansplat.poses.features import Features
 from pansplat.poses.solvers import rotation_angle
 from pansplat.poses.two_view import RelativePose
@@ -250,15 +250,15 @@ def _place_group(
 ) -> Group:
     growing = _GrowingGroup(_make_tracks(features, relations), relations, downs, noise)
     growing.grow()
-    problem, placed = growing.with_distances(), growing.placed
+    bundle, placed = growing.with_distances(), growing.placed
     for _ in range(_ROUNDS if len(placed) > 2 else 1):
         if len(placed) > 2:
-            problem = adjust(problem, noise)
-        problem = problem.select(residual_angles(problem) < _OUTLIER * noise)
+            bundle = adjust(bundle, noise)
+        bundle = bundle.select(residual_angles(bundle) < _OUTLIER * noise)
     poses = np.tile(np.eye(4), (len(placed), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = problem.rotations, problem.centres
+    poses[:, :3, :3], poses[:, :3, 3] = bundle.rotations, bundle.centres
     order = np.argsort(placed)
-    return Group(tuple(int(placed[i]) for i in order), poses[order], point_depths(problem), residual_angles(problem))
+    return Group(tuple(int(placed[i]) for i in order), poses[order], point_depths(bundle), residual_angles(bundle))
 
 
 def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) -> tuple[str, int | None]:
@@ -336,8 +336,8 @@ class _GrowingGroup:
     """Panoramas that are placed one after another; the first one is the world.
 
     Attributes:
-        placed: panoramas in the order of placing; cameras of the problem.
-        problem: their poses, and the points that two or more of them see.
+        placed: panoramas in the order of placing; cameras of the bundle.
+        bundle: their poses, and the points that two or more of them see.
     """
 
     def __init__(
@@ -364,25 +364,25 @@ class _GrowingGroup:
             if not candidates:
                 return
             self._add(max(candidates, key=lambda v: candidates[v]))
-            self.problem = adjust(self.problem, self._noise, steps=6)
+            self.bundle = adjust(self.bundle, self._noise, steps=6)
 
-    def with_distances(self) -> Problem:
-        """The problem with estimated distances for panoramas that few points connect to two others.
+    def with_distances(self) -> Bundle:
+        """The bundle with estimated distances for panoramas that few points connect to two others.
 
         Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
         """
-        problem, placed = self.problem, self.placed
-        counts = np.bincount(problem.point)
-        joint = np.bincount(problem.camera[counts[problem.point] > 2], minlength=len(placed))
+        bundle, placed = self.bundle, self.placed
+        counts = np.bincount(bundle.point)
+        joint = np.bincount(bundle.camera[counts[bundle.point] > 2], minlength=len(placed))
         weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
         pairs = [pair for pair in self._relations if weak & set(pair)]
         numbers = np.array([[placed.index(view) for view in pair] for pair in pairs], np.int64).reshape(-1, 2)
-        return replace(problem, pairs=numbers, distances=np.array([self._relations[pair].distance for pair in pairs]))
+        return replace(bundle, pairs=numbers, distances=np.array([self._relations[pair].distance for pair in pairs]))
 
     def _add(self, view: int) -> None:
         """Place a panorama where its relations to placed ones do, the strongest of those that agree most."""
         places = []
-        for other, rotation, origin in zip(self.placed, self.problem.rotations, self.problem.centres, strict=True):
+        for other, rotation, origin in zip(self.placed, self.bundle.rotations, self.bundle.centres, strict=True):
             motion = _motion_between(self._relations, view, other)
             if motion is not None:
                 pair = (view, other) if (view, other) in self._relations else (other, view)
@@ -397,10 +397,10 @@ class _GrowingGroup:
         ]
         rotation, centre, _ = places[int(np.argmax(support))]
         self.placed.append(view)
-        self._triangulate([*self.problem.rotations, rotation], [*self.problem.centres, centre])
+        self._triangulate([*self.bundle.rotations, rotation], [*self.bundle.centres, centre])
 
     def _triangulate(self, rotations: Sequence[Array], centres: Sequence[Array]) -> None:
-        """Make the problem of the placed panoramas at these poses."""
+        """Make the bundle of the placed panoramas at these poses."""
         observations = self._observations
         position = np.full(len(self._downs), -1)
         position[self.placed] = np.arange(len(self.placed))
@@ -415,4 +415,4 @@ class _GrowingGroup:
         world = np.einsum("nij,nj->ni", rotation, downs)
         known = np.isfinite(world).all(axis=1)
         down = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
-        self.problem = Problem(rotation, centre, points, camera, point, bearing, downs, down / np.linalg.norm(down))
+        self.bundle = Bundle(rotation, centre, points, camera, point, bearing, downs, down / np.linalg.norm(down))

@@ -17,13 +17,8 @@ from pansplat.errors import InputError
 from pansplat.images.image_files import read_mask, resize_panorama
 from pansplat.images.masks import lift_black_surfaces
 from pansplat.images.video import VideoFile, open_video
-from pansplat.inputs.folders import (
-    VIDEO_FILES,
-    find_trajectory,
-    is_loc360_sequence,
-    read_loc360_sequence,
-    require_known_masks,
-)
+from pansplat.inputs.folder_formats import find_trajectory, is_loc360_sequence, read_loc360_sequence
+from pansplat.inputs.folders import VIDEO_FILES, require_known_masks
 from pansplat.inputs.pairs import FAR_SEQUENCE, NEAR, Pair, Panorama, find_mask
 from pansplat.inputs.poses import read_number, read_trajectory
 from pansplat.inputs.views import Sample, Views, select_views

@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from pansplat.errors import InputError
-from pansplat.inputs.folders import is_matterport3d_scene, read_matterport3d_scene, read_triplet, triplet_files
+from pansplat.inputs.folder_formats import is_matterport3d_scene, read_matterport3d_scene, read_triplet, triplet_files
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Sample
 from pansplat.system.files import expand_home

@@ -3,7 +3,7 @@
 
 import { camera, nearestNode, parts, tangentOf } from "./camera.js";
 import { byId, calm, say } from "./dom.js";
-import { ease, freeze, isWaiting, jump, jumpTo, lookOn, setTouring } from "./flight.js";
+import { ease, isWaiting, jump, jumpTo, lookOn, setTouring, takeStill } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
 import { changed, measureAt, rayOf, sorted } from "./loop.js";
 import { DEGREE } from "./share.js";
@@ -50,7 +50,7 @@ class DollHouse {
       say("There is no doll's house of these rooms, because the surfaces that were found are too rough");
       return;
     }
-    freeze();
+    takeStill();
     this.setOn(true);
     camera.roll = 0;
     Object.assign(this, { fov: camera.fov, heading: { yaw: camera.yaw, pitch: camera.pitch } });

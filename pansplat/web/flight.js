@@ -30,15 +30,15 @@ function arriveAt(node, from) {
 
 // A yaw at a panorama; if it faces a wall, that of the start view or of the widest view (choose_heading).
 export function lookOn(node, yaw) {
-  const { start, blank, ahead } = HEADER.spots[node], part = yaw / (2 * Math.PI) + 0.5;
-  return blank >> Math.floor(DIRECTIONS * (part - Math.floor(part))) & 1 ? start ? start[0] : ahead : yaw;
+  const { start, blank, ahead } = HEADER.spots[node], turns = yaw / (2 * Math.PI) + 0.5;
+  return blank >> Math.floor(DIRECTIONS * (turns - Math.floor(turns))) & 1 ? start ? start[0] : ahead : yaw;
 }
 
 const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
 
 // `zoom`: of the image of before, by which a fast fade along a poor edge looks like a step.
 export function jump(position, { yaw, pitch }, zoom = null) {
-  freeze(zoom);
+  takeStill(zoom);
   place({ position: [...position], yaw, pitch });
 }
 
@@ -166,8 +166,8 @@ export function advanceRoute(seconds) {
     Object.assign(route, { time: index / HEADER.routeRate, offset: [0, 0, 0, 0, 0], last: { yaw, pitch } });
     return;
   }
-  const part = HEADER.jumps.includes(index) ? 0 : at - index;
-  const sample = plus(HEADER.route[index], scaled(minus(HEADER.route[index + 1], HEADER.route[index]), part));
+  const fraction = HEADER.jumps.includes(index) ? 0 : at - index;
+  const sample = plus(HEADER.route[index], scaled(minus(HEADER.route[index + 1], HEADER.route[index]), fraction));
   const left = 1 - ease(clamp((route.time - route.began) / route.seconds, 0, 1));
   const [x, y, z, yaw, pitch] = plus(sample, scaled(route.offset, left));
   camera.position = [x, y, z];
@@ -201,7 +201,7 @@ export function goHome() {
 function goToPose(pose) {
   const isFar = distanceOf(pose.position, camera.position) > NEAR;
   const isElsewhere = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
-  if (isFar || isElsewhere || headset.session) freeze();
+  if (isFar || isElsewhere || headset.session) takeStill();
   place(pose);
 }
 
@@ -220,38 +220,38 @@ export function jumpTo(node) {
 
 export const isFlying = () => flight !== null || route !== null;
 
-// The image of the last camera before a jump covers the new one until that is sorted, then it fades out.
-const still = byId("still");
-export let frozen = null;
+// The still, the image of the last camera before a jump, covers the new one until that is sorted, then it fades out.
+const stillCanvas = byId("still");
+export let still = null;
 
-export function freeze(zoom = null) {
+export function takeStill(zoom = null) {
   if (!renderer || !sorted) return;
   if (headset.session) {  // it fades from black
-    frozen = { began: null, left: 1, position: null, zoom: null };
+    still = { began: null, left: 1, position: null, zoom: null };
     return;
   }
   const size = fullSize();  // a photograph is drawn fast
   drawAt(...(photographs.isOpaque ? size : [canvas.width, canvas.height]));  // it can be copied in the task that drew it
-  const context = still.getContext("2d");
-  const isSame = still.width === size[0] && still.height === size[1];
-  context.globalAlpha = frozen && isSame ? 1 - frozen.left : 1;
-  if (!isSame) [still.width, still.height] = size;
+  const context = stillCanvas.getContext("2d");
+  const isSame = stillCanvas.width === size[0] && stillCanvas.height === size[1];
+  context.globalAlpha = still && isSame ? 1 - still.left : 1;
+  if (!isSame) [stillCanvas.width, stillCanvas.height] = size;
   context.drawImage(canvas, 0, 0, ...size);
-  frozen = { began: null, left: 1, position: null, zoom };
+  still = { began: null, left: 1, position: null, zoom };
   showStill();
   changed();
 }
 
 export function updateStill(now) {
-  if (!frozen) return;
-  frozen.position = frozen.position || [...camera.position];
-  const isSorted = isSortedAs() && distanceOf(sorted.position, frozen.position) < NEAR;
-  const isThere = frozen.zoom === null || !HEADER.photographs.length || photographs.isOpaque;
-  if (frozen.began === null && isSorted && isThere && isSeen()) frozen.began = now;
-  if (frozen.began !== null) {
-    const t = clamp((now - frozen.began) / (frozen.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);
-    frozen.left = 1 - t * t * (3 - 2 * t);
-    if (t === 1) frozen = null;
+  if (!still) return;
+  still.position = still.position || [...camera.position];
+  const isSorted = isSortedAs() && distanceOf(sorted.position, still.position) < NEAR;
+  const isThere = still.zoom === null || !HEADER.photographs.length || photographs.isOpaque;
+  if (still.began === null && isSorted && isThere && isSeen()) still.began = now;
+  if (still.began !== null) {
+    const t = clamp((now - still.began) / (still.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);
+    still.left = 1 - t * t * (3 - 2 * t);
+    if (t === 1) still = null;
   }
   showStill();
   changed();
@@ -259,9 +259,9 @@ export function updateStill(now) {
 
 function showStill() {
   const left = coverage();
-  still.hidden = !frozen || headset.session !== null;
-  still.style.opacity = left;
-  still.style.transform = frozen && frozen.zoom ? `scale(${1 + frozen.zoom * (1 - left)})` : "";
+  stillCanvas.hidden = !still || headset.session !== null;
+  stillCanvas.style.opacity = left;
+  stillCanvas.style.transform = still && still.zoom ? `scale(${1 + still.zoom * (1 - left)})` : "";
   byId("spots").style.opacity = 1 - left;
 }
 
@@ -269,7 +269,7 @@ function showStill() {
 const isSeen = () => doll.isOn || HEADER.groups[group].some((view) => sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
 
 // Whether nothing moves yet: the Gaussians have not arrived, or an image covers them.
-export const isWaiting = () => !sorted || frozen !== null && frozen.began === null;
+export const isWaiting = () => !sorted || still !== null && still.began === null;
 
 // How much of the picture the image covers, or the black in a headset.
-export const coverage = () => frozen ? frozen.left : 0;
+export const coverage = () => still ? still.left : 0;

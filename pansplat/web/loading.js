@@ -1,4 +1,4 @@
-// The data, which arrives in parts while the scene is shown, and failures. docs/web.md describes the data. A page in one file
+// The data, which arrives in chunks while the scene is shown, and failures. docs/web.md describes the data. A page in one file
 // has all views; one with a folder loads those that the camera needs.
 
 import { camera, currentPart, edges, group, nodeHere, parts } from "./camera.js";
@@ -7,9 +7,9 @@ import { byId, canvas } from "./dom.js";
 import { flight } from "./flight.js";
 import { onSorted, sorted } from "./loop.js";
 
-export let worker = null, failure = null, partsArrived = 0, arrived = 0;  // parts of the data, views
+export let worker = null, failure = null, chunksArrived = 0, arrived = 0;  // chunks of the data, views
 const asked = new Set(), got = new Set();  // views
-let onMissing = fail;                      // reports a part that does not arrive
+let onMissing = fail;                      // reports a chunk that does not arrive
 export const isComplete = () => [...asked].every((view) => got.has(view));
 
 export function fail(error) {
@@ -22,7 +22,7 @@ export function fail(error) {
   console.error(error);
 }
 
-// A script for each part of the data calls this. In a page of one file the part is the element before: unlike text in a
+// A script for each chunk of the data calls this. In a page of one file the chunk is the element before: unlike text in a
 // program, it is not kept.
 window.addPart = (view, isLast, text) => {
   const { currentScript: script } = document;
@@ -31,12 +31,12 @@ window.addPart = (view, isLast, text) => {
     script.previousElementSibling.remove();
   }
   script.remove();
-  partsArrived += 1;
-  byId("bar").value = partsArrived / countParts();
+  chunksArrived += 1;
+  byId("bar").value = chunksArrived / countChunks();
   if (worker) worker.postMessage({ view, text, isLast });
 };
 
-const countParts = () => [...asked].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
+const countChunks = () => [...asked].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
 
 // Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all of the part for the
 // doll's house, and all without edges.
@@ -83,7 +83,7 @@ export function load(onView) {
     if (HEADER.folder !== null) return;
     loadAround();
     addEventListener("DOMContentLoaded", () => {
-      if (partsArrived !== countParts()) fails(new Error("A part of the scene is missing. Copy the whole folder."));
+      if (chunksArrived !== countChunks()) fails(new Error("A part of the scene is missing. Copy the whole folder."));
     });
   });
 }

@@ -8,7 +8,7 @@ import {
 import { doll } from "./doll.js";
 import { canvas } from "./dom.js";
 import { embed } from "./embed.js";
-import { advanceFlight, advanceRoute, flight, frozen, isWaiting, route, updateStill } from "./flight.js";
+import { advanceFlight, advanceRoute, flight, isWaiting, route, still, updateStill } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus, scaled } from "./graph.js";
 import { walkByKeys } from "./input.js";
 import { arrived, isComplete, loadAround, worker } from "./loading.js";
@@ -75,7 +75,7 @@ export function onSorted(data) {
 // Whether the picture is final: all data is there and sorted for the camera, nothing moves or fades, and it is drawn.
 export function isSettled() {
   const isDrawn = headset.session !== null || !dirty && drawnScale === 1, tolerance = headset.session ? SORT_DISTANCE : 0;
-  const isMoving = [flight, route, doll.flight, fade, frozen].some((each) => each !== null);
+  const isMoving = [flight, route, doll.flight, fade, still].some((each) => each !== null);
   return isDrawn && !isMoving && photographs.isFinal() && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) && sorted.views.every((view) => shown[view] === 1);
 }
 

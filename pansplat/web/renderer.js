@@ -66,7 +66,7 @@ export class Renderer {
     return texture;
   }
 
-  // Writes texels from a place on; `components` of an array are one texel.
+  // Writes texels from the index `start` on; `components` of an array are one texel.
   write(texture, values, components, start, channels, type) {
     const gl = this.gl, end = start + values.length / components;
     gl.bindTexture(gl.TEXTURE_2D, texture);

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from synthetic_scenes import make_balls
 from torch import Tensor
 
 from pansplat import pipeline
 from pansplat.cli import run
-from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
 
 HEIGHT = 64
@@ -29,16 +29,10 @@ class Sphere:
         images = images[..., :: images.shape[-2] // 16, :: images.shape[-2] // 16]
         view, _, height, width = images.shape
         directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
-        count = view * len(directions)
-        return Gaussians(
-            means=torch.cat([2 * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world.double()]).float(),
-            scales=torch.full((count, 3), 0.3),
-            quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-            opacities=torch.full((count,), 0.9),
-            harmonics=((images.flatten(2).transpose(1, 2).reshape(-1, 1, 3) - 0.5) / 0.28209479).contiguous(),
-            levels=torch.arange(count) % 2,
-            views=torch.arange(view).repeat_interleave(len(directions)),
-        )
+        means = torch.cat([2 * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world.double()])
+        color, views = images.flatten(2).transpose(1, 2).reshape(-1, 3), torch.arange(view)
+        levels = torch.arange(len(means)) % 2
+        return make_balls(means, 0.3, color=color, levels=levels, views=views.repeat_interleave(len(directions)))
 
 
 @pytest.fixture(autouse=True)

@@ -11,13 +11,13 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat import pipeline
 from pansplat.cli import export as export_module
 from pansplat.cli import run
 from pansplat.export import page as page_module
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
@@ -267,18 +267,10 @@ def test_a_drawn_plan_needs_walls_and_all_that_each_panorama_shows(
 
 def test_a_plan_states_rooms_and_uncertainty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A room of 4 x 6 x 2.6 m."""
-    rays, here = fibonacci_directions(20000).double() + 1e-9, torch.tensor((0.3, -1.5, 0.2), dtype=torch.float64)
-    low, high = torch.tensor((-2.0, -2.6, -3.0)), torch.tensor((2.0, 0.0, 3.0))
-    distance = (torch.where(rays > 0, high - here, low - here) / rays).min(dim=1, keepdim=True).values
-    labels = torch.zeros(20000, dtype=torch.int64)
-    means = (here + distance * rays).float()
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(20000, 4)
-    sizes, black = torch.full((20000, 3), 0.02), torch.zeros(20000, 1, 3)
-    gaussians = Gaussians(means, sizes, quats, torch.ones(20000), black, labels, labels)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = here
+    low, high, here = torch.tensor((-2.0, -2.6, -3.0)), torch.tensor((2.0, 0.0, 3.0)), (0.3, -1.5, 0.2)
+    gaussians = make_balls(see_box(low, high, torch.tensor(here), 20000), 0.02, 1.0)
     scene = tmp_path / "scene.ply"
-    pipeline.save(Scene(gaussians, pose[None], 0.5, 10.0, names=("Kitchen",)), scene)
+    pipeline.save(Scene(gaussians, place_cameras(here), 0.5, 10.0, names=("Kitchen",)), scene)
     assert run(["export", str(scene), "-o", str(tmp_path / "plan.svg")]) == 0
     printed = capsys.readouterr().out
     assert "plan.svg: 1 room, 24.0 m² between the walls; scale: cameras 1.50 m over the floor" in printed

@@ -5,41 +5,28 @@ from dataclasses import replace
 
 import pytest
 import torch
+from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.errors import InputError
 from pansplat.export.cleanup import Change, Cleaning, clean_up, compare_pictures, find_floaters
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.refinement import fuse_views
 
 _COUNT = 12000  # Gaussians of a camera
 
 
 def _make(means: torch.Tensor, scale: float, view: int) -> Gaussians:
-    count = len(means)
-    return Gaussians(
-        means.float(),
-        torch.full((count, 3), scale),
-        torch.tensor((1.0, 0, 0, 0)).expand(count, 4),
-        torch.full((count,), 0.95),
-        torch.sin(3 * means.float())[:, None],
-        torch.zeros(count, dtype=torch.int64),
-        torch.full((count,), view),
-    )
+    return make_balls(means, scale, 0.95, harmonics=torch.sin(3 * means.float())[:, None], views=view)
 
 
 def _make_room() -> tuple[Scene, torch.Tensor]:
     """A room of 6 x 3 x 4 m with a lamp on a wire, seen by two cameras; and which Gaussians are those of the wire."""
     low, high = torch.tensor((-3.0, -1.5, -2.0)).double(), torch.tensor((3.0, 1.5, 2.0)).double()
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[:, 0, 3] = torch.tensor((-0.8, 0.8))
-    rays = fibonacci_directions(_COUNT).double() + 1e-9
+    poses = place_cameras((-0.8, 0, 0), (0.8, 0, 0))
     wire = torch.tensor((0.1, -1.5, 1.0)).double() + torch.arange(40)[:, None] * torch.tensor((0.0, 0.02, 0.0)).double()
     parts, is_wire = [], []
     for view, pose in enumerate(poses):
-        center = pose[:3, 3]
-        distance = (torch.where(rays > 0, high - center, low - center) / rays).amin(dim=1, keepdim=True)
-        parts += [_make(center + distance * rays, 0.05, view), _make(wire, 0.01, view)]
+        parts += [_make(see_box(low, high, pose[:3, 3], _COUNT), 0.05, view), _make(wire, 0.01, view)]
         is_wire += [torch.zeros(_COUNT, dtype=torch.bool), torch.ones(40, dtype=torch.bool)]
     scene = Scene(Gaussians.cat(parts), poses, 0.3, 8.0, ("left", "right"), "synthetic", 64)
     return scene, torch.cat(is_wire)

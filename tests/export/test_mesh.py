@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from synthetic_scenes import make_balls, place_cameras
 
 from pansplat.errors import InputError
 from pansplat.export.mesh import make_mesh
@@ -39,23 +40,13 @@ def _view(view: int, screen: float | None = None, count: int = 60000) -> Gaussia
     if screen is not None:
         distance = torch.where(rays[:, 2] > 0.95, screen, distance)
     means = center + distance[:, None] * rays
-    labels = torch.zeros(count, dtype=torch.int64)
-    return Gaussians(
-        means=means,
-        scales=0.009 * distance[:, None].repeat(1, 3),
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        opacities=torch.full((count,), 0.98),
-        harmonics=((_color(means) - 0.5) / 0.28209479)[:, None],
-        levels=labels,
-        views=labels + view,
-    )
+    return make_balls(means, 0.009 * distance[:, None], 0.98, color=_color(means), views=view)
 
 
 @pytest.fixture(scope="module")
 def box() -> Scene:
     """A room that two cameras see."""
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[:, :3, 3] = CENTERS.double()
+    poses = place_cameras(*CENTERS.tolist())
     poses[1, :3, :3] = TURN.double()
     return Scene(Gaussians.cat([_view(0), _view(1)]), poses, 0.5, 10.0, names=("a.jpg", "b.jpg"), height=128)
 

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from synthetic_scenes import make_balls, place_cameras
 
 from pansplat import pipeline
 from pansplat.cli import run
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Scene
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
 from pansplat.training.__main__ import run as run_training
@@ -40,17 +41,9 @@ class Outcome:
 def make_scene(count: int = 12) -> Scene:
     """Some Gaussians of two views, with two input cameras."""
     random = torch.Generator().manual_seed(0)
-    gaussians = Gaussians(
-        means=torch.randn(count, 3, generator=random) * 2,
-        scales=torch.full((count, 3), 0.2),
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        opacities=torch.full((count,), 0.8),
-        harmonics=torch.rand(count, 1, 3, generator=random),
-        levels=torch.zeros(count, dtype=torch.int64),
-        views=torch.arange(count) * 2 // count,
-    )
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[1, 0, 3] = 0.5
+    means, colors = torch.randn(count, 3, generator=random) * 2, torch.rand(count, 1, 3, generator=random)
+    gaussians = make_balls(means, 0.2, 0.8, harmonics=colors, views=torch.arange(count) * 2 // count)
+    poses = place_cameras((0, 0, 0), (0.5, 0, 0))
     return Scene(gaussians, poses, near=0.45, far=10.0, names=("a.png", "b.png"), model="sphere", height=64)
 
 

@@ -5,28 +5,21 @@ from dataclasses import replace
 
 import pytest
 import torch
+from synthetic_scenes import make_balls, place_cameras
 
 from pansplat.errors import InputError
 from pansplat.gaussians.crop import crop, keep_gaussians
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Scene
 
 
 def _make_row(*, joint: bool = False) -> Scene:
     """Three cameras in a row, 4 m apart along x, each with Gaussians at distances of 1 and 3 m before and behind it."""
-    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-    poses[:, 0, 3] = torch.tensor((0.0, 4.0, 8.0))
+    poses = place_cameras((0, 0, 0), (4, 0, 0), (8, 0, 0))
     offsets = torch.tensor((-3.0, -1.0, 1.0, 3.0))
     means = torch.zeros(12, 3)
     means[:, 0] = (poses[:, 0, 3, None] + offsets).flatten()
-    gaussians = Gaussians(
-        means,
-        torch.full((12, 3), 0.1),
-        torch.tensor((1.0, 0, 0, 0)).expand(12, 4),
-        torch.linspace(0.1, 1, 12),
-        torch.zeros(12, 1, 3),
-        torch.zeros(12, dtype=torch.uint8),
-        torch.arange(3).repeat_interleave(4).to(torch.uint8),
-    )
+    levels, views = torch.tensor(0, dtype=torch.uint8), torch.arange(3).repeat_interleave(4).to(torch.uint8)
+    gaussians = make_balls(means, 0.1, torch.linspace(0.1, 1, 12), levels=levels, views=views)
     gains, starts = ((1.0, 1.0, 1.0), (2.0, 2.0, 2.0), (3.0, 3.0, 3.0)), (None, (0.5, 0.0), (1.0, 0.0))
     links = ((0, 1, 0.1, 0.0, "on"), (1, 2, 0.2, 0.0, "on"), (2, 1, 0.3, 0.0, "back"))
     edges = ((0, 1, 0.4), (1, 2, 0.3))

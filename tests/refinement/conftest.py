@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from synthetic_scenes import make_balls, place_cameras
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -38,18 +39,10 @@ def room() -> Room:
     """Each view holds all Gaussians; in the prediction their distances, scales and colours are wrong."""
     random = torch.Generator().manual_seed(0)
     rays = fibonacci_directions(COUNT).float()
-    one = Gaussians(
-        means=rays * (2.5 + 0.6 * torch.sin(3 * rays[:, :1]) * torch.cos(2 * rays[:, 1:2])),
-        scales=torch.full((COUNT, 3), 0.13),
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(COUNT, 1),
-        opacities=torch.full((COUNT,), 0.95),
-        harmonics=1.5 * torch.rand(COUNT, 1, 3, generator=random) - 0.75,
-        levels=torch.zeros(COUNT, dtype=torch.int64),
-        views=torch.zeros(COUNT, dtype=torch.int64),
-    )
+    means = rays * (2.5 + 0.6 * torch.sin(3 * rays[:, :1]) * torch.cos(2 * rays[:, 1:2]))
+    one = make_balls(means, 0.13, 0.95, harmonics=1.5 * torch.rand(COUNT, 1, 3, generator=random) - 0.75)
     both = Gaussians.cat([one, dataclasses.replace(one, views=torch.ones_like(one.views))])
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[0, 0, 3], poses[1, 0, 3] = -0.3, 0.3
+    poses = place_cameras((-0.3, 0, 0), (0.3, 0, 0))
     truth = Scene(both, poses, near=0.5, far=10.0, names=("left", "right"), model="truth", height=HEIGHT)
     images = torch.stack([rasterize(one, pose, size=(HEIGHT, 2 * HEIGHT)).color for pose in poses]).clamp(0, 1)
     views = Views(images, poses, torch.ones(2, HEIGHT, 2 * HEIGHT, dtype=torch.bool), 0.5, 10.0, ("left", "right"))

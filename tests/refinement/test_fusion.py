@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from synthetic_scenes import make_balls, place_cameras
 
 from pansplat import pipeline
 from pansplat.errors import InputError
@@ -23,21 +24,12 @@ def _shell(center: torch.Tensor, view: int, distances: float | torch.Tensor = 3.
     if not isinstance(distances, torch.Tensor):  # where the rays meet the sphere about the origin
         along = (rays @ center)[:, None]
         distances = (-along + (along.square() - center.square().sum() + distances**2).sqrt())[:, 0]
-    count = len(rays)
-    return Gaussians(
-        means=center + rays * distances[:, None],
-        scales=0.05 * distances[:, None].repeat(1, 3),
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        opacities=torch.full((count,), 0.95),
-        harmonics=torch.zeros(count, 1, 3),
-        levels=torch.full((count,), level),
-        views=torch.full((count,), view),
-    )
+    far = distances[:, None]
+    return make_balls(center + rays * far, 0.05 * far, 0.95, levels=level, views=view)
 
 
 def _scene(*parts: Gaussians, near: float = 0.5) -> Scene:
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[0, :3, 3], poses[1, :3, 3] = LEFT, RIGHT
+    poses = place_cameras(LEFT.tolist(), RIGHT.tolist())
     return Scene(Gaussians.cat(parts), poses, near=near, far=10.0, height=HEIGHT)
 
 

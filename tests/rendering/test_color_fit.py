@@ -5,6 +5,7 @@ import itertools
 
 import pytest
 import torch
+from synthetic_scenes import make_balls
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -19,15 +20,8 @@ POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
 def truth() -> Gaussians:
     """Two views with Gaussians of random colours on a sphere."""
     count, random = 300, torch.Generator().manual_seed(0)
-    one = Gaussians(
-        means=2 * fibonacci_directions(count).float(),
-        scales=torch.full((count, 3), 0.12),
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        opacities=torch.full((count,), 0.9),
-        harmonics=1.5 * torch.rand(count, 1, 3, generator=random) - 0.75,
-        levels=torch.zeros(count, dtype=torch.uint8),
-        views=torch.zeros(count, dtype=torch.uint8),
-    )
+    colors, label = 1.5 * torch.rand(count, 1, 3, generator=random) - 0.75, torch.tensor(0, dtype=torch.uint8)
+    one = make_balls(2 * fibonacci_directions(count), 0.12, harmonics=colors, levels=label, views=label)
     return Gaussians.cat([one, dataclasses.replace(one, views=torch.ones_like(one.views))])
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import PIL.Image
 import pytest
 import torch
+from synthetic_scenes import make_balls, place_cameras, see_box
 
 import pansplat.tours as tours
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.gaussians.scene import Scene
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import Placement
 from pansplat.tours import TourGraph, draw_floor_plan, find_floor_outline
@@ -21,25 +21,10 @@ from pansplat.tours import TourGraph, draw_floor_plan, find_floor_outline
 @pytest.fixture(scope="module")
 def room_scene() -> Scene:
     """Gaussians on the surfaces of a room 4 m wide and 6 m long, around a camera 1.5 m over its floor; z is up."""
-    low, high, count = np.array((-1.0, -2.0, 0.0)), np.array((3.0, 4.0, 2.5)), 20000
-    here = np.array((0.5, 0.0, 1.5))
-    directions = fibonacci_directions(count).double().numpy() + 1e-9
-    far = np.where(directions > 0, high - here, low - here) / directions
-    means = here + far.min(-1, keepdims=True) * directions
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.tensor(((1.0, 0, 0), (0, 0, 1), (0, -1, 0)))
-    pose[:3, 3] = torch.from_numpy(here)
-    zeros = torch.zeros(count, dtype=torch.int64)
-    gaussians = Gaussians(
-        torch.from_numpy(means).float(),
-        torch.full((count, 3), 0.02),
-        torch.tensor((1.0, 0, 0, 0)).expand(count, 4),
-        torch.ones(count),
-        torch.zeros(count, 1, 3),
-        zeros,
-        zeros,
-    )
-    return Scene(gaussians, pose[None], 0.45, 10.0)
+    pose = place_cameras((0.5, 0.0, 1.5))
+    pose[:, :3, :3] = torch.tensor(((1.0, 0, 0), (0, 0, 1), (0, -1, 0)))
+    low, high = torch.tensor((-1.0, -2.0, 0.0)), torch.tensor((3.0, 4.0, 2.5))
+    return Scene(make_balls(see_box(low, high, pose[0, :3, 3], 20000), 0.02, 1.0), pose, 0.45, 10.0)
 
 
 def test_the_floor_of_a_room_ends_at_its_walls(room_scene):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from synthetic_scenes import make_balls
 
 import pansplat.tours as tours
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
@@ -17,8 +18,7 @@ from pansplat.tours.route import plan_route
 
 
 def make_gaussians(count: int) -> Gaussians:
-    zeros, sizes = torch.zeros(count, dtype=torch.int64), torch.ones(count, 3)
-    return Gaussians(sizes, sizes, torch.ones(count, 4), torch.ones(count), torch.zeros(count, 1, 3), zeros, zeros)
+    return make_balls(torch.ones(count, 3), 1.0, 1.0)
 
 
 def test_pairs_that_share_panoramas_are_one_tour(make_tour):

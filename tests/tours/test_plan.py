@@ -12,11 +12,12 @@ import ezdxf
 import numpy as np
 import pytest
 import torch
+from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
 from pansplat.export.cleanup import crop_to_rooms
 from pansplat.export.plan_files import _Drawing, describe_plan, write_picture, write_plan
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.system.files import is_written
 from pansplat.tours import make_graph
@@ -92,16 +93,8 @@ def _make_house(
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = torch.from_numpy(center)
         poses.append(pose)
-    total = count * len(cameras)
-    gaussians = Gaussians(
-        torch.from_numpy(np.concatenate(means)).float(),
-        torch.full((total, 3), 0.02),
-        torch.tensor((1.0, 0, 0, 0)).expand(total, 4),
-        torch.ones(total),
-        torch.zeros(total, 1, 3),
-        torch.zeros(total, dtype=torch.int64),
-        torch.from_numpy(np.concatenate(views)),
-    )
+    labels = torch.from_numpy(np.concatenate(views))
+    gaussians = make_balls(torch.from_numpy(np.concatenate(means)), 0.02, 1.0, views=labels)
     edges = tuple((k, k + 1, 0.5) for k in range(len(cameras) - 1)) if len(cameras) > 1 else ((0, 0, 1.0),)
     return Scene(gaussians, torch.stack(poses), 0.45, 10.0, names=tuple(names), overlaps=edges)
 

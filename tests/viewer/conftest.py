@@ -12,6 +12,7 @@ import moderngl
 import numpy as np
 import pytest
 import torch
+from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
@@ -299,15 +300,7 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     directions, cam2world = fibonacci_directions(500), tour.cam2world[list(entry.views)]
     color = torch.tensor((0.3, 0.5, 0.7)).roll(sum(entry.views)) + 0.2 * directions
     parts = [
-        Gaussians(
-            means=(pose[:3, 3] + 4 * directions).float(),
-            scales=torch.full((500, 3), 0.5),
-            quats=torch.tensor((1.0, 0, 0, 0)).expand(500, 4),
-            opacities=torch.full((500,), 0.95),
-            harmonics=((color.float() - 0.5) / _Y0)[:, None],
-            levels=torch.zeros(500, dtype=torch.int64),
-            views=torch.full((500,), view),
-        )
+        make_balls(pose[:3, 3] + 4 * directions, 0.5, 0.95, color=color, views=view)
         for view, pose in enumerate(cam2world)
     ]
     scene = Scene(Gaussians.cat(parts), cam2world, 0.45, 10.0, (), "synthetic", 64)

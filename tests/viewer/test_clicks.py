@@ -16,6 +16,7 @@ import pytest
 import torch
 from imgui_bundle import imgui
 from PIL import Image
+from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
@@ -180,19 +181,10 @@ def make_sphere_scene(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
     right, forward = (np.cos(yaw), -np.sin(yaw), 0.0), (np.sin(yaw), np.cos(yaw), 0.0)
     pose[:3, :3] = torch.tensor((right, (0.0, 0.0, -1.0), forward)).T
     pose[:3, 3] = torch.tensor((1.0, -2.0, 0.5))
-    count = 3000
-    directions = fibonacci_directions(count)
+    directions = fibonacci_directions(3000)
     image = torch.from_numpy(photos[0]).permute(2, 0, 1)
     color = sample_equirect(image, uv_from_directions(directions).float()).T
-    gaussians = Gaussians(
-        means=(pose[:3, 3] + 3 * directions @ pose[:3, :3].T).float(),
-        scales=torch.full((count, 3), 0.2),
-        quats=torch.tensor((1.0, 0, 0, 0)).expand(count, 4),
-        opacities=torch.full((count,), 0.99),
-        harmonics=((color - 0.5) / 0.28209479177387814)[:, None],
-        levels=torch.zeros(count, dtype=torch.int64),
-        views=torch.zeros(count, dtype=torch.int64),
-    )
+    gaussians = make_balls(pose[:3, 3] + 3 * directions @ pose[:3, :3].T, 0.2, 0.99, color=color)
     scene = Scene(gaussians, pose[None], 0.45, 10.0, ("a.png",), "synthetic", 128)
     (panorama, *_) = entry.pair.context
     entry = replace(entry, pair=replace(entry.pair, context=(replace(panorama, cam2world=pose),)))
@@ -594,8 +586,11 @@ def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
 def test_the_photograph_of_the_comparison_is_chosen_in_a_list(user):
     user.state.comparison, user.state.photograph = "photograph", 1
     user.draw_frames(2)
+    comparer = user.viewer.stage.comparer
+    assert user.viewer.right_name == "photograph b.png" and comparer.measure_distance(user.state) == pytest.approx(0.5)
     user.click("Go")
-    assert user.state.camera.position == pytest.approx((0, 0, 0.5))
+    assert user.state.camera.position == pytest.approx((0, 0, 0.5)) and user.state.camera.yaw_radians == 0
+    assert comparer.measure_distance(user.state) == pytest.approx(0)
     user.click("photographs")
     left, _, _, bottom = user.panels.widgets.items["photographs"]
     user.click_at(left + 20, bottom + 12)
@@ -749,7 +744,7 @@ def test_a_refinement_is_cancelled_or_compared_with_its_prediction(user, small_s
         if not go.is_set():
             user.click("Cancel")
             user.settle()
-            assert user.viewer.refinement is None
+            assert user.viewer.refinement is user.viewer.error is None and user.viewer.loaded.scene is small_scene
             predicted = user.read_image()
             go.set()
     user.settle()
@@ -987,6 +982,8 @@ def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     user.click("visit 0")
     fly(user)
     assert find_node(user) == 0
+    user.press(imgui.Key.r)
+    assert user.state.camera == user.state.home
 
 
 def match_photograph(user: User, node: int) -> float:
@@ -1246,15 +1243,17 @@ def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
     user.click("Write film")
     user.settle()
     files = user.viewer.recorder.files[-3:]
+    assert [file.name[-9:] for file in files] == [f"_{i:04d}.png" for i in range(3)]
     user.state.message = ""
     shown = user.read_image()
     with Image.open(files[-1]) as file:
         assert np.abs(np.asarray(file).astype(int)[IMAGE] - shown).max() <= 3, "the last frame is the last key frame"
     user.state.path = path.add(replace(path.key_frames[0], seconds=600.0))
     user.click("Write film")
+    assert 0 <= user.viewer.jobs.progress("film")[1] < 1
     user.click("Cancel##film")
     user.settle()
-    assert user.viewer.error is None and user.viewer.recorder.files[-3:] == files
+    assert user.viewer.jobs.progress("film") is user.viewer.error is None and user.viewer.recorder.files[-3:] == files
 
 
 def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):

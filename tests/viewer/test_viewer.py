@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 from imgui_bundle import imgui
-from PIL import Image
 
 from pansplat.errors import InputError
 from pansplat.export.cleanup import find_floaters
@@ -264,6 +263,7 @@ def test_progress_is_shown_and_input_accepted_while_a_scene_is_loaded(app, small
     gate.open()
     app.settle()
     assert app.viewer.loading is None and app.viewer.loaded.entry.name == "slow"
+    assert app.library.loader.poll() is app.library.loader.progress is None, "the result is handed over once"
 
 
 def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
@@ -294,32 +294,18 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
     app.load = load
     app.viewer.show([SceneEntry("kitchen")], 0)
     app.until(lambda: app.viewer.refinement == 0.5, "refinement")
+    assert app.viewer.loading is None and not app.viewer.loaded.is_final
     app.frame(held=frozenset("w"))
     camera, stage = app.state.camera, app.viewer.stage
     go.set()
     app.until(lambda: app.library.loader.refinement is None, "refined scene")
     app.settle()
     assert app.viewer.refinement == 1 and stage.slot.scene is refined and app.state.camera == camera
+    assert app.library.loader.poll() is None
     for expected in (small_scene, refined):
         app.press("b")
         app.settle()
         assert stage.slot.scene is expected
-
-
-def test_a_cancelled_refinement_keeps_the_prediction(app, small_scene):
-    gate = Gate(lambda entry: pytest.fail("cancelled"), "refining", 0.6)
-
-    def load(entry: SceneEntry, progress: object, show: Callable[..., None]) -> LoadedScene:
-        show(LoadedScene(entry, small_scene, is_final=False))
-        return gate(entry, progress, show)
-
-    app.load = load
-    app.viewer.show([SceneEntry("kitchen")], 0)
-    app.until(lambda: app.viewer.refinement is not None, "refinement")
-    app.library.loader.cancel()
-    app.until(lambda: gate.ended, "end of the thread")
-    app.settle()
-    assert app.viewer.refinement is app.viewer.error is None and app.viewer.loaded.scene is small_scene
 
 
 def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(app, small_scene, monkeypatch):
@@ -464,15 +450,6 @@ def test_the_view_of_a_photograph_is_kept_when_its_scene_is_there(make_app, pair
     assert camera.yaw_radians > 0.1 and app.state.camera == replace(camera, distance=app.state.camera.distance)
 
 
-def test_a_chosen_photograph_is_compared_from_its_own_camera(app):
-    comparer = app.viewer.stage.comparer
-    app.state.comparison, app.state.photograph = "photograph", 1
-    assert app.viewer.right_name == "photograph b.png" and comparer.measure_distance(app.state) == pytest.approx(0.5)
-    comparer.go_to_photograph(app.state)
-    assert app.state.camera.position == pytest.approx((0, 0, 0.5)) and app.state.camera.yaw_radians == 0
-    assert comparer.measure_distance(app.state) == pytest.approx(0)
-
-
 def test_a_photograph_that_cannot_be_read_is_an_error(app, pair, tmp_path):
     broken = replace(pair.context[0], image=tmp_path / "gone.png")
     app.show(SceneEntry("broken", pair=replace(pair, context=(broken, pair.context[1]))))
@@ -485,16 +462,6 @@ def test_a_scene_without_photographs_has_no_comparison_with_one(app):
     app.show(SceneEntry("no photographs"))
     app.press("c")
     assert app.viewer.right_name is None
-
-
-def test_a_pinned_image_keeps_its_settings_beside_other_scenes(app):
-    app.press("x")
-    assert app.state.comparison == "pinned" and app.viewer.right_name == "first, joint, color"
-    app.state.settings = replace(app.state.settings, mode="view")
-    app.show(SceneEntry("other"))
-    assert app.viewer.right_name == "first, joint, color"
-    app.press("x")
-    assert app.viewer.right_name == "other, view, color"
 
 
 # --- screenshots, paths and films ---
@@ -532,29 +499,6 @@ def test_a_path_is_saved_and_loaded_and_other_files_are_kept(path_app, tmp_path)
         act(str(tmp_path / name))
         assert name in viewer.error
     assert own.read_text() == "{}"
-
-
-@pytest.mark.slow
-def test_the_last_frame_of_a_film_is_the_last_key_frame(path_app):
-    app = path_app
-    app.state.film_fps, app.state.film_suffix = 2.0, ".png"
-    app.viewer.start_film()
-    app.settle()
-    files = app.viewer.recorder.files
-    assert [file.name[-9:] for file in files] == [f"_{i:04d}.png" for i in range(3)]
-    with Image.open(files[-1]) as file:
-        assert file.size == SIZE and np.asarray(file).std() > 10
-
-
-def test_a_film_can_be_cancelled(path_app):
-    app = path_app
-    app.state.path = app.state.path.add(replace(app.state.path.key_frames[0], seconds=600.0))
-    app.viewer.start_film()
-    app.frame()
-    assert 0 <= app.viewer.jobs.progress("film")[1] < 1
-    app.viewer.jobs.cancel("film", join=True)
-    app.settle()
-    assert app.viewer.jobs.progress("film") is app.viewer.error is None and app.viewer.recorder.files == []
 
 
 def test_a_film_of_a_tour_is_cancelled_during_a_prediction(tour_app, load_house):
@@ -836,20 +780,6 @@ def tour_app(make_app, house) -> App:
     app = make_app()
     app.show(SceneEntry(house.name, tour=house))
     return app
-
-
-def test_a_click_on_a_hotspot_flies_there_and_shows_its_scene(tour_app):
-    app, first = tour_app, tour_app.viewer.stage.slot.scene
-    click_on(app, 2)
-    assert app.state.target == 2 and not app.state.points
-    app.fly()
-    assert np.linalg.norm(app.state.camera.position - app.viewer.tour.tour.positions[2]) < 1e-6
-    app.state.target = 3
-    app.fly()
-    assert app.node == 3 and app.viewer.stage.slot.scene is not first
-    app.press("r")
-    app.settle()
-    assert app.node == 0 and app.state.camera == app.state.home
 
 
 def test_hotspots_are_in_points_of_a_screen_with_two_pixels_a_point(tour_app):

@@ -22,9 +22,8 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.images.cube_faces import find_gap, find_layout, require_faces
+from pansplat.images.cube_faces import find_gap, read_picture, require_faces
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
-from pansplat.images.image_files import read_size, require_complete
 from pansplat.inputs.pairs import Link, Note
 from pansplat.inputs.web_tours.entries import (
     MAX_BYTES,
@@ -213,14 +212,7 @@ def _read_equirect(scene: Mapping[str, Any], folder: Path) -> Path | CubeImage:
     ]
     if spans != [360, 180]:
         raise InputError(f"needed a picture of 360 x 180 degrees, got {spans[0]:g} x {spans[1]:g} (haov, vaov)")
-    width, height = read_size(image)
-    if width == 2 * height:
-        require_complete(image)
-        return image
-    layout = find_layout(image)
-    if layout is None:
-        raise InputError(f"{image}: needed a 2:1 equirectangular panorama, got {width}x{height} (width x height)")
-    return layout
+    return read_picture(image)
 
 
 def _read_cube_map(scene: Mapping[str, Any], folder: Path) -> CubeImage:

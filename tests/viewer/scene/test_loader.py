@@ -208,36 +208,6 @@ def test_folder_name_is_a_single_valid_name(name, folder):
     assert SceneEntry(name).folder_name == folder
 
 
-def test_loader_reports_progress_and_returns_the_result_once(small_scene, wait_until):
-    go, reported = threading.Event(), threading.Event()
-
-    def load(entry, progress, show):
-        progress("reading", 0.25)
-        reported.set()
-        assert go.wait(300)
-        return LoadedScene(entry, small_scene)
-
-    loader = SceneLoader(load)
-    assert loader.progress is None and loader.poll() is None
-    loader.request(SceneEntry("kitchen"))
-    assert reported.wait(300)
-    assert loader.progress == ("kitchen", "reading", 0.25) and loader.poll() is None
-    go.set()
-    assert wait_until(loader.poll, "result").scene is small_scene
-    assert loader.progress is None and loader.poll() is None
-    loader.close()
-
-
-def test_an_exception_is_returned(wait_until):
-    def load(entry, progress, show):
-        raise InputError(f"{entry.name} is damaged")
-
-    loader = SceneLoader(load)
-    loader.request(SceneEntry("kitchen"))
-    assert str(wait_until(loader.poll, "result")) == "kitchen is damaged"
-    loader.close()
-
-
 def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
     def load(entry, progress, show):
         return work_forever(entry, progress, show) if entry.name == "first" else LoadedScene(entry, small_scene)
@@ -272,27 +242,6 @@ def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene)
     loaded = load_entry(entry, options, lambda task, done: tasks.append(task))
     assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)
     assert loaded.scene is small_scene and tasks[0] == "predicting"
-
-
-def test_the_prediction_is_returned_before_the_refined_scene(small_scene, wait_until):
-    go = threading.Event()
-
-    def load(entry, progress, show):
-        show(LoadedScene(entry, small_scene, is_final=False))
-        progress("refining", 0.75)
-        assert go.wait(300)
-        return LoadedScene(entry, small_scene)
-
-    loader = SceneLoader(load)
-    loader.request(SceneEntry("kitchen"))
-    assert loader.refinement is None
-    assert not wait_until(loader.poll, "prediction").is_final
-    assert wait_until(lambda: loader.refinement, "progress") == pytest.approx(0.5)
-    assert loader.progress is None and loader.poll() is None
-    go.set()
-    assert wait_until(loader.poll, "result").is_final
-    assert loader.refinement is None and loader.poll() is None
-    loader.close()
 
 
 def test_an_entry_shows_its_prediction_before_the_refined_scene(monkeypatch, small_scene):

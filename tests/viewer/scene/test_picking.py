@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from synthetic_scenes import make_balls
 
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Scene
 from pansplat.rendering import rasterize
 from pansplat_viewer.scene.camera import Camera, turn
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point, project_point
@@ -20,15 +21,9 @@ CAMERA = replace(turn(Camera(), 0.4, 0.2), position=(0.3, -0.2, 0.1), vertical_f
 @pytest.fixture
 def scene() -> Scene:
     """Two flat discs ahead of the origin: a translucent one at 2 m and an opaque one at 3 m."""
-    gaussians = Gaussians(
-        means=torch.tensor(((0.0, 0.0, 2.0), (0.0, 0.0, 3.0))),
-        scales=torch.tensor(((0.2, 0.2, 0.0), (0.5, 0.5, 0.0))),
-        quats=torch.tensor((1.0, 0, 0, 0)).expand(2, 4),
-        opacities=torch.tensor((0.25, 0.9)),
-        harmonics=torch.zeros(2, 1, 3),
-        levels=torch.tensor((0, 2)),
-        views=torch.tensor((0, 1)),
-    )
+    means, sizes = ((0.0, 0.0, 2.0), (0.0, 0.0, 3.0)), ((0.2, 0.2, 0.0), (0.5, 0.5, 0.0))
+    opacities, levels, views = torch.tensor((0.25, 0.9)), torch.tensor((0, 2)), torch.tensor((0, 1))
+    gaussians = make_balls(torch.tensor(means), torch.tensor(sizes), opacities, levels=levels, views=views)
     return Scene(gaussians, torch.eye(4, dtype=torch.float64)[None], 0.1, 10.0)
 
 
