@@ -1,13 +1,10 @@
 """A predictor, panoramas and a scene for the commands' tests."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from synthetic_scenes import make_balls
 from torch import Tensor
 
@@ -42,32 +39,8 @@ def sphere_model(monkeypatch: pytest.MonkeyPatch) -> type:
     return Sphere
 
 
-WriteRoom = Callable[..., Path]
-
-
-@pytest.fixture(scope="session")
-def write_room() -> WriteRoom:
-    """A function that writes a folder with a pair of tiny panoramas and a target between them."""
-
-    def write(folder: Path, *, height: int = HEIGHT, target: bool = True) -> Path:
-        folder.mkdir(parents=True)
-        random = np.random.default_rng(0)
-        poses = {}
-        for name, x in {"a.png": 0.0, "b.png": 1.0, "c.png": 0.5}.items():
-            Image.fromarray(random.integers(0, 255, (height, 2 * height, 3), dtype=np.uint8)).save(folder / name)
-            pose = np.eye(4)
-            pose[0, 3] = x
-            poses[name] = pose.tolist()
-        (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
-        case = {"context": ["a.png", "b.png"]} | ({"target": "c.png"} if target else {})
-        (folder / "pairs.json").write_text(json.dumps({"pairs": [case]}))
-        return folder
-
-    return write
-
-
 @pytest.fixture
-def room(tmp_path: Path, write_room: WriteRoom) -> Path:
+def room(tmp_path: Path, write_room: Callable[..., Path]) -> Path:
     return write_room(tmp_path / "room")
 
 

@@ -103,7 +103,7 @@ def test_invalid_arguments_are_refused(room: Path, tmp_path: Path, refusal, argu
 def test_a_scene_needs_the_photographs_of_its_own_pair(scene: Path, tmp_path: Path, write_room, refusal) -> None:
     assert "give the folder of its pair with --photographs" in refusal("refine", scene, "-o", tmp_path / "x.ply")
     poses = json.loads((write_room(tmp_path / "other") / "poses.json").read_text())
-    poses["poses"]["b.png"][0][3] = 2.0
+    poses["poses"]["b.png"]["cam2world"][0][3] = 2.0
     (tmp_path / "other" / "poses.json").write_text(json.dumps(poses))
     message = refusal("refine", scene, "-o", tmp_path / "x.ply", "--photographs", tmp_path / "other")
     assert "differ by up to 1" in message

@@ -1,7 +1,9 @@
 """The evaluation of pairs: its files, metrics and table."""
 
+import functools
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,28 +27,18 @@ KEYS = [
 ]
 
 
-def write_triplet(folder: Path, *, target: bool = True) -> Path:
-    folder.mkdir(parents=True)
-    random = np.random.default_rng(0)
-    names = ["a.png", "b.png", *(["c.png"] if target else [])]
-    poses = {}
-    for index, name in enumerate(names):
-        Image.fromarray(random.integers(0, 255, (HEIGHT, 2 * HEIGHT, 3), dtype=np.uint8)).save(folder / name)
-        pose = np.eye(4)
-        pose[0, 3] = (0.0, 1.0, 0.5)[index]
-        poses[name] = pose.tolist()
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
-    case = {"context": names[:2]} | ({"target": "c.png"} if target else {})
-    (folder / "pairs.json").write_text(json.dumps({"pairs": [case]}))
-    return folder
-
-
 def read_image(path: str | Path) -> Tensor:
     return torch.from_numpy(np.array(Image.open(path)) / np.float32(255)).permute(2, 0, 1)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def write_triplet(write_room: Callable[..., Path]) -> Callable[..., Path]:
+    """Write a pair with a target."""
+    return functools.partial(write_room, height=HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, write_triplet: Callable[..., Path]) -> Path:
     """A folder with a triplet in `room`."""
     return write_triplet(tmp_path_factory.mktemp("report") / "room").parent
 
@@ -86,7 +78,9 @@ def test_the_drawing_changes_the_images(folder: Path, case: Row, tmp_path: Path,
     assert official.get("psnr") != case.get("psnr") and abs(official.get("psnr") - case.get("psnr")) < 3
 
 
-def test_an_evaluation_does_not_use_the_prediction_cache(tmp_path: Path, sphere_predictor: type) -> None:
+def test_an_evaluation_does_not_use_the_prediction_cache(
+    tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
+) -> None:
     pairs, predictor = load_pairs(write_triplet(tmp_path / "room")), sphere_predictor()
     for _ in range(2):
         evaluate(pairs, predictor, tmp_path / "out", height=HEIGHT)
@@ -94,7 +88,7 @@ def test_an_evaluation_does_not_use_the_prediction_cache(tmp_path: Path, sphere_
 
 
 def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(
-    tmp_path: Path, sphere_predictor: type
+    tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
 ) -> None:
     pairs = [load_pairs(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
     cases = evaluate(pairs, sphere_predictor(), tmp_path / "out", height=HEIGHT)
@@ -109,8 +103,11 @@ def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(
     assert below[:2] == ["cross-fade", f"{cases[0].get('cross_fade_ws_psnr'):.2f}"]
 
 
-def test_pairs_without_target_are_skipped(tmp_path: Path, sphere_predictor: type) -> None:
-    alone = load_pairs(write_triplet(tmp_path / "alone", target=False))
+@pytest.mark.filterwarnings("ignore:.*in no pair of pairs")
+def test_pairs_without_target_are_skipped(
+    tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
+) -> None:
+    alone = load_pairs(write_triplet(tmp_path / "alone", target=False))  # a pair and a single view
     with_target = load_pairs(write_triplet(tmp_path / "room"))
     assert len(evaluate([*alone, *with_target], sphere_predictor(), tmp_path / "out", height=HEIGHT)) == 1
     with pytest.raises(InputError, match="none of the pairs has a target view"):
@@ -127,7 +124,7 @@ def test_a_file_at_the_output_folders_path_is_an_input_error(
 
 
 def test_a_masked_target_has_second_values_of_the_scene_and_of_the_cross_fade(
-    tmp_path: Path, sphere_predictor: type
+    tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
 ) -> None:
     folder = write_triplet(tmp_path / "room")
     mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
@@ -171,7 +168,7 @@ def test_error_images_are_brighter_for_larger_errors() -> None:
 
 @pytest.mark.usefixtures("refinement_clock")
 def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(
-    tmp_path: Path, sphere_predictor: type
+    tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
 ) -> None:
     pairs = load_pairs(write_triplet(tmp_path / "room"))
     options = {"height": HEIGHT, "blend": "joint"}  # of random images, held-out blocks say nothing

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -12,10 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from synthetic_scenes import make_balls, place_cameras
 
 from pansplat import pipeline
@@ -47,26 +44,11 @@ def make_scene(count: int = 12) -> Scene:
     return Scene(gaussians, poses, near=0.45, far=10.0, names=("a.png", "b.png"), model="sphere", height=64)
 
 
-def write_pair(folder: Path) -> Path:
-    """Two panoramas and a target of 16 rows, with poses.json and pairs.json."""
-    folder.mkdir()
-    random = np.random.default_rng(0)
-    poses = {}
-    for name, x in {"a.png": 0.0, "b.png": 0.5, "c.png": 0.25}.items():
-        Image.fromarray(random.integers(0, 255, (16, 32, 3), dtype=np.uint8)).save(folder / name)
-        pose = np.eye(4)
-        pose[0, 3] = x
-        poses[name] = pose.tolist()
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
-    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": ["a.png", "b.png"], "target": "c.png"}]}))
-    return folder
-
-
 @pytest.fixture(scope="session")
-def originals(tmp_path_factory: pytest.TempPathFactory, small_config: Any) -> Path:
+def originals(tmp_path_factory: pytest.TempPathFactory, small_config: Any, write_room: Callable[..., Path]) -> Path:
     """The undamaged files: `pair`, `scene.ply`, `weights.safetensors`."""
     folder = tmp_path_factory.mktemp("originals")
-    write_pair(folder / "pair")
+    write_room(folder / "pair", height=16, baseline=0.5)
     pipeline.save(make_scene(), folder / "scene.ply")
     torch.manual_seed(0)
     network = PanSplat(small_config)

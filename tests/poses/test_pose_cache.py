@@ -71,6 +71,7 @@ def test_hashes_depend_on_how_parts_are_divided() -> None:
     assert hash_parts("ab", "c") != hash_parts("a", "bc") and hash_parts(np.zeros(2)) != hash_parts(np.ones(2))
 
 
+@pytest.mark.usefixtures("few_samples")
 def test_a_further_panorama_costs_its_own_features_and_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = []
     for name in ("left", "middle", "right"):
