@@ -210,7 +210,7 @@ class _Page:
             counts = f"{page.num_flights} ways between panoramas are flights, {page.num_fades} are fades"
             print(f"note: {out}: {counts}, because the surfaces of their panoramas disagree", file=sys.stderr)
         if page.num_rough:
-            views = f"{page.num_rough} panorama{'s' if page.num_rough > 1 else ''}"
+            views = describe_count(page.num_rough, "panorama")
             print(
                 f"note: {out}: without doll's house and distances of {views}, whose surfaces are too rough",
                 file=sys.stderr,

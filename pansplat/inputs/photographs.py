@@ -180,10 +180,10 @@ def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Pa
 
 def describe_notes(notes: Sequence[Note]) -> list[dict[str, Any]]:
     """Notes as in links.json."""
-    described = [{"yaw": round(note.yaw, 5), "pitch": round(note.pitch, 5), "text": note.text} for note in notes]
     return [
-        entry | ({"addresses": note.addresses} if note.addresses else {})
-        for entry, note in zip(described, notes, strict=True)
+        {"yaw": round(note.yaw, 5), "pitch": round(note.pitch, 5), "text": note.text}
+        | ({"addresses": note.addresses} if note.addresses else {})
+        for note in notes
     ]
 
 
