@@ -37,10 +37,19 @@ def _compile_as_part_of(module):
     nb.njit(function)(1.0)
 
 
+class _Timer:
+    """Ends at once or never; the thread of a real timer may not run before the kernels are compiled."""
+
+    def __init__(self, delay, function):
+        self.start = function if delay == 0.0 else lambda: None
+        self.cancel = lambda: None
+
+
 @pytest.fixture
 def count_messages(monkeypatch, capsys, tmp_path):
     """A function that compiles two kernels as in a new process, and counts the messages."""
     monkeypatch.setattr(runtime, "_cache_folder", tmp_path)
+    monkeypatch.setattr(threading, "Timer", _Timer)
 
     def run(delay, module):
         monkeypatch.setattr(runtime, "_MESSAGE_DELAY", delay)
