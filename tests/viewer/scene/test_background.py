@@ -44,7 +44,7 @@ def test_joining_waits_for_all_cancelled_work():
     worker.start(first)
     assert begun.wait(60)
     worker.start(lambda report: order.append("second"))
-    threading.Timer(0.1, worker_is_joining.set).start()
+    threading.Timer(0.5, worker_is_joining.set).start()
     assert worker.cancel(join=True)
     assert order == ["first has ended"]
     worker.close()

@@ -196,7 +196,7 @@ def test_a_search_hands_over_panoramas_before_its_result(wait_until):
     loader.wait_for_entries()
     assert wait_until(loader.poll, "entries") is found and not loader.is_searching
     loader.search(Path("tour"), lambda path, progress, show: show(early) or found)
-    time.sleep(0.05)
+    loader._searching.future.result(300)
     assert wait_until(loader.poll, "entries") is found and not loader.is_searching, "a finished search has its result"
     loader.close()
 
