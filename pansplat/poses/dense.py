@@ -125,9 +125,9 @@ def _compare_all(first: Surroundings, second: Surroundings, rotations: Array, tr
     there = b.T @ rotations @ a, translations @ b
     back = there[0].transpose(0, 2, 1), -np.einsum("nji,nj->ni", there[0], there[1])
     values = np.zeros((len(rotations), 5))
-    for (turns, ways), source, target in ((there, first, second), (back, second, first)):
+    for (turns, translations), source, target in ((there, first, second), (back, second, first)):
         values += 0.5 * _compare_one_way(
-            _upright_rays(), source.maps, target.maps, turns.astype(np.float32), ways.astype(np.float32), step
+            _upright_rays(), source.maps, target.maps, turns.astype(np.float32), translations.astype(np.float32), step
         )
     return values
 

@@ -26,7 +26,7 @@ from pansplat.inputs.placements import BY_HAND, Tie, find_holds, is_by_hand, rea
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
 from pansplat.inputs.web_tours import is_scene_of_tour
 from pansplat.poses.estimate import PoseEstimate
-from pansplat.poses.placing import Place, Suggestion
+from pansplat.poses.placing import PlanPose, Suggestion
 from pansplat.poses.pose_file import (
     format_pose_file,
     make_pose_content,
@@ -103,7 +103,7 @@ class PoseEditor:
             if not (isinstance(names, list) and len(names) == 2 and set(map(str, names)) <= set(images)):
                 continue
             rows = [row for row in places if _is_row(row)] if isinstance(places, list) else []
-            found[images[names[0]], images[names[1]]] = tuple(Suggestion(Place(*row[:3]), row[3]) for row in rows)
+            found[images[names[0]], images[names[1]]] = tuple(Suggestion(PlanPose(*row[:3]), row[3]) for row in rows)
         return found
 
     def read_unit(self, world: int) -> float | None:

@@ -42,11 +42,11 @@ from pansplat.poses.learned import (
     load_matcher,
     match_learned,
 )
+from pansplat.poses.link_directions import NO_LINKS, LinkDirections
 from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
 from pansplat.poses.pose_cache import PoseCache, hash_parts
 from pansplat.poses.tour import Group, IndexPair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
-from pansplat.poses.ways import NO_WAYS, Ways
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
 from pansplat.predictor import Progress, part_of
 from pansplat.sweep.guided_sweep import load_default_sweep
@@ -247,7 +247,7 @@ def estimate_poses(
     Args:
         images: files, 2:1; one that is repeated is used once.
         masks: the mask file of each image, if it has one; by default those beside the images (docs/input.md).
-        links: for an image, the yaw at which a tour shows the way to other images, radians to the right of the centre.
+        links: for an image, the yaw at which a tour links to other images, radians to the right of the centre.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images of the largest group and their distance in metres, instead of the camera's height.
         seed: of the random samples.
@@ -290,9 +290,9 @@ def estimate_poses(
         count = len(kept)
         split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
         views = _describe_views(paths, files, pixels, hints, kept, cache, part_of(progress, 0.0, split))
-        ways = links or {}
+        links = links or {}
         yaws = {
-            (i, j): Ways(ways.get(paths[a], {}).get(paths[b]), ways.get(paths[b], {}).get(paths[a]))
+            (i, j): LinkDirections(links.get(paths[a], {}).get(paths[b]), links.get(paths[b], {}).get(paths[a]))
             for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
         }
         relations = _relate_views(views, yaws, seed, cache, part_of(progress, split, 0.9))
@@ -511,7 +511,7 @@ def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: PoseCa
 
 
 def _relate_views(
-    views: Sequence[_View], ways: Mapping[IndexPair, Ways], seed: int, cache: PoseCache, report: Progress
+    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], seed: int, cache: PoseCache, report: Progress
 ) -> dict[IndexPair, RelativePose]:
     """Relative poses of the pairs that have most in common, and of those that links connect.
 
@@ -525,7 +525,7 @@ def _relate_views(
         with worker_threads() as pool:
             quick = pool.map(lambda pair: _quick_overlap(views[pair[0]].features, views[pair[1]].features), pairs)
             overlap.update(zip(pairs, quick, strict=True))
-        chosen = {pair for pair, way in ways.items() if way != NO_WAYS}
+        chosen = {pair for pair, directions in links.items() if directions != NO_LINKS}
         for view in range(len(views)):
             own = sorted((pair for pair in pairs if view in pair), key=lambda pair: -overlap[pair])
             chosen |= set(own[:_THOROUGH])
@@ -537,7 +537,7 @@ def _relate_views(
         first, second = views[pair[0]], views[pair[1]]
         matches = _match(first, second, matcher)
         prior = RotationPrior(first.axes, second.axes)
-        relation = _estimate_pair(first, second, matches, prior, ways[pair], seed)
+        relation = _estimate_pair(first, second, matches, prior, links[pair], seed)
         if not (relation.is_reliable or relation.is_doubtful):
             return relation
         if relation.is_reliable and _is_mirrored(first, second, overlap.get(pair), relation):
@@ -550,14 +550,14 @@ def _relate_views(
 
     def look_up(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
-        key = hash_parts(first.key, second.key, f"{ways[pair]} {seed}")
+        key = hash_parts(first.key, second.key, f"{links[pair]} {seed}")
         return cache.get(f"pair-{hash_parts(first.picture_hash, second.picture_hash)}", key, lambda: relate(pair))
 
     groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
 
     def is_needed(pair: IndexPair) -> bool:
         i, j = pair
-        if groups[i] != groups[j] or ways[pair] != NO_WAYS:
+        if groups[i] != groups[j] or links[pair] != NO_LINKS:
             return True
         return min(counts[i], counts[j]) < _NEEDED_PAIRS
 
@@ -599,11 +599,16 @@ def _match(first: _View, second: _View, matcher: Matcher | None) -> Matches:
 
 
 def _estimate_pair(
-    first: _View, second: _View, matches: Matches, prior: RotationPrior = NO_PRIOR, ways: Ways = NO_WAYS, seed: int = 0
+    first: _View,
+    second: _View,
+    matches: Matches,
+    prior: RotationPrior = NO_PRIOR,
+    links: LinkDirections = NO_LINKS,
+    seed: int = 0,
 ) -> RelativePose:
     """The relative pose of two views."""
     surroundings = first.surroundings, second.surroundings
-    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, ways, seed=seed)
+    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, links, seed=seed)
 
 
 def _describe_mirrored(

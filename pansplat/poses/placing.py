@@ -44,8 +44,8 @@ _MOST_SUGGESTIONS = 4  # of a pair
 _NEIGHBOURS = 4  # nearest panoramas that a place is compared with
 
 
-class Place(NamedTuple):
-    """The place of a camera on a floor plan, or relative to another one.
+class PlanPose(NamedTuple):
+    """The pose of a camera on a floor plan, or relative to another one.
 
     Attributes:
         right, forward: metres; of a `Suggestion` heights of the camera (`add` has its unit).
@@ -56,26 +56,27 @@ class Place(NamedTuple):
     forward: float
     yaw: float
 
-    def add(self, other: Place, unit: float = 1.0) -> Place:
+    def add(self, other: PlanPose, unit: float = 1.0) -> PlanPose:
         """A place that is known relative to this one, in a unit of metres."""
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         right, forward = unit * other.right, unit * other.forward
-        return Place(
+        return PlanPose(
             self.right + cosine * right + sine * forward,
             self.forward - sine * right + cosine * forward,
             wrap_angle(self.yaw + other.yaw),
         )
 
-    def inverse(self) -> Place:
+    def inverse(self) -> PlanPose:
         """The place of the plan's origin relative to this one."""
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
-        return Place(-cosine * self.right + sine * self.forward, -sine * self.right - cosine * self.forward, -self.yaw)
+        right, forward = sine * self.forward - cosine * self.right, -sine * self.right - cosine * self.forward
+        return PlanPose(right, forward, -self.yaw)
 
-    def distance(self, other: Place) -> float:
+    def distance(self, other: PlanPose) -> float:
         """Between the cameras, in the unit of both."""
         return math.hypot(self.right - other.right, self.forward - other.forward)
 
-    def turn_between(self, other: Place) -> float:
+    def turn_between(self, other: PlanPose) -> float:
         """Absolute difference of the headings, radians."""
         return abs(wrap_angle(self.yaw - other.yaw))
 
@@ -83,7 +84,7 @@ class Place(NamedTuple):
 class Suggestion(NamedTuple):
     """A place of one panorama relative to another one, camera heights, with the logarithm of its odds."""
 
-    place: Place
+    place: PlanPose
     log_odds: float
 
 
@@ -101,14 +102,14 @@ def list_suggestions(
         if poses.log_odds[n] > -math.inf:
             centre = upright[0].T @ (-poses.rotations[n].T @ poses.translations[n])
             forward = upright[0].T @ poses.rotations[n].T @ upright[1][:, 2]
-            place = Place(float(centre[0]), float(centre[2]), math.atan2(forward[0], forward[2]))
+            place = PlanPose(float(centre[0]), float(centre[2]), math.atan2(forward[0], forward[2]))
             found.append(Suggestion(place, float(poses.log_odds[n])))
     return tuple(found)
 
 
 def suggest_by_links(
     first: Panorama, second: Panorama, upright: tuple[Float[Array, "3 3"], Float[Array, "3 3"]]
-) -> Place | None:
+) -> PlanPose | None:
     """The place of the second panorama relative to the first one by the links of a tour, camera heights.
 
     It is where a link meets the floor, 1 to 4 camera heights away. A link back states the heading. Without it the start
@@ -128,7 +129,7 @@ def suggest_by_links(
         heading = yaw + math.pi - _meet_floor(back.yaw, back.pitch, upright[1])[0]
     else:
         heading = yaw - (_meet_floor(*second.start, upright[1])[0] if second.start else 0.0)
-    return Place(distance * math.sin(yaw), distance * math.cos(yaw), wrap_angle(heading))
+    return PlanPose(distance * math.sin(yaw), distance * math.cos(yaw), wrap_angle(heading))
 
 
 def _meet_floor(yaw: float, pitch: float, upright: Float[Array, "3 3"]) -> tuple[float, float]:
@@ -166,7 +167,7 @@ class Piece:
         found = trace_floor(places.astype(np.float64))
         return None if found is None else found[0] / found[1]
 
-    def draw_outline(self, place: Place, unit: float) -> Float[Array, "azimuth 2"]:
+    def draw_outline(self, place: PlanPose, unit: float) -> Float[Array, "azimuth 2"]:
         """The outline on the plan, metres; a small circle if there is none."""
         outline = self.outline
         if outline is None:
@@ -209,13 +210,13 @@ class PlanFrame:
             up = torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64)
         return PlanFrame(level_pose(matrices[0], up)[:3, :3].numpy(), unit)
 
-    def find_place(self, pose: Float[Array, "4 4"], upright: Float[Array, "3 3"]) -> Place:
+    def find_place(self, pose: Float[Array, "4 4"], upright: Float[Array, "3 3"]) -> PlanPose:
         """The place of a camera."""
         right, _, forward = (self.level.T @ pose[:3, 3]).tolist()
         ahead = self.level.T @ pose[:3, :3] @ upright[:, 2]
-        return Place(right, forward, math.atan2(ahead[0], ahead[2]))
+        return PlanPose(right, forward, math.atan2(ahead[0], ahead[2]))
 
-    def make_pose(self, place: Place, upright: Float[Array, "3 3"], down: float) -> Float[Array, "4 4"]:
+    def make_pose(self, place: PlanPose, upright: Float[Array, "3 3"], down: float) -> Float[Array, "4 4"]:
         """The pose, cam2world, of an upright camera at a place; `down` is its place along that axis, metres."""
         cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
         pose = np.eye(4)
@@ -233,13 +234,13 @@ class Snapped(NamedTuple):
         is_aligned: whether only its walls were turned parallel to the plan's.
     """
 
-    place: Place
+    place: PlanPose
     suggestion: int | None = None
     is_aligned: bool = False
 
 
 def snap(
-    place: Place, suggestions: Sequence[Place], wall_yaw: float | None = None, target_yaw: float | None = None
+    place: PlanPose, suggestions: Sequence[PlanPose], wall_yaw: float | None = None, target_yaw: float | None = None
 ) -> Snapped:
     """The nearest suggestion within reach, or else the place with its walls parallel to those of the plan.
 

@@ -15,8 +15,8 @@ from numpy import ndarray as Array
 from pansplat.poses.axes import RotationPrior
 from pansplat.poses.dense import Surroundings, compare_many, overlap_weight
 from pansplat.poses.depth import MatchDepths
+from pansplat.poses.link_directions import LinkDirections
 from pansplat.poses.solvers import Bearings
-from pansplat.poses.ways import Ways
 
 Pose = tuple[Float[Array, "3 3"], Float[Array, "3"]]
 """R and t of x2 = R x1 + t, camera heights."""
@@ -39,7 +39,7 @@ def propose_by_depth(
     depths: MatchDepths,
     axes: RotationPrior,
     surroundings: tuple[Surroundings, Surroundings],
-    ways: Ways,
+    links: LinkDirections,
     rng: np.random.Generator,
 ) -> tuple[list[Pose], list[Pose]]:
     """Poses on which the translations of many matches agree, and those under which both panoramas look most alike.
@@ -50,7 +50,7 @@ def propose_by_depth(
         depths: estimated at the matches.
         axes: gravity and walls of both panoramas.
         surroundings: all that both panoramas show.
-        ways: from each panorama towards the other one.
+        links: from each panorama towards the other one.
         rng: supplies the samples of pairs of matches.
     """
     a, b, prior, depths = a[:_VOTERS], b[:_VOTERS], prior[:_VOTERS], depths.select(slice(_VOTERS))
@@ -67,14 +67,14 @@ def propose_by_depth(
     found += _vote_pairs(x, y, reach, prior, rng)
     found.sort(key=lambda item: -item[2])
     agreed = [(levels[1].T @ rotation @ levels[0], t @ levels[1]) for rotation, t, _ in found[:_KEPT_BY_DEPTH]]
-    return agreed, _choose_alike(singles, levels, surroundings, ways)
+    return agreed, _choose_alike(singles, levels, surroundings, links)
 
 
 def _choose_alike(
     singles: Sequence[tuple[Float[Array, "3 3"], Float[Array, "n 3"], Float[Array, "n"]]],
     levels: tuple[Float[Array, "3 3"], Float[Array, "3 3"]],
     surroundings: tuple[Surroundings, Surroundings],
-    ways: Ways,
+    links: LinkDirections,
 ) -> list[Pose]:
     """Levelled poses near those of single matches under which both panoramas look most alike."""
     if not singles:
@@ -84,7 +84,7 @@ def _choose_alike(
     kept = (np.abs(translations[:, 2]) < _CLIMB) & (np.linalg.norm(translations, axis=1) < _FARTHEST)
     rotations, translations, votes = rotations[kept], translations[kept] * (1, 1, 0), votes[kept]
     poses = levels[1].T @ rotations @ levels[0], translations @ levels[1]
-    odds = _ALIKE[0] * np.log1p(votes) + _compare_alike(surroundings, *poses, coarse=True) + ways.score(*poses)
+    odds = _ALIKE[0] * np.log1p(votes) + _compare_alike(surroundings, *poses, coarse=True) + links.score(*poses)
     chosen: list[int] = []
     for n in np.argsort(-odds).tolist():
         if len(chosen) == _KEPT_ALIKE:

@@ -26,13 +26,13 @@ from pansplat.poses.two_view import RelativePose
 IndexPair = tuple[int, int]
 
 _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
-_LARGEST_GAP = 0.15  # of the way around it, relative to its length
+_LARGEST_GAP = 0.15  # of the translations around it, relative to their length
 _JOINED_ODDS = 1.0  # logarithm of the odds of a junction of two groups
 _AGREEMENT = 1.5  # logarithm: how much rarer hypotheses of two pairs agree if they are wrong; neighbours look alike
 _LEAST_ODDS = -9.0  # of a hypothesis
-_JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; of the way, camera heights, and relative
+_JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; gaps in camera heights, and relative
 _RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # least differences of junctions that exclude each other
-_AGREEING_PLACES = 0.2  # distance of two places of a panorama that confirm each other, relative to the way to it
+_AGREEING_PLACES = 0.2  # distance of two places of a panorama that confirm each other, relative to its own distance
 _OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
 _FEW_JOINT = 40  # points with two other panoramas, below which estimated distances count in the adjustment
 _ROUNDS = 3  # of adjustment and removal of outliers
@@ -184,11 +184,11 @@ def _hypotheses(relation: RelativePose) -> tuple[Float[Array, "n 4 4"], Float[Ar
 def _agree(
     first: Float[Array, "n 4 4"], second: Float[Array, "m 4 4"], turn: float, gap: tuple[float, float]
 ) -> Bool[Array, "n m"]:
-    """Whether motions differ by less than a turn and a gap of the way, in camera heights or relative."""
+    """Whether motions differ by less than a turn and a gap, in camera heights or relative."""
     cosine = (np.einsum("nij,mij->nm", first[:, :3, :3], second[:, :3, :3]) - 1) / 2
-    ways = first[:, None, :3, 3], second[None, :, :3, 3]
-    length = np.linalg.norm(ways[0], axis=-1) + np.linalg.norm(ways[1], axis=-1)
-    distance = np.linalg.norm(ways[0] - ways[1], axis=-1)
+    translations = first[:, None, :3, 3], second[None, :, :3, 3]
+    length = np.linalg.norm(translations[0], axis=-1) + np.linalg.norm(translations[1], axis=-1)
+    distance = np.linalg.norm(translations[0] - translations[1], axis=-1)
     return (cosine > math.cos(turn)) & (distance < np.maximum(gap[0], gap[1] * length))
 
 
@@ -220,14 +220,14 @@ def _assemble(part: _Part, groups: Sequence[Group]) -> Group:
 
 
 def _closes(kept: Mapping[IndexPair, RelativePose], relation: RelativePose, pair: IndexPair, k: int) -> bool | None:
-    """Whether a relation agrees with the way by a third panorama; None if the way is not known."""
+    """Whether a relation agrees with those by a third panorama; None if they are not known."""
     first, second = _motion_between(kept, pair[0], k), _motion_between(kept, k, pair[1])
     if first is None or second is None:
         return None
     turn = float(rotation_angle(second[0] @ first[0] @ relation.rotation.T))
-    way = second[0] @ first[1] + second[1]
+    translation = second[0] @ first[1] + second[1]
     length = relation.distance + float(np.linalg.norm(first[1]) + np.linalg.norm(second[1]))
-    gap = float(np.linalg.norm(way - relation.distance * relation.translation))
+    gap = float(np.linalg.norm(translation - relation.distance * relation.translation))
     return turn < _LARGEST_LOOP and gap < _LARGEST_GAP * length
 
 
@@ -271,7 +271,7 @@ def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) ->
 
 
 def _find_contradictions(relations: Mapping[IndexPair, RelativePose]) -> tuple[IndexPair, ...]:
-    """Pairs that contradict two better pairs of a triangle more often than they agree, by rotation or by the way.
+    """Pairs that contradict two better pairs of a triangle more often than they agree, by rotation or by translation.
 
     A pair is compared with its triangles in the order of the odds and scores, so that a wrong one does not discredit
     others.

@@ -23,6 +23,7 @@ from pansplat.poses.axes import NO_PRIOR, RotationPrior
 from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import MatchDepths
 from pansplat.poses.features import Features, Matches
+from pansplat.poses.link_directions import NO_LINKS, LinkDirections
 from pansplat.poses.proposals import Pose, propose_by_depth
 from pansplat.poses.solvers import (
     Bearings,
@@ -40,7 +41,6 @@ from pansplat.poses.solvers import (
     upright_from_three,
     upright_from_two,
 )
-from pansplat.poses.ways import NO_WAYS, Ways
 
 _WIDE_SHARE, _WIDE = 0.3, 3.0  # share of right matches of larger error, and how many times larger
 _MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
@@ -89,11 +89,11 @@ class _Support:
 
 _COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds of a hypothesis against none, linear in: 1, log(1 + score), log(1 + places), parallel walls,
-# log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the way), whether it is
-# that of a comparison (docs/poses.md).
+# log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the translation),
+# whether it is that of a comparison (docs/poses.md).
 _ODDS = (-32.94, 0.73, 1.39, 3.95, -2.41, 7.65, -0.38, 4.57, -0.75, -1.73, -1.7)
 _LEAST_CONFLICT, _LEAST_SLOPE = 0.003, 0.01
-_NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; way, camera heights, and relative
+_NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; translation, camera heights, and relative
 _PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pose by matches
 _PROPOSAL_NOISE = math.radians(0.5), 0.1  # of the pose of a comparison: rotation; position, camera heights
 _LARGEST_SLOPE = 0.3
@@ -142,7 +142,7 @@ class _Evidence:
         axes: gravity and walls of both panoramas.
         depths: estimated at the matches, if they are known.
         surroundings: all that both panoramas show, with estimated depths.
-        ways: from each panorama towards the other one, as a tour's links state them.
+        links: from each panorama towards the other one, as a tour's links state them.
     """
 
     a: Float[Array, "match 3"]
@@ -152,7 +152,7 @@ class _Evidence:
     axes: RotationPrior
     depths: MatchDepths | None = None
     surroundings: tuple[Surroundings, Surroundings] | None = None
-    ways: Ways = NO_WAYS
+    links: LinkDirections = NO_LINKS
 
     def strongest(self, count: int) -> _Evidence:
         """The evidence of the first `count` matches."""
@@ -394,7 +394,7 @@ def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> tuple[li
     if evidence.depths is None or evidence.surroundings is None:
         return [], []
     matches = evidence.a, evidence.b, evidence.prior, evidence.depths
-    return propose_by_depth(*matches, evidence.axes, evidence.surroundings, evidence.ways, rng)
+    return propose_by_depth(*matches, evidence.axes, evidence.surroundings, evidence.links, rng)
 
 
 def _sample_depths(
@@ -567,7 +567,7 @@ def estimate_relative_pose(
     matches: Matches,
     axes: RotationPrior = NO_PRIOR,
     surroundings: tuple[Surroundings, Surroundings] | None = None,
-    ways: Ways = NO_WAYS,
+    links: LinkDirections = NO_LINKS,
     *,
     seed: int = 0,
 ) -> RelativePose:
@@ -578,14 +578,14 @@ def estimate_relative_pose(
         matches: between them.
         axes: gravity and walls of both panoramas.
         surroundings: all that both panoramas show, with estimated depths; without them only the matches count.
-        ways: from each panorama towards the other one.
+        links: from each panorama towards the other one.
         seed: of the random samples.
     """
     count = min(len(matches), _MAX_MATCHES)
     indices = matches.indices[:count]
     a, b = first.bearings[indices[:, 0]], second.bearings[indices[:, 1]]
     noise, depths = _match_noise(first, second, indices), _sample_depths(surroundings, a, b)
-    evidence = _Evidence(a, b, matches.prior[:count], noise, axes, depths, surroundings, ways)
+    evidence = _Evidence(a, b, matches.prior[:count], noise, axes, depths, surroundings, links)
     found, proposed = _search_hypotheses(evidence, np.random.default_rng(seed))
     if not found:
         no_match = f"only {count} features match"
@@ -665,8 +665,8 @@ def _choose_compared(compared: Sequence[Hypothesis], odds: Float[Array, "n"]) ->
 
 def _are_near(first: Hypothesis, second: Hypothesis) -> bool:
     """Whether two hypotheses state one pose, by the distance of the cameras, too."""
-    ways = [h.distance * h.translation for h in (first, second)]
-    gap = float(np.linalg.norm(ways[0] - ways[1]))
+    translations = [h.distance * h.translation for h in (first, second)]
+    gap = float(np.linalg.norm(translations[0] - translations[1]))
     longest = max(first.distance, second.distance)
     turned = rotation_angle(first.rotation @ second.rotation.T)
     return first is second or bool(turned < _NEAR[0] and gap < max(_NEAR[1], _NEAR[2] * longest))
@@ -692,7 +692,7 @@ def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
         math.log(_LEAST_SLOPE + min(slope, _LARGEST_SLOPE)),
         float(hypothesis.is_proposed),
     )
-    return float(np.dot(_ODDS, values) + evidence.ways.score(hypothesis.rotation[None], translation[None])[0])
+    return float(np.dot(_ODDS, values) + evidence.links.score(hypothesis.rotation[None], translation[None])[0])
 
 
 def _count_all_places(hypothesis: Hypothesis, evidence: _Evidence) -> float:

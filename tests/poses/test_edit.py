@@ -14,7 +14,7 @@ from pansplat.inputs.pairs import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.files import write_poses
-from pansplat.poses.placing import Place, Suggestion
+from pansplat.poses.placing import PlanPose, Suggestion
 from pansplat.poses.two_view import RelativePose
 
 NAMES = "abcdef"
@@ -41,7 +41,7 @@ def _estimate(images, **options) -> PoseEstimate:
         {images[5]: "no door"} if len(images) > 5 else {},
         {pair: _relation(value) for pair, value in odds.items() if max(pair) < len(images)},
         (),
-        {(images[0], images[5]): (Suggestion(Place(1.0, 2.0, 0.5), -1.5),)} if len(images) > 5 else {},
+        {(images[0], images[5]): (Suggestion(PlanPose(1.0, 2.0, 0.5), -1.5),)} if len(images) > 5 else {},
     )
 
 
@@ -242,7 +242,7 @@ def test_suggestions_are_kept_from_the_cache_to_the_file(folder: Path):
     for _ in range(2):
         editor = _edit(folder)
         assert editor.read_suggestions() == {
-            (folder / "a.png", folder / "f.png"): (Suggestion(Place(1.0, 2.0, 0.5), -1.5),)
+            (folder / "a.png", folder / "f.png"): (Suggestion(PlanPose(1.0, 2.0, 0.5), -1.5),)
         }
         editor.place({folder / "e.png": np.eye(4)}, 0)
 

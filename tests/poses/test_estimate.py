@@ -33,10 +33,10 @@ from pansplat.poses.estimate import (
 from pansplat.poses.features import Features, detect_features
 from pansplat.poses.files import write_poses
 from pansplat.poses.learned import LearnedFeatures, LearnedMatches, MatcherMissingError
+from pansplat.poses.link_directions import NO_LINKS, LinkDirections
 from pansplat.poses.pose_cache import PoseCache
 from pansplat.poses.solvers import angle_between, rotation_angle
 from pansplat.poses.two_view import RelativePose
-from pansplat.poses.ways import NO_WAYS, Ways
 
 SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
 
@@ -222,10 +222,10 @@ def test_a_linked_pair_is_compared_among_many(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("pansplat.poses.estimate._THOROUGH", 1)
     monkeypatch.setattr("pansplat.poses.estimate._quick_overlap", lambda first, second: 0.0)
     views = [_view(_no_features(1), np.zeros((4, 8), np.float32)) for _ in range(8)]
-    ways = {(i, j): NO_WAYS for i in range(8) for j in range(i + 1, 8)}
+    links = {(i, j): NO_LINKS for i in range(8) for j in range(i + 1, 8)}
     found = [
-        _relate_views(views, ways | linked, 0, PoseCache(None, (), ""), lambda *_: None)
-        for linked in ({}, {(4, 6): Ways(back=0.5)})
+        _relate_views(views, links | linked, 0, PoseCache(None, (), ""), lambda *_: None)
+        for linked in ({}, {(4, 6): LinkDirections(back=0.5)})
     ]
     assert set(found[1]) - set(found[0]) == {(4, 6)}
 
@@ -248,13 +248,13 @@ def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatc
     monkeypatch.setattr("pansplat.poses.estimate.polish_relative_pose", lambda relation, *_: relation)
     monkeypatch.setattr("pansplat.poses.estimate.match_features", lambda *_: MagicMock())
     monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_: MagicMock())
-    ways = {pair: NO_WAYS for pair in itertools.combinations(range(11), 2)}
-    relations = _relate_views(views, ways, 0, PoseCache(None, (), ""), lambda *_: None)
+    links = {pair: NO_LINKS for pair in itertools.combinations(range(11), 2)}
+    relations = _relate_views(views, links, 0, PoseCache(None, (), ""), lambda *_: None)
     home = {pair for pair in relations if pair[1] < 8}
     assert (0, 7) not in home and 12 <= len(home) < 23, "of 28"
     assert all(sum(n in pair for pair in home) >= 4 for n in range(8))
     assert len([pair for pair in relations if pair[0] > 7]) == 3, "nothing is left out without certain pairs"
-    linked = ways | {(0, 7): Ways(back=0.5)}
+    linked = links | {(0, 7): LinkDirections(back=0.5)}
     assert (0, 7) in _relate_views(views, linked, 0, PoseCache(None, (), ""), lambda *_: None)
 
 

@@ -14,8 +14,8 @@ from pansplat.poses.placing import (
     SNAP_RADIUS,
     WALL_ANGLE,
     Piece,
-    Place,
     PlanFrame,
+    PlanPose,
     find_wall_yaw,
     list_suggestions,
     measure_fit,
@@ -33,16 +33,16 @@ def _upright(yaw: float) -> np.ndarray:
     return rotation_exp(np.array((0.0, yaw, 0)))
 
 
-def _assert_same(first: Place, second: Place) -> None:
+def _assert_same(first: PlanPose, second: PlanPose) -> None:
     assert first.distance(second) < 1e-9 and first.turn_between(second) < 1e-9
 
 
 def test_a_place_and_its_inverse_cancel():
-    first, second = Place(1.0, -2.0, 0.7), Place(0.4, 3.0, -2.0)
-    _assert_same(first.add(first.inverse()), Place(0, 0, 0))
+    first, second = PlanPose(1.0, -2.0, 0.7), PlanPose(0.4, 3.0, -2.0)
+    _assert_same(first.add(first.inverse()), PlanPose(0, 0, 0))
     _assert_same(first.add(second).add(second.inverse()), first)
-    _assert_same(Place(0, 0, QUARTER).add(Place(0, 1, 0)), Place(1, 0, QUARTER))  # turned right: forward is right
-    _assert_same(Place(0, 0, 0).add(Place(0, 1, 0), unit=1.5), Place(0, 1.5, 0))
+    _assert_same(PlanPose(0, 0, QUARTER).add(PlanPose(0, 1, 0)), PlanPose(1, 0, QUARTER))  # turned: forward is right
+    _assert_same(PlanPose(0, 0, 0).add(PlanPose(0, 1, 0), unit=1.5), PlanPose(0, 1.5, 0))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.15])
@@ -51,8 +51,8 @@ def test_a_pose_of_a_place_has_this_place_whatever_the_tilt(tilt):
     world[:3, :3] = rotation_exp(np.array((0.4, 1.0, 0))) @ _upright(0.5)
     floor = PlanFrame.of_world(world[None], 1.5)
     upright = rotation_exp(np.array((tilt, 0, -tilt)))
-    pose = floor.make_pose(Place(2.0, 1.0, 0.8), upright, -0.3)
-    _assert_same(floor.find_place(pose, upright), Place(2.0, 1.0, 0.8))
+    pose = floor.make_pose(PlanPose(2.0, 1.0, 0.8), upright, -0.3)
+    _assert_same(floor.find_place(pose, upright), PlanPose(2.0, 1.0, 0.8))
     assert floor.level[:, 1] @ pose[:3, 3] == pytest.approx(-0.3)
     assert np.allclose(pose[:3, :3] @ upright[:, 1], floor.level[:, 1])  # gravity
 
@@ -66,24 +66,24 @@ def test_y_is_down_if_the_cameras_are_nearly_upright():
 def test_suggestions_are_where_the_second_camera_of_a_candidate_is():
     """The second camera is 2 camera heights to the right of the first one and 1 ahead, and is turned by 0.6 radians."""
     uprights = rotation_exp(np.array((0.1, 0, 0.05))), rotation_exp(np.array((-0.05, 0, 0.1)))
-    first = PlanFrame(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3), uprights[0], 0.0)
-    second = PlanFrame(np.eye(3), 1.0).make_pose(Place(0, 0, 0.3).add(Place(2, 1, 0.6)), uprights[1], 0.0)
+    first = PlanFrame(np.eye(3), 1.0).make_pose(PlanPose(0, 0, 0.3), uprights[0], 0.0)
+    second = PlanFrame(np.eye(3), 1.0).make_pose(PlanPose(0, 0, 0.3).add(PlanPose(2, 1, 0.6)), uprights[1], 0.0)
     motion = np.linalg.inv(second) @ first
-    rotations, ways = np.stack((motion[:3, :3], np.eye(3))), np.stack((motion[:3, 3], np.zeros(3)))
-    hypotheses = Hypotheses(rotations, ways, np.array((-1.0, -4.0)))
+    rotations, translations = np.stack((motion[:3, :3], np.eye(3))), np.stack((motion[:3, 3], np.zeros(3)))
+    hypotheses = Hypotheses(rotations, translations, np.array((-1.0, -4.0)))
     none = np.zeros((0, 2), int)
     relation = RelativePose(np.eye(3), np.array((0.0, 0, 1)), none, problem="no", hypotheses=hypotheses)
     best, other = list_suggestions(relation, uprights)
-    _assert_same(best.place, Place(2, 1, 0.6))
+    _assert_same(best.place, PlanPose(2, 1, 0.6))
     assert (best.log_odds, other.log_odds) == (-1.0, -4.0)
 
 
 def test_a_place_snaps_to_the_nearest_suggestion_within_radius_and_angle():
-    suggestions = [Place(0, 0, 0), Place(0.3, 0, 0), Place(0, 0, 1.0)]
-    assert snap(Place(0.2, 0.02, 0.05), suggestions) == (suggestions[1], 1, False)
-    for place in (Place(0, SNAP_RADIUS + 0.01, 0), Place(-0.1, 0, SNAP_ANGLE + 0.01)):
+    suggestions = [PlanPose(0, 0, 0), PlanPose(0.3, 0, 0), PlanPose(0, 0, 1.0)]
+    assert snap(PlanPose(0.2, 0.02, 0.05), suggestions) == (suggestions[1], 1, False)
+    for place in (PlanPose(0, SNAP_RADIUS + 0.01, 0), PlanPose(-0.1, 0, SNAP_ANGLE + 0.01)):
         assert snap(place, suggestions) == (place, None, False)
-    assert snap(Place(0.05, 0, 0.97), suggestions).suggestion == 2  # of two at one point, that of the heading
+    assert snap(PlanPose(0.05, 0, 0.97), suggestions).suggestion == 2  # of two at one point, that of the heading
 
 
 @pytest.mark.parametrize("quarters", range(4))
@@ -91,10 +91,10 @@ def test_walls_snap_to_multiples_of_a_quarter_turn(quarters):
     target, own = 0.3, 0.1
     exact = target - own + quarters * QUARTER
     for error in (-0.9 * WALL_ANGLE, 0.9 * WALL_ANGLE):
-        snapped = snap(Place(1, 2, exact + error), [], own, target)
-        assert snapped.is_aligned and snapped.place.turn_between(Place(0, 0, exact)) < 1e-9
+        snapped = snap(PlanPose(1, 2, exact + error), [], own, target)
+        assert snapped.is_aligned and snapped.place.turn_between(PlanPose(0, 0, exact)) < 1e-9
         assert snapped.place[:2] == (1, 2)
-    place = Place(1, 2, exact + 1.1 * WALL_ANGLE)
+    place = PlanPose(1, 2, exact + 1.1 * WALL_ANGLE)
     assert snap(place, [], own, target) == snap(place, []) == (place, None, False)
 
 
@@ -109,10 +109,10 @@ def test_the_outline_of_a_room_is_where_its_walls_are(look_around):
     """The camera is 1.35 m over the floor of a room of 5.2 x 4.2 m, off its middle."""
     centre = np.array((0.6, 0.0, -0.4))
     piece = Piece(look_around(1, np.eye(3), centre), None)
-    corners = piece.draw_outline(Place(0.6, -0.4, 0), 1.35)
+    corners = piece.draw_outline(PlanPose(0.6, -0.4, 0), 1.35)
     assert np.allclose(corners.max(axis=0), (2.6, 2.1), atol=0.12)
     assert np.allclose(corners.min(axis=0), (-2.6, -2.1), atol=0.12)
-    turned = piece.draw_outline(Place(0, 0, QUARTER), 1.35) + np.array(
+    turned = piece.draw_outline(PlanPose(0, 0, QUARTER), 1.35) + np.array(
         (-0.4, -0.6)
     )  # the same room, turned to the right
     assert np.allclose(turned.max(axis=0), (2.1, 2.6), atol=0.12)
@@ -146,7 +146,7 @@ def test_a_piece_that_has_nothing_in_common_with_the_others_has_no_fit(look_arou
 
 
 def test_links_suggest_the_place_at_which_they_meet_the_floor_also_of_tilted_cameras():
-    truth, upright = Place(1.2, 1.6, -2.0), (_tilt(0.1), _tilt(-0.2))
+    truth, upright = PlanPose(1.2, 1.6, -2.0), (_tilt(0.1), _tilt(-0.2))
     levels = {"a": (truth.right, 1.0, truth.forward), "b": (truth.inverse().right, 1.0, truth.inverse().forward)}
     links = {}
     for name, axes in zip("ab", upright, strict=True):

@@ -7,9 +7,9 @@ import pytest
 
 from pansplat.poses.axes import RotationPrior, SceneAxes
 from pansplat.poses.depth import MatchDepths
+from pansplat.poses.link_directions import NO_LINKS
 from pansplat.poses.proposals import propose_by_depth
 from pansplat.poses.solvers import rotation_angle, rotation_exp
-from pansplat.poses.ways import NO_WAYS
 
 HEIGHT = 1.35  # of the cameras over the floor, metres
 AXES = np.array(((0.0, 1, 0), (0, 0, 1), (1, 0, 0)))  # down, and two walls, in the world
@@ -36,7 +36,7 @@ def test_poses_by_matches_and_by_comparison_are_near_the_right_one(look_around, 
         MatchDepths(log_depth, np.full((60, 2), 0.05)),
         axes,
         (views[0], views[1]),
-        NO_WAYS,
+        NO_LINKS,
         rng,
     )
     rotation, translation = turns[1].T @ turns[0], turns[1].T @ (centres[0] - centres[1]) / HEIGHT

@@ -163,8 +163,9 @@ def suggest(pair: IndexPair, *log_odds: float, turn: float = 0.0, problem: str |
     rotation = rotation_exp(np.array((0, turn, 0))) @ right.rotation
     count = len(log_odds)
     wrong = [rotation_exp(np.array((0, 1.0 + n + 0.5 * pair[0], 0))) @ right.rotation for n in range(count - 1)]
-    ways = np.stack([right.distance * right.translation] + [right.translation * (2 + n) for n in range(count - 1)])
-    hypotheses = Hypotheses(np.stack([rotation, *wrong]), ways, np.array(log_odds))
+    distances = [right.distance] + [2 + n for n in range(count - 1)]
+    translations = np.array(distances)[:, None] * right.translation
+    hypotheses = Hypotheses(np.stack([rotation, *wrong]), translations, np.array(log_odds))
     return replace(right, rotation=rotation, log_odds=max(log_odds), problem=problem, hypotheses=hypotheses)
 
 

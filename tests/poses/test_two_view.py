@@ -10,9 +10,9 @@ from pansplat.poses.dense import Surroundings
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
 from pansplat.poses.two_view import (
-    NO_WAYS,
+    NO_LINKS,
+    LinkDirections,
     RelativePose,
-    Ways,
     estimate_relative_pose,
     polish_pose,
     polish_relative_pose,
@@ -191,19 +191,19 @@ def test_depths_in_other_units_do_not_outweigh_matches_that_suffice(scene, see_r
     assert found.is_certain and max(errors_degrees(found, bearings)) < 0.3, found.problem
 
 
-def find_ways(bearings) -> Ways:
-    """The right ways of a pose."""
+def find_links(bearings) -> LinkDirections:
+    """The right links of a pose."""
     there, back = -bearings.rotation.T @ bearings.translation, bearings.translation
-    return Ways(*(math.atan2(direction[0], direction[2]) for direction in (there, back)))
+    return LinkDirections(*(math.atan2(direction[0], direction[2]) for direction in (there, back)))
 
 
 def test_ways_choose_among_poses_of_equal_matches(see_room, look_around, quick) -> None:
     poses = (TURN, CENTRES[1]), (HALF_TURN @ TURN, HALF_TURN @ CENTRES[1])
     parts = [see_room(11 + n, 40, *pose) for n, pose in enumerate(poses)]
     blank = [Surroundings(np.full((64, 128, 3), 0.5), view.depth) for view in look(look_around, *poses[0])]
-    both, single = find_ways(parts[0]), find_ways(parts[1])
-    for wanted, ways in ((0, both), (1, Ways(there=single.there)), (1, Ways(back=single.back))):
-        found = estimate(join(*parts), axes=PARALLEL, surroundings=tuple(blank), ways=ways)
+    both, single = find_links(parts[0]), find_links(parts[1])
+    for wanted, links in ((0, both), (1, LinkDirections(there=single.there)), (1, LinkDirections(back=single.back))):
+        found = estimate(join(*parts), axes=PARALLEL, surroundings=tuple(blank), links=links)
         assert max(errors_degrees(found, parts[wanted])) < 0.5
 
 
@@ -213,13 +213,13 @@ def test_ways_state_the_direction_to_the_other_camera() -> None:
     yaw = math.atan2(towards[0], towards[2])
     for wrong, sign in ((0.0, 1), (0.2, 1), (2.0, -1), (math.pi, -1)):
         for turn in (wrong, wrong + 2 * math.pi, wrong - 2 * math.pi):
-            assert sign * Ways(there=yaw + turn).score(rotation[None], translation[None])[0] > 1
-    assert NO_WAYS.score(rotation[None], translation[None]).tolist() == [0]
+            assert sign * LinkDirections(there=yaw + turn).score(rotation[None], translation[None])[0] > 1
+    assert NO_LINKS.score(rotation[None], translation[None]).tolist() == [0]
 
 
 def test_only_matches_count_without_surroundings(see_room, quick) -> None:
     bearings = see_room(12, 60, TURN, CENTRES[1])
-    plain, linked = (estimate(bearings, ways=ways) for ways in (NO_WAYS, Ways(2.0, 2.0)))
+    plain, linked = (estimate(bearings, links=links) for links in (NO_LINKS, LinkDirections(2.0, 2.0)))
     assert plain.log_odds == linked.log_odds and np.array_equal(plain.translation, linked.translation)
 
 

@@ -23,8 +23,8 @@ from pansplat.poses.placing import (
     POOR_FIT,
     Fit,
     Piece,
-    Place,
     PlanFrame,
+    PlanPose,
     Snapped,
     Suggestion,
     find_wall_yaw,
@@ -61,7 +61,7 @@ class Ghost:
         other: the photograph that it is relative to.
     """
 
-    place: Place
+    place: PlanPose
     log_odds: float
     other: int
 
@@ -115,13 +115,13 @@ class Placing:
         self.with_group, self.targets = False, ()
         self._world: int | None = None
         self.floor = PlanFrame(np.eye(3), 1.0)
-        self.places: dict[int, Place] = {}
+        self.places: dict[int, PlanPose] = {}
         self.ghosts: list[Ghost] = []
-        self._raw = Place(0, 0, 0)
+        self._raw = PlanPose(0, 0, 0)
         self.shown = Snapped(self._raw)
         self.fit: Fit | None = None
         self._measured: tuple[object, ...] = ()
-        self._doubted: Place | None = None  # a place of which the user was asked
+        self._doubted: PlanPose | None = None  # a place of which the user was asked
         self._is_moved = False
         self._step = 0.0  # metres, of the adjustment in progress
         self.is_changed = False
@@ -391,7 +391,7 @@ class Placing:
         place, best = self.shown.place, self.fit
         steps = np.concatenate((np.eye(3), -np.eye(3))) * (1, 1, _ADJUST_TURN) * self._step
         for right, forward, turn in steps.tolist():
-            near = Place(place.right + right, place.forward + forward, wrap_angle(place.yaw + turn))
+            near = PlanPose(place.right + right, place.forward + forward, wrap_angle(place.yaw + turn))
             fit = self._measure(known, near)
             if fit is not None and (best is None or fit.score > best.score):
                 best, self.shown = fit, Snapped(near)
@@ -439,7 +439,7 @@ class Placing:
             return Snapped(self.ghosts[0].place, 0)
         right = max((place.right for place in self.places.values()), default=0.0)
         forward = float(np.mean([place.forward for place in self.places.values()])) if self.places else 0.0
-        return Snapped(Place(right + _BESIDE, forward, 0.0))
+        return Snapped(PlanPose(right + _BESIDE, forward, 0.0))
 
     @property
     def wall_yaw(self) -> float | None:
@@ -468,7 +468,7 @@ class Placing:
         """
         factor = FINE if fine else 1.0
         raw = self._raw
-        self._set(Place(raw.right + factor * right, raw.forward + factor * forward, raw.yaw), free=fine or free)
+        self._set(PlanPose(raw.right + factor * right, raw.forward + factor * forward, raw.yaw), free=fine or free)
 
     def turn(self, steps: float, *, fine: bool = False, free: bool = False) -> None:
         """Turn the piece to the right by steps of 5 degrees, or of half a degree if `fine`; see `move`."""
@@ -490,7 +490,7 @@ class Placing:
         """End a drag: the next one starts from where the piece is shown."""
         self._raw = self.shown.place
 
-    def _set(self, raw: Place, *, free: bool, largest_turn: float | None = None) -> None:
+    def _set(self, raw: PlanPose, *, free: bool, largest_turn: float | None = None) -> None:
         if self.node is None or self._get_piece(self.node) is None:
             return
         self._raw, self._is_moved, self._step = raw, True, 0.0
@@ -513,7 +513,7 @@ class Placing:
             place = self.places.get(node)
         return None if place is None else piece.draw_outline(place, self.floor.unit)
 
-    def _find_down(self, place: Place) -> float:
+    def _find_down(self, place: PlanPose) -> float:
         """The height of the nearest placed camera, along the plan's down axis, metres."""
         nearest = min(self.places, key=lambda target: place.distance(self.places[target]))
         return float(self.floor.level[:, 1] @ self._get_pose(nearest)[:3, 3])
@@ -531,7 +531,7 @@ class Placing:
         """
         return self._find_poses(self.shown.place)
 
-    def _find_poses(self, place: Place) -> dict[int, Float[np.ndarray, "4 4"]]:
+    def _find_poses(self, place: PlanPose) -> dict[int, Float[np.ndarray, "4 4"]]:
         assert self.node is not None
         upright = self.pieces[self._image(self.node)].upright
         pose = self.floor.make_pose(place, upright, self._find_down(place))
@@ -548,7 +548,7 @@ class Placing:
         motion[:3, 3] = self.floor.level @ (place.right, down, place.forward) - motion[:3, :3] @ old[:3, 3]
         return {node: motion @ self._get_pose(node) for node in self.moved}
 
-    def _measure(self, known: Sequence[int], place: Place) -> Fit | None:
+    def _measure(self, known: Sequence[int], place: PlanPose) -> Fit | None:
         assert self.node is not None
         others = [(self.pieces[self._image(target)], self._get_pose(target)) for target in known]
         piece = self.pieces[self._image(self.node)]

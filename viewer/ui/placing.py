@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from pansplat.inputs.placements import State
 from pansplat.poses.placing import Piece
-from pansplat_viewer.scene.placing import Nodes, Place, Placing, PlanView
+from pansplat_viewer.scene.placing import Nodes, Placing, PlanPose, PlanView
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
 
 if TYPE_CHECKING:
@@ -233,7 +233,7 @@ class PlacingWindow:
                 imgui.set_tooltip(f"hypothesis beside {other}: {share}")
 
     def _draw_camera(
-        self, canvas: imgui.ImDrawList, place: Place, color: tuple, scale: float, *, hollow: bool = False
+        self, canvas: imgui.ImDrawList, place: PlanPose, color: tuple, scale: float, *, hollow: bool = False
     ) -> None:
         (x, y), *_ = self._to_screen(np.array([place[:2]]))
         tip = (x + 11 * scale * math.sin(place.yaw), y - 11 * scale * math.cos(place.yaw))

@@ -18,7 +18,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.pairs import Panorama
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
-from pansplat.poses.placing import WALL_ANGLE, Piece, Place
+from pansplat.poses.placing import WALL_ANGLE, Piece, PlanPose
 from pansplat.poses.solvers import rotation_exp
 from pansplat.tours import find_tours
 from pansplat_viewer.scene.loader import SceneEntry, list_panoramas
@@ -104,7 +104,7 @@ def started(placing: Placing) -> Placing:
     return placing
 
 
-def _true_place(placing: Placing, name: str = "c") -> Place:
+def _true_place(placing: Placing, name: str = "c") -> PlanPose:
     return placing.floor.find_place(_pose(name), np.eye(3))
 
 

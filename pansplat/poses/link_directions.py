@@ -1,4 +1,4 @@
-"""Ways from one panorama towards another, as the links of a tour state them, as evidence for relative poses."""
+"""Directions of one panorama in another, which the links of a tour state, as evidence for relative poses."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-_WAY_NOISE, _WAY_SHARE = math.radians(15), 0.85  # of links, which are often on a door; their share of right ones
+_NOISE, _RIGHT = math.radians(15), 0.85  # of a link, which is often on a door; share of right links
 
 
-class Ways(NamedTuple):
+class LinkDirections(NamedTuple):
     """Where a tour's links place the other panorama: yaw to the right of the centre column, radians; None without one.
 
     Attributes:
@@ -33,9 +33,9 @@ class Ways(NamedTuple):
             if yaw is not None:
                 angle = np.arctan2(directions[:, 0], directions[:, 2]) - yaw
                 angle = (angle + math.pi) % (2 * math.pi) - math.pi
-                density = np.exp(-0.5 * (angle / _WAY_NOISE) ** 2) / (math.sqrt(2 * math.pi) * _WAY_NOISE)
-                score += np.log(_WAY_SHARE * density * 2 * math.pi + 1 - _WAY_SHARE)
+                density = np.exp(-0.5 * (angle / _NOISE) ** 2) / (math.sqrt(2 * math.pi) * _NOISE)
+                score += np.log(_RIGHT * density * 2 * math.pi + 1 - _RIGHT)
         return score
 
 
-NO_WAYS = Ways()
+NO_LINKS = LinkDirections()
