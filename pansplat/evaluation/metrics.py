@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -74,13 +75,12 @@ def ssim(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 h
 
 def _average_windows(image: np.ndarray) -> np.ndarray:
     """Gaussian-weighted local means (3 H W) of all windows inside the image."""
-    from scipy.ndimage import correlate1d
-
     offsets = np.arange(-_SSIM_RADIUS, _SSIM_RADIUS + 1)
     kernel = np.exp(-0.5 * (offsets / _SSIM_SIGMA) ** 2)
     kernel /= kernel.sum()
     inside = slice(_SSIM_RADIUS, -_SSIM_RADIUS)
-    return correlate1d(correlate1d(image, kernel, axis=1), kernel, axis=2)[:, inside, inside]
+    columns = scipy.ndimage.correlate1d(image, kernel, axis=1)
+    return scipy.ndimage.correlate1d(columns, kernel, axis=2)[:, inside, inside]
 
 
 def _weighted_mean(error: Tensor, weights: Tensor, mask: Tensor | None) -> float:

@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 from shapely import contains_xy
 from shapely.geometry import Polygon
 from torch import Tensor
@@ -219,7 +219,7 @@ def find_floaters(scene: Scene) -> Bool[Tensor, "n"]:
     rest = finite[~is_floater[finite]]
     if not len(suspects) or not len(rest):
         return torch.zeros(len(means), dtype=torch.bool, device=gaussians.means.device)
-    tree = cKDTree(means[rest])
+    tree = scipy.spatial.cKDTree(means[rest])
     for view in np.unique(views[suspects]).tolist():
         chosen = suspects[views[suspects] == view]
         radii = _CONFIRMED * np.linalg.norm(means[chosen] - scene.cam2world[view, :3, 3].numpy(), axis=1)
@@ -245,7 +245,7 @@ def _are_nearer(offsets: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 
         return is_nearer
     (distances, rays), (other_distances, other_rays) = _split(offsets), _split(others)
     logs, other_logs = np.log(distances), np.log(other_distances)
-    tree = cKDTree(other_rays, balanced_tree=False, compact_nodes=False)
+    tree = scipy.spatial.cKDTree(other_rays, balanced_tree=False, compact_nodes=False)
     for start in range(0, len(rays), _CHUNK):
         part = slice(start, start + _CHUNK)
         neighbours = tree.query(rays[part], _NEIGHBOURS + 1, workers=torch.get_num_threads())[1][:, 1:]
@@ -266,7 +266,7 @@ def _are_lonely(means: Float[np.ndarray, "n 3"], sizes: Float[np.ndarray, "n"]) 
     is_lonely = np.zeros(len(means), bool)
     if len(means) <= _NEIGHBOURS:
         return is_lonely
-    tree, workers = cKDTree(means), torch.get_num_threads()
+    tree, workers = scipy.spatial.cKDTree(means), torch.get_num_threads()
     parts = [slice(start, start + _CHUNK) for start in range(0, len(means), _CHUNK)]
     reach = np.concatenate([tree.query(means[part], [_NEIGHBOURS + 1], workers=workers)[0][:, 0] for part in parts])
     suspects = np.flatnonzero(reach > _LONELY * sizes)

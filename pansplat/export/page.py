@@ -23,12 +23,11 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import scipy
 import shapely
 import torch
 from jaxtyping import Float, Int
 from PIL import Image
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.spatial.distance import cdist
 from shapely.geometry import Polygon
 from torch import Tensor
 
@@ -598,7 +597,8 @@ def _limit_parts(
     if not flights.edges:
         if num_panoramas == 1:
             return [min(_SINGLE_REACH, 0.5 * float(reaches[0]))]
-        longest_step = float(minimum_spanning_tree(cdist(positions, positions)).toarray().max(initial=0.0))
+        distances = scipy.spatial.distance.cdist(positions, positions)
+        longest_step = float(scipy.sparse.csgraph.minimum_spanning_tree(distances).toarray().max(initial=0.0))
         return [max(float(reaches[0]), 0.75 * longest_step)]
     most = REACH if len(reaches) > 1 else math.inf
     return [

@@ -19,9 +19,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from pansplat.errors import InputError
 from pansplat.images.cube_images import BESIDE, CUBE_SUFFIX
@@ -152,7 +152,7 @@ def blur_hidden(color: NDArray[Any], hidden: Bool[NDArray[Any], "height width"])
     y, x = np.nonzero(hidden)
     places = (y + 0.5) * rows / height + 0.5, (x + 0.5) * 2 * rows / width + 0.5
     for channel in range(3):
-        values = ndimage.map_coordinates(blurred[..., channel], places, order=1)
+        values = scipy.ndimage.map_coordinates(blurred[..., channel], places, order=1)
         result[y, x, channel] = np.rint(values) if color.dtype == np.uint8 else values
     return result
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray as Array
@@ -228,12 +229,10 @@ def drop_repeated(first: Features, second: Features, matches: Matches) -> Matche
 
 def are_distinct(places: Float[Array, "match n"]) -> Bool[Array, "match"]:
     """Whether no better match that is kept has the same place; bearings of one or both panoramas, best match first."""
-    from scipy.spatial import cKDTree
-
     kept = np.ones(len(places), bool)
     if not len(places):
         return kept
-    near = cKDTree(places).query_pairs(_REPEATED_MATCH, output_type="ndarray")  # the better match first
+    near = scipy.spatial.cKDTree(places).query_pairs(_REPEATED_MATCH, output_type="ndarray")  # the better match first
     for better, worse in near[np.argsort(near[:, 1], kind="stable")].tolist():
         if kept[better]:
             kept[worse] = False

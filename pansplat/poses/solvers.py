@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
@@ -67,9 +68,7 @@ def rotation_exp(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"
 
 def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """The rotation vector, radians, of a rotation matrix."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_rotvec()
+    return scipy.spatial.transform.Rotation.from_matrix(rotation).as_rotvec()
 
 
 def rotation_angle(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:

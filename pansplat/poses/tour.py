@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
@@ -22,6 +23,7 @@ from pansplat.poses.bundle import Bundle, adjust, point_depths, residual_angles,
 from pansplat.poses.features import Features
 from pansplat.poses.solvers import rotation_angle
 from pansplat.poses.two_view import RelativePose
+from pansplat.system.components import label_components
 
 IndexPair = tuple[int, int]
 
@@ -233,13 +235,10 @@ def _closes(kept: Mapping[IndexPair, RelativePose], relation: RelativePose, pair
 
 def _connect(count: int, relations: Mapping[IndexPair, RelativePose]) -> list[set[int]]:
     """The sets of two or more panoramas that relations connect."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = np.array(list(relations), np.int64).reshape(-1, 2)
-    labels = connected_components(coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count)), directed=False)[1]
-    sets = [set(np.flatnonzero(labels == label).tolist()) for label in np.unique(labels)]
-    return [members for members in sets if len(members) > 1]
+    sets: dict[int, set[int]] = {}
+    for view, label in enumerate(label_components(count, relations)):
+        sets.setdefault(label, set()).add(view)
+    return [members for members in sets.values() if len(members) > 1]
 
 
 def _place_group(
@@ -312,14 +311,11 @@ class _Observations:
 
 def _make_tracks(features: Sequence[Features], relations: Mapping[IndexPair, RelativePose]) -> _Observations:
     """Features that matches connect; tracks with two features of one panorama are dropped."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     starts = np.concatenate(((0,), np.cumsum([len(f) for f in features])))
     edges = np.concatenate([relation.indices + starts[[i, j]] for (i, j), relation in relations.items()])
     size = int(starts[-1])
-    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(size, size))
-    labels = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(size, size))
+    labels = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     nodes = np.unique(edges)
     view = np.searchsorted(starts, nodes, side="right") - 1
     track = np.unique(labels[nodes], return_inverse=True)[1].reshape(-1)

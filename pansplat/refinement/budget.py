@@ -12,9 +12,9 @@ import itertools
 import math
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float, Integer
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pansplat.gaussians.harmonics import SH_0
@@ -173,7 +173,7 @@ def _find_mutual_neighbours(
     distances = offsets.norm(dim=1, keepdim=True).clamp_min(1e-9)
     labels = _labels(gaussians, len(cameras)).cpu().numpy()
     features = torch.cat((offsets / distances, distances.log()), dim=1).cpu().numpy().astype(np.float32)
-    turn = Rotation.random(random_state=seed).as_matrix().astype(np.float32)
+    turn = scipy.spatial.transform.Rotation.random(random_state=seed).as_matrix().astype(np.float32)
     cells = np.clip((features[:, :3] @ turn + 1) * (1 << _DIRECTION_BITS), 0, (2 << _DIRECTION_BITS) - 1)
     order = np.lexsort((morton_codes(cells.astype(np.int64)), labels))
     features, labels = features[order], labels[order]

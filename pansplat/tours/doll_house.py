@@ -11,6 +11,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import shapely
 import torch
 from jaxtyping import Bool, Float
@@ -174,10 +175,8 @@ def measure_roughness(places: Float[np.ndarray, "n 3"]) -> float:
     Args:
         places: on surfaces, more than 12.
     """
-    from scipy.spatial import cKDTree  # .1 s, of a window that opens too
-
     chosen = places[:: max(len(places) // _PLACES, 1)]
-    near = places[cKDTree(places).query(chosen, k=_NEIGHBORS + 1)[1]]
+    near = places[scipy.spatial.cKDTree(places).query(chosen, k=_NEIGHBORS + 1)[1]]
     sizes = np.linalg.svd(near - near.mean(axis=1, keepdims=True), compute_uv=False)
     return float(np.quantile(sizes[:, 2] / np.maximum(sizes[:, 1], 1e-12), 0.8))
 

@@ -14,13 +14,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, shortest_path
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, Starts
 from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
 from pansplat.inputs.pairs import FAR, NEAR, Link, Pair, Panorama
+from pansplat.system.components import label_components
 from pansplat.system.descriptions import describe_count, describe_range, list_first
 from pansplat.tours.layout import REACH, lay_out
 from pansplat.tours.walls import find_walls
@@ -104,19 +103,13 @@ class TourGraph:
     @cached_property
     def parts(self) -> tuple[int, ...]:
         """The part of each node; parts are numbered in the order of their first nodes."""
-        return self._number_components([*self.overlaps])
+        return tuple(label_components(len(self), self.overlaps))
 
     @cached_property
     def worlds(self) -> tuple[int, ...]:
         """The world of each node: parts with walls between them have known relative places. A pair has no edges."""
-        return self._number_components([*self.overlaps, *self.walls]) if self.overlaps else (0,) * len(self)
-
-    def _number_components(self, edges: Sequence[Edge]) -> tuple[int, ...]:
-        ends = np.array(edges, int).reshape(-1, 2).T
-        graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(self), len(self)))
-        labels = connected_components(graph, directed=False)[1].tolist()
-        numbers = {label: number for number, label in enumerate(dict.fromkeys(labels))}
-        return tuple(numbers[label] for label in labels)
+        edges = [*self.overlaps, *self.walls]
+        return tuple(label_components(len(self), edges)) if self.overlaps else (0,) * len(self)
 
     def is_placed(self, node: int) -> bool:
         """Whether the place of a node relative to another one is known."""
@@ -410,7 +403,7 @@ class TourGraph:
             # With little overlap a way around looks better.
             doubt = 1.0 if (a, b) in self.poor else max(1 - overlap / 0.25, 0.0)
             costs[a, b] = costs[b, a] = max(self.length((a, b)), 1e-3) * (1 + 3 * doubt)
-        ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
+        ways, previous = _find_shortest_ways(costs)
         is_near = np.isfinite(ways)
         if not is_near.all():
             # Two fades cost more than each way within a part, so that a way between nodes of a part stays in it.
@@ -420,8 +413,22 @@ class TourGraph:
             for a, b in (*self.links, *self.walls):
                 if self.parts[a] != self.parts[b]:
                     costs[a, b] = costs[b, a] = fade
-            ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
+            ways, previous = _find_shortest_ways(costs)
         return ways, previous
+
+
+def _find_shortest_ways(
+    costs: Float[np.ndarray, "node node"],
+) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
+    """Cost of the cheapest way between all nodes, and the node before its end, of symmetric costs (Floyd, Warshall)."""
+    ways, previous = costs.copy(), np.repeat(np.arange(len(costs))[:, None], len(costs), axis=1)
+    np.fill_diagonal(ways, 0.0)
+    for middle in range(len(costs)):
+        through = ways[:, middle, None] + ways[middle]
+        is_cheaper = through < ways
+        ways[is_cheaper] = through[is_cheaper]
+        previous = np.where(is_cheaper, previous[middle], previous)
+    return ways, previous
 
 
 def _order_by_distance(costs: Float[np.ndarray, "node node"], start: int) -> Int[np.ndarray, "node"]:

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from shapely.geometry import MultiPolygon, Polygon
 
 from pansplat.gaussians.scene import Scene
+from pansplat.system.components import label_components
 from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, trace_floor
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.surfaces import locate_surfaces
@@ -438,10 +437,9 @@ def _outline_rooms(
     ]
     if not mutual:
         return []
-    graph = coo_array((np.ones(len(mutual)), np.array(mutual).T), shape=(len(traced),) * 2)
-    labels = connected_components(graph, directed=False)[1]
+    labels = np.array(label_components(len(traced), mutual))
     shapes: list[tuple[tuple[int, ...], shapely.Geometry]] = []
-    for label in dict.fromkeys(labels.tolist()):
+    for label in range(labels.max() + 1):
         nodes = tuple(traced[k] for k in np.flatnonzero(labels == label))
         lines = _find_lines([seen[k] for k in nodes], normals, unit)
         outlines = [_trace_outline(seen[k], lines, unit) or alone[k] for k in nodes]

@@ -49,9 +49,7 @@ from pansplat_viewer.scene.camera import Pinhole
 from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
-_POLL_SECONDS = (
-    0.02  # wait for an image that is drawn without waiting, so that a window does not draw the old one again
-)
+_POLL_SECONDS = 0.02  # wait for an image in the background, so that a window does not draw the old one again
 _MAX_FACE_SETS = 5
 _MAX_SELECTIONS = 8
 _MAX_TEXTURES = 4

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import scipy
 import torch
 from msgspec import Meta, Struct
 from torch import Tensor
@@ -83,8 +84,6 @@ class CameraPath:
             level: a camera with the scene's level axes.
             tour: that the path is in.
         """
-        from scipy.interpolate import PchipInterpolator  # .1 s, of a window that opens too
-
         frames = self.key_frames if tour is None else self._select_part(seconds, tour)
         times = np.array([frame.seconds for frame in frames])
         cameras = [_place(frame, level) for frame in frames]
@@ -96,7 +95,8 @@ class CameraPath:
             ]
         )
         at = min(max(seconds, times[0]), times[-1])
-        x, y, z, yaw, pitch, fov = (values[0] if len(frames) == 1 else PchipInterpolator(times, values)(at)).tolist()
+        value = values[0] if len(frames) == 1 else scipy.interpolate.PchipInterpolator(times, values)(at)
+        x, y, z, yaw, pitch, fov = value.tolist()
         return replace(level, position=(x, y, z), yaw_radians=yaw, pitch_radians=pitch, vertical_fov_degrees=fov)
 
     def _select_part(self, seconds: float, tour: TourGraph) -> tuple[KeyFrame, ...]:

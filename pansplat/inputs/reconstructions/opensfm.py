@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial.transform import Rotation
 
 from pansplat.errors import InputError
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
@@ -46,7 +46,8 @@ def read_opensfm(source: Path, convention: str | None = None) -> Reconstruction:
                 missing.append(name)
                 continue
             matrix = torch.eye(4, dtype=torch.float64)
-            matrix[:3, :3] = torch.from_numpy(Rotation.from_rotvec(np.array(shot["rotation"], float)).as_matrix())
+            rotation = scipy.spatial.transform.Rotation.from_rotvec(np.array(shot["rotation"], float))
+            matrix[:3, :3] = torch.from_numpy(rotation.as_matrix())
             matrix[:3, 3] = torch.tensor(shot["translation"], dtype=torch.float64)
             pose = to_cam2world(rigid_matrix(matrix.tolist(), where), convention or "world2cam opencv")
             shots.append(Shot(name, image, pose))

@@ -11,12 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
@@ -27,6 +25,7 @@ from pansplat.images.rig_images import Lens, RigImage, RigView, write_rig
 from pansplat.inputs.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
 from pansplat.inputs.poses import read_number
 from pansplat.inputs.stated_files import find_inside
+from pansplat.system.components import label_components
 
 _SCALE = "scale.txt"
 _IMAGE_FOLDERS = ("images", "image", "panos", "frames", "input", ".")
@@ -172,7 +171,7 @@ def _find_range(
     centres: Float[Array, "camera 3"], points: Float[Array, "point 3"], is_metric: bool
 ) -> tuple[float, float]:
     """Near and far of cameras, from the distances of points to their nearest cameras, or of cameras to each other."""
-    tree = cKDTree(centres)
+    tree = scipy.spatial.cKDTree(centres)
     if len(points) >= _MIN_POINTS:
         distances = tree.query(points)[0]
         near = float(np.quantile(distances, _NEAR_QUANTILE)) / _MARGIN
@@ -242,10 +241,9 @@ def _group_by_place(shots: Sequence[Shot]) -> Iterable[list[Shot]]:
     local, farthest = (float(np.abs(places).max()) for places in (offsets, centres))
     tolerance = _RIG_SIZE * spread + _ROUNDING * (1 + local) + _DIGITS * farthest
     flat = np.flatnonzero([shot.lens is not None for shot in shots])
-    ends = flat[cKDTree(centres[flat]).query_pairs(tolerance, output_type="ndarray")].reshape(-1, 2).T
-    graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(shots), len(shots)))
+    ends = flat[scipy.spatial.cKDTree(centres[flat]).query_pairs(tolerance, output_type="ndarray")]
     groups: dict[int, list[Shot]] = {}
-    for shot, label in zip(shots, connected_components(graph, directed=False)[1].tolist(), strict=True):
+    for shot, label in zip(shots, label_components(len(shots), ends.tolist()), strict=True):
         groups.setdefault(label, []).append(shot)
     return groups.values()
 
