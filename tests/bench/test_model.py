@@ -41,6 +41,7 @@ def test_the_command_measures_predictions_of_the_network(weights, monkeypatch, t
         return values, prediction
 
     monkeypatch.setattr(bench_model, "measure_case", measure)
+    monkeypatch.setattr(bench_model, "time_workload", lambda: 0.02)
     cases = [PLAIN, dataclasses.replace(PLAIN, tiles=2)]
     cases += [dataclasses.replace(PLAIN, precision="bfloat16")] * has_bfloat16()
     monkeypatch.setattr(bench_model, "list_model_cases", lambda threads, bfloat16, quick: cases)
