@@ -43,7 +43,7 @@ class Presenter:
         self._program = self._programs.present()
         self._triangle = ctx.vertex_array(self._program, [])
         self._program["image"], self._program["fading"], self._program["right"], self._program["table"] = range(4)
-        self._table = create_table_texture(ctx, ERROR_MAP)
+        self._table: moderngl.Texture | None = None  # of the first error: matplotlib takes .2 s of a window that opens
 
     def draw(
         self,
@@ -69,7 +69,9 @@ class Presenter:
         for unit, texture in enumerate((image, fading or image, side)):
             texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
             texture.use(unit)
-        self._table.use(3)
+        if right is not None and right.comparison == "error":
+            self._table = self._table or create_table_texture(self.ctx, ERROR_MAP)
+            self._table.use(3)
         self._program["weight"] = weight
         self._program["comparison"] = 0 if right is None else get_args(Comparison).index(right.comparison)
         self._program["split"] = 2.0 if right is None else right.split
@@ -95,7 +97,8 @@ class Presenter:
 
     def release(self) -> None:
         """Free the GL objects."""
-        self._table.release()
+        if self._table is not None:
+            self._table.release()
         self._triangle.release()
         self._programs.release()
 
