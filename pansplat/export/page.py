@@ -264,7 +264,9 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
         first = tour.find_start_view(0) if len(tour) else None
         start = path_poses(scene.cam2world)[0]
         level = start[:3, :3].numpy()
-        yaw, pitch = (_look_on(scene, 0, level, 0.0), 0.0) if first is None else find_angles(level.T @ first)
+        yaw, pitch = choose_heading(measure_outlook(scene, 0, level), 0.0), 0.0
+        if first is not None:
+            yaw, pitch = find_angles(level.T @ first)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
@@ -273,7 +275,7 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
     samples, jumps = _resample(route)
     start, (yaw, pitch) = torch.from_numpy(route.pose(0.0)), samples[0, 3:].tolist()
     if tour.find_start_view(walk[0]) is None:
-        yaw = _look_on(scene, walk[0], route.level, yaw)
+        _, yaw = find_blank(measure_outlook(scene, walk[0], route.level))
     start[:3, :3] = torch.from_numpy(route.level)
     return _Flights(
         _look(start, route.level, yaw, pitch),
@@ -295,11 +297,6 @@ def _order_views(scene: Scene, flights: _Flights) -> list[int]:
     distances = (scene.cam2world[:, :3, 3] - flights.start[:3, 3]).norm(dim=1).numpy()
     parts = np.array(flights.parts)
     return np.lexsort((distances, parts != parts[distances.argmin()])).tolist()
-
-
-def _look_on(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], yaw: float) -> float:
-    """A yaw at a view, or that of the widest view if it faces a wall."""
-    return choose_heading(measure_outlook(scene, view, level), math.remainder(yaw, 2 * math.pi))
 
 
 def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: float, pitch: float) -> Tensor:

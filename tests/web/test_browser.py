@@ -971,6 +971,14 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         assert page.camera["position"] == page.run("HEADER.spots[3].position")
         assert (page.camera["yaw"], page.camera["pitch"]) == pytest.approx((3.1, 0.2), abs=1e-5)
         assert page.run(shown) == []
+        # Directions of before say nothing in a world of its own: it shows its widest view.
+        page.run("Object.assign(HEADER.spots[3], { ahead: 2.2, blank: 0, start: undefined })")
+        for world, expected in ((2, 2.2), (0, 0.7)):
+            page.run("(world) => { HEADER.plan.worlds[3] = world; }", world)
+            page.run("pansplat.goTo(1, { jump: true }).then(() => pansplat.setPose({ yaw: 0.7 * 180 / Math.PI }))")
+            assert page.run("pansplat.goTo(4, { jump: true })")
+            assert page.camera["yaw"] == pytest.approx(expected, abs=1e-5)
+        page.settle()
         # The camera slows down near the limit.
         page.run("passed = []; HEADER.speed *= 3")
         keyboard.down("KeyW")

@@ -152,7 +152,7 @@ def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: 
     assert distances[0, 0] < 1e-3 and distances[-1, 0] < 1e-3, "it ends where it begins"
     assert np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1).max() < 1.05 / header["routeRate"], "1 m/s"
     assert header["start"]["position"] == pytest.approx(route[0, :3], abs=1e-3)
-    assert header["start"]["yaw"] == pytest.approx(route[0, 3], abs=1e-3)
+    assert header["start"]["yaw"] == pytest.approx(header["spots"][0]["ahead"], abs=1e-3), "not along the first flight"
 
 
 def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scene, tmp_path: Path) -> None:
