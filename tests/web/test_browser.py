@@ -1338,7 +1338,7 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
         level = np.array(page.run("HEADER.level"))
         positions = (np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level)[:, [0, 2]]
         outline = (positions[0] + ((-15, -20), (25, -20), (25, 20), (-15, 20))).tolist()
-        room = {"name": "<i>salon", "nodes": [0], "outline": outline, "label": [*outline[0], 2]}
+        room = {"name": "<i>salon and dining room", "nodes": [0], "outline": outline, "label": [*outline[0], 2]}
         rooms = [room, {**room, "nodes": [2], "name": "other world"}]
         page.run(f"HEADER.plan.turn = 0.3; HEADER.plan.rooms = {json.dumps(rooms)}")
         page.run(f"HEADER.plan.doors = [{{ room: 0, ends: {outline[:2]} }}]")
@@ -1362,7 +1362,14 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
         assert corners == pytest.approx(expected - (drawing["x"], drawing["y"]), abs=0.6)
         elsewhere = page.page.locator("#elsewhere button")
         assert elsewhere.all_inner_texts() == ["</script><b>hall", "attic"]
-        assert page.page.locator("#plan svg text").all_text_contents() == ["<i>salon", "room 1"]
+        assert page.page.inner_text("#elsewhere").startswith("Not on the plan")
+        names = page.page.locator("#plan svg text")
+        assert names.all_text_contents() == ["<i>salon and dining room", "room 1"]
+        for box in (name.bounding_box() for name in names.all()):  # the first is that of a corner
+            assert all(
+                drawing[x] <= box[x] and box[x] + box[side] <= drawing[x] + drawing[side]
+                for x, side in (("x", "width"), ("y", "height"))
+            )
         assert page.run("document.querySelector('#drawing [aria-current]').ariaLabel") == "Go to room 0"
         turned = "document.querySelector('#plan path').getAttribute('transform')"
         page.run("pansplat.setPose({ yaw: 90 + HEADER.plan.turn * 180 / Math.PI })")
