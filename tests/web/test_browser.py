@@ -1278,6 +1278,10 @@ def test_rings_on_a_touch_screen_have_names_and_room_for_a_finger(chromium: Any,
             "Array.from(document.querySelectorAll('#buttons > :not([hidden])'), (e) => e.getBoundingClientRect().left)"
         )
         assert min(right) >= 0
+        page.page.click("#more")
+        page.page.click("#measure")
+        box = page.page.query_selector("#status").bounding_box()
+        assert box["width"] > 0.8 * 390 and box["x"] >= 0 and box["x"] + box["width"] <= 390, "a message is wide"
 
 
 @pytest.mark.slow
@@ -1338,7 +1342,7 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
         level = np.array(page.run("HEADER.level"))
         positions = (np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level)[:, [0, 2]]
         outline = (positions[0] + ((-15, -20), (25, -20), (25, 20), (-15, 20))).tolist()
-        room = {"name": "<i>salon and dining room", "nodes": [0], "outline": outline, "label": [*outline[0], 2]}
+        room = {"name": "<i>salon and dining room", "nodes": [0], "outline": outline, "label": [*outline[3], 2]}
         rooms = [room, {**room, "nodes": [2], "name": "other world"}]
         page.run(f"HEADER.plan.turn = 0.3; HEADER.plan.rooms = {json.dumps(rooms)}")
         page.run(f"HEADER.plan.doors = [{{ room: 0, ends: {outline[:2]} }}]")
@@ -1365,7 +1369,7 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
         assert page.page.inner_text("#elsewhere").startswith("Not on the plan")
         names = page.page.locator("#plan svg text")
         assert names.all_text_contents() == ["<i>salon and dining room", "room 1"]
-        for box in (name.bounding_box() for name in names.all()):  # the first is that of a corner
+        for box in (name.bounding_box() for name in names.all()):  # the first is at the left border
             assert all(
                 drawing[x] <= box[x] and box[x] + box[side] <= drawing[x] + drawing[side]
                 for x, side in (("x", "width"), ("y", "height"))
