@@ -153,6 +153,14 @@ def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Pa
         assert float(label.split()[0]) == pytest.approx(area, rel=0.05) and "m²" in label
 
 
+def test_the_longest_wall_of_known_place_is_horizontal() -> None:
+    plan = _plan(_make_house(WALLS, CAMERAS, turn_degrees=17))
+    oblique = np.array(L_ROOM) @ np.array(((3.0, 2.0), (-2.0, 3.0)))  # of a house of its own
+    lost = dataclasses.replace(plan.rooms[0], outline=oblique, is_placed=False)
+    assert dataclasses.replace(plan, rooms=(lost, *plan.rooms)).turn == plan.turn
+    assert math.sin(2 * (dataclasses.replace(plan, rooms=(lost,)).turn - plan.turn)) != pytest.approx(0, abs=0.1)
+
+
 def test_an_oblique_wall_stays_oblique() -> None:
     corners = [(0.0, 0.0), (5.0, 0.0), (5.0, 2.0), (3.0, 4.0), (0.0, 4.0)]
     (room,) = _plan(_make_house(_walls_around(corners), [(2.0, 1.8)])).rooms
