@@ -39,7 +39,7 @@ from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, count_bytes, 
 from pansplat.export.page_photographs import PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.pairs import Link, Pair
 from pansplat.inputs.views import Views
 from pansplat.predictor import Progress
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
@@ -450,7 +450,7 @@ def _describe_scene(
         "views": views_of_page,
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(tour, positions, heights, level) if flights.edges else [],
+        "links": _describe_links(_link_parts(tour), positions, heights, level) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
@@ -546,6 +546,20 @@ def _describe_rooms(
         means = scene.gaussians.means[torch.from_numpy(cameras == camera)].double() - torch.from_numpy(origin)
         boxes[camera] = [_round(corner) for corner in measure_box(means, level)]
     return {"ranges": packed.rooms, "storeys": storeys, "boxes": boxes} if any(boxes) else None
+
+
+def _link_parts(tour: TourGraph) -> TourGraph:
+    """The tour with links between parts with a wall between them, where these are nearest; none if there is one."""
+    linked = {frozenset((tour.parts[a], tour.parts[b])) for a, b in tour.links}
+    panoramas = list(tour.panoramas)
+    for a, b in sorted(tour.walls, key=tour.length):
+        parts = frozenset((tour.parts[a], tour.parts[b]))
+        for start, end in ((a, b), (b, a)) if len(parts) > 1 and parts not in linked else ():
+            x, y, z = tour.cam2world[start, :3, :3].numpy().T @ (tour.positions[end] - tour.positions[start])
+            link = Link(panoramas[end].name, math.atan2(x, z), math.atan2(y, math.hypot(x, z)))
+            panoramas[start] = dataclasses.replace(panoramas[start], links=(*panoramas[start].links, link))
+        linked.add(parts)
+    return dataclasses.replace(tour, panoramas=tuple(panoramas))
 
 
 def _describe_links(
