@@ -38,7 +38,7 @@ from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, count_bytes, 
 from pansplat.export.page_photographs import PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.pairs import Link, Pair
 from pansplat.inputs.views import Views
 from pansplat.predictor import Progress
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
@@ -263,7 +263,9 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
         first = tour.find_start_view(0) if len(tour) else None
         start = path_poses(scene.cam2world)[0]
         level = start[:3, :3].numpy()
-        yaw, pitch = (_look_on(scene, 0, level, 0.0), 0.0) if first is None else find_angles(level.T @ first)
+        yaw, pitch = choose_heading(measure_outlook(scene, 0, level), 0.0), 0.0
+        if first is not None:
+            yaw, pitch = find_angles(level.T @ first)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
@@ -272,7 +274,7 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
     samples, jumps = _resample(route)
     start, (yaw, pitch) = torch.from_numpy(route.pose(0.0)), samples[0, 3:].tolist()
     if tour.find_start_view(walk[0]) is None:
-        yaw = _look_on(scene, walk[0], route.level, yaw)
+        _, yaw = find_blank(measure_outlook(scene, walk[0], route.level))
     start[:3, :3] = torch.from_numpy(route.level)
     return _Flights(
         _look(start, route.level, yaw, pitch),
@@ -294,11 +296,6 @@ def _order_views(scene: Scene, flights: _Flights) -> list[int]:
     distances = (scene.cam2world[:, :3, 3] - flights.start[:3, 3]).norm(dim=1).numpy()
     parts = np.array(flights.parts)
     return np.lexsort((distances, parts != parts[distances.argmin()])).tolist()
-
-
-def _look_on(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], yaw: float) -> float:
-    """A yaw at a view, or that of the widest view if it faces a wall."""
-    return choose_heading(measure_outlook(scene, view, level), math.remainder(yaw, 2 * math.pi))
 
 
 def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: float, pitch: float) -> Tensor:
@@ -452,7 +449,7 @@ def _describe_scene(
         "views": views_of_page,
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(tour, positions, heights, level) if flights.edges else [],
+        "links": _describe_links(_link_parts(tour), positions, heights, level) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
@@ -548,6 +545,20 @@ def _describe_rooms(
         means = scene.gaussians.means[torch.from_numpy(cameras == camera)].double() - torch.from_numpy(origin)
         boxes[camera] = [_round(corner) for corner in measure_box(means, level)]
     return {"ranges": packed.rooms, "storeys": storeys, "boxes": boxes} if any(boxes) else None
+
+
+def _link_parts(tour: TourGraph) -> TourGraph:
+    """The tour with links between parts with a wall between them, where these are nearest; none if there is one."""
+    linked = {frozenset((tour.parts[a], tour.parts[b])) for a, b in tour.links}
+    panoramas = list(tour.panoramas)
+    for a, b in sorted(tour.walls, key=tour.length):
+        parts = frozenset((tour.parts[a], tour.parts[b]))
+        for start, end in ((a, b), (b, a)) if len(parts) > 1 and parts not in linked else ():
+            x, y, z = tour.cam2world[start, :3, :3].numpy().T @ (tour.positions[end] - tour.positions[start])
+            link = Link(panoramas[end].name, math.atan2(x, z), math.atan2(y, math.hypot(x, z)))
+            panoramas[start] = dataclasses.replace(panoramas[start], links=(*panoramas[start].links, link))
+        linked.add(parts)
+    return dataclasses.replace(tour, panoramas=tuple(panoramas))
 
 
 def _describe_links(

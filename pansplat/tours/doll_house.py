@@ -127,16 +127,16 @@ def find_rooms(scene: Scene) -> Rooms:
 
     Where a view shows neither, most of its surfaces are.
     """
-    tour, gaussians = make_graph(scene), scene.gaussians
+    tour, gaussians = make_graph(scene), scene.gaussians.to(device="cpu")
     level, count = tour.level_axes, len(tour)
-    step = max(len(gaussians) // (_SAMPLES * max(len(gaussians.views.unique()), 1)), 1)
-    gaussians = gaussians.select(torch.arange(0, len(gaussians), step)).to(device="cpu")
     gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
+    plan = make_plan(dataclasses.replace(scene, gaussians=gaussians), tour)  # too few show no walls
+    step = max(len(gaussians) // (_SAMPLES * max(len(gaussians.views.unique()), 1)), 1)
+    gaussians = gaussians.select(torch.arange(0, len(gaussians), step))
     scene = dataclasses.replace(scene, gaussians=gaussians)
     heights = [find_camera_height(scene, view, level) for view in range(count)]
     unit = choose_camera_height(heights, scene.far)
     ceilings = [find_ceiling(locate_surfaces(scene, view, level)) for view in range(count)]
-    plan = make_plan(scene, tour)
     shapes = [Polygon(room.outline).buffer(_WALL * unit, join_style="mitre") for room in plan.rooms]
     enclosed = {view for room in plan.rooms for view in room.panoramas}
     for view in set(range(count)) - enclosed:

@@ -114,8 +114,12 @@ class Plan:
 
     @property
     def turn(self) -> float:
-        """The angle, anticlockwise, by which plan coordinates are turned so that the longest wall is horizontal."""
-        sides = [np.roll(room.outline, -1, axis=0) - room.outline for room in self.rooms]
+        """The angle, anticlockwise, by which plan coordinates are turned so that the longest wall is horizontal.
+
+        It is one of rooms whose places are known, if there are any: the others have directions of their own.
+        """
+        rooms = [room for room in self.rooms if room.is_placed] or self.rooms
+        sides = [np.roll(room.outline, -1, axis=0) - room.outline for room in rooms]
         walls = np.concatenate([*sides, np.eye(2)[:1] * 1e-9])
         x, y = walls[np.linalg.norm(walls, axis=1).argmax()]
         return -math.remainder(math.atan2(y, x), math.pi)

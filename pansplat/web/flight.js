@@ -21,11 +21,13 @@ const DIRECTIONS = 24;              // of the bits of `blank`
 const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
 
-// The heading after a fade: away from the link back, or the start view, or that of before.
+// The heading after a fade: away from the link back, or the start view; else that of before, or from another world, whose
+// directions are unknown, the widest view.
 function arriveAt(node, from) {
-  const back = findLink(node, from), { start } = HEADER.spots[node];
-  if (start && !(back && back.leave)) return { yaw: start[0], pitch: start[1] };
-  return { yaw: lookOn(node, back && back.leave ? back.yaw + Math.PI : camera.yaw), pitch: 0 };
+  const back = findLink(node, from), { start, ahead } = HEADER.spots[node], { worlds } = HEADER.plan;
+  if (back && back.leave) return { yaw: lookOn(node, back.yaw + Math.PI), pitch: 0 };
+  if (start) return { yaw: start[0], pitch: start[1] };
+  return { yaw: worlds[node] === worlds[from] ? lookOn(node, camera.yaw) : ahead, pitch: 0 };
 }
 
 // A yaw at a panorama; if it faces a wall, that of the start view or of the widest view (choose_heading).

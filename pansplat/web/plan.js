@@ -10,7 +10,7 @@ import { drawSvg } from "./measure.js";
 import { here } from "./rings.js";
 import { DEGREE } from "./share.js";
 
-const PLAN_MARGIN = 24;        // pixels
+const PLAN_MARGIN = 32;        // pixels
 const LARGEST_PLAN_SCALE = 60; // pixels for a metre
 const STOREY = 1.5;            // metres: rooms with a larger difference in height from the camera are faint
 const PLAN_TEXT = 13;          // pixels, height of a room's name, at most
@@ -54,7 +54,7 @@ class Plan {
       return element;
     };
     const write = (node, [x, y], text, width) => {
-      svg.append(add(node, drawSvg("text", { x, y, "font-size": clamp(1.6 * width / text.length, 8, PLAN_TEXT) }, text)));
+      svg.append(add(node, drawSvg("text", { x, y, "font-size": clamp(1.6 * width / text.length, 10, PLAN_TEXT) }, text)));
     };
     rooms.forEach(({ name, nodes: [node, ...others], label: [right, forward, width] }, k) => {
       if (!outlines[k]) return;
@@ -80,7 +80,11 @@ class Plan {
       return add(node, button);
     });
     byId("drawing").replaceChildren(svg, ...buttons);
-    byId("elsewhere").replaceChildren(...[...worlds.keys()].filter((node) => !nodes.includes(node)).map((node) => {
+    for (const text of svg.querySelectorAll("text")) {  // names stay in the drawing
+      const half = 0.5 * text.getComputedTextLength() + 4;
+      text.setAttribute("x", clamp(Number(text.getAttribute("x")), half, Math.max(size - half, half)));
+    }
+    byId("elsewhere").replaceChildren(make("p", "", "Not on the plan"), ...[...worlds.keys()].filter((node) => !nodes.includes(node)).map((node) => {
       const button = make("button", "", HEADER.spots[node].name);
       button.onclick = () => goTo(node);
       return add(node, button);

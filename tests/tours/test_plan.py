@@ -20,7 +20,7 @@ from pansplat.export.plan_files import _Drawing, describe_plan, write_picture, w
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.system.files import is_written
-from pansplat.tours import make_graph
+from pansplat.tours import doll_house, make_graph
 from pansplat.tours.plan import Plan, make_plan
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
@@ -131,6 +131,13 @@ def test_rooms_have_their_areas_angles_and_corners(noise: float) -> None:
     assert plan.camera_height == pytest.approx(CAMERA_HEIGHT, rel=0.01)
 
 
+def test_the_dolls_house_has_the_plan_of_all_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doll_house, "_SAMPLES", 1000)  # which show no walls
+    scene = _make_house(WALLS, CAMERAS, count=20000)
+    pairs = zip(doll_house.find_rooms(scene).plan.rooms, _plan(scene).rooms, strict=True)
+    assert [np.array_equal(found.outline, room.outline) for found, room in pairs] == [True, True]
+
+
 @pytest.mark.parametrize("suffix", [".svg", ".dxf"])
 def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Path, suffix: str) -> None:
     scene = _make_house(WALLS, CAMERAS, names=("living room", "living room", "hall"), count=20000)
@@ -144,6 +151,14 @@ def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Pa
     for name, area in (("living room", 24.0), ("hall", 15.6)):
         label = texts[texts.index(name) + 1]
         assert float(label.split()[0]) == pytest.approx(area, rel=0.05) and "m²" in label
+
+
+def test_the_longest_wall_of_known_place_is_horizontal() -> None:
+    plan = _plan(_make_house(WALLS, CAMERAS, turn_degrees=17))
+    oblique = np.array(L_ROOM) @ np.array(((3.0, 2.0), (-2.0, 3.0)))  # of a house of its own
+    lost = dataclasses.replace(plan.rooms[0], outline=oblique, is_placed=False)
+    assert dataclasses.replace(plan, rooms=(lost, *plan.rooms)).turn == plan.turn
+    assert math.sin(2 * (dataclasses.replace(plan, rooms=(lost,)).turn - plan.turn)) != pytest.approx(0, abs=0.1)
 
 
 def test_an_oblique_wall_stays_oblique() -> None:

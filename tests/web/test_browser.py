@@ -970,6 +970,14 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         assert page.camera["position"] == page.run("HEADER.spots[3].position")
         assert (page.camera["yaw"], page.camera["pitch"]) == pytest.approx((3.1, 0.2), abs=1e-5)
         assert page.run(shown) == []
+        # Directions of before say nothing in a world of its own: it shows its widest view.
+        page.run("Object.assign(HEADER.spots[3], { ahead: 2.2, blank: 0, start: undefined })")
+        for world, expected in ((2, 2.2), (0, 0.7)):
+            page.run("(world) => { HEADER.plan.worlds[3] = world; }", world)
+            page.run("pansplat.goTo(1, { jump: true }).then(() => pansplat.setPose({ yaw: 0.7 * 180 / Math.PI }))")
+            assert page.run("pansplat.goTo(4, { jump: true })")
+            assert page.camera["yaw"] == pytest.approx(expected, abs=1e-5)
+        page.settle()
         # The camera slows down near the limit.
         page.run("passed = []; HEADER.speed *= 3")
         keyboard.down("KeyW")
@@ -1269,6 +1277,10 @@ def test_rings_on_a_touch_screen_have_names_and_room_for_a_finger(chromium: Any,
             "Array.from(document.querySelectorAll('#buttons > :not([hidden])'), (e) => e.getBoundingClientRect().left)"
         )
         assert min(right) >= 0
+        page.page.click("#more")
+        page.page.click("#measure")
+        box = page.page.query_selector("#status").bounding_box()
+        assert box["width"] > 0.8 * 390 and box["x"] >= 0 and box["x"] + box["width"] <= 390, "a message is wide"
 
 
 @pytest.mark.slow
@@ -1329,7 +1341,7 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
         level = np.array(page.run("HEADER.level"))
         positions = (np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level)[:, [0, 2]]
         outline = (positions[0] + ((-15, -20), (25, -20), (25, 20), (-15, 20))).tolist()
-        room = {"name": "<i>salon", "nodes": [0], "outline": outline, "label": [*outline[0], 2]}
+        room = {"name": "<i>salon and dining room", "nodes": [0], "outline": outline, "label": [*outline[3], 2]}
         rooms = [room, {**room, "nodes": [2], "name": "other world"}]
         page.run(f"HEADER.plan.turn = 0.3; HEADER.plan.rooms = {json.dumps(rooms)}")
         page.run(f"HEADER.plan.doors = [{{ room: 0, ends: {outline[:2]} }}]")
@@ -1353,7 +1365,14 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
         assert corners == pytest.approx(expected - (drawing["x"], drawing["y"]), abs=0.6)
         elsewhere = page.page.locator("#elsewhere button")
         assert elsewhere.all_inner_texts() == ["</script><b>hall", "attic"]
-        assert page.page.locator("#plan svg text").all_text_contents() == ["<i>salon", "room 1"]
+        assert page.page.inner_text("#elsewhere").startswith("Not on the plan")
+        names = page.page.locator("#plan svg text")
+        assert names.all_text_contents() == ["<i>salon and dining room", "room 1"]
+        for box in (name.bounding_box() for name in names.all()):  # the first is at the left border
+            assert all(
+                drawing[x] <= box[x] and box[x] + box[side] <= drawing[x] + drawing[side]
+                for x, side in (("x", "width"), ("y", "height"))
+            )
         assert page.run("document.querySelector('#drawing [aria-current]').ariaLabel") == "Go to room 0"
         turned = "document.querySelector('#plan path').getAttribute('transform')"
         page.run("pansplat.setPose({ yaw: 90 + HEADER.plan.turn * 180 / Math.PI })")

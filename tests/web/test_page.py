@@ -112,6 +112,21 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
     assert headers[1]["plan"]["worlds"] == [0, 0, 0]
 
 
+def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Path) -> None:
+    """The nearest ones of two parts without a link; others have that of their tour."""
+    walls = tuple((node, alone, 0.0) for alone in (2, 3) for node in (0, 1))
+    write_page(dataclasses.replace(flat, overlaps=(*flat.overlaps, *walls)), tmp_path / "page.html")
+    header = read_header(tmp_path / "page.html")
+    spots, level = header["spots"], np.array(header["level"])
+    places = np.array([spot["position"] for spot in spots])
+    near = int(np.linalg.norm(places[:2] - places[3], axis=1).argmin())
+    assert [(link["from"], link["to"]) for link in header["links"]] == [(0, 2), *sorted([(near, 3), (2, 0)]), (3, near)]
+    for link in header["links"]:
+        if 3 in (link["from"], link["to"]):
+            right, _, ahead = level.T @ (places[link["to"]] - places[link["from"]])
+            assert math.cos(link["yaw"] - math.atan2(right, ahead)) == pytest.approx(1, abs=1e-6) and link["mark"]
+
+
 def test_a_rough_storey_has_no_dolls_house(flat: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     views = torch.unique(flat.gaussians.views).tolist()
     monkeypatch.setattr(doll_house, "_is_clear", lambda inside, views: 2 not in views)
@@ -152,7 +167,7 @@ def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: 
     assert distances[0, 0] < 1e-3 and distances[-1, 0] < 1e-3, "it ends where it begins"
     assert np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1).max() < 1.05 / header["routeRate"], "1 m/s"
     assert header["start"]["position"] == pytest.approx(route[0, :3], abs=1e-3)
-    assert header["start"]["yaw"] == pytest.approx(route[0, 3], abs=1e-3)
+    assert header["start"]["yaw"] == pytest.approx(header["spots"][0]["ahead"], abs=1e-3), "not along the first flight"
 
 
 def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scene, tmp_path: Path) -> None:
