@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -49,14 +49,17 @@ class VideoFile:
     def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
         """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order."""
         numbers = sorted(set(frames))
-        if numbers and not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
+        if not numbers:
+            return {}
+        if not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
             raise InputError(
                 f"{self.path}: needed frames 0 to {len(self.stamps) - 1}, got {numbers[0]} to {numbers[-1]}."
             )
         found: dict[int, NDArray[np.uint8]] = {}
         with _open_container(self.path) as container:
             container.streams.video[0].thread_type = "AUTO"
-            for group in _group_near_frames(numbers):
+            gaps = np.flatnonzero(np.diff(numbers) > _MAX_SKIP)
+            for group in (part.tolist() for part in np.split(numbers, gaps + 1)):
                 found |= self._decode(container, group, self.stamps[group[0]])
                 missing = [frame for frame in group if frame not in found]
                 if missing:  # key frames of some files are wrong: decode from the start
@@ -120,18 +123,6 @@ def _open_container(path: Path) -> Any:
         return av.open(str(path))
     except (OSError, FFmpegError) as error:
         raise InputError(f"{path}: needed a readable video file, got '{error}'; check it.") from error
-
-
-def _group_near_frames(frames: Sequence[int]) -> Iterator[list[int]]:
-    """Split sorted frame numbers where consecutive ones are more than `_MAX_SKIP` apart."""
-    group: list[int] = []
-    for frame in frames:
-        if group and frame - group[-1] > _MAX_SKIP:
-            yield group
-            group = []
-        group.append(frame)
-    if group:
-        yield group
 
 
 def write_video(

@@ -370,8 +370,7 @@ def single_view_pairs(
 
 def list_names(files: Sequence[Path]) -> str:
     """The names of files, for notes; of many the first ones."""
-    names = ", ".join(file.name for file in files[:_MAX_NAMES])
-    return names if len(files) <= _MAX_NAMES else f"{names} and {len(files) - _MAX_NAMES} more"
+    return list_first([file.name for file in files], _MAX_NAMES)
 
 
 def find_mask(image: Path, folder: Path) -> Path | None:

@@ -40,13 +40,11 @@ def judge_edges(
         edges: pairs of panoramas; those with another panorama are left out.
     """
     inside, surfaces, centers = locate_ends(scene, panoramas, edges)
-    return {(a, b): _predict(surfaces[a], surfaces[b], centers[b] - centers[a]) for a, b in inside}
-
-
-def _predict(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "m 3"], way: Float[np.ndarray, "3"]) -> float:
-    """The expected LPIPS; `first` and `second` are relative to their cameras."""
-    disagreement, nearest = measure_way(first, second, way)
-    return _CONSTANT + _DISAGREEMENT * disagreement + _NEARNESS * nearest
+    errors = {}
+    for a, b in inside:
+        disagreement, nearest = measure_way(surfaces[a], surfaces[b], centers[b] - centers[a])
+        errors[a, b] = _CONSTANT + _DISAGREEMENT * disagreement + _NEARNESS * nearest
+    return errors
 
 
 def measure_way(

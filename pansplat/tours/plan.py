@@ -198,9 +198,8 @@ def _look(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], height: floa
         found = trace_floor(places)
         if found is None:
             return None
-        walls = np.repeat(found[0], _RAYS // len(found[0]), axis=0)
-        angles = _ray_angles()
-        walls = np.linalg.norm(walls, axis=1)[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1)
+        reach = np.repeat(np.linalg.norm(found[0], axis=1), _RAYS // len(found[0]))
+        walls = reach[:, None] * _rays()
         return _Sight(center, walls, center + walls, low[:0])  # no wall is above the openings
     band = flat[(-down > _WALL_BAND[0] * ceiling) & (-down < _WALL_BAND[1] * ceiling)]
     band = band[np.linalg.norm(band, axis=1) > _LEAST_DISTANCE * height]
@@ -220,17 +219,13 @@ def _rays() -> Float[np.ndarray, "ray 2"]:
     return np.stack((np.sin(angles), np.cos(angles)), axis=1)
 
 
-def _sectors(places: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """The ray next to each place."""
-    return ((np.arctan2(places[:, 0], places[:, 1]) / (2 * math.pi) % 1.0) * _RAYS).astype(int) % _RAYS
-
-
 def _measure_reach(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "ray"]:
     """Distance around each ray of the surface that most places show; NaN where there are fewer than three.
 
     It is the median of those near the median of all, so that a beam in front or an opening does not move it.
     """
-    sector, distance = _sectors(places), np.linalg.norm(places, axis=1)
+    turns, distance = np.arctan2(places[:, 0], places[:, 1]) / (2 * math.pi), np.linalg.norm(places, axis=1)
+    sector = (turns % 1.0 * _RAYS).astype(int) % _RAYS
     beside = np.concatenate([sector + shift for shift in range(-_BESIDE, _BESIDE + 1)]) % _RAYS
     order = np.argsort(beside, kind="stable")
     ordered = np.tile(distance, 2 * _BESIDE + 1)[order]
@@ -351,7 +346,7 @@ def _is_along(outline: Outline, lines: _Lines, unit: float) -> bool:
 
 def _choose_piece(shape: shapely.Geometry, center: Float[np.ndarray, "2"]) -> Polygon | None:
     """The polygon of a shape that is at a camera; None without one."""
-    pieces = [piece for piece in getattr(shape, "geoms", [shape]) if isinstance(piece, Polygon) and piece.area > 0]
+    pieces = [piece for piece in shapely.get_parts(shape) if isinstance(piece, Polygon) and piece.area > 0]
     place = shapely.Point(center)
     return min(pieces, key=lambda piece: piece.distance(place), default=None)
 
@@ -461,9 +456,10 @@ def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
     for sign in (-1, 1):  # first spikes, then slots
         shape = shape.buffer(sign * narrow, join_style="mitre").buffer(-sign * narrow, join_style="mitre")
     # The start of a ring may be in the middle of a wall, where `simplify` keeps it.
-    pieces = [piece for piece in getattr(shape, "geoms", [shape]) if isinstance(piece, Polygon) and not piece.is_empty]
     rings = []
-    for piece in pieces:
+    for piece in shapely.get_parts(shape):
+        if piece.is_empty:
+            continue
         corners = np.array(piece.exterior.simplify(_COLLINEAR * unit).coords)[:-1]
         turned = np.roll(corners, -1, axis=0)
         rings.append(Polygon(np.array(Polygon(turned).exterior.simplify(_COLLINEAR * unit).coords)))
@@ -478,7 +474,7 @@ def _separate(
     centers = [shapely.MultiPoint([sights[node].center for node in nodes]) for nodes, _ in shapes]
     for a, b in itertools.combinations(range(len(shapes)), 2):
         common = result[a].intersection(result[b])
-        for piece in getattr(common, "geoms", [common]):
+        for piece in shapely.get_parts(common):
             if piece.area == 0:
                 continue
             place = piece.representative_point()
