@@ -78,8 +78,8 @@ def make_mesh(
     parts = []
     for view, (depth, pose) in enumerate(zip(depths, poses.cpu(), strict=True)):
         places = depth[..., None] * pixel_directions(*size, dtype=torch.float64)
-        corners = _connect(places.numpy(), _join_at_pole(places, 0), _join_at_pole(places, -1))
         points = torch.cat((places.reshape(-1, 3), _join_at_pole(places, 0)[None], _join_at_pole(places, -1)[None]))
+        corners = _connect(points.numpy(), rows)
         points = points @ pose[:3, :3].T + pose[:3, 3]
         is_free = ~_are_seen_nearer(points, view, poses.cpu(), reaches).numpy()
         numbers = _find_points(corners, rows)
@@ -114,14 +114,13 @@ def _find_points(corners: Int[np.ndarray, "*shape"], rows: int) -> Int[np.ndarra
     return np.where(corners < first_pole, grid, rows * columns + (corners - first_pole) // columns)
 
 
-def _connect(places: Float[np.ndarray, "row column 3"], *poles: Float[Tensor, "3"]) -> Int[np.ndarray, "triangle 3"]:
+def _connect(points: Float[np.ndarray, "n 3"], rows: int) -> Int[np.ndarray, "triangle 3"]:
     """The triangles of a panorama's surfaces: its vertices, seen from the camera; see `_find_points`."""
-    rows, columns, _ = places.shape
+    columns = 2 * rows
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     upper = row * (columns + 1) + column
     lower = upper + columns + 1
     quads = np.stack((upper, upper + 1, lower, lower + 1), axis=-1).reshape(-1, 4)
-    points = np.concatenate([places.reshape(-1, 3), *(pole.numpy()[None] for pole in poles)])
     # The shorter diagonal follows the edge of a surface.
     ends = points[_find_points(quads, rows)]
     is_falling = np.linalg.norm(ends[:, 0] - ends[:, 3], axis=1) <= np.linalg.norm(ends[:, 1] - ends[:, 2], axis=1)

@@ -5,6 +5,7 @@ Imports no OpenGL: the film and the window use the same objects.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -70,7 +71,7 @@ class TourScenes:
             merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
             max_views: of the predictor (`TourGraph.choose_predictions`).
         """
-        self.tour, self._merged, self._max_views = tour, merged, max_views
+        self.tour = tour
         self._graphs = [tour]  # also those before poor edges and walls were found, which pending entries have
         self.edge: Edge = next(iter(tour.overlaps))
         self._is_placed = False  # whether the camera has been at the edge
@@ -143,11 +144,11 @@ class TourScenes:
 
     def copy(self) -> TourScenes:
         """A copy with the scenes that are in memory, for a film in another thread."""
-        memory = self._budget / 2**30
-        scenes = TourScenes(self.tour, memory=memory, merged=self._merged, max_views=self._max_views)
-        scenes._views, scenes._providers = self._views, self._providers
-        scenes._sources, scenes._predictions = self._sources, self._predictions
-        scenes._loaded = self._loaded.copy()
+        scenes = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, (dict, list, set)):
+                setattr(scenes, name, value.copy())
+        scenes._is_placed = False
         return scenes
 
     @property
