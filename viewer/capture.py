@@ -21,7 +21,9 @@ from pansplat.images.image_files import write_image
 from pansplat.images.video import VIDEO_SUFFIXES, write_video
 from pansplat.inputs.pairs import Pair
 from pansplat.rendering.image_planes import ImagePlane, image_planes
-from pansplat.tours import FADE_SECONDS, Route, TourGraph, paint_floor_plan
+from pansplat.tours.floor import paint_floor_plan
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.route import FADE_SECONDS, Route
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.stereo import ImageFormat, render_image
 from pansplat_viewer.scene import camera as cameras

@@ -106,7 +106,8 @@ class _Mesh:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
         from pansplat.export.mesh_files import name_mesh_files, save_mesh
-        from pansplat.tours import find_rooms, make_graph, select_views
+        from pansplat.tours.doll_house import find_rooms
+        from pansplat.tours.graph import make_graph, select_views
 
         require_replaceable("--out", name_mesh_files(export.out, 1), export.overwrite)  # before the prediction
         scene, changes, photographs = export.open()

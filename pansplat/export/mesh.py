@@ -51,7 +51,7 @@ def make_mesh(
         scene: with input cameras; of a joint scene all Gaussians are drawn for each.
         triangles: largest number; bounds the rows of the panoramas, of which there are at most 512.
         textures: by default the images of the views' Gaussians at their cameras.
-        inside: chooses the places of a triangle's corners (`pansplat.tours.find_rooms`); by default all.
+        inside: chooses the places of a triangle's corners (`pansplat.tours.doll_house.find_rooms`); by default all.
     """
     count = len(scene.cam2world)
     if not count:

@@ -30,7 +30,7 @@ from pansplat.images.masks import mask_holes
 from pansplat.inputs.pairs import Pair
 from pansplat.predictor import Progress
 from pansplat.system.files import SOFTWARE
-from pansplat.tours import TourGraph, make_graph, select_views
+from pansplat.tours.graph import TourGraph, make_graph, select_views
 
 MIN_HEIGHT = 1024  # of a photograph in a page, pixels, unless it is smaller
 MAX_HEIGHT = 4096  # of a photograph in a folder

@@ -1,5 +1,5 @@
 // Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of the methods of
-// pansplat.tours.TourGraph that they name; tests/web/test_browser.py compares them.
+// pansplat.tours.graph.TourGraph that they name; tests/web/test_browser.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
 // on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; and the `reach` around a part,

@@ -7,8 +7,7 @@ import pytest
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import find_poor_edges
-from pansplat.tours.edges import judge_edges, measure_way
+from pansplat.tours.edges import find_poor_edges, judge_edges, measure_way
 from pansplat.tours.surfaces import locate_surfaces
 
 

@@ -7,7 +7,7 @@ import torch
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.tours import find_walls
+from pansplat.tours.walls import find_walls
 
 
 @pytest.mark.parametrize(

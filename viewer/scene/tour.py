@@ -16,21 +16,10 @@ import torch
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.tours import (
-    EDGE_HYSTERESIS,
-    FADE_SECONDS,
-    MAX_SCENE_VIEWS,
-    STOP_SECONDS,
-    Edge,
-    FloorOutline,
-    Route,
-    TourGraph,
-    ViewNumbers,
-    choose_camera_height,
-    find_link_ring,
-    plan_route,
-    select_views,
-)
+from pansplat.tours.floor import FloorOutline, choose_camera_height
+from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
+from pansplat.tours.links import find_link_ring
+from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
