@@ -470,7 +470,8 @@ def read_trajectory_folder(folder: Path, convention: str | None = None) -> Colle
     expected = source.suffix.lower().lstrip(".")
     if expected == "txt":
         expected = next((kind for kind in ("kitti", "tum") if kind in source.stem.lower()), None)
-    trajectory = read_trajectory(source, convention, expected)
+    scale = read_number(folder / "scale.txt") if (folder / "scale.txt").is_file() else 1.0
+    trajectory = read_trajectory(source, convention, expected, scale)
     images: list[Path] = []
     for sub in _IMAGE_FOLDERS:
         images = images or (list_panorama_files(folder / sub) if (folder / sub).is_dir() else [])
@@ -480,9 +481,8 @@ def read_trajectory_folder(folder: Path, convention: str | None = None) -> Colle
             f"{trajectory.kind.upper()} poses; keep only the images that were tracked, in order, or "
             "use poses.json."
         )
-    scale = read_number(folder / "scale.txt") if (folder / "scale.txt").is_file() else 1.0
     panoramas = tuple(
         Panorama(image.stem, image, pose, find_mask(image, folder))
-        for image, pose in zip(images, trajectory.scaled_poses(scale), strict=True)
+        for image, pose in zip(images, trajectory.poses, strict=True)
     )
     return Collection(source, panoramas, ordered=True, far=FAR_SEQUENCE)

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,25 +35,16 @@ _RIGID_TOLERANCE = 1e-2  # for files with 4 to 6 decimals; errors of wrong matri
 _OPENGL_TO_OPENCV = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
 
 
-@dataclass(frozen=True)
-class Trajectory:
+class Trajectory(NamedTuple):
     """Poses of a trajectory file.
 
     Attributes:
         kind: "kitti" or "tum".
-        poses: in file order; cam2world, OpenCV axes, in the unit of the file.
+        poses: in file order; cam2world, OpenCV axes, metres.
     """
 
     kind: str
     poses: tuple[Float[Tensor, "4 4"], ...]
-
-    def scaled_poses(self, scale: float) -> tuple[Float[Tensor, "4 4"], ...]:
-        """The poses with their translations multiplied by `scale`."""
-        scaled = []
-        for pose in self.poses:
-            scaled.append(pose.clone())
-            scaled[-1][:3, 3] *= scale
-        return tuple(scaled)
 
 
 def parse_convention(text: str | None, source: Path | str) -> str:
@@ -162,7 +152,9 @@ def read_number(path: Path) -> float:
     return number
 
 
-def read_trajectory(path: Path, convention: str | None = None, expected: str | None = None) -> Trajectory:
+def read_trajectory(
+    path: Path, convention: str | None = None, expected: str | None = None, scale: float = 1.0
+) -> Trajectory:
     """Poses of a KITTI (12 numbers per line) or TUM (8 numbers per line) trajectory file.
 
     KITTI: rows of a 3x4 matrix. TUM: timestamp tx ty tz qx qy qz qw. Both are cam2world with OpenCV axes by default.
@@ -172,6 +164,7 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
         path: text file; numbers separated by spaces or commas.
         convention: one of `CONVENTIONS`; overrides the default.
         expected: "kitti" or "tum" to refuse the other format; None to accept both.
+        scale: metres per unit of the file.
     """
     convention = "cam2world opencv" if convention is None else parse_convention(convention, "`convention`")
     rows = _number_rows(path)
@@ -198,7 +191,9 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
         )
     lines, numbers = [line for line, _ in rows], torch.from_numpy(np.array([row for _, row in rows], np.float64))
     matrices = _kitti_matrices(numbers) if kind == "kitti" else _tum_matrices(numbers, lines, path)
-    return Trajectory(kind, tuple(to_cam2world(_rigid_matrices(matrices, lines, path), convention).unbind()))
+    cam2world = to_cam2world(_rigid_matrices(matrices, lines, path), convention)
+    cam2world[:, :3, 3] *= scale
+    return Trajectory(kind, cam2world.unbind())
 
 
 def _rigid_matrices(matrices: Float[Tensor, "n 4 4"], lines: list[int], path: Path) -> Float[Tensor, "n 4 4"]:

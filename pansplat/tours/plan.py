@@ -24,7 +24,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.system.components import label_components
 from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, trace_floor
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import locate_surfaces
+from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
 
 _RAYS = 360
 _SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it
@@ -224,16 +224,11 @@ def _measure_reach(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "ray"]
 
     It is the median of those near the median of all, so that a beam in front or an opening does not move it.
     """
-    turns, distance = np.arctan2(places[:, 0], places[:, 1]) / (2 * math.pi), np.linalg.norm(places, axis=1)
-    sector = (turns % 1.0 * _RAYS).astype(int) % _RAYS
-    beside = np.concatenate([sector + shift for shift in range(-_BESIDE, _BESIDE + 1)]) % _RAYS
-    order = np.argsort(beside, kind="stable")
-    ordered = np.tile(distance, 2 * _BESIDE + 1)[order]
-    borders = np.searchsorted(beside[order], np.arange(_RAYS + 1))
+    distances = split_by_azimuth(places, np.linalg.norm(places, axis=1), _RAYS)
     reach = np.full(_RAYS, np.nan)
-    for ray, (first, last) in enumerate(itertools.pairwise(borders.tolist())):
-        if last - first > 2:
-            found = ordered[first:last]
+    for ray in range(_RAYS):
+        found = np.concatenate([distances[(ray + shift) % _RAYS] for shift in range(-_BESIDE, _BESIDE + 1)])
+        if len(found) > 2:
             level = np.quantile(found, 0.5, method="lower")
             reach[ray] = np.median(found[np.abs(found - level) <= _SURFACE * level])
     return reach
