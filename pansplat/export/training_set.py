@@ -10,16 +10,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
 from pansplat.geometry.cubemap import FACES, face_poses, face_rotations
 from pansplat.geometry.equirect import pad_equirect, uv_from_directions
-from pansplat.images.image_files import read_height, read_mask, read_panorama, write_image
-from pansplat.images.masks import scene_mask_of_files
+from pansplat.images.image_files import read_height, read_panorama, write_image
 from pansplat.images.rig_images import Lens
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.pairs import Panorama, read_scene_mask
 from pansplat.inputs.reconstructions.colmap import write_colmap
 from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
 
@@ -58,7 +57,9 @@ def write_dataset(
     sparse = folder / "sparse" / "0"
     for sub in (folder / "images", sparse):
         sub.mkdir(parents=True)
-    masks = [_find_mask(view, siblings) for view in views]
+    masks = [
+        read_panorama(view.image, _MASK_HEIGHT)[1] & read_scene_mask(view, siblings, _MASK_HEIGHT) for view in views
+    ]
     has_masks = not all(bool(mask.all()) for mask in masks)
     if has_masks:
         (folder / "masks").mkdir()
@@ -87,14 +88,6 @@ def write_dataset(
     write_nerfstudio(folder / "transforms.json", shots, POINTS if len(points) else None)
     (folder / "scale.txt").write_text("1\n", "utf-8")  # metres per unit
     return len(shots)
-
-
-def _find_mask(view: Panorama, siblings: tuple[Path, ...]) -> Bool[Tensor, "height width"]:
-    """Where the panorama shows the scene, as predictions see it."""
-    opaque = read_panorama(view.image, _MASK_HEIGHT)[1]
-    if view.mask is not None:
-        return opaque & read_mask(view.mask, _MASK_HEIGHT)
-    return opaque & scene_mask_of_files(siblings, _MASK_HEIGHT)
 
 
 def cut_faces(image: Float[Tensor, "3 height width"], size: int) -> Iterator[Float[Array, "size size 3"]]:

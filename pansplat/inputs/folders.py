@@ -75,6 +75,7 @@ def load_pairs(
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
     """
     root = expand_home(path)
+    convention = None if convention is None else parse_convention(convention, "`convention`")
     try:
         pairs = _load_pairs(root, convention, near, far)
     except UnposedPanoramasError as error:
@@ -300,8 +301,7 @@ def _find_collections(folder: Path, depth: int, exports: bool, convention: str |
     if find_trajectory(folder) is not None:
         return [(folder, read_trajectory_folder(folder, convention))]
     if (source := find_reconstruction(folder)) is not None:
-        given = None if convention is None else parse_convention(convention, "`convention`")
-        found = read_reconstruction(source, folder, given)
+        found = read_reconstruction(source, folder, convention)
         is_joined = any(len(list_pictures(view.image)) > 1 for view in found.panoramas)
         return [(folder, found if is_joined else with_further(found))]
     if find_web_tour(folder) is not None:

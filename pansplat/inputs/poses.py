@@ -166,7 +166,6 @@ def read_trajectory(
         expected: "kitti" or "tum" to refuse the other format; None to accept both.
         scale: metres per unit of the file.
     """
-    convention = "cam2world opencv" if convention is None else parse_convention(convention, "`convention`")
     rows = _number_rows(path)
     if not rows:
         raise InputError(f"{path}: needed one pose per line, got an empty file; export the trajectory again.")
@@ -191,7 +190,7 @@ def read_trajectory(
         )
     lines, numbers = [line for line, _ in rows], torch.from_numpy(np.array([row for _, row in rows], np.float64))
     matrices = _kitti_matrices(numbers) if kind == "kitti" else _tum_matrices(numbers, lines, path)
-    cam2world = to_cam2world(_rigid_matrices(matrices, lines, path), convention)
+    cam2world = to_cam2world(_rigid_matrices(matrices, lines, path), convention or "cam2world opencv")
     cam2world[:, :3, 3] *= scale
     return Trajectory(kind, cam2world.unbind())
 

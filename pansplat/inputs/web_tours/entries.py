@@ -223,15 +223,18 @@ def make_panoramas(entries: Sequence[Entry], source: Path, tour: str) -> list[Pa
         kept.append((name, entry))
     panoramas = []
     for name, entry in kept:
-        image = entry.picture if isinstance(entry.picture, Path) else write_cube(entry.picture, folder, name)
-        mask = find_mask(image, folder)
-        pose = torch.eye(4, dtype=torch.float64)
         title = "" if entry.title == name else entry.title
         links = resolve_links(entry.links, names, name, source)
         notes = tuple(note for note in entry.notes if note.text or note.addresses)
         about = {"title": title, "links": links, "notes": notes, "tour": tour, "start": entry.start}
-        panoramas.append(Panorama(name, image, pose, mask, **about))
+        panoramas.append(replace(make_panorama(name, entry.picture, folder), **about))
     return panoramas
+
+
+def make_panorama(name: str, picture: Path | CubeImage, folder: Path) -> Panorama:
+    """A panorama without a pose; cube faces get a file in the cache folder."""
+    image = picture if isinstance(picture, Path) else write_cube(picture, folder, name)
+    return Panorama(name, image, torch.eye(4, dtype=torch.float64), find_mask(image, folder))
 
 
 def resolve_links(links: Sequence[Link], names: Mapping[str, str], own: str, source: Path) -> tuple[Link, ...]:
