@@ -200,5 +200,5 @@ def _make_part(
     in_grid = used < first
     u = np.where(in_grid, column + 0.5, around + 1.0) / columns
     v = np.where(in_grid, (row + 0.5) / rows, (used - first) // columns)
-    positions = points[_find_points(used[:, None], rows)[:, 0]]
+    positions = points[_find_points(used, rows)]
     return MeshPart(name, positions, np.stack((u, v), axis=1), triangles.reshape(-1, 3), texture)

@@ -300,7 +300,7 @@ def _find_lines(sights: Sequence[_Sight], normals: Float[np.ndarray, "direction 
             first, last = (np.searchsorted(offsets, offsets + sign * _CLUSTER * unit) for sign in (-1, 1))
             near = sums[last] - sums[first]
             best = int(near.argmax())
-            if near[best] < _LEAST_WALL * unit * len({id(s) for s in sights}) ** 0.5:
+            if near[best] < _LEAST_WALL * unit * len(sights) ** 0.5:
                 break
             a, b = first[best], last[best]
             middle = np.searchsorted(sums[a : b + 1], (sums[a] + sums[b]) / 2)

@@ -240,12 +240,11 @@ def _load_tour_scene(
     The first scene of a window is not refined if it is predicted again with the rest of its part.
     """
     from pansplat import pipeline
-    from pansplat.tours.edges import find_poor_edges
+    from pansplat.tours.edges import find_poor_edges, find_walls
     from pansplat.tours.floor import find_floor_outlines
     from pansplat.tours.graph import select_views
     from pansplat.tours.outlook import measure_outlook
     from pansplat.tours.overlap import connect
-    from pansplat.tours.walls import find_walls
 
     tour, views, merged, prediction = entry.tour, entry.views, entry.merged, options.prediction
     assert tour is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import glob
 import itertools
 import re
 import warnings
@@ -101,15 +102,11 @@ def find_picture(folder: Path, name: str, *more: Path) -> Path | None:
         if found is not None:
             return found
     for base in bases:  # a label without a suffix
-        found = sorted(base.glob(f"{_escape(last)}.*")) if last and base.is_dir() else []
+        found = sorted(base.glob(f"{glob.escape(last)}.*")) if last and base.is_dir() else []
         pictures = [file for file in found if file.suffix.lower() in READABLE_SUFFIXES and file.is_file()]
         if pictures:
             return pictures[0]
     return None
-
-
-def _escape(text: str) -> str:
-    return re.sub(r"([*?\[])", r"[\1]", text)
 
 
 def make_collection(found: Reconstruction) -> Collection:

@@ -108,9 +108,7 @@ def _find_configuration(source: Path) -> dict[str, Any] | None:
     text = read_text(source)
     if source.suffix.lower() == ".json":
         start = len(text) - len(text.lstrip())
-        if not text[start:].startswith("{") or not any(
-            f'"{key}"' in text or key in text for key in ("scenes", *_PICTURES)
-        ):
+        if not text.startswith("{", start) or not any(key in text for key in ("scenes", *_PICTURES)):
             return None
         return _accept(parse_literal(text, start, source)[0])
     for literal in _list_arguments(text, source):
