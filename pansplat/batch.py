@@ -304,7 +304,7 @@ def _process_unit(
             scene = merge_scenes(tour, lambda views: readers[views](), max_views)
         if options.suffix == ".html":
             from pansplat.export.page import write_page
-            from pansplat.export.page_photographs import list_photographs
+            from pansplat.export.photographs import list_photographs
 
             count, title = int(_count_of_page(options)), name.replace("_", " ")
             photographs = list_photographs(tour or pairs[0], range(len(scene.cam2world)))

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from pansplat.export.film import FilmPhotographs
-from pansplat.export.page_photographs import list_photographs
+from pansplat.export.photographs import list_photographs
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses

@@ -393,7 +393,7 @@ class Export(Writer):
             gaussians: of a page; see `pansplat.predict_tour`.
         """
         from pansplat import pipeline
-        from pansplat.export.page_photographs import list_photographs
+        from pansplat.export.photographs import list_photographs
         from pansplat.refinement import fuse_views
 
         if not is_scene_file(self.path):

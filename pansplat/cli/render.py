@@ -78,7 +78,7 @@ class Render(Writer):
 
         from pansplat import pipeline
         from pansplat.export.film import FilmPhotographs
-        from pansplat.export.page_photographs import list_photographs
+        from pansplat.export.photographs import list_photographs
         from pansplat.images.image_files import write_depth, write_image
         from pansplat.images.video import write_video
 

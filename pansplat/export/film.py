@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.export.page_photographs import load_photograph
+from pansplat.export.photographs import load_photograph
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.inputs.pairs import Pair
 from pansplat.rendering.image_planes import ImagePlane

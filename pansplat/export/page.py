@@ -35,7 +35,7 @@ from pansplat import constants, pipeline
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.film import FilmPhotographs
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
-from pansplat.export.page_photographs import PackedPhotograph, pack_photographs
+from pansplat.export.photographs import PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Pair

@@ -1,4 +1,5 @@
-"""Photographs of a page: cube tiles of two or three sizes, which the page shows where a camera stands at a panorama.
+"""Photographs in pages and films, which show them where a camera stands at a panorama; for pages cube tiles of two or
+three sizes.
 
 What masks hide is replaced before anything is encoded: blur masks by the reading of every panorama, scene masks by what
 the Gaussians show there. The tiles are encoded from pixels, so that no metadata of a file is in them.
