@@ -107,22 +107,19 @@ def _describe_error(matrix: Float[Tensor, "4 4"], error: float) -> str:
             f"a mirrored one (determinant {determinant:.3f}): one axis is flipped or two axes are "
             "exchanged; flip one axis so that the system is right-handed."
         )
-    if scale > 0 and orthonormal_error(_with_rotation(matrix, rotation / scale)) <= _RIGID_TOLERANCE:
+    unscaled = matrix.clone()
+    unscaled[:3, :3] /= scale
+    if scale > 0 and orthonormal_error(unscaled) <= _RIGID_TOLERANCE:
         return f"a rotation scaled by {scale:.4g}; divide its 3x3 part by this number."
     return f"a 3x3 part that is no rotation (R R' differs from 1 by {error:.3g}); check the order of the numbers."
 
 
-def _with_rotation(matrix: Float[Tensor, "4 4"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-    changed = matrix.clone()
-    changed[:3, :3] = rotation
-    return changed
-
-
-def _nearest_rigid(matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """The matrix with its 3x3 part replaced by the nearest rotation; removes the rounding errors of files."""
-    u, _, vt = torch.linalg.svd(matrix[:3, :3])
-    rigid = _with_rotation(matrix, u @ vt)
-    rigid[3] = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
+def _nearest_rigid(matrices: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """The matrices with their 3x3 parts replaced by the nearest rotations; removes the rounding errors of files."""
+    u, _, vt = torch.linalg.svd(matrices[..., :3, :3])
+    rigid = matrices.clone()
+    rigid[..., :3, :3] = u @ vt
+    rigid[..., 3, :] = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
     return rigid
 
 
@@ -204,9 +201,7 @@ def _rigid_matrices(matrices: Float[Tensor, "n 4 4"], lines: list[int], path: Pa
     for index in suspect.nonzero()[:1, 0].tolist():
         rigid_matrix(matrices[index].tolist(), f"{path}, line {lines[index]}")
     inexact = error > _EXACT
-    if inexact.any():
-        u, _, vt = torch.linalg.svd(rotations[inexact])
-        matrices[inexact, :3, :3] = u @ vt
+    matrices[inexact] = _nearest_rigid(matrices[inexact])
     return matrices
 
 
