@@ -130,7 +130,6 @@ def write_video(
     frames: Iterable[NDArray[np.uint8]],
     fps: float,
     *,
-    quality: int = 18,
     panorama: bool | Projection = False,
     stereo: Stereo = "mono",
 ) -> int:
@@ -142,7 +141,6 @@ def write_video(
         path: file to write, ending in .mp4 or .webm.
         frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
         fps: frames per second.
-        quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
         panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
             players then show an .mp4 as 360 degrees. A .webm has no such mark.
         stereo: arrangement of the eyes in a panorama's frame.
@@ -165,7 +163,7 @@ def write_video(
                 pixels = _check_frame(path, frame, count, None if stream is None else (stream.height, stream.width))
                 if stream is None:
                     encoder = video_encoder(path.suffix.lower())
-                    stream = _add_stream(container, encoder, pixels.shape[1], pixels.shape[0], fps, quality)
+                    stream = _add_stream(container, encoder, pixels.shape[1], pixels.shape[0], fps)
                 video_frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 for packet in stream.encode(video_frame.reformat(format="yuv420p", dst_colorspace="ITU709")):
                     container.mux(packet)
@@ -196,15 +194,15 @@ def video_encoder(suffix: str = ".mp4") -> str:
     raise InputError(f"needed PyAV with one of the encoders {_ENCODERS[suffix]}, got none of them; reinstall `av`.")
 
 
-def _add_stream(container: Any, encoder: str, width: int, height: int, fps: float, quality: int) -> Any:
+def _add_stream(container: Any, encoder: str, width: int, height: int, fps: float) -> Any:
     stream = container.add_stream(encoder, rate=Fraction(fps).limit_denominator(1001))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     if encoder == "libx264":
-        stream.options = {"crf": str(quality), "preset": "medium"}
+        stream.options = {"crf": "18", "preset": "medium"}
     elif encoder == "libvpx-vp9":
-        stream.options = {"crf": str(quality + 6), "b": "0", "row-mt": "1", "cpu-used": "4"}  # crf is 0 to 63
+        stream.options = {"crf": "24", "b": "0", "row-mt": "1", "cpu-used": "4"}  # crf is 0 to 63
     elif encoder == "libsvtav1":
-        stream.options = {"crf": str(quality + 10), "preset": "8"}  # crf is 0 to 63
+        stream.options = {"crf": "28", "preset": "8"}  # crf is 0 to 63
     else:
         stream.bit_rate = int(width * height * fps * 0.2)
     # BT.709, limited range. Without these tags players guess the colour space from the size, and colours shift.
