@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta, Struct
 
-from pansplat import __version__, pipeline, tours
+from pansplat import __version__, pipeline
 from pansplat.errors import InputError, InputWarning, collect_notes
 from pansplat.export.plan_files import write_picture
 from pansplat.gaussians.scene import Scene
@@ -42,7 +42,8 @@ from pansplat.system.atomic import replacing
 from pansplat.system.console import is_out_of_memory
 from pansplat.system.files import SCENE_SUFFIXES, expand_home, is_portable_name, read_file
 from pansplat.system.strict_json import read_json
-from pansplat.tours import TourGraph, find_tours, merge_scenes
+from pansplat.tours.graph import TourGraph, find_tours, merge_scenes
+from pansplat.tours.overlap import connect
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
@@ -264,7 +265,7 @@ def _connect(tour: TourGraph, outputs: _Outputs) -> TourGraph:
     key = _join_hash(_LAYOUT, "graph", [panoramas, tour.near, tour.far, list(tour.overlaps)])
 
     def write(path: Path) -> None:
-        overlaps = tours.connect(tour).list_overlaps()
+        overlaps = connect(tour).list_overlaps()
         with replacing(path) as temporary:
             temporary.write_text(json.dumps({"overlaps": overlaps}), "utf-8")
 
@@ -303,7 +304,7 @@ def _process_unit(
             scene = merge_scenes(tour, lambda views: readers[views](), max_views)
         if options.suffix == ".html":
             from pansplat.export.page import write_page
-            from pansplat.export.page_photographs import list_photographs
+            from pansplat.export.photographs import list_photographs
 
             count, title = int(_count_of_page(options)), name.replace("_", " ")
             photographs = list_photographs(tour or pairs[0], range(len(scene.cam2world)))

@@ -50,16 +50,16 @@ from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import expand_home, find_scene_suffix
 from pansplat.system.options import MIN_HEIGHT
-from pansplat.tours import (
+from pansplat.tours.graph import (
     MAX_SCENE_VIEWS,
     TourGraph,
-    connect,
     find_tours,
     list_starts,
     make_graph,
     merge_scenes,
     select_views,
 )
+from pansplat.tours.overlap import connect
 
 __all__ = [
     "estimate_poses",
@@ -514,7 +514,7 @@ def predict_tour(
     predicted by `default`, with a warning, if the model needs two or more views.
 
     Args:
-        tour: of `pansplat.tours.connect`, or the path of a folder that holds the panoramas of one tour.
+        tour: of `pansplat.tours.overlap.connect`, or the path of a folder that holds the panoramas of one tour.
         model, progress, compat, precision, refine_seconds, cache: see `predict`; the time limit is that of three
             panoramas.
         height: panoramas are resized to (height, 2 height); by default that of the photographs, at most 512.

@@ -148,7 +148,7 @@ bool set_footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2)
     return true;
 }
 
-// Whether the camera sees a Gaussian from the other side than the camera of its view: pansplat.tours.find_fronts.
+// Whether the camera sees a Gaussian from the other side than the camera of its view: find_fronts of pansplat.tours.doll_house.
 bool is_back(Gaussian gaussian, vec3 offset) {
     vec3 seen = gaussian.mean - texelFetch(cameras, ivec2(gaussian.view, 0), 0).xyz, scale = abs(gaussian.scale);
     if (dot(offset, seen) < FRONT_COSINE * length(offset) * length(seen)) return true;

@@ -18,7 +18,7 @@ from typing import Any
 import psutil
 import pytest
 
-from pansplat import batch, pipeline, tours
+from pansplat import batch, pipeline
 from pansplat.batch import BatchOptions, Item, list_items, process_item
 from pansplat.cli import run
 from pansplat.cli.batch import Batch, _write_report
@@ -120,7 +120,7 @@ def test_a_tour_has_a_file_for_each_scene_and_one_page(
     assert len(predictions) == 2 and page.endswith("-house tour.html") and graph.endswith("-house tour.json")
     assert len(json.loads((out / page).read_text().split("const HEADER = ")[1].split(";\n")[0])["edges"]) == 3
     with monkeypatch.context() as patch:
-        patch.setattr(tours, "connect", None)  # the file of the graph is used
+        patch.setattr(batch, "connect", None)  # the file of the graph is used
         assert process("predict", "export").status == "skipped"
     whole = process("export", suffix=".splat")  # nothing is predicted into files
     assert whole.error is None and len(whole.outputs) == 2

@@ -34,7 +34,7 @@ from pansplat.pipeline import (
     save,
 )
 from pansplat.rendering import blend, rasterize
-from pansplat.tours import TourGraph, find_tours, select_views
+from pansplat.tours.graph import TourGraph, find_tours, select_views
 
 HEIGHT = 16
 

@@ -272,7 +272,7 @@ def _write_film(
 
     Names of scenes and files are printed as soon as they are there.
     """
-    from pansplat.tours import plan_route
+    from pansplat.tours.route import plan_route
     from pansplat_viewer.capture import Film, TourFrames, open_frames, write_flythrough, write_path_film, write_tour
     from pansplat_viewer.draw.cpu_renderer import create_renderer
     from pansplat_viewer.scene.state import create_level_camera, fit_settings

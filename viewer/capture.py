@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from pansplat.export.film import FilmPhotographs
-from pansplat.export.page_photographs import list_photographs
+from pansplat.export.photographs import list_photographs
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
@@ -21,7 +21,9 @@ from pansplat.images.image_files import write_image
 from pansplat.images.video import VIDEO_SUFFIXES, write_video
 from pansplat.inputs.pairs import Pair
 from pansplat.rendering.image_planes import ImagePlane, image_planes
-from pansplat.tours import FADE_SECONDS, Route, TourGraph, paint_floor_plan
+from pansplat.tours.floor import paint_floor_plan
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.route import FADE_SECONDS, Route
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.stereo import ImageFormat, render_image
 from pansplat_viewer.scene import camera as cameras

@@ -27,7 +27,8 @@ from pansplat.geometry.path import find_direction
 from pansplat.inputs.photographs import LINKS, write_notes
 from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import find_scene_suffix, require_replaceable
-from pansplat.tours import find_angles, list_starts, plan_route
+from pansplat.tours.graph import list_starts
+from pansplat.tours.route import find_angles, plan_route
 from pansplat_viewer.recorder import Recorder
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.background import Jobs

@@ -191,7 +191,8 @@ class Evaluate(Writer):
 
 def _leave_out_each(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
     """A pair for each panorama of the tours of a folder that has others in its part; the rest are named."""
-    from pansplat.tours import connect, find_tours
+    from pansplat.tours.graph import find_tours
+    from pansplat.tours.overlap import connect
 
     tours = find_tours(pairs)
     if not tours:

@@ -106,7 +106,8 @@ class _Mesh:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
         from pansplat.export.mesh_files import name_mesh_files, save_mesh
-        from pansplat.tours import find_rooms, make_graph, select_views
+        from pansplat.tours.doll_house import find_rooms
+        from pansplat.tours.graph import make_graph, select_views
 
         require_replaceable("--out", name_mesh_files(export.out, 1), export.overwrite)  # before the prediction
         scene, changes, photographs = export.open()
@@ -256,7 +257,7 @@ class _TrainingSet:
         """Write cube faces, poses and points to a new folder."""
         import torch
 
-        from pansplat.export.training_set import POINTS, PosedPanorama, write_dataset
+        from pansplat.export.training_set import POINTS, write_dataset
         from pansplat.gaussians.ply import make_colors, save_points
         from pansplat.gaussians.scene import prune
         from pansplat.inputs.pairs import Pair
@@ -280,13 +281,13 @@ class _TrainingSet:
             gaussians = gaussians.select(chosen.sort().values)
         panoramas = source.context if isinstance(source, Pair) else source.panoramas
         views = [
-            PosedPanorama(panorama, pose, source.siblings)
+            dataclasses.replace(panorama, cam2world=pose)
             for panorama, pose in zip(panoramas, scene.frame.globalize(scene.cam2world), strict=True)
         ]
         means = scene.frame.globalize_places(gaussians.means).cpu().numpy()
         colors = make_colors(gaussians).cpu().numpy()
         with replacing_folder(export.out) as folder, progress_bar() as progress:
-            count = write_dataset(folder, views, means, colors, progress)
+            count = write_dataset(folder, views, source.siblings, means, colors, progress)
             save_points(dataclasses.replace(scene, gaussians=gaussians).rotated(Z_UP[:3, :3]), folder / POINTS)
         print(
             f"{export.out}: {count} cube faces of {len(views)} panoramas, {len(gaussians):,} points; sparse/0 is a "
@@ -392,7 +393,7 @@ class Export(Writer):
             gaussians: of a page; see `pansplat.predict_tour`.
         """
         from pansplat import pipeline
-        from pansplat.export.page_photographs import list_photographs
+        from pansplat.export.photographs import list_photographs
         from pansplat.refinement import fuse_views
 
         if not is_scene_file(self.path):

@@ -21,7 +21,7 @@ from pansplat.system.options import Height
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.pairs import Pair
-    from pansplat.tours import TourGraph
+    from pansplat.tours.graph import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
 OptionalOut = Annotated[Path | None, arg(aliases=["-o"])]
@@ -77,7 +77,8 @@ class ScenePrediction:
             gaussians: of a page; see `pansplat.predict_tour`.
             joint: see `pansplat.predict`; predictions of networks are returned as they are.
         """
-        from pansplat.tours import connect, find_tours
+        from pansplat.tours.graph import find_tours
+        from pansplat.tours.overlap import connect
 
         pairs = load_choice(path, self.choice)
         tours = find_tours(pairs) if self.choice.pair is None else []

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pansplat.export.film import FilmPhotographs
     from pansplat.gaussians.scene import Scene
     from pansplat.predictor import Progress
-    from pansplat.tours import Route
+    from pansplat.tours.route import Route
 
     Frame = list[tuple[Tensor, float]]  # poses whose images are mixed, and their weights
 
@@ -78,7 +78,7 @@ class Render(Writer):
 
         from pansplat import pipeline
         from pansplat.export.film import FilmPhotographs
-        from pansplat.export.page_photographs import list_photographs
+        from pansplat.export.photographs import list_photographs
         from pansplat.images.image_files import write_depth, write_image
         from pansplat.images.video import write_video
 
@@ -200,7 +200,8 @@ class Render(Writer):
 
 def _plan_flight(scene: Scene) -> Route | None:
     """The flight through a tour of several parts; None for another scene. Between parts there is nothing to see."""
-    from pansplat.tours import make_graph, plan_route
+    from pansplat.tours.graph import make_graph
+    from pansplat.tours.route import plan_route
 
     if not scene.overlaps:
         return None

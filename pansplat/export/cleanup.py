@@ -25,8 +25,8 @@ from pansplat.geometry.equirect import pad_equirect, row_weights, uv_from_direct
 from pansplat.pipeline import render
 from pansplat.rendering import rasterize
 from pansplat.system.descriptions import describe_count
-from pansplat.tours import make_graph
 from pansplat.tours.floor import assign_storeys
+from pansplat.tours.graph import make_graph
 from pansplat.tours.plan import make_plan
 
 _NEIGHBOURS = 16  # of a Gaussian

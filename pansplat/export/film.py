@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.export.page_photographs import load_photograph
+from pansplat.export.photographs import load_photograph
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.inputs.pairs import Pair
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.tours import STOP_REACH, STOP_SECONDS
+from pansplat.tours.route import STOP_REACH, STOP_SECONDS
 
 _HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
 

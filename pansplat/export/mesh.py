@@ -51,7 +51,7 @@ def make_mesh(
         scene: with input cameras; of a joint scene all Gaussians are drawn for each.
         triangles: largest number; bounds the rows of the panoramas, of which there are at most 512.
         textures: by default the images of the views' Gaussians at their cameras.
-        inside: chooses the places of a triangle's corners (`pansplat.tours.find_rooms`); by default all.
+        inside: chooses the places of a triangle's corners (`pansplat.tours.doll_house.find_rooms`); by default all.
     """
     count = len(scene.cam2world)
     if not count:
@@ -78,8 +78,8 @@ def make_mesh(
     parts = []
     for view, (depth, pose) in enumerate(zip(depths, poses.cpu(), strict=True)):
         places = depth[..., None] * pixel_directions(*size, dtype=torch.float64)
-        corners = _connect(places.numpy(), _join_at_pole(places, 0), _join_at_pole(places, -1))
         points = torch.cat((places.reshape(-1, 3), _join_at_pole(places, 0)[None], _join_at_pole(places, -1)[None]))
+        corners = _connect(points.numpy(), rows)
         points = points @ pose[:3, :3].T + pose[:3, 3]
         is_free = ~_are_seen_nearer(points, view, poses.cpu(), reaches).numpy()
         numbers = _find_points(corners, rows)
@@ -114,14 +114,13 @@ def _find_points(corners: Int[np.ndarray, "*shape"], rows: int) -> Int[np.ndarra
     return np.where(corners < first_pole, grid, rows * columns + (corners - first_pole) // columns)
 
 
-def _connect(places: Float[np.ndarray, "row column 3"], *poles: Float[Tensor, "3"]) -> Int[np.ndarray, "triangle 3"]:
+def _connect(points: Float[np.ndarray, "n 3"], rows: int) -> Int[np.ndarray, "triangle 3"]:
     """The triangles of a panorama's surfaces: its vertices, seen from the camera; see `_find_points`."""
-    rows, columns, _ = places.shape
+    columns = 2 * rows
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     upper = row * (columns + 1) + column
     lower = upper + columns + 1
     quads = np.stack((upper, upper + 1, lower, lower + 1), axis=-1).reshape(-1, 4)
-    points = np.concatenate([places.reshape(-1, 3), *(pole.numpy()[None] for pole in poles)])
     # The shorter diagonal follows the edge of a surface.
     ends = points[_find_points(quads, rows)]
     is_falling = np.linalg.norm(ends[:, 0] - ends[:, 3], axis=1) <= np.linalg.norm(ends[:, 1] - ends[:, 2], axis=1)
@@ -201,5 +200,5 @@ def _make_part(
     in_grid = used < first
     u = np.where(in_grid, column + 0.5, around + 1.0) / columns
     v = np.where(in_grid, (row + 0.5) / rows, (used - first) // columns)
-    positions = points[_find_points(used[:, None], rows)[:, 0]]
+    positions = points[_find_points(used, rows)]
     return MeshPart(name, positions, np.stack((u, v), axis=1), triangles.reshape(-1, 3), texture)

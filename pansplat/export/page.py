@@ -35,7 +35,7 @@ from pansplat import constants, pipeline
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.film import FilmPhotographs
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
-from pansplat.export.page_photographs import PackedPhotograph, pack_photographs
+from pansplat.export.photographs import PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Link, Pair
@@ -48,29 +48,15 @@ from pansplat.shaders import load_shader
 from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import SOFTWARE, is_written
-from pansplat.tours import (
-    EDGE_HYSTERESIS,
-    Rooms,
-    Route,
-    TourGraph,
-    choose_camera_height,
-    choose_heading,
-    find_angles,
-    find_blank,
-    find_camera_height,
-    find_link_ring,
-    find_poor_edges,
-    find_rooms,
-    find_way_along_link,
-    is_hidden,
-    make_graph,
-    measure_box,
-    measure_outlook,
-    plan_route,
-    select_views,
-)
+from pansplat.tours.doll_house import Rooms, find_rooms, measure_box
+from pansplat.tours.edges import find_poor_edges
+from pansplat.tours.floor import choose_camera_height, find_camera_height
+from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
 from pansplat.tours.layout import REACH
+from pansplat.tours.links import find_link_ring, find_way_along_link
+from pansplat.tours.outlook import choose_heading, find_blank, is_hidden, measure_outlook
 from pansplat.tours.plan import Plan
+from pansplat.tours.route import Route, find_angles, plan_route
 from pansplat.tours.surfaces import locate_surfaces
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB

@@ -24,6 +24,7 @@ from shapely.geometry import Polygon
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.system.atomic import replacing
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import SOFTWARE
 from pansplat.tours.floor import assign_storeys, write_floor_plan
 from pansplat.tours.graph import make_graph
@@ -111,23 +112,18 @@ def describe_plan(plan: Plan) -> list[str]:
     """Lines on the size of a plan and its uncertainty."""
     area = sum(room.area for room in plan.rooms)
     spread = "" if plan.scale_error is None else f", which differ by {100 * plan.scale_error:.1f} %"
-    count = f"median of {plan.num_heights} panorama{'s' if plan.num_heights > 1 else ''}"
+    count = describe_count(plan.num_heights, "panorama")
     lines = [
-        f"{len(plan.rooms)} room{'s' if len(plan.rooms) > 1 else ''}, {area:.1f} m² between the walls",
-        f"scale: cameras {plan.camera_height:.2f} m over the floor ({count}{spread})",
+        f"{describe_count(len(plan.rooms), 'room')}, {area:.1f} m² between the walls",
+        f"scale: cameras {plan.camera_height:.2f} m over the floor (median of {count}{spread})",
     ]
     inside = {node for room in plan.rooms for node in room.panoramas}
     if outside := [panorama.name for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
         lines.append(f"no closed walls around {', '.join(outside)}")
     if plan.wall_error is None:
         return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
-    walls = f"{plan.num_walls} wall{'s' if plan.num_walls > 1 else ''}"
+    walls = describe_count(plan.num_walls, "wall")
     return [*lines, f"walls: ± {100 * plan.wall_error:.1f} cm, by the panoramas that show the same {walls}"]
-
-
-def _describe_area(plan: Plan, number: int) -> str:
-    room = plan.rooms[number]
-    return f"{room.area:.1f} m² ± {plan.area_error(room):.1f}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,12 +186,13 @@ class _Drawing:
 
     def list_texts(self) -> Iterator[_Text]:
         """Names and areas of rooms, lengths of walls, and the names of panoramas outside of rooms."""
-        for number, room in enumerate(self.plan.rooms):
+        for room in self.plan.rooms:
             corners = self.outline(room)
             circle = shapely.maximum_inscribed_circle(Polygon(corners))
             (x, y), width = circle.coords[0], 2 * circle.length
             name = room.name if room.is_placed else f"{room.name} (not placed)"
-            for row, text in ((0.7, name), (-0.7, _describe_area(self.plan, number))):
+            area = f"{room.area:.1f} m² ± {self.plan.area_error(room):.1f}"
+            for row, text in ((0.7, name), (-0.7, area)):
                 size = min(_TEXT, 0.9 * width / (_LETTER * max(len(text), 1)))
                 yield _Text("ROOMS", (x, y + row * size), text, size)
             for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -211,6 +208,11 @@ class _Drawing:
             if node not in inside:
                 name = self.plan.tour.panoramas[node].name
                 yield _Text("PANORAMAS", (x + 0.12, y), name, _SMALL_TEXT, is_centred=False)
+
+
+def _place_notes(notes: list[str]) -> list[_Text]:
+    places = [(_MARGIN / 2, -_LINE * (row + 1)) for row in range(len(notes))]
+    return [_Text("NOTES", place, note, 0.15, is_centred=False) for place, note in zip(places, notes, strict=True)]
 
 
 def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
@@ -237,8 +239,7 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
         axes.plot(*ends.T, color="#f2f0ea", linewidth=points(0.09), solid_capstyle="butt")
         axes.plot(*ends.T, color="#c26a1b", linewidth=points(0.035), solid_capstyle="butt")
     axes.plot(*drawing.panoramas.T, "o", color="#2b7bb9", markersize=points(0.12), markeredgewidth=0)
-    rows = [_Text("NOTES", (_MARGIN / 2, -_LINE * (n + 1)), note, 0.15, False) for n, note in enumerate(notes)]
-    for text in [*drawing.list_texts(), *rows]:
+    for text in [*drawing.list_texts(), *_place_notes(notes)]:
         axes.text(
             *text.place,
             text.text.encode(errors="backslashreplace").decode(),
@@ -272,11 +273,7 @@ def _draw_dxf(drawing: _Drawing) -> bytes:
         space.add_line(*ends.tolist(), dxfattribs={"layer": "DOORS"})
     for place in drawing.panoramas.tolist():
         space.add_circle(place, 0.06, dxfattribs={"layer": "PANORAMAS"})
-    notes = [
-        _Text("NOTES", (_MARGIN / 2, -_LINE * (row + 1)), note, 0.15, is_centred=False)
-        for row, note in enumerate(drawing.notes)
-    ]
-    for text in [*drawing.list_texts(), *notes]:
+    for text in [*drawing.list_texts(), *_place_notes(drawing.notes)]:
         content = text.text.encode(errors="backslashreplace").decode().replace("\n", " ")
         align = TextEntityAlignment.MIDDLE_CENTER if text.is_centred else TextEntityAlignment.MIDDLE_LEFT
         entity = space.add_text(content, height=text.size, rotation=text.angle, dxfattribs={"layer": text.layer})

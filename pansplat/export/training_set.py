@@ -5,22 +5,20 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
 from pansplat.geometry.cubemap import FACES, face_poses, face_rotations
 from pansplat.geometry.equirect import pad_equirect, uv_from_directions
-from pansplat.images.image_files import read_height, read_mask, read_panorama, write_image
-from pansplat.images.masks import scene_mask_of_files
+from pansplat.images.image_files import read_height, read_panorama, write_image
 from pansplat.images.rig_images import Lens
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.pairs import Panorama, read_scene_mask
 from pansplat.inputs.reconstructions.colmap import write_colmap
 from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
 
@@ -33,24 +31,10 @@ _MARGIN = 2  # pixels, of the cubic filter
 _BAND_ROWS = 256  # rows of a face that are sampled together
 
 
-@dataclass(frozen=True, eq=False)
-class PosedPanorama:
-    """A panorama to write.
-
-    Attributes:
-        panorama: its picture and mask; its pose is not used.
-        cam2world: OpenCV axes, metres, a world with y down.
-        siblings: panoramas in which static content is detected, see `pansplat.inputs.pairs.Pair`.
-    """
-
-    panorama: Panorama
-    cam2world: Float[Tensor, "4 4"]
-    siblings: tuple[Path, ...] = ()
-
-
 def write_dataset(
     folder: Path,
-    views: Sequence[PosedPanorama],
+    views: Sequence[Panorama],
+    siblings: tuple[Path, ...],
     points: Float[Array, "point 3"],
     colors: UInt8[Array, "point 3"],
     progress: Callable[[str, float], None],
@@ -62,7 +46,8 @@ def write_dataset(
 
     Args:
         folder: an empty one.
-        views: the panoramas.
+        views: the panoramas, in a world of metres with y down.
+        siblings: panoramas in which static content is detected, see `pansplat.inputs.pairs.Pair`.
         points, colors: positions, metres, and 8-bit sRGB.
         progress: called with a description and the completed fraction.
 
@@ -72,22 +57,23 @@ def write_dataset(
     sparse = folder / "sparse" / "0"
     for sub in (folder / "images", sparse):
         sub.mkdir(parents=True)
-    masks = [_find_mask(view) for view in views]
+    masks = [
+        read_panorama(view.image, _MASK_HEIGHT)[1] & read_scene_mask(view, siblings, _MASK_HEIGHT) for view in views
+    ]
     has_masks = not all(bool(mask.all()) for mask in masks)
     if has_masks:
         (folder / "masks").mkdir()
     rigs, shots = [], []
     for number, (view, mask) in enumerate(zip(views, masks, strict=True)):
         progress("writing cube faces", number / len(views))
-        image = view.panorama.image
-        height = min(read_height(image), _MAX_HEIGHT)
+        height = min(read_height(view.image), _MAX_HEIGHT)
         size = 2 * math.ceil(height / math.pi)
         lens = Lens(size / 2, size / 2, size / 2, size / 2, size, size)
-        faces = cut_faces(read_panorama(image, height)[0], size)
+        faces = cut_faces(read_panorama(view.image, height)[0], size)
         shown = cut_faces(mask.float().expand(3, -1, -1), size)
-        plain = re.sub(r"[^\w.-]+", "_", view.panorama.name)  # COLMAP reads no spaces
+        plain = re.sub(r"[^\w.-]+", "_", view.name)  # COLMAP reads no spaces
         stem = f"{number:04d}_{plain}"
-        suffix = ".png" if image.suffix.lower() in _LOSSLESS else ".jpg"
+        suffix = ".png" if view.image.suffix.lower() in _LOSSLESS else ".jpg"
         rig = []
         for face, pose in enumerate(face_poses(view.cam2world.double())):
             name = f"{stem}_{FACES[face]}{suffix}"
@@ -102,15 +88,6 @@ def write_dataset(
     write_nerfstudio(folder / "transforms.json", shots, POINTS if len(points) else None)
     (folder / "scale.txt").write_text("1\n", "utf-8")  # metres per unit
     return len(shots)
-
-
-def _find_mask(view: PosedPanorama) -> Bool[Tensor, "height width"]:
-    """Where the panorama shows the scene, as predictions see it."""
-    panorama = view.panorama
-    opaque = read_panorama(panorama.image, _MASK_HEIGHT)[1]
-    if panorama.mask is not None:
-        return opaque & read_mask(panorama.mask, _MASK_HEIGHT)
-    return opaque & scene_mask_of_files(view.siblings, _MASK_HEIGHT)
 
 
 def cut_faces(image: Float[Tensor, "3 height width"], size: int) -> Iterator[Float[Array, "size size 3"]]:

@@ -156,7 +156,7 @@ class Scene:
         height: of the input panoramas, pixels.
         gains: exposure and white balance of each view's photograph, as factors of R, G and B relative to the geometric
             mean of all; a refinement estimates them. The colours of a view's Gaussians are those of its photograph.
-        overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.TourGraph`.
+        overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.graph.TourGraph`.
         links: of a scene of a whole tour: the known directions from one panorama towards another one.
         starts: of a scene of a whole tour: one for each view, or none.
         joint: whether the Gaussians of all views belong in one image, as other programs draw them. Else those of a view

@@ -37,12 +37,12 @@ ROW, COLUMN = "{row}", "{column}"  # in the path of a face: numbers of a tile, f
 
 Decode = Callable[[Path], UInt8[Array, "rows columns 3"]]
 
+LARGEST_DENSITY, DENSITY = 1.5, 1.28  # pixels of a picture for one of a panorama, above which it is reduced, and then
 MAX_SIZE = 8000  # pixels along a face; OpenCV resamples at most 32,767 rows
 _MIN_HEIGHT = 4  # of a panorama in which every face has rows and columns
 _PAD = 2  # pixels of the neighbouring faces, for the cubic filter
 _SAMPLES = 2  # per pixel and axis; faces are up to twice as dense at their edges as a panorama
 _DENSE_FACE = 2 / math.pi  # face size over panorama height at which the centre of a face is as dense as the panorama
-_LARGEST_DENSITY, _DENSITY = 1.5, 1.28  # the same ratio, above which faces are reduced, and of reduced faces
 _CAP = 0.6  # latitude above which a column meets the upper or lower face, radians; at the cube's corners 0.615
 
 
@@ -186,8 +186,8 @@ def equirect_from_faces(faces: list[UInt8[Array, "size size 3"]], height: int) -
     """The panorama at (height, 2 height): the mean of 2 x 2 bicubic samples a pixel, which continue across edges."""
     if height < _MIN_HEIGHT:
         return cv2.resize(equirect_from_faces(faces, _MIN_HEIGHT), (2 * height, height), interpolation=cv2.INTER_AREA)
-    if len(faces[0]) > _LARGEST_DENSITY * height:
-        size = max(round(_DENSITY * height), 1)
+    if len(faces[0]) > LARGEST_DENSITY * height:
+        size = max(round(DENSITY * height), 1)
         faces = [cv2.resize(face, (size, size), interpolation=cv2.INTER_AREA) for face in faces]
     padded = _pad_faces(faces)
     rows = _SAMPLES * height

@@ -23,16 +23,12 @@ from numpy import ndarray as Array
 from pansplat.errors import InputError
 from pansplat.geometry.cubemap import face_rotations
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.images.cube_images import Decode, equirect_from_faces, write_description
+from pansplat.images.cube_images import DENSITY, LARGEST_DENSITY, Decode, equirect_from_faces, write_description
 from pansplat.system.strict_json import read_json
 
 RIG_SUFFIX = ".rig.json"
 
 _SAMPLES = 2  # per pixel and axis
-_LARGEST_DENSITY, _DENSITY = (
-    1.5,
-    1.28,
-)  # pixels of a picture for one of the panorama, above which it is reduced, and then
 _CUBE_TOLERANCE = 1e-4  # radians, and of half a face
 _EDGE = 0.5  # pixels beyond the outermost pixel centres' edges that count as covered: rounding at common edges
 
@@ -113,8 +109,8 @@ class RigImage:
             pixels = _decode_view(view, decode)
             lens = view.lens.scaled(*pixels.shape[1::-1])
             ratio = max(lens.fx, lens.fy) * math.pi / height
-            if ratio > _LARGEST_DENSITY:
-                size = [max(round(side * _DENSITY / ratio), 1) for side in pixels.shape[1::-1]]
+            if ratio > LARGEST_DENSITY:
+                size = [max(round(side * DENSITY / ratio), 1) for side in pixels.shape[1::-1]]
                 pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
                 lens = lens.scaled(*size)
             pictures.append(pixels)

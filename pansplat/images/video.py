@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -49,14 +49,17 @@ class VideoFile:
     def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
         """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order."""
         numbers = sorted(set(frames))
-        if numbers and not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
+        if not numbers:
+            return {}
+        if not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
             raise InputError(
                 f"{self.path}: needed frames 0 to {len(self.stamps) - 1}, got {numbers[0]} to {numbers[-1]}."
             )
         found: dict[int, NDArray[np.uint8]] = {}
         with _open_container(self.path) as container:
             container.streams.video[0].thread_type = "AUTO"
-            for group in _group_near_frames(numbers):
+            gaps = np.flatnonzero(np.diff(numbers) > _MAX_SKIP)
+            for group in (part.tolist() for part in np.split(numbers, gaps + 1)):
                 found |= self._decode(container, group, self.stamps[group[0]])
                 missing = [frame for frame in group if frame not in found]
                 if missing:  # key frames of some files are wrong: decode from the start
@@ -122,24 +125,11 @@ def _open_container(path: Path) -> Any:
         raise InputError(f"{path}: needed a readable video file, got '{error}'; check it.") from error
 
 
-def _group_near_frames(frames: Sequence[int]) -> Iterator[list[int]]:
-    """Split sorted frame numbers where consecutive ones are more than `_MAX_SKIP` apart."""
-    group: list[int] = []
-    for frame in frames:
-        if group and frame - group[-1] > _MAX_SKIP:
-            yield group
-            group = []
-        group.append(frame)
-    if group:
-        yield group
-
-
 def write_video(
     path: Path | str,
     frames: Iterable[NDArray[np.uint8]],
     fps: float,
     *,
-    quality: int = 18,
     panorama: bool | Projection = False,
     stereo: Stereo = "mono",
 ) -> int:
@@ -151,7 +141,6 @@ def write_video(
         path: file to write, ending in .mp4 or .webm.
         frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
         fps: frames per second.
-        quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
         panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
             players then show an .mp4 as 360 degrees. A .webm has no such mark.
         stereo: arrangement of the eyes in a panorama's frame.
@@ -174,7 +163,7 @@ def write_video(
                 pixels = _check_frame(path, frame, count, None if stream is None else (stream.height, stream.width))
                 if stream is None:
                     encoder = video_encoder(path.suffix.lower())
-                    stream = _add_stream(container, encoder, pixels.shape[1], pixels.shape[0], fps, quality)
+                    stream = _add_stream(container, encoder, pixels.shape[1], pixels.shape[0], fps)
                 video_frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 for packet in stream.encode(video_frame.reformat(format="yuv420p", dst_colorspace="ITU709")):
                     container.mux(packet)
@@ -205,15 +194,15 @@ def video_encoder(suffix: str = ".mp4") -> str:
     raise InputError(f"needed PyAV with one of the encoders {_ENCODERS[suffix]}, got none of them; reinstall `av`.")
 
 
-def _add_stream(container: Any, encoder: str, width: int, height: int, fps: float, quality: int) -> Any:
+def _add_stream(container: Any, encoder: str, width: int, height: int, fps: float) -> Any:
     stream = container.add_stream(encoder, rate=Fraction(fps).limit_denominator(1001))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     if encoder == "libx264":
-        stream.options = {"crf": str(quality), "preset": "medium"}
+        stream.options = {"crf": "18", "preset": "medium"}
     elif encoder == "libvpx-vp9":
-        stream.options = {"crf": str(quality + 6), "b": "0", "row-mt": "1", "cpu-used": "4"}  # crf is 0 to 63
+        stream.options = {"crf": "24", "b": "0", "row-mt": "1", "cpu-used": "4"}  # crf is 0 to 63
     elif encoder == "libsvtav1":
-        stream.options = {"crf": str(quality + 10), "preset": "8"}  # crf is 0 to 63
+        stream.options = {"crf": "28", "preset": "8"}  # crf is 0 to 63
     else:
         stream.bit_rate = int(width * height * fps * 0.2)
     # BT.709, limited range. Without these tags players guess the colour space from the size, and colours shift.

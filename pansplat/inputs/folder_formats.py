@@ -1,8 +1,8 @@
 """Folders of posed panoramas by format: poses.json, data sets, and sequences of frames (docs/input.md).
 
 Each format has a function that recognises a folder and one that reads it into a `Collection`. The argument `convention`
-of the readers overrides the format's pose convention. Readers raise an InputError for missing or invalid files; the
-message names the file and the entry.
+of the readers, one of `CONVENTIONS`, overrides that of the format. Readers raise an InputError for missing or invalid
+files; the message names the file and the entry.
 """
 
 from __future__ import annotations
@@ -54,10 +54,6 @@ _Z_UP = torch.tensor(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)), 
 CAMERA_POSES = "camera_pose.json"  # of 360Loc
 
 
-def _choose_convention(convention: str | None, default: str) -> str:
-    return default if convention is None else parse_convention(convention, "`convention`")
-
-
 # poses.json with an optional pairs.json: the package's own format.
 
 
@@ -75,8 +71,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
             "see docs/input.md."
         )
     is_stated = convention is None
-    text, origin = (content.get("convention"), source) if is_stated else (convention, "`convention`")
-    convention = parse_convention(text, origin)
+    convention = convention or parse_convention(content.get("convention"), source)
     tour = _read_tour_of_folder(folder)
     panoramas = tuple(
         _read_pose_entry(folder, name, entry, convention, is_stated, tour.get(name)) for name, entry in entries.items()
@@ -341,7 +336,7 @@ def read_matterport3d_scene(folder: Path, convention: str | None = None) -> Coll
 
     The world is rotated to z-up, as in the official code.
     """
-    convention = _choose_convention(convention, "cam2world opengl")
+    convention = convention or "cam2world opengl"
     panoramas = tuple(_read_view_folder(view, folder, convention) for view in _view_folders(folder))
     last = len(panoramas) - 1
     groups = (((0, last), tuple(range(1, last))),) if last > 0 else None
@@ -393,7 +388,6 @@ def read_triplet(source: Path, convention: str | None = None) -> Collection:
 
     The first and last view are the context, those between are targets.
     """
-    convention = _choose_convention(convention, "cam2world opencv")
     content = read_json(source)
     matrices = content.get("c2w") if isinstance(content, dict) else None
     if not isinstance(matrices, list) or len(matrices) < 2:
@@ -404,7 +398,7 @@ def read_triplet(source: Path, convention: str | None = None) -> Collection:
         if not image.is_file():
             raise InputError(f"{source}: needed the image {image.name} for pose {i}, got no such file; add it.")
         depth = source.with_name(f"{source.stem}_{i}_depth.png")
-        cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, pose {i}"), convention)
+        cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, pose {i}"), convention or "cam2world opencv")
         mask = find_mask(image, source.parent)
         panoramas.append(Panorama(image.stem, image, cam2world, mask, depth if depth.is_file() else None))
     last = len(panoramas) - 1
@@ -425,7 +419,7 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
     The matrices are cam2world with OpenCV axes, as the official code reads them.
     """
     source = folder / CAMERA_POSES
-    convention = _choose_convention(convention, "cam2world opencv")
+    convention = convention or "cam2world opencv"
     content = read_json(source)
     if not isinstance(content, dict):
         raise InputError(
@@ -470,7 +464,8 @@ def read_trajectory_folder(folder: Path, convention: str | None = None) -> Colle
     expected = source.suffix.lower().lstrip(".")
     if expected == "txt":
         expected = next((kind for kind in ("kitti", "tum") if kind in source.stem.lower()), None)
-    trajectory = read_trajectory(source, convention, expected)
+    scale = read_number(folder / "scale.txt") if (folder / "scale.txt").is_file() else 1.0
+    trajectory = read_trajectory(source, convention, expected, scale)
     images: list[Path] = []
     for sub in _IMAGE_FOLDERS:
         images = images or (list_panorama_files(folder / sub) if (folder / sub).is_dir() else [])
@@ -480,9 +475,8 @@ def read_trajectory_folder(folder: Path, convention: str | None = None) -> Colle
             f"{trajectory.kind.upper()} poses; keep only the images that were tracked, in order, or "
             "use poses.json."
         )
-    scale = read_number(folder / "scale.txt") if (folder / "scale.txt").is_file() else 1.0
     panoramas = tuple(
         Panorama(image.stem, image, pose, find_mask(image, folder))
-        for image, pose in zip(images, trajectory.scaled_poses(scale), strict=True)
+        for image, pose in zip(images, trajectory.poses, strict=True)
     )
     return Collection(source, panoramas, ordered=True, far=FAR_SEQUENCE)

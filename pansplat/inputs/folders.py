@@ -44,6 +44,7 @@ from pansplat.inputs.photographs import LINKS, add_links, list_photographs, list
 from pansplat.inputs.poses import parse_convention
 from pansplat.inputs.reconstructions import find_reconstruction, read_reconstruction
 from pansplat.inputs.web_tours import find_web_tour, is_web_tour_file, read_web_tour
+from pansplat.system.descriptions import list_first
 from pansplat.system.files import expand_home, is_scene_file, is_written
 
 VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
@@ -74,6 +75,7 @@ def load_pairs(
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
     """
     root = expand_home(path)
+    convention = None if convention is None else parse_convention(convention, "`convention`")
     try:
         pairs = _load_pairs(root, convention, near, far)
     except UnposedPanoramasError as error:
@@ -299,8 +301,7 @@ def _find_collections(folder: Path, depth: int, exports: bool, convention: str |
     if find_trajectory(folder) is not None:
         return [(folder, read_trajectory_folder(folder, convention))]
     if (source := find_reconstruction(folder)) is not None:
-        given = None if convention is None else parse_convention(convention, "`convention`")
-        found = read_reconstruction(source, folder, given)
+        found = read_reconstruction(source, folder, convention)
         is_joined = any(len(list_pictures(view.image)) > 1 for view in found.panoramas)
         return [(folder, found if is_joined else with_further(found))]
     if find_web_tour(folder) is not None:
@@ -375,7 +376,7 @@ class UnposedPanoramasError(InputError):
     """A folder or web tour holds two or more panoramas, and no poses in a known format."""
 
     def __init__(self, folder: Path, panoramas: list[Panorama]) -> None:
-        names = _list_first([panorama.image.name for panorama in panoramas])
+        names = list_first([panorama.image.name for panorama in panoramas])
         super().__init__(
             f"{folder}: needed poses for the panoramas, got images only ({names}); run `pansplat pose {folder} -o "
             f"{folder / POSES}`, or add a pose file (docs/input.md)."
@@ -389,13 +390,13 @@ def _nothing_found(root: Path) -> InputError:
     others = [file for file in sorted(root.iterdir()) if file.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES)]
     tables = [file for file in sorted(root.iterdir()) if file.suffix.lower() in _TABLE_SUFFIXES and file.is_file()]
     if inside:
-        got = f"some without poses in {_list_first([str(folder.relative_to(root)) for folder in inside])}; "
+        got = f"some without poses in {list_first([str(folder.relative_to(root)) for folder in inside])}; "
         advice = f"open one of these folders, or run `pansplat pose {inside[0]} -o {inside[0] / POSES}` for each"
     elif others:
         got, advice = _advise_on_file(others[0]), ""
     else:
         got = (
-            "none; " if not tables else f"none, and {_list_first([file.name for file in tables])}, of no known format; "
+            "none; " if not tables else f"none, and {list_first([file.name for file in tables])}, of no known format; "
         )
         advice = "give the folder that holds the pictures; docs/input.md lists the formats of poses"
     return InputError(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP, HEIC or EXR), got {got}{advice}.")
@@ -409,10 +410,6 @@ def _advise_on_file(file: Path) -> str:
             "FOLDER"
         )
     return f"{file.name}, which the program of its camera must stitch; export it as a 2:1 JPG or MP4"
-
-
-def _list_first(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
 
 
 def make_names_unique(pairs: list[Pair]) -> list[Pair]:

@@ -169,7 +169,7 @@ class Pair:
         for i, panorama in enumerate(panoramas):
             image, opaque = read_panorama(panorama.image, height)
             images[i] = image if panorama.is_scan else lift_black_surfaces(image)
-            masks[i] = opaque & self._scene_mask(panorama, height)
+            masks[i] = opaque & read_scene_mask(panorama, self.siblings, height)
             if not masks[i].any():
                 raise InputError(
                     f"{panorama.mask or panorama.image}: needed some pixels that show the scene (white in a mask, "
@@ -190,11 +190,12 @@ class Pair:
             frame=frame,
         )
 
-    def _scene_mask(self, panorama: Panorama, height: int) -> Bool[Tensor, "height width"]:
-        """The mask file if there is one, else the complement of the detected static content."""
-        if panorama.mask is not None:
-            return read_mask(panorama.mask, height)
-        return scene_mask_of_files(self.siblings, height)
+
+def read_scene_mask(panorama: Panorama, siblings: tuple[Path, ...], height: int) -> Bool[Tensor, "height width"]:
+    """The mask file of a panorama if there is one, else the complement of the static content of its siblings."""
+    if panorama.mask is not None:
+        return read_mask(panorama.mask, height)
+    return scene_mask_of_files(siblings, height)
 
 
 def too_many_panoramas(source: object, count: int) -> InputError:
@@ -370,8 +371,7 @@ def single_view_pairs(
 
 def list_names(files: Sequence[Path]) -> str:
     """The names of files, for notes; of many the first ones."""
-    names = ", ".join(file.name for file in files[:_MAX_NAMES])
-    return names if len(files) <= _MAX_NAMES else f"{names} and {len(files) - _MAX_NAMES} more"
+    return list_first([file.name for file in files], _MAX_NAMES)
 
 
 def find_mask(image: Path, folder: Path) -> Path | None:

@@ -10,15 +10,20 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
 from pansplat.images.cube_faces import group_faces, read_picture
-from pansplat.images.cube_images import CubeImage, write_cube
+from pansplat.images.cube_images import CubeImage
 from pansplat.images.image_files import is_two_to_one
-from pansplat.inputs.pairs import Link, Note, Panorama, find_mask, list_panorama_files
-from pansplat.inputs.web_tours.entries import Number, make_note, plain_text, read_direction, resolve_links
+from pansplat.inputs.pairs import Link, Note, Panorama, list_panorama_files
+from pansplat.inputs.web_tours.entries import (
+    Number,
+    make_note,
+    make_panorama,
+    plain_text,
+    read_direction,
+    resolve_links,
+)
 from pansplat.system.atomic import replacing
 from pansplat.system.files import is_written
 from pansplat.system.strict_json import convert, read_field, read_json
@@ -28,7 +33,7 @@ LINKS = "links.json"
 
 def read_photograph(image: Path) -> Panorama:
     """A 2:1 picture, or one that holds six cube faces, as a panorama at the origin of a world of its own."""
-    return _make_panorama(image.stem, read_picture(image), image.parent)
+    return make_panorama(image.stem, read_picture(image), image.parent)
 
 
 def list_photographs(folder: Path) -> list[Panorama]:
@@ -112,12 +117,7 @@ def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama]
             pictures[name] = read_picture(image)
         except InputError as error:
             problems.append(str(error))
-    return [_make_panorama(name, pictures[name], folder) for name in sorted(pictures)], problems
-
-
-def _make_panorama(name: str, picture: Path | CubeImage, folder: Path) -> Panorama:
-    image = picture if isinstance(picture, Path) else write_cube(picture, folder, name)
-    return Panorama(name, image, torch.eye(4, dtype=torch.float64), find_mask(image, folder))
+    return [make_panorama(name, pictures[name], folder) for name in sorted(pictures)], problems
 
 
 def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:

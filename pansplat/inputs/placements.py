@@ -115,7 +115,7 @@ def find_holds(names: Sequence[str], ties: Iterable[Tie], fixed: Collection[str]
     holds = {}
     for number in sorted(set(numbers) & set(depth) - {core}):
         holding = tuple(tie for tie in links if _is_towards_core(tie, number, part, depth))
-        reached = _reach(core, {(part[tie.first], part[tie.second]) for tie in links if tie not in holding})
+        reached = _measure_depths(core, {(part[tie.first], part[tie.second]) for tie in links if tie not in holding})
         members = tuple(name for name in tied if part[name] in depth and part[name] not in reached)
         holds |= {name: Hold(holding, members) for name in tied if part[name] == number}
     is_single = numbers.count(core) == 1
@@ -139,10 +139,6 @@ def _measure_depths(start: int, edges: Collection[tuple[int, int]]) -> dict[int,
         last = sorted(beside - set(depth))
         depth |= dict.fromkeys(last, max(depth.values()) + 1)
     return depth
-
-
-def _reach(start: int, edges: Collection[tuple[int, int]]) -> set[int]:
-    return set(_measure_depths(start, edges))
 
 
 def judge(names: Sequence[str], ties: Iterable[Tie], by_hand: Collection[str], source: Path) -> dict[str, Placement]:

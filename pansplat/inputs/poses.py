@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,25 +35,16 @@ _RIGID_TOLERANCE = 1e-2  # for files with 4 to 6 decimals; errors of wrong matri
 _OPENGL_TO_OPENCV = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
 
 
-@dataclass(frozen=True)
-class Trajectory:
+class Trajectory(NamedTuple):
     """Poses of a trajectory file.
 
     Attributes:
         kind: "kitti" or "tum".
-        poses: in file order; cam2world, OpenCV axes, in the unit of the file.
+        poses: in file order; cam2world, OpenCV axes, metres.
     """
 
     kind: str
     poses: tuple[Float[Tensor, "4 4"], ...]
-
-    def scaled_poses(self, scale: float) -> tuple[Float[Tensor, "4 4"], ...]:
-        """The poses with their translations multiplied by `scale`."""
-        scaled = []
-        for pose in self.poses:
-            scaled.append(pose.clone())
-            scaled[-1][:3, 3] *= scale
-        return tuple(scaled)
 
 
 def parse_convention(text: str | None, source: Path | str) -> str:
@@ -117,22 +107,19 @@ def _describe_error(matrix: Float[Tensor, "4 4"], error: float) -> str:
             f"a mirrored one (determinant {determinant:.3f}): one axis is flipped or two axes are "
             "exchanged; flip one axis so that the system is right-handed."
         )
-    if scale > 0 and orthonormal_error(_with_rotation(matrix, rotation / scale)) <= _RIGID_TOLERANCE:
+    unscaled = matrix.clone()
+    unscaled[:3, :3] /= scale
+    if scale > 0 and orthonormal_error(unscaled) <= _RIGID_TOLERANCE:
         return f"a rotation scaled by {scale:.4g}; divide its 3x3 part by this number."
     return f"a 3x3 part that is no rotation (R R' differs from 1 by {error:.3g}); check the order of the numbers."
 
 
-def _with_rotation(matrix: Float[Tensor, "4 4"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-    changed = matrix.clone()
-    changed[:3, :3] = rotation
-    return changed
-
-
-def _nearest_rigid(matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """The matrix with its 3x3 part replaced by the nearest rotation; removes the rounding errors of files."""
-    u, _, vt = torch.linalg.svd(matrix[:3, :3])
-    rigid = _with_rotation(matrix, u @ vt)
-    rigid[3] = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
+def _nearest_rigid(matrices: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """The matrices with their 3x3 parts replaced by the nearest rotations; removes the rounding errors of files."""
+    u, _, vt = torch.linalg.svd(matrices[..., :3, :3])
+    rigid = matrices.clone()
+    rigid[..., :3, :3] = u @ vt
+    rigid[..., 3, :] = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
     return rigid
 
 
@@ -162,7 +149,9 @@ def read_number(path: Path) -> float:
     return number
 
 
-def read_trajectory(path: Path, convention: str | None = None, expected: str | None = None) -> Trajectory:
+def read_trajectory(
+    path: Path, convention: str | None = None, expected: str | None = None, scale: float = 1.0
+) -> Trajectory:
     """Poses of a KITTI (12 numbers per line) or TUM (8 numbers per line) trajectory file.
 
     KITTI: rows of a 3x4 matrix. TUM: timestamp tx ty tz qx qy qz qw. Both are cam2world with OpenCV axes by default.
@@ -172,8 +161,8 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
         path: text file; numbers separated by spaces or commas.
         convention: one of `CONVENTIONS`; overrides the default.
         expected: "kitti" or "tum" to refuse the other format; None to accept both.
+        scale: metres per unit of the file.
     """
-    convention = "cam2world opencv" if convention is None else parse_convention(convention, "`convention`")
     rows = _number_rows(path)
     if not rows:
         raise InputError(f"{path}: needed one pose per line, got an empty file; export the trajectory again.")
@@ -198,7 +187,9 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
         )
     lines, numbers = [line for line, _ in rows], torch.from_numpy(np.array([row for _, row in rows], np.float64))
     matrices = _kitti_matrices(numbers) if kind == "kitti" else _tum_matrices(numbers, lines, path)
-    return Trajectory(kind, tuple(to_cam2world(_rigid_matrices(matrices, lines, path), convention).unbind()))
+    cam2world = to_cam2world(_rigid_matrices(matrices, lines, path), convention or "cam2world opencv")
+    cam2world[:, :3, 3] *= scale
+    return Trajectory(kind, cam2world.unbind())
 
 
 def _rigid_matrices(matrices: Float[Tensor, "n 4 4"], lines: list[int], path: Path) -> Float[Tensor, "n 4 4"]:
@@ -210,9 +201,7 @@ def _rigid_matrices(matrices: Float[Tensor, "n 4 4"], lines: list[int], path: Pa
     for index in suspect.nonzero()[:1, 0].tolist():
         rigid_matrix(matrices[index].tolist(), f"{path}, line {lines[index]}")
     inexact = error > _EXACT
-    if inexact.any():
-        u, _, vt = torch.linalg.svd(rotations[inexact])
-        matrices[inexact, :3, :3] = u @ vt
+    matrices[inexact] = _nearest_rigid(matrices[inexact])
     return matrices
 
 

@@ -2,19 +2,17 @@
 
 from collections.abc import Sequence
 
-_MAX_NAMES = 4  # of a list that is shown
-
 
 def describe_count(count: int, noun: str) -> str:
     """A number and its noun, such as "1 panorama" or "1,200 panoramas"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
-def list_first(names: Sequence[str]) -> str:
-    """The names, of many the first ones and the number of the others."""
-    if len(names) <= _MAX_NAMES + 1:
+def list_first(names: Sequence[str], most: int = 4) -> str:
+    """The names; of more than `most` and one the first ones and the number of the others."""
+    if len(names) <= most + 1:
         return ", ".join(names)
-    return f"{', '.join(names[:_MAX_NAMES])} and {len(names) - _MAX_NAMES} more"
+    return f"{', '.join(names[:most])} and {len(names) - most} more"
 
 
 def describe_range(low: float, high: float, unit: str = "") -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import re
 import stat
@@ -47,6 +48,13 @@ def make_portable_name(name: str) -> str:
     """The name of a scene as that of a file or folder on every system; empty if no letter is left."""
     plain = re.sub(r"[^\w.-]+", "_", name).strip("._")
     return f"_{plain}" if _DEVICE.fullmatch(plain) else plain
+
+
+def make_unique_name(name: str, taken: Iterable[str]) -> str:
+    """The name, with a number if it is taken, also in other capitals: file systems may not distinguish them."""
+    folded = {other.lower() for other in taken}
+    numbered = (f"{name}_{number}" for number in itertools.count(2))
+    return next(text for text in itertools.chain((name,), numbered) if text.lower() not in folded)
 
 
 def describe_kind(path: Path | str) -> str | None:

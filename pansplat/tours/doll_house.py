@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -59,7 +60,7 @@ class Rooms:
         shape: the rooms from above, in plan coordinates.
         parts, storeys: of each view.
         plan: the floor plan.
-        is_clear: whether the surfaces of the part and the storey of each view are smooth enough to be seen from afar.
+        samples: of the Gaussians, which the rooms were found by.
     """
 
     level: Float[np.ndarray, "3 3"]
@@ -70,7 +71,15 @@ class Rooms:
     parts: tuple[int, ...]
     storeys: tuple[int, ...]
     plan: Plan
-    is_clear: tuple[bool, ...] = ()
+    samples: Gaussians
+
+    @cached_property
+    def is_clear(self) -> tuple[bool, ...]:
+        """Whether the surfaces of the part and the storey of each view are smooth enough to be seen from afar."""
+        inside = self.samples.select(self.find_inside(self.samples))
+        levels = [self.list_level(view) for view in range(len(self.parts))]
+        clear = {views: _is_clear(inside, views) for views in set(levels)}
+        return tuple(clear[views] for views in levels)
 
     def list_level(self, view: int) -> tuple[int, ...]:
         """The views of the part and the storey of a view."""
@@ -146,7 +155,7 @@ def find_rooms(scene: Scene) -> Rooms:
         elif len(places := locate_surfaces(scene, view, level)):
             reach = float(np.quantile(np.hypot(places[:, 0], places[:, 2]), _SHOWN))
             shapes.append(shapely.Point(tour.positions[view] @ level[:, (0, 2)]).buffer(reach))
-    rooms = Rooms(
+    return Rooms(
         level,
         tour.positions,
         np.array([height or unit for height in heights]),
@@ -155,11 +164,8 @@ def find_rooms(scene: Scene) -> Rooms:
         tour.worlds,
         tuple(assign_storeys(tour)),
         plan,
+        gaussians,
     )
-    inside = gaussians.select(rooms.find_inside(gaussians))
-    levels = [rooms.list_level(view) for view in range(count)]
-    clear = {views: _is_clear(inside, views) for views in set(levels)}
-    return dataclasses.replace(rooms, is_clear=tuple(clear[views] for views in levels))
 
 
 def _is_clear(inside: Gaussians, views: tuple[int, ...]) -> bool:

@@ -1,4 +1,4 @@
-"""Edges whose flights would show how far the surfaces of two panoramas disagree: there the image fades.
+"""Edges along which no camera flies: through walls, and where the surfaces of two panoramas disagree; there it fades.
 
 Half-way between the panoramas, places of their surfaces are drawn as points. Two numbers predict LPIPS-squeeze of the
 picture there: the share of the sphere where the surfaces disagree, and how near the nearest ones are.
@@ -7,6 +7,7 @@ docs/web.md has the calibration on flights through generated homes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -19,7 +20,27 @@ POOR = 0.27  # predicted LPIPS-squeeze half-way, above which an edge fades
 _ROWS = 64  # of the depth half-way
 _DISAGREE = 0.1  # of the logarithms of depths
 _NEAR = 0.05  # quantile of the depth around the horizon
+_COSINE = math.cos(math.radians(3))  # of the Gaussians around the direction of the other camera
+_SHARE = 0.98  # of them on a wall; others are seen beyond a door, or stray
+_DEPTH = 0.95  # of the distance of the other camera, the largest depth of a wall
 _CONSTANT, _DISAGREEMENT, _NEARNESS = 0.256, 0.345, -0.198  # fitted to flights of generated homes
+
+
+def find_walls(scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The edges that lead through a wall or a closed door: each camera sees a surface in front of the other camera.
+
+    Args:
+        scene, panoramas, edges: see `judge_edges`.
+    """
+    inside, surfaces, centers = locate_ends(scene, panoramas, edges)
+
+    def is_blocked(node: int, other: int) -> bool:
+        way = centers[other] - centers[node]
+        distances, length = np.linalg.norm(surfaces[node], axis=1), float(np.linalg.norm(way))
+        ahead = distances[surfaces[node] @ way > _COSINE * distances * length]
+        return len(ahead) > 0 and bool(np.quantile(ahead, _SHARE) < _DEPTH * length)
+
+    return [(a, b) for a, b in inside if is_blocked(a, b) and is_blocked(b, a)]
 
 
 def find_poor_edges(
@@ -40,13 +61,11 @@ def judge_edges(
         edges: pairs of panoramas; those with another panorama are left out.
     """
     inside, surfaces, centers = locate_ends(scene, panoramas, edges)
-    return {(a, b): _predict(surfaces[a], surfaces[b], centers[b] - centers[a]) for a, b in inside}
-
-
-def _predict(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "m 3"], way: Float[np.ndarray, "3"]) -> float:
-    """The expected LPIPS; `first` and `second` are relative to their cameras."""
-    disagreement, nearest = measure_way(first, second, way)
-    return _CONSTANT + _DISAGREEMENT * disagreement + _NEARNESS * nearest
+    errors = {}
+    for a, b in inside:
+        disagreement, nearest = measure_way(surfaces[a], surfaces[b], centers[b] - centers[a])
+        errors[a, b] = _CONSTANT + _DISAGREEMENT * disagreement + _NEARNESS * nearest
+    return errors
 
 
 def measure_way(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,14 +9,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
 from pansplat.tours.graph import TourGraph, ViewNumbers, make_graph
 from pansplat.tours.route import Route
-from pansplat.tours.surfaces import locate_surfaces
+from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
 
 _PLAN_SIZE = 1024  # of the longer side of a floor plan as a file, pixels
 _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
@@ -112,11 +111,9 @@ def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "az
     height = _find_floor(places)
     if height is None:
         return None
-    right, down, forward = places.T
-    flat = np.hypot(right, forward)
-    sector = ((np.arctan2(right, forward) / (2 * math.pi) % 1.0) * _AZIMUTHS).astype(int) % _AZIMUTHS
-    floor = _measure_reach(flat, sector, np.abs(down - height) < 0.08 * height, 0.98)
-    standing = _measure_reach(flat, sector, (down > 0.15 * height) & (down < 0.8 * height), 0.5)
+    down = places[:, 1]
+    floor = _measure_reach(places[np.abs(down - height) < 0.08 * height], 0.98)
+    standing = _measure_reach(places[(down > 0.15 * height) & (down < 0.8 * height)], 0.5)
     reach = np.fmin(floor, standing)
     known = np.flatnonzero(np.isfinite(floor))
     if len(known) < _AZIMUTHS // 4:
@@ -128,20 +125,11 @@ def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "az
     return reach[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1), height
 
 
-def _measure_reach(
-    distances: Float[np.ndarray, "n"],
-    sector: Int[np.ndarray, "n"],
-    selected: Bool[np.ndarray, "n"],
-    quantile: float,
-) -> Float[np.ndarray, "azimuth"]:
-    """A quantile of the selected distances at each azimuth; NaN where there are fewer than three."""
-    reach = np.full(_AZIMUTHS, np.nan)
-    order = np.argsort(sector[selected], kind="stable")
-    ordered, borders = distances[selected][order], np.searchsorted(sector[selected][order], np.arange(_AZIMUTHS + 1))
-    for azimuth, (first, last) in enumerate(itertools.pairwise(borders.tolist())):
-        if last - first >= 3:
-            reach[azimuth] = np.quantile(ordered[first:last], quantile)
-    return reach
+def _measure_reach(places: Float[np.ndarray, "n 3"], quantile: float) -> Float[np.ndarray, "azimuth"]:
+    """A quantile of the level distances at each azimuth; NaN where there are fewer than three."""
+    flat = places[:, (0, 2)]
+    parts = split_by_azimuth(flat, np.hypot(*flat.T), _AZIMUTHS)
+    return np.array([np.quantile(part, quantile) if len(part) > 2 else np.nan for part in parts])
 
 
 def find_storeys(heights: Float[np.ndarray, "n"]) -> list[list[int]]:

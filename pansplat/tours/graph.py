@@ -21,8 +21,8 @@ from pansplat.geometry.path import find_direction, level_pose, up_direction, wra
 from pansplat.inputs.pairs import FAR, NEAR, Link, Pair, Panorama
 from pansplat.system.components import label_components
 from pansplat.system.descriptions import describe_count, describe_range, list_first
+from pansplat.tours.edges import find_walls
 from pansplat.tours.layout import REACH, lay_out
-from pansplat.tours.walls import find_walls
 
 Edge = tuple[int, int]
 """Indices of two panoramas, the smaller one first; a panorama without another one has a self-edge, twice its index."""

@@ -24,7 +24,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.system.components import label_components
 from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, trace_floor
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import locate_surfaces
+from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
 
 _RAYS = 360
 _SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it
@@ -202,9 +202,8 @@ def _look(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], height: floa
         found = trace_floor(places)
         if found is None:
             return None
-        walls = np.repeat(found[0], _RAYS // len(found[0]), axis=0)
-        angles = _ray_angles()
-        walls = np.linalg.norm(walls, axis=1)[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1)
+        reach = np.repeat(np.linalg.norm(found[0], axis=1), _RAYS // len(found[0]))
+        walls = reach[:, None] * _rays()
         return _Sight(center, walls, center + walls, low[:0])  # no wall is above the openings
     band = flat[(-down > _WALL_BAND[0] * ceiling) & (-down < _WALL_BAND[1] * ceiling)]
     band = band[np.linalg.norm(band, axis=1) > _LEAST_DISTANCE * height]
@@ -224,25 +223,16 @@ def _rays() -> Float[np.ndarray, "ray 2"]:
     return np.stack((np.sin(angles), np.cos(angles)), axis=1)
 
 
-def _sectors(places: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """The ray next to each place."""
-    return ((np.arctan2(places[:, 0], places[:, 1]) / (2 * math.pi) % 1.0) * _RAYS).astype(int) % _RAYS
-
-
 def _measure_reach(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "ray"]:
     """Distance around each ray of the surface that most places show; NaN where there are fewer than three.
 
     It is the median of those near the median of all, so that a beam in front or an opening does not move it.
     """
-    sector, distance = _sectors(places), np.linalg.norm(places, axis=1)
-    beside = np.concatenate([sector + shift for shift in range(-_BESIDE, _BESIDE + 1)]) % _RAYS
-    order = np.argsort(beside, kind="stable")
-    ordered = np.tile(distance, 2 * _BESIDE + 1)[order]
-    borders = np.searchsorted(beside[order], np.arange(_RAYS + 1))
+    distances = split_by_azimuth(places, np.linalg.norm(places, axis=1), _RAYS)
     reach = np.full(_RAYS, np.nan)
-    for ray, (first, last) in enumerate(itertools.pairwise(borders.tolist())):
-        if last - first > 2:
-            found = ordered[first:last]
+    for ray in range(_RAYS):
+        found = np.concatenate([distances[(ray + shift) % _RAYS] for shift in range(-_BESIDE, _BESIDE + 1)])
+        if len(found) > 2:
             level = np.quantile(found, 0.5, method="lower")
             reach[ray] = np.median(found[np.abs(found - level) <= _SURFACE * level])
     return reach
@@ -314,7 +304,7 @@ def _find_lines(sights: Sequence[_Sight], normals: Float[np.ndarray, "direction 
             first, last = (np.searchsorted(offsets, offsets + sign * _CLUSTER * unit) for sign in (-1, 1))
             near = sums[last] - sums[first]
             best = int(near.argmax())
-            if near[best] < _LEAST_WALL * unit * len({id(s) for s in sights}) ** 0.5:
+            if near[best] < _LEAST_WALL * unit * len(sights) ** 0.5:
                 break
             a, b = first[best], last[best]
             middle = np.searchsorted(sums[a : b + 1], (sums[a] + sums[b]) / 2)
@@ -355,7 +345,7 @@ def _is_along(outline: Outline, lines: _Lines, unit: float) -> bool:
 
 def _choose_piece(shape: shapely.Geometry, center: Float[np.ndarray, "2"]) -> Polygon | None:
     """The polygon of a shape that is at a camera; None without one."""
-    pieces = [piece for piece in getattr(shape, "geoms", [shape]) if isinstance(piece, Polygon) and piece.area > 0]
+    pieces = [piece for piece in shapely.get_parts(shape) if isinstance(piece, Polygon) and piece.area > 0]
     place = shapely.Point(center)
     return min(pieces, key=lambda piece: piece.distance(place), default=None)
 
@@ -465,9 +455,10 @@ def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
     for sign in (-1, 1):  # first spikes, then slots
         shape = shape.buffer(sign * narrow, join_style="mitre").buffer(-sign * narrow, join_style="mitre")
     # The start of a ring may be in the middle of a wall, where `simplify` keeps it.
-    pieces = [piece for piece in getattr(shape, "geoms", [shape]) if isinstance(piece, Polygon) and not piece.is_empty]
     rings = []
-    for piece in pieces:
+    for piece in shapely.get_parts(shape):
+        if piece.is_empty:
+            continue
         corners = np.array(piece.exterior.simplify(_COLLINEAR * unit).coords)[:-1]
         turned = np.roll(corners, -1, axis=0)
         rings.append(Polygon(np.array(Polygon(turned).exterior.simplify(_COLLINEAR * unit).coords)))
@@ -482,7 +473,7 @@ def _separate(
     centers = [shapely.MultiPoint([sights[node].center for node in nodes]) for nodes, _ in shapes]
     for a, b in itertools.combinations(range(len(shapes)), 2):
         common = result[a].intersection(result[b])
-        for piece in getattr(common, "geoms", [common]):
+        for piece in shapely.get_parts(common):
             if piece.area == 0:
                 continue
             place = piece.representative_point()

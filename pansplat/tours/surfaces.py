@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -29,6 +30,20 @@ def locate_surfaces(
     return (gaussians.means[shown].double().cpu().numpy() - scene.cam2world[view, :3, 3].double().cpu().numpy()).dot(
         level
     )
+
+
+def split_by_azimuth(
+    flat: Float[np.ndarray, "n 2"], values: Float[np.ndarray, "n"], count: int
+) -> list[Float[np.ndarray, "m"]]:
+    """The values of the places in each of `count` equal sectors around a camera, from forward to the right.
+
+    Args:
+        flat: places (right, forward) relative to the camera.
+        values: of the places.
+    """
+    sectors = ((np.arctan2(flat[:, 0], flat[:, 1]) / (2 * math.pi) % 1.0) * count).astype(int) % count
+    order = np.argsort(sectors, kind="stable")
+    return np.split(values[order], np.searchsorted(sectors[order], np.arange(1, count)))
 
 
 def locate_ends(

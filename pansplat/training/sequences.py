@@ -225,19 +225,13 @@ def read_video_folder(folder: Path) -> VideoSequence:
         raise InputError(
             f"{video.path}: needed a 2:1 equirectangular video, got {video.width}x{video.height}; export it as such."
         )
-    trajectory = read_trajectory(source)
+    require_known_masks(folder)
+    trajectory = read_trajectory(source, scale=_read_scale(folder))
     if trajectory.kind == "tum" and len(trajectory.poses) != len(video.stamps):
         frames = _frames_by_time(source, video)
     else:
         frames = _frames_in_order(source, video, len(trajectory.poses))
-    require_known_masks(folder)
-    return VideoSequence(
-        folder.resolve().name,
-        video,
-        frames,
-        trajectory.scaled_poses(_read_scale(folder)),
-        find_mask(video.path, folder),
-    )
+    return VideoSequence(folder.resolve().name, video, frames, trajectory.poses, find_mask(video.path, folder))
 
 
 def _list_videos(folder: Path) -> list[Path]:

@@ -4,7 +4,7 @@
 
 import { doll } from "./doll.js";
 import {
-  clamp, closestOnEdge, distanceOf, dot, followEdge, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
+  clamp, closestOnEdge, distanceOf, dot, followEdge, indexOfLeast, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
 } from "./graph.js";
 import { changed, sorted } from "./loop.js";
 import { DEGREE } from "./share.js";
@@ -18,9 +18,14 @@ export const camera = makeStart();
 
 // Camera to world; positive yaw turns right, positive pitch up (viewer/scene/camera.py). The device's motion adds a roll.
 export function rotationOf({ yaw, pitch, roll }) {
-  const [cy, sy, cp, sp, cr, sr] = [yaw, pitch, roll].flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
-  const turned = multiply([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], [[1, 0, 0], [0, cp, -sp], [0, sp, cp]]);
-  return multiply(HEADER.level, multiply(turned, [[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]]));
+  const [c, s] = [Math.cos(roll), Math.sin(roll)];
+  return multiply(HEADER.level, multiply(turned(yaw, pitch), [[c, -s, 0], [s, c, 0], [0, 0, 1]]));
+}
+
+// Camera without roll to level axes.
+export function turned(yaw, pitch) {
+  const [cy, sy, cp, sp] = [yaw, pitch].flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
+  return multiply([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], [[1, 0, 0], [0, cp, -sp], [0, sp, cp]]);
 }
 
 // Half the height of the image at distance 1. The field of view is that of a landscape image; a portrait one is taller.
@@ -40,7 +45,7 @@ export function walk(right, up, forward) {
   const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
   const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
   const target = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
-  const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : nearestSpot(target);
+  const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : findSpot(target).position;
   const limit = HEADER.limits[currentPart()], before = distanceOf(camera.position, from), after = distanceOf(target, from);
   const outward = Math.max(after - before, 0), slower = clamp((1 - before / limit) / SOFT, 0, 1);
   const allowed = Math.min(after - (1 - slower) * outward, limit);
@@ -48,14 +53,9 @@ export function walk(right, up, forward) {
   changed();
 }
 
-function nearestSpot(position) {
-  return GRAPH.positions[nearestNode(position)];
-}
-
 // The nearest panorama, in a tour of the camera's part.
 export function nearestNode(position) {
-  const distances = GRAPH.positions.map((place, node) => parts[node] === currentPart() ? distanceOf(place, position) : Infinity);
-  return distances.indexOf(Math.min(...distances));
+  return indexOfLeast(GRAPH.positions.map((place, node) => parts[node] === currentPart() ? distanceOf(place, position) : Infinity));
 }
 
 // The panorama at the camera, or that from which it looked at the doll's house.
@@ -70,8 +70,7 @@ export function cameraFor({ position, yaw, pitch, fov }) {
   if (position !== undefined) {
     check("position", [0, 1, 2].map((k) => position[k]));
     const edge = edges.length ? nearestEdge(GRAPH, position) : null;
-    const distances = GRAPH.positions.map((each) => distanceOf(each, position));
-    const from = edge === null ? GRAPH.positions[distances.indexOf(Math.min(...distances))] : closestOnEdge(GRAPH, edge, position);
+    const from = edge === null ? findSpot(position).position : closestOnEdge(GRAPH, edge, position);
     const limit = HEADER.limits[edge === null ? 0 : partOfEdge(GRAPH, edge)], away = distanceOf(position, from);
     found.position = plus(from, scaled(minus(position, from), Math.min(limit / Math.max(away, 1e-9), 1)));
   }
@@ -96,8 +95,8 @@ const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill 
 export const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
 export const DOLLY_MS = 500;               // of a fade along a poor edge
 
-export const { edges, parts, next, poor, hysteresis, reach } = HEADER;
-export const GRAPH = { positions: HEADER.spots.map((spot) => spot.position), edges, parts, next, poor, hysteresis, reach };
+export const { edges, parts } = HEADER;
+export const GRAPH = { ...HEADER, positions: HEADER.spots.map((spot) => spot.position) };
 export let edge = 0, group = edges.length ? edges[0][2] : 0, fade = null;
 
 // Weights of the views of a group at a position: normalised inverse distances (docs/rendering.md, section 7). Other

@@ -1,10 +1,10 @@
 // The doll's house view: the camera turns around the rooms from outside, and nothing is drawn that shows its back. docs/web.md
 // describes it. The rooms are those of the part and the storey of the panorama that the camera leaves.
 
-import { camera, nearestNode, parts, tangentOf } from "./camera.js";
+import { camera, nearestNode, parts, tangentOf, turned } from "./camera.js";
 import { byId, calm, say } from "./dom.js";
 import { ease, isWaiting, jump, jumpTo, lookOn, setTouring, takeStill } from "./flight.js";
-import { clamp, column, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
+import { clamp, column, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
 import { changed, measureAt, rayOf, sorted } from "./loop.js";
 import { DEGREE } from "./share.js";
 import { headset } from "./xr.js";
@@ -90,7 +90,7 @@ class DollHouse {
 
   // The distance from which a box fits into the picture.
   fit(box, yaw, pitch) {
-    const rotation = this.turned(yaw, pitch), middle = scaled(plus(...box), 0.5);
+    const rotation = turned(yaw, pitch), middle = scaled(plus(...box), 0.5);
     const tall = tangentOf(innerWidth, innerHeight, DOLL_FOV), wide = tall * innerWidth / innerHeight;
     let distance = 0;
     for (let corner = 0; corner < 8; corner++) {
@@ -101,14 +101,9 @@ class DollHouse {
     return 1.05 * distance;
   }
 
-  turned(yaw, pitch) {
-    const [cy, sy, cp, sp] = [yaw, pitch].flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
-    return multiply([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], [[1, 0, 0], [0, cp, -sp], [0, sp, cp]]);
-  }
-
   // Where a camera with these angles sees the rooms.
   place(yaw, pitch) {
-    const forward = HEADER.level.map((row) => dot(row, column(this.turned(yaw, pitch), 2)));
+    const forward = HEADER.level.map((row) => dot(row, column(turned(yaw, pitch), 2)));
     return { position: minus(this.center, scaled(forward, this.distance)) };
   }
 
@@ -141,8 +136,7 @@ class DollHouse {
     const distance = measureAt(left, top);
     if (this.flight || distance === null) return;
     const point = plus(camera.position, scaled(rayOf(left, top), distance));
-    const away = HEADER.spots.map(({ position }, node) => this.shows(node) ? distanceOf(position, point) : Infinity);
-    this.visit(away.indexOf(Math.min(...away)));
+    this.visit(indexOfLeast(HEADER.spots.map(({ position }, node) => this.shows(node) ? distanceOf(position, point) : Infinity)));
   }
 
   flyTo(target, then = () => {}) {

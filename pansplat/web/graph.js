@@ -1,5 +1,5 @@
 // Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of the methods of
-// pansplat.tours.TourGraph that they name; tests/web/test_browser.py compares them.
+// pansplat.tours.graph.TourGraph that they name; tests/web/test_browser.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
 // on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; and the `reach` around a part,
@@ -13,6 +13,7 @@ export const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((
 export const column = (matrix, k) => matrix.map((row) => row[k]);
 export const distanceOf = (a, b) => Math.hypot(...minus(a, b));
 export const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+export const indexOfLeast = (values) => values.indexOf(Math.min(...values));
 export const lengthOf = (path) => path.slice(1).reduce((sum, point, i) => sum + distanceOf(point, path[i]), 0);
 
 export function closestOnEdge(graph, edge, position) {
@@ -29,10 +30,9 @@ export const partOfEdge = (graph, edge) => graph.parts[graph.edges[edge][0]];
 
 // find_nearest_edge, without the distance; of one part if it is given
 export function nearestEdge(graph, position, part = null) {
-  const distances = graph.edges.map((_, edge) => {
+  return indexOfLeast(graph.edges.map((_, edge) => {
     return part === null || part === partOfEdge(graph, edge) ? distanceToEdge(graph, edge, position) : Infinity;
-  });
-  return distances.indexOf(Math.min(...distances));
+  }));
 }
 
 // follow_edge

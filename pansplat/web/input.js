@@ -10,7 +10,7 @@ import { changed } from "./loop.js";
 import { measure } from "./measure.js";
 import { plan } from "./plan.js";
 import { openList } from "./rings.js";
-import { parsePose, share } from "./share.js";
+import { copyLink, parsePose, savePicture } from "./share.js";
 
 const held = new Set(), fingers = new Map();
 let fast = false;
@@ -26,7 +26,7 @@ const PRESSES = {
   KeyL: () => openList(),
   KeyM: () => { if (HEADER.spots.length > 1) plan.toggle(); },
   KeyO: () => doll.toggle(),
-  KeyP: () => share.savePicture(),
+  KeyP: () => savePicture(),
 };
 const CLOSES = { KeyH: "keys", KeyL: "list" };  // the dialogs that a key opens and closes
 
@@ -79,12 +79,11 @@ function onMove(event) {
     if (doll.isOn) doll.orbit(2 * Math.PI * moved[0] / clientWidth, -Math.PI * moved[1] / clientHeight);
     else turn(-moved[0] * radians, moved[1] * radians);
   } else if (before.length === 2) {
-    const apart = ([a, b]) => distanceOf(a, b);
     const metres = 2 * HEADER.speed / Math.min(canvas.clientWidth, canvas.clientHeight);
-    const pinch = apart([...fingers.values()]) - apart(before);
-    if (doll.isOn) doll.zoom(apart(before) / Math.max(apart([...fingers.values()]), 1));
+    const gap = distanceOf(...before), apart = distanceOf(...fingers.values());
+    if (doll.isOn) doll.zoom(gap / Math.max(apart, 1));
     setTouring(false);
-    walk(-0.5 * moved[0] * metres, 0, (0.5 * moved[1] + pinch) * metres);
+    walk(-0.5 * moved[0] * metres, 0, (0.5 * moved[1] + apart - gap) * metres);
   }
 }
 
@@ -181,7 +180,7 @@ export function listen() {
   byId("doll").hidden = !doll.isPossible;
   byId("no-doll").hidden = doll.isPossible;
   byId("more").onclick = () => showMore(byId("menu").hidden);
-  for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", () => share.savePicture()], ["link", () => share.copyLink()]]) {
+  for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", savePicture], ["link", copyLink]]) {
     byId(id).onclick = () => {
       showMore(false);
       act();

@@ -4,7 +4,7 @@
 import { camera } from "./camera.js";
 import { byId, make } from "./dom.js";
 import { goTo } from "./flight.js";
-import { clamp, column, distanceOf, dot, minus, plus, scaled } from "./graph.js";
+import { clamp, column, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
 import { changed } from "./loop.js";
 import { drawSvg } from "./measure.js";
 import { here } from "./rings.js";
@@ -96,8 +96,7 @@ class Plan {
   // Areas of panoramas next to each other overlap.
   nearest(nodes, x, y) {
     const { left, top } = byId("drawing").getBoundingClientRect();
-    const distances = nodes.map((node) => distanceOf(this.toPlan(this.placeOf(node)), [x - left, y - top]));
-    return nodes[distances.indexOf(Math.min(...distances))];
+    return nodes[indexOfLeast(nodes.map((node) => distanceOf(this.toPlan(this.placeOf(node)), [x - left, y - top])))];
   }
 
   // The world of the panorama at the camera; for one alone, the one that is shown, at first the largest.

@@ -169,10 +169,7 @@ export class Renderer {
     gl.uniform3f(places.background, 0, 0, 0);
     gl.uniform1i(places.sum_color, 0);
     gl.uniform1i(places.sum_depth, 1);
-    this.targets[1].textures.forEach((texture, unit) => {
-      gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-    });
+    this.bind(this.targets[1].textures);
     gl.bindVertexArray(this.screen);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
@@ -217,13 +214,17 @@ export class Renderer {
     gl.uniform1i(places.cameras, 4);
   }
 
+  bind(textures) {
+    textures.forEach((texture, unit) => {
+      this.gl.activeTexture(this.gl.TEXTURE0 + unit);
+      this.gl.bindTexture(this.gl.TEXTURE_2D, texture);
+    });
+  }
+
   drawLayer(start, count) {
     const gl = this.gl;
     gl.useProgram(this.splat.program);
-    [this.geometry, this.colors, this.order, this.scales, this.cameras].forEach((texture, unit) => {
-      gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-    });
+    this.bind([this.geometry, this.colors, this.order, this.scales, this.cameras]);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.splats);
@@ -238,10 +239,7 @@ export class Renderer {
     gl.uniform1i(places.layer_color, 0);
     gl.uniform1i(places.layer_depth, textures.length - 1);
     gl.uniform1i(places.with_depth, textures.length - 1);
-    textures.forEach((texture, unit) => {
-      gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-    });
+    this.bind(textures);
     if (isFirst) gl.disable(gl.BLEND);
     else gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE);

@@ -25,32 +25,24 @@ export function parsePose(hash) {
   return { position: [x, y, z], yaw, pitch, fov };
 }
 
-class Share {
-  get link() {
-    return location.href.split("#")[0] + formatPose(poseOf(camera));
-  }
-
-  // Where the browser does not allow the clipboard, the link is shown.
-  async copyLink() {
-    const { link } = this;
-    try {
-      await navigator.clipboard.writeText(link);
-      say("Link to this view copied");
-    } catch {
-      explain(link);
-    }
-  }
-
-  // Downloads the picture of the camera at the full resolution.
-  async savePicture() {
-    const blob = await takePicture(), link = document.createElement("a");
-    if (!blob) return;
-    link.href = URL.createObjectURL(blob);
-    link.download = `${document.title}.png`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 60000);
-    say(window.parent === window ? "Picture saved" : "Picture saved, if the page around this frame allows downloads");
+// Where the browser does not allow the clipboard, the link is shown.
+export async function copyLink() {
+  const link = location.href.split("#")[0] + formatPose(poseOf(camera));
+  try {
+    await navigator.clipboard.writeText(link);
+    say("Link to this view copied");
+  } catch {
+    explain(link);
   }
 }
 
-export const share = new Share();
+// Downloads the picture of the camera at the full resolution.
+export async function savePicture() {
+  const blob = await takePicture(), link = document.createElement("a");
+  if (!blob) return;
+  link.href = URL.createObjectURL(blob);
+  link.download = `${document.title}.png`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+  say(window.parent === window ? "Picture saved" : "Picture saved, if the page around this frame allows downloads");
+}

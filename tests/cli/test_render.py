@@ -16,7 +16,7 @@ from pansplat.geometry.equirect import rotate_equirect
 from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import read_depth
 from pansplat.rendering import Rendering
-from pansplat.tours import find_tours
+from pansplat.tours.graph import find_tours
 
 HEIGHT = 64
 

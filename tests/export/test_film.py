@@ -11,7 +11,7 @@ from pansplat.export.film import FilmPhotographs
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.rendering.image_planes import image_planes
-from pansplat.tours import STOP_SECONDS
+from pansplat.tours.route import STOP_SECONDS
 
 POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
 POSES[1, :3, :3] = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # looks to the right

@@ -19,7 +19,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
-from pansplat.tours import find_rooms
+from pansplat.tours.doll_house import find_rooms
 
 LOW, HIGH = torch.tensor((-2.0, -1.1, -3.0)), torch.tensor((2.0, 1.5, 3.0))  # y is down
 CENTERS = torch.tensor(((-0.8, 0.0, -1.0), (0.8, 0.1, 1.2)))

@@ -17,7 +17,7 @@ from pansplat import pipeline
 from pansplat.batch import _hash_pair
 from pansplat.cli.pose import Pose
 from pansplat.errors import InputError, InputWarning
-from pansplat.export.training_set import PosedPanorama, write_dataset
+from pansplat.export.training_set import write_dataset
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.images.blur_masks import blur_hidden, find_blur_mask, resize_hidden, widen_hidden
@@ -599,8 +599,8 @@ def test_scenes_training_sets_and_caches_depend_on_what_masks_leave(
         mask.write_bytes(stated)
         new = tmp_path / f"new{person}"
         new.mkdir()
-        posed = [PosedPanorama(view, view.cam2world, pair.siblings) for view in pair.context]
-        write_dataset(new, posed, np.zeros((1, 3)), np.zeros((1, 3), np.uint8), lambda what, done: None)
+        nothing = np.zeros((1, 3))
+        write_dataset(new, pair.context, pair.siblings, nothing, nothing.astype(np.uint8), lambda what, done: None)
         sets.append({file.name: file.read_bytes() for file in new.rglob("*.*")})
     plain, first, _, second = scenes
     assert torch.equal(first.harmonics, second.harmonics) and torch.equal(first.means, second.means)

@@ -16,7 +16,7 @@ from pansplat.pipeline import load_model
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.rendering import Rendering
 from pansplat.system.descriptions import describe_count, describe_range, list_first
-from pansplat.tours import TourGraph
+from pansplat.tours.graph import TourGraph
 
 POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pansplat.inputs.pairs import Link, Pair, Panorama
-from pansplat.tours import TourGraph, find_tours
+from pansplat.tours.graph import TourGraph, find_tours
 
 
 def _make_tour(places, edges, folder: Path = Path()) -> TourGraph:

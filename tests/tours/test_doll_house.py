@@ -10,8 +10,7 @@ import torch
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import quats_from_rotations
-from pansplat.tours import find_fronts, find_rooms, fit_box
-from pansplat.tours.doll_house import measure_roughness
+from pansplat.tours.doll_house import find_fronts, find_rooms, fit_box, measure_roughness
 
 LOW, HIGH = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0))  # of the room around the first camera: x, y down, z
 

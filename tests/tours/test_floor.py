@@ -10,12 +10,13 @@ import pytest
 import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
-import pansplat.tours as tours
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import Placement
-from pansplat.tours import TourGraph, draw_floor_plan, find_floor_outline
+from pansplat.tours import floor
+from pansplat.tours.floor import draw_floor_plan, find_floor_outline
+from pansplat.tours.graph import TourGraph
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +37,10 @@ def test_the_floor_of_a_room_ends_at_its_walls(room_scene):
     border = np.minimum(inside, 1 - inside).min(axis=1)
     assert np.abs(border).max() < 0.04, "all corners are near a wall"
     scene = Scene(room_scene.gaussians.select(torch.arange(20)), room_scene.cam2world, 0.45, 10.0)
-    assert find_floor_outline(scene, 0, level) is None and tours.find_camera_height(scene, 0, level) is None
-    assert tours.find_camera_height(room_scene, 0, level) == outline.camera_height
-    assert tours.choose_camera_height((1.0, None, 1.4, 1.6), 10.0) == 1.4
-    assert tours.choose_camera_height((None,), 10.0) == 1.5
+    assert find_floor_outline(scene, 0, level) is None and floor.find_camera_height(scene, 0, level) is None
+    assert floor.find_camera_height(room_scene, 0, level) == outline.camera_height
+    assert floor.choose_camera_height((1.0, None, 1.4, 1.6), 10.0) == 1.4
+    assert floor.choose_camera_height((None,), 10.0) == 1.5
 
 
 def test_the_plan_shows_the_floor_and_its_walls(room_scene):
@@ -63,7 +64,7 @@ def test_the_plan_shows_the_floor_and_its_walls(room_scene):
 
 
 def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):
-    tours.write_floor_plan(room_scene, tmp_path / "plan.png")
+    floor.write_floor_plan(room_scene, tmp_path / "plan.png")
     with PIL.Image.open(tmp_path / "plan.png") as image:
         colors = np.asarray(image.convert("RGB")).astype(int)
     assert max(colors.shape[:2]) in (1024, 1025)
@@ -71,7 +72,7 @@ def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):
     empty = dataclasses.replace(room_scene, gaussians=room_scene.gaussians.select(torch.arange(20)))
     for scene in (empty, dataclasses.replace(empty, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64))):
         with pytest.raises(InputError, match="needed a floor below"):
-            tours.write_floor_plan(scene, tmp_path / "none.png")
+            floor.write_floor_plan(scene, tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
 
 
@@ -82,21 +83,21 @@ def test_a_panorama_that_is_probably_placed_is_a_ring(room_scene):
     for view in views:
         tour = TourGraph("", Path(), (view, view), 0.45, 10.0, overlaps={(0, 1): 0.5})
         outline = find_floor_outline(room_scene, 0, pose[:3, :3].numpy())
-        image, plan = tours.paint_floor_plan(tour, {0: outline}), draw_floor_plan(tour, [outline], size=1024)
+        image, plan = floor.paint_floor_plan(tour, {0: outline}), draw_floor_plan(tour, [outline], size=1024)
         x, y = plan.to_pixels(np.array((0.5, 0.0))).round().astype(int)
         colors.append((image[y, x].tolist(), image[y, x + 6].tolist()))
     assert colors[0][0] == [90, 204, 255] != colors[1][0] and colors[1][1] == [90, 204, 255]
 
 
 def test_storeys_are_levels_of_cameras_and_stairs_are_in_none():
-    assert tours.find_storeys(np.empty(0)) == []
-    assert tours.find_storeys(np.array((1.5, 1.2, 1.52, 1.15))) == [[0, 1, 2, 3]], "two steps of a room"
-    assert tours.find_storeys(np.array((1.5, 1.5, 2.5))) == [[0, 1]], "one on the stairs"
-    assert tours.find_storeys(np.array((1.5, 2.5))) == [[0, 1]], "nothing states which one is on stairs"
-    assert tours.find_storeys(np.array((2.9, 0.0, 0.3, 1.0, 3.0, 2.0, 0.1))) == [[1, 2, 6], [0, 4]]
-    assert tours.find_storeys(np.array((0.0, 1.4, 0.05, 2.9))) == [[0, 2], [3]], "one alone between two levels"
-    assert tours.find_storeys(np.array((1.0, 2.0, 0.0))) == [[2], [1]]
-    assert tours.find_storeys(np.array((0.0, 0.5, 1.0, 1.1, 6.0, 6.0))) == [[2, 3], [4, 5]]
+    assert floor.find_storeys(np.empty(0)) == []
+    assert floor.find_storeys(np.array((1.5, 1.2, 1.52, 1.15))) == [[0, 1, 2, 3]], "two steps of a room"
+    assert floor.find_storeys(np.array((1.5, 1.5, 2.5))) == [[0, 1]], "one on the stairs"
+    assert floor.find_storeys(np.array((1.5, 2.5))) == [[0, 1]], "nothing states which one is on stairs"
+    assert floor.find_storeys(np.array((2.9, 0.0, 0.3, 1.0, 3.0, 2.0, 0.1))) == [[1, 2, 6], [0, 4]]
+    assert floor.find_storeys(np.array((0.0, 1.4, 0.05, 2.9))) == [[0, 2], [3]], "one alone between two levels"
+    assert floor.find_storeys(np.array((1.0, 2.0, 0.0))) == [[2], [1]]
+    assert floor.find_storeys(np.array((0.0, 0.5, 1.0, 1.1, 6.0, 6.0))) == [[2, 3], [4, 5]]
 
 
 def _make_two_storeys(room_scene: Scene) -> TourGraph:
@@ -112,16 +113,16 @@ def _make_two_storeys(room_scene: Scene) -> TourGraph:
 
 def test_other_storeys_are_those_of_the_same_world_at_another_level(room_scene):
     tour = _make_two_storeys(room_scene)
-    assert tours.find_other_storeys(tour, tour.positions[0] + (0, 0, 0.3)) == {2, 3, 4}
-    assert tours.find_other_storeys(tour, tour.positions[4]) == {0, 1}, "the stairs are nearer to the upper storey"
-    assert tours.find_other_storeys(tour, tour.positions[2]) == {0, 1}
-    assert tours.find_other_storeys(tour, tour.positions[5]) == frozenset(), "levels of two worlds cannot be compared"
+    assert floor.find_other_storeys(tour, tour.positions[0] + (0, 0, 0.3)) == {2, 3, 4}
+    assert floor.find_other_storeys(tour, tour.positions[4]) == {0, 1}, "the stairs are nearer to the upper storey"
+    assert floor.find_other_storeys(tour, tour.positions[2]) == {0, 1}
+    assert floor.find_other_storeys(tour, tour.positions[5]) == frozenset(), "levels of two worlds cannot be compared"
 
 
 def test_storeys_of_a_plan_are_next_to_each_other(room_scene):
     tour = _make_two_storeys(room_scene)
     outline = find_floor_outline(room_scene, 0, tour.level_axes)
-    image = tours.paint_floor_plan(tour, {0: outline})
+    image = floor.paint_floor_plan(tour, {0: outline})
     plan = draw_floor_plan(tour, [outline], size=1024)
     height, width = plan.image.shape[:2]
     assert image.shape == (height, 2 * width, 3)

@@ -11,11 +11,10 @@ import scipy
 import torch
 from synthetic_scenes import make_balls
 
-import pansplat.tours as tours
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.inputs.pairs import Pair, Panorama
-from pansplat.tours import find_tours
-from pansplat.tours.graph import _find_shortest_ways
+from pansplat.tours import graph
+from pansplat.tours.graph import _find_shortest_ways, find_tours
 from pansplat.tours.route import plan_route
 
 
@@ -224,13 +223,13 @@ def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_ove
         gaussians = dataclasses.replace(make_gaussians(count), means=means, views=labels.byte())
         return Scene(gaussians, tour.cam2world[list(views)], 1.0, 2.0, tuple(f"{view}.jpg" for view in views))
 
-    scene = tours.merge_scenes(tour, load)
+    scene = graph.merge_scenes(tour, load)
     assert loaded == [(2, 3), (0, 1, 2)]
     assert scene.gaussians.views.tolist() == [0] * 10 + [1] * 10 + [2] * 10 + [3] * 10
     assert scene.gaussians.means[:, 0].equal(scene.gaussians.views.float())
     assert scene.names == ("0.jpg", "1.jpg", "2.jpg", "3.jpg") and scene.cam2world.equal(tour.cam2world)
     assert (scene.near, scene.far) == (0.45, 10.0)
-    part = tours.select_views(scene, (3, 1))
+    part = graph.select_views(scene, (3, 1))
     assert part.gaussians.means[:, 0].tolist() == [1] * 10 + [3] * 10
     assert part.gaussians.views.tolist() == [1] * 10 + [0] * 10 and part.names == ("3.jpg", "1.jpg")
     assert part.cam2world.equal(tour.cam2world[[3, 1]]) and part.overlaps == ()
@@ -247,8 +246,8 @@ def test_a_merged_scene_has_the_gains_of_all_photographs_relative_to_their_mean(
         return Scene(empty_gaussians(), tour.cam2world[list(views)], 1.0, 2.0, gains=known)
 
     assert set(tour.choose_sources()) == {(0, 1), (1, 2)}
-    assert np.allclose(tours.merge_scenes(tour, load).gains, expected)
-    assert tours.merge_scenes(tour, lambda views: load(views, refined=False)).gains == ()
+    assert np.allclose(graph.merge_scenes(tour, load).gains, expected)
+    assert graph.merge_scenes(tour, lambda views: load(views, refined=False)).gains == ()
 
 
 def test_a_merged_scene_of_parts_has_their_links_titles_and_gains(home):
@@ -263,17 +262,17 @@ def test_a_merged_scene_of_parts_has_their_links_titles_and_gains(home):
         names = tuple(f"p{view}" for view in views)
         return Scene(empty_gaussians(), tour.cam2world[list(views)], 1.0, 2.0, names, gains=gains)
 
-    scene = tours.merge_scenes(tour, load)
+    scene = graph.merge_scenes(tour, load)
     assert scene.names == ("p0", "p1", "p2", title, "p4", "p5", title)
     gains = np.array(scene.gains)
     assert np.allclose(gains[[3, 6]], 1) and np.allclose(gains[[4, 5]], [[2] * 3, [0.5] * 3])
     assert scene.starts == (None,) * 3 + ((9.0 - 2 * math.pi, 0.1),) + (None,) * 3
-    again = tours.make_graph(scene)
+    again = graph.make_graph(scene)
     assert again.overlaps == tour.overlaps and set(again.links) == set(tour.links) and again.parts == tour.parts
     assert again.links[2, 3].text == "to the hall"
     assert np.allclose(again.find_direction(2, 3), tour.find_direction(2, 3))
     assert [panorama.label for panorama in again.panoramas] == list(scene.names)
-    part = tours.select_views(scene, (3,))
+    part = graph.select_views(scene, (3,))
     assert part.names == (title,) and part.links == part.starts == part.overlaps == ()
 
 

@@ -6,7 +6,8 @@ import math
 import numpy as np
 
 from pansplat.inputs.pairs import Link
-from pansplat.tours import TourGraph, find_link_ring, find_way_along_link
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.links import find_link_ring, find_way_along_link
 
 
 def _link(tour: TourGraph, pitch: float) -> TourGraph:

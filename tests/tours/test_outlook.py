@@ -7,8 +7,8 @@ import pytest
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import find_blank, is_hidden, measure_outlook, plan_route
-from pansplat.tours.outlook import BINS, choose_heading
+from pansplat.tours.outlook import BINS, choose_heading, find_blank, is_hidden, measure_outlook
+from pansplat.tours.route import plan_route
 from pansplat.tours.surfaces import locate_surfaces
 
 

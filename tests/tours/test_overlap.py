@@ -7,7 +7,7 @@ import torch
 
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.images.image_files import write_image
-from pansplat.tours import connect
+from pansplat.tours.overlap import connect
 
 
 def draw_room(place, low, high, seed) -> torch.Tensor:

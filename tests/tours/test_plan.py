@@ -20,7 +20,8 @@ from pansplat.export.plan_files import _Drawing, describe_plan, write_picture, w
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.system.files import is_written
-from pansplat.tours import doll_house, make_graph
+from pansplat.tours import doll_house
+from pansplat.tours.graph import make_graph
 from pansplat.tours.plan import Plan, make_plan
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5

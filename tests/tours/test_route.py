@@ -13,8 +13,9 @@ from PIL import Image
 
 from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.pairs import Panorama
-from pansplat.tours import TourGraph, find_tours, plan_route
 from pansplat.tours.floor import assign_storeys
+from pansplat.tours.graph import TourGraph, find_tours
+from pansplat.tours.route import plan_route
 
 
 def test_a_route_is_smooth_and_passes_the_panoramas(comb):

@@ -23,7 +23,8 @@ from pansplat.geometry.pose import rotations_from_quats
 from pansplat.images.image_files import write_image
 from pansplat.inputs.pairs import Link, Pair, Panorama
 from pansplat.rendering import Rendering, rasterize
-from pansplat.tours import FloorOutline, TourGraph, merge_scenes
+from pansplat.tours.floor import FloorOutline
+from pansplat.tours.graph import TourGraph, merge_scenes
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context

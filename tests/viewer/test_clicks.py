@@ -29,7 +29,7 @@ from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
 from pansplat.rendering.cpu.display import DisplayScene
-from pansplat.tours import find_tours
+from pansplat.tours.graph import find_tours
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing

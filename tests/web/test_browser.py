@@ -34,7 +34,8 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import path_poses
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.pairs import Link, Note, Pair, Panorama
-from pansplat.tours import EDGE_HYSTERESIS, TourGraph, find_fronts, find_rooms, make_graph, select_views
+from pansplat.tours.doll_house import find_fronts, find_rooms
+from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
 from pansplat.tours.layout import REACH
 
 SIZE = (320, 240)

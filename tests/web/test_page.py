@@ -28,7 +28,10 @@ from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.inputs.pairs import Pair
 from pansplat.refinement.budget import merge_to
-from pansplat.tours import doll_house, edges, find_camera_height, find_rooms, make_graph, select_views
+from pansplat.tours import doll_house, edges
+from pansplat.tours.doll_house import find_rooms
+from pansplat.tours.floor import find_camera_height
+from pansplat.tours.graph import make_graph, select_views
 from pansplat.tours.plan import make_plan
 
 

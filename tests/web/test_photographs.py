@@ -18,9 +18,9 @@ from jaxtyping import Float
 from PIL import Image
 
 from pansplat.export import page as page_module
-from pansplat.export import page_photographs as module
+from pansplat.export import photographs as module
 from pansplat.export.page import write_page
-from pansplat.export.page_photographs import PackedPhotograph, pack_photographs, read_photograph
+from pansplat.export.photographs import PackedPhotograph, pack_photographs, read_photograph
 from pansplat.gaussians.scene import Scene
 from pansplat.images.cube_images import equirect_from_faces
 from pansplat.images.image_files import read_panorama

@@ -290,7 +290,7 @@ class CpuRenderer:
         return _Groups(labels, np.array(list(layer_weights.values()), np.float32), visible)
 
     def _find_fronts(self, position: tuple[float, float, float]) -> Bool[np.ndarray, "n"]:
-        """`pansplat.tours.find_fronts` for a position in the moved frame."""
+        """`pansplat.tours.doll_house.find_fronts` for a position in the moved frame."""
         assert self._splats is not None and self._scene is not None
         splats, scene = self._splats, self._scene
         if self._seen is None:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import Rooms, find_rooms, fit_box, measure_box
+from pansplat.tours.doll_house import Rooms, find_rooms, fit_box, measure_box
 from pansplat_viewer.scene.background import Jobs, Report
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.state import GLIDE_SECONDS, Glide, ViewerState, leave_doll_house

@@ -27,7 +27,7 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import read_json
-from pansplat.tours import TourGraph
+from pansplat.tours.graph import TourGraph
 from pansplat_viewer.scene.camera import MAX_FOV_DEGREES, MIN_FOV_DEGREES, Camera, move_to_pose
 
 MAX_SECONDS = 3600.0

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.pairs import Pair, Panorama
-    from pansplat.tours import Edge, FloorOutline, TourGraph
+    from pansplat.tours.floor import FloorOutline
+    from pansplat.tours.graph import Edge, TourGraph
 
 
 Progress = Callable[[str, float], None]  # task, fraction done
@@ -144,7 +145,7 @@ def find_entries(
             raise
         pairs, notes = [], []
     from pansplat.pipeline import load_predictor, warn_of_single_views
-    from pansplat.tours import find_tours
+    from pansplat.tours.graph import find_tours
 
     tours = find_tours(pairs)
     if any(a == b for tour in tours for a, b in tour.overlaps):
@@ -159,7 +160,7 @@ def find_entries(
 
 
 def _list_tours(pairs: "list[Pair]") -> list[SceneEntry]:
-    from pansplat.tours import find_tours
+    from pansplat.tours.graph import find_tours
 
     return [SceneEntry(tour.name, tour=tour) for tour in find_tours(pairs)]
 
@@ -216,7 +217,7 @@ def load_entry(
         scene = pipeline.load(entry.file)
         if not scene.overlaps or scene.joint:  # the views of an edge alone lack surfaces of others
             return LoadedScene(entry, scene)
-        from pansplat.tours import make_graph
+        from pansplat.tours.graph import make_graph
 
         tour = replace(make_graph(scene), name=entry.name)
         return _load_tour_scene(replace(entry, tour=tour, merged=scene), options, progress, show)
@@ -239,7 +240,11 @@ def _load_tour_scene(
     The first scene of a window is not refined if it is predicted again with the rest of its part.
     """
     from pansplat import pipeline
-    from pansplat.tours import connect, find_floor_outlines, find_poor_edges, find_walls, measure_outlook, select_views
+    from pansplat.tours.edges import find_poor_edges, find_walls
+    from pansplat.tours.floor import find_floor_outlines
+    from pansplat.tours.graph import select_views
+    from pansplat.tours.outlook import measure_outlook
+    from pansplat.tours.overlap import connect
 
     tour, views, merged, prediction = entry.tour, entry.views, entry.merged, options.prediction
     assert tour is not None

@@ -17,7 +17,8 @@ from pansplat.geometry.path import (
     path_poses,
     up_direction,
 )
-from pansplat.tours import Route, TourGraph
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.route import Route
 from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.scene.picking import PickedPoint

@@ -5,6 +5,7 @@ Imports no OpenGL: the film and the window use the same objects.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -15,21 +16,10 @@ import torch
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.tours import (
-    EDGE_HYSTERESIS,
-    FADE_SECONDS,
-    MAX_SCENE_VIEWS,
-    STOP_SECONDS,
-    Edge,
-    FloorOutline,
-    Route,
-    TourGraph,
-    ViewNumbers,
-    choose_camera_height,
-    find_link_ring,
-    plan_route,
-    select_views,
-)
+from pansplat.tours.floor import FloorOutline, choose_camera_height
+from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
+from pansplat.tours.links import find_link_ring
+from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
@@ -70,7 +60,7 @@ class TourScenes:
             merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
             max_views: of the predictor (`TourGraph.choose_predictions`).
         """
-        self.tour, self._merged, self._max_views = tour, merged, max_views
+        self.tour = tour
         self._graphs = [tour]  # also those before poor edges and walls were found, which pending entries have
         self.edge: Edge = next(iter(tour.overlaps))
         self._is_placed = False  # whether the camera has been at the edge
@@ -143,11 +133,11 @@ class TourScenes:
 
     def copy(self) -> TourScenes:
         """A copy with the scenes that are in memory, for a film in another thread."""
-        memory = self._budget / 2**30
-        scenes = TourScenes(self.tour, memory=memory, merged=self._merged, max_views=self._max_views)
-        scenes._views, scenes._providers = self._views, self._providers
-        scenes._sources, scenes._predictions = self._sources, self._predictions
-        scenes._loaded = self._loaded.copy()
+        scenes = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, (dict, list, set)):
+                setattr(scenes, name, value.copy())
+        scenes._is_placed = False
         return scenes
 
     @property

@@ -12,7 +12,8 @@ import moderngl
 import numpy as np
 from imgui_bundle import imgui
 
-from pansplat.tours import FloorPlan, TourGraph, draw_floor_plan, find_other_storeys
+from pansplat.tours.floor import FloorPlan, draw_floor_plan, find_other_storeys
+from pansplat.tours.graph import TourGraph
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.tour import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.pairs import Note, Panorama
-from pansplat.tours import STOP_REACH
+from pansplat.tours.route import STOP_REACH
 
 MAX_HEIGHT = 2048  # pixels; sharper than the image at fields of view above 65 degrees on 720 rows
 _MAX_TEXTURES = 4  # 25 MB each

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import glob
 import itertools
 import re
 import warnings
@@ -26,6 +27,7 @@ from pansplat.inputs.pairs import FAR, NEAR, Collection, Panorama, find_mask, li
 from pansplat.inputs.poses import read_number
 from pansplat.inputs.stated_files import find_inside
 from pansplat.system.components import label_components
+from pansplat.system.files import make_unique_name
 
 _SCALE = "scale.txt"
 _IMAGE_FOLDERS = ("images", "image", "panos", "frames", "input", ".")
@@ -100,15 +102,11 @@ def find_picture(folder: Path, name: str, *more: Path) -> Path | None:
         if found is not None:
             return found
     for base in bases:  # a label without a suffix
-        found = sorted(base.glob(f"{_escape(last)}.*")) if last and base.is_dir() else []
+        found = sorted(base.glob(f"{glob.escape(last)}.*")) if last and base.is_dir() else []
         pictures = [file for file in found if file.suffix.lower() in READABLE_SUFFIXES and file.is_file()]
         if pictures:
             return pictures[0]
     return None
-
-
-def _escape(text: str) -> str:
-    return re.sub(r"([*?\[])", r"[\1]", text)
 
 
 def make_collection(found: Reconstruction) -> Collection:
@@ -217,16 +215,15 @@ def _join_shots(found: Reconstruction) -> tuple[list[Panorama], dict[str, float]
         names = [shot.name for shot in shots]
         if shots[0].lens is None:
             image, pose = shots[0].image, shots[0].cam2world
-            name = image.stem
+            name = make_unique_name(image.stem, taken)
         else:
             rig, pose = _make_rig(shots)
             coverage = rig.measure_coverage()
             if coverage < _PANORAMIC:
                 partial |= dict.fromkeys(names, coverage)
                 continue
-            name = _make_unique(_find_common_name(names), taken)
+            name = make_unique_name(_find_common_name(names), taken)
             image = write_rig(rig, found.folder, name)
-        name = _make_unique(name, taken)
         taken.add(name)
         stated = shots[0].mask if shots[0].lens is None else None
         panoramas.append(Panorama(name, image, pose, stated or find_mask(image, found.folder)))
@@ -282,8 +279,3 @@ def _find_common_name(names: Sequence[str]) -> str:
     if not common and len(parents) == 1:
         common = parents.pop()
     return re.sub(r"[^\w.-]+", "_", common or paths[0].stem).strip(".") or "panorama"
-
-
-def _make_unique(name: str, taken: set[str]) -> str:
-    numbered = (f"{name}_{number}" for number in itertools.count(2))
-    return next(text for text in itertools.chain((name,), numbered) if text not in taken)

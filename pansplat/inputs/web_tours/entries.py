@@ -21,7 +21,7 @@ from pansplat.geometry.path import wrap_angle
 from pansplat.images.cube_images import CubeImage, write_cube
 from pansplat.inputs.pairs import Link, Note, Panorama, find_mask
 from pansplat.inputs.stated_files import locate_inside
-from pansplat.system.files import make_portable_name, read_file
+from pansplat.system.files import make_portable_name, make_unique_name, read_file
 from pansplat.system.strict_json import convert
 
 _T = TypeVar("_T")
@@ -87,6 +87,17 @@ def optional(what: str, read: Callable[[], _T]) -> _T | None:
     except InputError as error:
         warnings.warn(f"{what} is left out: {error}", category=InputWarning, stacklevel=3)
         return None
+
+
+def read_spots(what: str, spots: Any, read: Callable[[dict[str, Any]], _T]) -> tuple[_T, ...]:
+    """What `read` returns for each hot spot of a list, without those that cannot be used (`optional`)."""
+    found = (optional(what, lambda spot=spot: read(spot)) for spot in list_objects(spots))
+    return tuple(each for each in found if each is not None)
+
+
+def list_objects(value: Any) -> list[dict[str, Any]]:
+    """The objects in a list; none if the value is no list."""
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
 def locate(folder: Path, *parts: Any, suffix: str = "") -> str:
@@ -205,21 +216,25 @@ def make_panoramas(entries: Sequence[Entry], source: Path, tour: str) -> list[Pa
         if entry.picture in by_picture:
             names.setdefault(entry.key, by_picture[entry.picture])
             continue
-        name = _unique(_safe_name(entry.key) or f"scene_{number}", set(by_picture.values()))
+        portable = make_portable_name(entry.key)[:_MAX_NAME].rstrip(".")
+        name = make_unique_name(portable or f"scene_{number}", by_picture.values())
         names.setdefault(entry.key, name)
         by_picture[entry.picture] = name
         kept.append((name, entry))
     panoramas = []
     for name, entry in kept:
-        image = entry.picture if isinstance(entry.picture, Path) else write_cube(entry.picture, folder, name)
-        mask = find_mask(image, folder)
-        pose = torch.eye(4, dtype=torch.float64)
         title = "" if entry.title == name else entry.title
         links = resolve_links(entry.links, names, name, source)
         notes = tuple(note for note in entry.notes if note.text or note.addresses)
         about = {"title": title, "links": links, "notes": notes, "tour": tour, "start": entry.start}
-        panoramas.append(Panorama(name, image, pose, mask, **about))
+        panoramas.append(replace(make_panorama(name, entry.picture, folder), **about))
     return panoramas
+
+
+def make_panorama(name: str, picture: Path | CubeImage, folder: Path) -> Panorama:
+    """A panorama without a pose; cube faces get a file in the cache folder."""
+    image = picture if isinstance(picture, Path) else write_cube(picture, folder, name)
+    return Panorama(name, image, torch.eye(4, dtype=torch.float64), find_mask(image, folder))
 
 
 def resolve_links(links: Sequence[Link], names: Mapping[str, str], own: str, source: Path) -> tuple[Link, ...]:
@@ -236,14 +251,3 @@ def resolve_links(links: Sequence[Link], names: Mapping[str, str], own: str, sou
         elif names[link.target] != own:
             resolved.append(replace(link, target=names[link.target]))
     return tuple(resolved)
-
-
-def _safe_name(key: str) -> str:
-    return make_portable_name(key)[:_MAX_NAME].rstrip(".")
-
-
-def _unique(name: str, taken: set[str]) -> str:
-    """The name, with a number if it is taken, also in other capitals: file systems may not distinguish them."""
-    lower = {other.lower() for other in taken}
-    numbered = (f"{name}_{n}" for n in range(2, len(taken) + 3))
-    return name if name.lower() not in lower else next(other for other in numbered if other.lower() not in lower)

@@ -25,12 +25,14 @@ from pansplat.inputs.pairs import Link, Note
 from pansplat.inputs.web_tours.entries import (
     Entry,
     Pixels,
+    list_objects,
     locate,
     optional,
     plain_text,
     read_direction,
     read_entries,
     read_note,
+    read_spots,
     read_text,
     require_tiles,
 )
@@ -87,16 +89,9 @@ def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
     levels = _find_levels(key, scene, source)
     view = scene.get("initialViewParameters")
     start = optional(f"{source}: the start view of {key}", lambda: read_direction(view)) if view else None
-    links = [
-        optional(f"{source}: a link of {key}", lambda spot=spot: _read_link(spot))
-        for spot in _objects(scene.get("linkHotspots"))
-    ]
-    notes = [
-        optional(f"{source}: a hot spot of {key}", lambda spot=spot: _read_note(spot))
-        for spot in _objects(scene.get("infoHotspots"))
-    ]
-    picture, title = CubeImage(source.parent, levels), plain_text(scene.get("name"))
-    return Entry(key, picture, title, tuple(filter(None, links)), tuple(filter(None, notes)), start)
+    links = read_spots(f"{source}: a link of {key}", scene.get("linkHotspots"), _read_link)
+    notes = read_spots(f"{source}: a hot spot of {key}", scene.get("infoHotspots"), _read_note)
+    return Entry(key, CubeImage(source.parent, levels), plain_text(scene.get("name")), links, notes, start)
 
 
 def _read_link(spot: Mapping[str, Any]) -> Link:
@@ -105,10 +100,6 @@ def _read_link(spot: Mapping[str, Any]) -> Link:
 
 def _read_note(spot: Mapping[str, Any]) -> Note:
     return read_note(read_direction(spot), [spot.get("title"), spot.get("text")])
-
-
-def _objects(value: Any) -> list[dict[str, Any]]:
-    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
 def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[CubeLevel, ...]:
@@ -120,7 +111,7 @@ def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[Cube
     base = locate(folder, "tiles", plain_text(scene.get("id")))
     stated = [
         tuple(convert(level.get(key), Pixels, key, strict=False) for key in ("size", "tileSize"))
-        for level in _objects(scene.get("levels"))
+        for level in list_objects(scene.get("levels"))
     ]
     for pixels, tile in stated:
         require_tiles(min(pixels, MAX_SIZE), tile)

@@ -30,12 +30,14 @@ from pansplat.inputs.web_tours.entries import (
     Entry,
     Number,
     Pixels,
+    list_objects,
     locate,
     optional,
     plain_text,
     read_direction,
     read_entries,
     read_note,
+    read_spots,
     read_text,
     require_tiles,
 )
@@ -106,9 +108,7 @@ def _find_configuration(source: Path) -> dict[str, Any] | None:
     text = read_text(source)
     if source.suffix.lower() == ".json":
         start = len(text) - len(text.lstrip())
-        if not text[start:].startswith("{") or not any(
-            f'"{key}"' in text or key in text for key in ("scenes", *_PICTURES)
-        ):
+        if not text.startswith("{", start) or not any(key in text for key in ("scenes", *_PICTURES)):
             return None
         return _accept(parse_literal(text, start, source)[0])
     for literal in _list_arguments(text, source):
@@ -156,11 +156,6 @@ def _accept(content: Any) -> dict[str, Any] | None:
     return content if is_tour or any(content.get(key) for key in _PICTURES) else None
 
 
-def _spots(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
-    spots = scene.get("hotSpots")
-    return [spot for spot in spots if isinstance(spot, dict)] if isinstance(spots, list) else []
-
-
 def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
     kind = scene.get("type", "equirectangular")
     readers = {"equirectangular": _read_equirect, "cubemap": _read_cube_map, "multires": _read_tiles}
@@ -171,18 +166,11 @@ def _read_scene(key: str, scene: Mapping[str, Any], source: Path) -> Entry:
     picture = readers[kind](scene, source.parent)
     has_start = "yaw" in scene or "pitch" in scene
     start = optional(f"{source}: the start view of {key}", lambda: _read_direction(scene)) if has_start else None
-    links = [
-        optional(f"{source}: a link of {key}", lambda spot=spot: _read_link(spot))
-        for spot in _spots(scene)
-        if spot.get("sceneId")
-    ]
-    notes = [
-        optional(f"{source}: a hot spot of {key}", lambda spot=spot: _read_note(spot))
-        for spot in _spots(scene)
-        if not spot.get("sceneId")
-    ]
-    title = plain_text(scene.get("title"))
-    return Entry(key, picture, title, tuple(filter(None, links)), tuple(filter(None, notes)), start)
+    spots = list_objects(scene.get("hotSpots"))
+    ways, others = ([spot for spot in spots if bool(spot.get("sceneId")) == is_way] for is_way in (True, False))
+    links = read_spots(f"{source}: a link of {key}", ways, _read_link)
+    notes = read_spots(f"{source}: a hot spot of {key}", others, _read_note)
+    return Entry(key, picture, plain_text(scene.get("title")), links, notes, start)
 
 
 def _read_link(spot: Mapping[str, Any]) -> Link:
@@ -198,7 +186,7 @@ def _read_note(spot: Mapping[str, Any]) -> Note:
 
 def _read_direction(content: Mapping[str, Any]) -> tuple[float, float]:
     yaw, pitch = read_direction(content, unit=math.radians(1))
-    return yaw, -pitch
+    return yaw, 0.0 - pitch  # not -0.0
 
 
 def _base(scene: Mapping[str, Any]) -> list[Any]:

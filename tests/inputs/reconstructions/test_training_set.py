@@ -13,7 +13,7 @@ from numpy import ndarray as Array
 from PIL import Image
 
 from pansplat.export import training_set
-from pansplat.export.training_set import PosedPanorama, write_dataset
+from pansplat.export.training_set import write_dataset
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.pairs import Panorama
@@ -34,12 +34,11 @@ def dataset(tmp_path: Path, cameras: list[Array], points: Array, write_panorama)
             white = np.full((64, 128), 255, np.uint8)
             white[50:] = 0
             Image.fromarray(white).save(mask)
-        panorama = Panorama(image.stem, image, torch.eye(4), mask)
-        views.append(PosedPanorama(panorama, torch.from_numpy(pose)))
+        views.append(Panorama(image.stem, image, torch.from_numpy(pose), mask))
     folder = tmp_path / "set"
     folder.mkdir()
     colors = np.arange(3 * len(points)).reshape(-1, 3).astype(np.uint8)
-    assert write_dataset(folder, views, points, colors, lambda *_: None) == 18
+    assert write_dataset(folder, views, (), points, colors, lambda *_: None) == 18
     return folder
 
 
@@ -115,7 +114,7 @@ def test_one_picture_is_in_memory_at_a_time(
     image, mask = tmp_path / "p.png", tmp_path / "m.png"
     write_panorama(image, cameras[0])
     Image.fromarray(np.arange(64 * 128, dtype=np.uint8).reshape(64, 128) // 128 * 255).save(mask)
-    view = PosedPanorama(Panorama("p", image, torch.eye(4), mask), torch.from_numpy(cameras[0]))
+    view = Panorama("p", image, torch.from_numpy(cameras[0]), mask)
     written: list[weakref.ref] = []
 
     def write(path: Path, pixels: Array, *, panorama: bool) -> None:
@@ -126,7 +125,7 @@ def test_one_picture_is_in_memory_at_a_time(
     monkeypatch.setattr(training_set, "write_image", write)
     folder = tmp_path / "set"
     folder.mkdir()
-    write_dataset(folder, [view], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), lambda *_: None)
+    write_dataset(folder, [view], (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), lambda *_: None)
     assert len(written) == 12
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.tours import find_fronts
+from pansplat.tours.doll_house import find_fronts
 from pansplat_viewer.scene.settings import DrawSettings
 
 pytestmark = pytest.mark.gl

@@ -92,7 +92,7 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
     alone = parted_house.panoramas[3]
     tour = replace(parted_house, panoramas=(alone, *parted_house.panoramas[:3]), originals=())
     tour = replace(tour, overlaps={(0, 0): 1.0, (1, 2): 0.4, (2, 3): 0.4})
-    monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: tour)
+    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: tour)
     scene = load_house(TourScenes(tour).make_entry((0,))).scene
     monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, **options: scene)
     single = replace(tour, panoramas=(alone,), overlaps={(0, 0): 1.0})
@@ -104,7 +104,7 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
 def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_follows(monkeypatch, house, load_house):
     # The walk of the graph that is not connected starts at 0; that of the connected one at 3.
     connected = replace(house, overlaps={(0, 1): 0.13, (1, 2): 0.4, (2, 3): 0.4, (0, 2): 0.4})
-    monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: connected)
+    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: connected)
     asked = []
 
     def predict(pair, refine_seconds, on_predicted, **options):

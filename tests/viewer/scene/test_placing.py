@@ -20,7 +20,7 @@ from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import WALL_ANGLE, Piece, PlanPose
 from pansplat.poses.solvers import rotation_exp
-from pansplat.tours import find_tours
+from pansplat.tours.graph import find_tours
 from pansplat_viewer.scene.loader import SceneEntry, list_panoramas
 from pansplat_viewer.scene.placing import FINE, TURN_STEP, Placing, PlanView
 

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from pansplat.inputs.pairs import Link
-from pansplat.tours import FADE_SECONDS, plan_route
+from pansplat.tours.route import FADE_SECONDS, plan_route
 from pansplat_viewer import run
 from pansplat_viewer.capture import Film, TourFrames, _find_nearest_frames, write_tour
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
@@ -378,7 +378,7 @@ def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house,
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
-    monkeypatch.setattr("pansplat.tours.connect", lambda tour, progress: replace(tour, overlaps=house.overlaps))
+    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: replace(tour, overlaps=house.overlaps))
     arguments = ["--offscreen", str(tmp_path), "--size", "64x32", "--seconds", "0.5", "--renderer", "cpu"]
     assert run([str(house.folder), *arguments]) == 0
     stills = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]

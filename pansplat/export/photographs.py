@@ -1,4 +1,5 @@
-"""Photographs of a page: cube tiles of two or three sizes, which the page shows where a camera stands at a panorama.
+"""Photographs in pages and films, which show them where a camera stands at a panorama; for pages cube tiles of two or
+three sizes.
 
 What masks hide is replaced before anything is encoded: blur masks by the reading of every panorama, scene masks by what
 the Gaussians show there. The tiles are encoded from pixels, so that no metadata of a file is in them.
@@ -30,7 +31,7 @@ from pansplat.images.masks import mask_holes
 from pansplat.inputs.pairs import Pair
 from pansplat.predictor import Progress
 from pansplat.system.files import SOFTWARE
-from pansplat.tours import TourGraph, make_graph, select_views
+from pansplat.tours.graph import TourGraph, make_graph, select_views
 
 MIN_HEIGHT = 1024  # of a photograph in a page, pixels, unless it is smaller
 MAX_HEIGHT = 4096  # of a photograph in a folder
