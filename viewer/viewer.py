@@ -190,7 +190,7 @@ class Viewer:
         entry = self.library.loader.entry
         if self.tour is None or self.loaded is None:
             return False
-        return self._incoming is None if entry is None else entry.tour is self.tour.tour
+        return self._incoming is None if entry is None else self.tour.is_of(entry)
 
     @property
     def reduced(self) -> int | None:

@@ -38,7 +38,7 @@ from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, count_bytes, 
 from pansplat.export.photographs import PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
-from pansplat.inputs.pairs import Link, Pair
+from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
 from pansplat.predictor import Progress
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
@@ -53,7 +53,7 @@ from pansplat.tours.edges import find_poor_edges
 from pansplat.tours.floor import choose_camera_height, find_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
 from pansplat.tours.layout import REACH
-from pansplat.tours.links import find_link_ring, find_way_along_link
+from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
 from pansplat.tours.outlook import choose_heading, find_blank, is_hidden, measure_outlook
 from pansplat.tours.plan import Plan
 from pansplat.tours.route import Route, find_angles, plan_route
@@ -435,7 +435,7 @@ def _describe_scene(
         "views": views_of_page,
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(_link_parts(tour), positions, heights, level) if flights.edges else [],
+        "links": _describe_links(link_parts(tour), positions, heights, level) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
@@ -531,20 +531,6 @@ def _describe_rooms(
         means = scene.gaussians.means[torch.from_numpy(cameras == camera)].double() - torch.from_numpy(origin)
         boxes[camera] = [_round(corner) for corner in measure_box(means, level)]
     return {"ranges": packed.rooms, "storeys": storeys, "boxes": boxes} if any(boxes) else None
-
-
-def _link_parts(tour: TourGraph) -> TourGraph:
-    """The tour with links between parts with a wall between them, where these are nearest; none if there is one."""
-    linked = {frozenset((tour.parts[a], tour.parts[b])) for a, b in tour.links}
-    panoramas = list(tour.panoramas)
-    for a, b in sorted(tour.walls, key=tour.length):
-        parts = frozenset((tour.parts[a], tour.parts[b]))
-        for start, end in ((a, b), (b, a)) if len(parts) > 1 and parts not in linked else ():
-            x, y, z = tour.cam2world[start, :3, :3].numpy().T @ (tour.positions[end] - tour.positions[start])
-            link = Link(panoramas[end].name, math.atan2(x, z), math.atan2(y, math.hypot(x, z)))
-            panoramas[start] = dataclasses.replace(panoramas[start], links=(*panoramas[start].links, link))
-        linked.add(parts)
-    return dataclasses.replace(tour, panoramas=tuple(panoramas))
 
 
 def _describe_links(

@@ -1,15 +1,33 @@
-"""Where the links of a tour are in space: the way along a link, and its ring on the floor."""
+"""Where the links of a tour are in space, the way along a link and its ring on the floor, and links through walls."""
 
 from __future__ import annotations
+
+import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
 
+from pansplat.inputs.pairs import Link
 from pansplat.tours.graph import TourGraph
 
 _WAY_METRES = 0.7  # that the camera goes along a link, before the fade
 _RING_METRES = (1.0, 3.0)  # distance of a link's ring
 _MIN_LEVEL = 0.1  # level length of the direction of a link that is not vertical
+
+
+def link_parts(tour: TourGraph) -> TourGraph:
+    """The tour with links through walls, where these are nearest, between parts that no link joins."""
+    joined = {frozenset((tour.parts[a], tour.parts[b])) for a, b in tour.links}
+    panoramas = list(tour.panoramas)
+    for a, b in sorted(tour.walls, key=tour.length):
+        parts = frozenset((tour.parts[a], tour.parts[b]))
+        for start, end in ((a, b), (b, a)) if len(parts) > 1 and parts not in joined else ():
+            x, y, z = tour.cam2world[start, :3, :3].numpy().T @ (tour.positions[end] - tour.positions[start])
+            link = Link(panoramas[end].name, math.atan2(x, z), math.atan2(y, math.hypot(x, z)))
+            panoramas[start] = dataclasses.replace(panoramas[start], links=(*panoramas[start].links, link))
+        joined.add(parts)
+    return dataclasses.replace(tour, panoramas=tuple(panoramas)) if tour.walls else tour
 
 
 def find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:

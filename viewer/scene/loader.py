@@ -243,6 +243,7 @@ def _load_tour_scene(
     from pansplat.tours.edges import find_poor_edges, find_walls
     from pansplat.tours.floor import find_floor_outlines
     from pansplat.tours.graph import select_views
+    from pansplat.tours.links import link_parts
     from pansplat.tours.outlook import measure_outlook
     from pansplat.tours.overlap import connect
 
@@ -250,7 +251,7 @@ def _load_tour_scene(
     assert tour is not None
     if merged is not None:
         first, views = _choose_first_scene(tour, tour)
-        entry = replace(entry, views=views, start=first)
+        entry = replace(entry, tour=link_parts(tour), views=views, start=first)
         outlines = find_floor_outlines(tour, merged, tuple(range(len(tour))))
         outlooks = {node: measure_outlook(merged, node, tour.level_axes) for node in range(len(tour))}
         poor = () if merged.joint else find_poor_edges(merged, range(len(tour)), tour.overlaps)
@@ -260,7 +261,7 @@ def _load_tour_scene(
         connected, max_views = connect(tour, progress), pipeline.find_max_views(predictor)
         # A window shows photographs before: they begin where the graph that is not connected yet does.
         first, views = _choose_first_scene(connected, connected if show is None else tour)
-        tour, part = connected, connected.choose_predictions(max_views).get(first, views)
+        tour, part = link_parts(connected), connected.choose_predictions(max_views).get(first, views)
         if show is None:
             views = part
         elif views != part:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours.floor import FloorOutline, choose_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
-from pansplat.tours.links import find_link_ring
+from pansplat.tours.links import find_link_ring, link_parts
 from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
@@ -205,11 +205,11 @@ class TourScenes:
         self._graphs.append(tour)
 
     def _block(self, walls: Sequence[Edge]) -> None:
-        """Put walls in place of edges. A panorama without another edge keeps the scene of its first one."""
+        """Put walls with links in place of edges. A panorama without another edge keeps the scene of its first one."""
         blocked = [edge for edge in walls if edge in self.tour.overlaps]
         if not blocked:
             return
-        self._change(self.tour.with_walls(blocked))
+        self._change(link_parts(self.tour.with_walls(blocked)))
         of_node = {node: views for edge, views in self._views.items() for node in edge}
         self._views = {edge: self._views.get(edge, of_node[edge[0]]) for edge in self.tour.overlaps}
         if self.edge in blocked:

@@ -136,6 +136,9 @@ def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(hous
     assert scenes.edge == (0, 0) and scenes.get(scenes.views) is not None, "the camera stays where it is"
     assert scenes.list_next(None, 0.0) == [part] and scenes.copy().list_next(None, 0.0) == [part]
     assert scenes.plan_way(house.cam2world[0].numpy(), 2).fades == (0,)
+    camera = Camera(position=tuple(house.positions[0].tolist()))
+    (hotspot,) = find_hotspots(scenes, camera, (200, 200))
+    assert hotspot.node == 1 and hotspot.is_fade, "a ring leads through the wall"
 
 
 def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_house, monkeypatch):
