@@ -487,7 +487,7 @@ def _describe_plan(
     of each panorama; panoramas of other worlds are elsewhere."""
     worlds = tour.worlds if tour.overlaps else (0,) * max(len(tour), 1)
     if plan is None or not plan.rooms:
-        return {"worlds": worlds, "turn": 0.0, "rooms": [], "doors": []}
+        return {"worlds": worlds, "turns": [0.0] * (max(worlds) + 1), "rooms": [], "doors": []}
     turn, middle = tour.level_axes[:, (0, 2)].T @ level[:, (0, 2)], origin @ level[:, (0, 2)]
     turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in plan.rooms]
     plan, rooms = dataclasses.replace(plan, rooms=tuple(turned)), []
@@ -497,7 +497,7 @@ def _describe_plan(
         outline = [_round(corner) for corner in room.outline - middle]
         rooms.append({"name": room.name, "nodes": room.panoramas, "outline": outline, "label": label})
     doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in plan.doors]
-    return {"worlds": worlds, "turn": round(plan.turn, 5), "rooms": rooms, "doors": doors}
+    return {"worlds": worlds, "turns": _round(np.array(plan.turns)), "rooms": rooms, "doors": doors}
 
 
 def _find_cameras(scene: Scene, rooms: Rooms) -> Int[np.ndarray, "n"]:

@@ -1,7 +1,7 @@
 """Floor plans of straight walls as drawings: SVG and PNG of one figure, and DXF for CAD programs.
 
-The longest wall is horizontal. Storeys are next to each other, the lowest on the left. All are to scale: figures are
-1:50 on paper, a DXF is in metres.
+The longest wall is horizontal. Storeys are next to each other, the lowest on the left. Rooms that are not placed are
+dashed and beside them. All are to scale: figures are 1:50 on paper, a DXF is in metres.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from pansplat.system.descriptions import describe_count
 from pansplat.system.files import SOFTWARE
 from pansplat.tours.floor import assign_storeys, write_floor_plan
 from pansplat.tours.graph import make_graph
+from pansplat.tours.layout import arrange_in_rows
 from pansplat.tours.plan import Plan, Room, make_plan
 
 SUFFIXES = (".svg", ".png", ".dxf")
@@ -120,6 +121,8 @@ def describe_plan(plan: Plan) -> list[str]:
     inside = {node for room in plan.rooms for node in room.panoramas}
     if outside := [panorama.name for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
         lines.append(f"no closed walls around {', '.join(outside)}")
+    if not all(room.is_placed for room in plan.rooms):
+        lines.append("dashed: rooms whose places are not known")
     if plan.wall_error is None:
         return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
     walls = describe_count(plan.num_walls, "wall")
@@ -133,51 +136,73 @@ class _Drawing:
     plan: Plan
 
     @cached_property
-    def _turn(self) -> Float[np.ndarray, "2 2"]:
-        """The rotation, applied from the right, after which the longest wall is horizontal."""
-        cosine, sine = math.cos(self.plan.turn), math.sin(self.plan.turn)
-        return np.array(((cosine, sine), (-sine, cosine)))
+    def _pieces(self) -> list[tuple[int, int]]:
+        """World and storey of each panorama."""
+        return list(zip(self.plan.tour.worlds, assign_storeys(self.plan.tour), strict=True))
 
     @cached_property
-    def storeys(self) -> list[int]:
-        """The storey of each panorama."""
-        return assign_storeys(self.plan.tour)
+    def _turns(self) -> Float[np.ndarray, "world 2 2"]:
+        """For each world the rotation, applied from the right, after which its longest wall is horizontal."""
+        cosines, sines = np.cos(self.plan.turns), np.sin(self.plan.turns)
+        return np.stack((cosines, sines, -sines, cosines), axis=1).reshape(-1, 2, 2)
 
     @cached_property
     def _centers(self) -> Float[np.ndarray, "node 2"]:
-        return self.plan.tour.positions @ self.plan.tour.level_axes[:, (0, 2)] @ self._turn
+        places = self.plan.tour.positions @ self.plan.tour.level_axes[:, (0, 2)]
+        return np.stack([place @ self._turns[world] for place, (world, _) in zip(places, self._pieces, strict=True)])
 
     @cached_property
-    def _layout(self) -> tuple[Float[np.ndarray, "storey 2"], tuple[float, float]]:
-        """What each storey is moved by, so that all are in one row from (0, 0) on, and the size of the row."""
-        moves, right, height = [], 0.0, 0.0
-        for storey in range(max(self.storeys) + 1):
-            outlines = [room.outline @ self._turn for room in self.plan.rooms if room.storey == storey]
-            places = np.concatenate([self._centers[np.array(self.storeys) == storey], *outlines])
-            low, size = places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN
-            moves.append((right - low[0], -low[1]))
-            right, height = right + float(size[0]) + _GAP, max(height, float(size[1]))
-        return np.array(moves), (right - _GAP, height)
+    def _layout(self) -> tuple[dict[tuple[int, int], Float[np.ndarray, "2"]], tuple[float, float]]:
+        """What each world and storey is moved by, and the size of all.
+
+        Storeys are next to each other. Worlds are in rows from (0, 0) on, the largest one in the upper left corner.
+        """
+        worlds = self.plan.tour.worlds
+        boxes: dict[int, list[tuple[tuple[int, int], np.ndarray, np.ndarray]]] = {}
+        for piece in sorted(set(self._pieces), key=lambda piece: (-worlds.count(piece[0]), piece)):
+            nodes = [node for node, own in enumerate(self._pieces) if own == piece]
+            outlines = [room.outline @ self._turns[piece[0]] for room in self.plan.rooms if room.panoramas[0] in nodes]
+            places = np.concatenate([self._centers[nodes], *outlines])
+            box = piece, places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN
+            boxes.setdefault(piece[0], []).append(box)
+        sizes = np.array(
+            [
+                (sum(size[0] for *_, size in row) + _GAP * (len(row) - 1), max(size[1] for *_, size in row))
+                for row in boxes.values()
+            ]
+        )
+        corners = np.array(arrange_in_rows(sizes))
+        width, height = (corners + sizes).max(axis=0).tolist()
+        moves = {}
+        for row, (right, back) in zip(boxes.values(), corners, strict=True):
+            for piece, low, size in row:
+                moves[piece] = np.array((right, height - back - size[1])) - low
+                right += size[0] + _GAP
+        return moves, (width, height)
 
     @property
     def size(self) -> tuple[float, float]:
         """Width and height of all storeys."""
         return self._layout[1]
 
+    def _draw(self, places: Float[np.ndarray, "n 2"], room: Room) -> Float[np.ndarray, "n 2"]:
+        """Places of a room on the sheet."""
+        piece = self._pieces[room.panoramas[0]]
+        return places @ self._turns[piece[0]] + self._layout[0][piece]
+
     def outline(self, room: Room) -> Float[np.ndarray, "corner 2"]:
         """The corners of a room."""
-        return room.outline @ self._turn + self._layout[0][room.storey]
+        return self._draw(room.outline, room)
 
     @cached_property
     def doors(self) -> list[Float[np.ndarray, "2 2"]]:
         """The ends of all doors."""
-        moves = [self._layout[0][self.plan.rooms[door.rooms[0]].storey] for door in self.plan.doors]
-        return [door.ends @ self._turn + move for door, move in zip(self.plan.doors, moves, strict=True)]
+        return [self._draw(door.ends, self.plan.rooms[door.rooms[0]]) for door in self.plan.doors]
 
     @cached_property
     def panoramas(self) -> Float[np.ndarray, "node 2"]:
         """The places of all panoramas."""
-        return self._centers + self._layout[0][self.storeys]
+        return self._centers + np.stack([self._layout[0][piece] for piece in self._pieces])
 
     @cached_property
     def notes(self) -> list[str]:
@@ -188,11 +213,12 @@ class _Drawing:
         """Names and areas of rooms, lengths of walls, and the names of panoramas outside of rooms."""
         for room in self.plan.rooms:
             corners = self.outline(room)
-            circle = shapely.maximum_inscribed_circle(Polygon(corners))
+            free = Polygon(corners).buffer(-2 * _SMALL_TEXT)  # of lengths, and of the dots of panoramas
+            free -= shapely.MultiPoint(self.panoramas[list(room.panoramas)]).buffer(_SMALL_TEXT)
+            circle = shapely.maximum_inscribed_circle(Polygon(corners) if free.is_empty else free)
             (x, y), width = circle.coords[0], 2 * circle.length
-            name = room.name if room.is_placed else f"{room.name} (not placed)"
             area = f"{room.area:.1f} m² ± {self.plan.area_error(room):.1f}"
-            for row, text in ((0.7, name), (-0.7, area)):
+            for row, text in ((0.7, room.name), (-0.7, area)):
                 size = min(_TEXT, 0.9 * width / (_LETTER * max(len(text), 1)))
                 yield _Text("ROOMS", (x, y + row * size), text, size)
             for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -268,7 +294,8 @@ def _draw_dxf(drawing: _Drawing) -> bytes:
         document.layers.add(name, color=color)
     space = document.modelspace()
     for room in drawing.plan.rooms:
-        space.add_lwpolyline(drawing.outline(room).tolist(), close=True, dxfattribs={"layer": "WALLS"})
+        style = {"layer": "WALLS", "linetype": "BYLAYER" if room.is_placed else "DASHED"}
+        space.add_lwpolyline(drawing.outline(room).tolist(), close=True, dxfattribs=style)
     for ends in drawing.doors:
         space.add_line(*ends.tolist(), dxfattribs={"layer": "DOORS"})
     for place in drawing.panoramas.tolist():

@@ -36,7 +36,7 @@ def lay_out(panoramas: Sequence[Panorama]) -> tuple[Panorama, ...]:
     levels = [level_pose(group[0], up_direction(group))[:3, :3] for group in poses]
     places = [(group[:, :3, 3] @ level).numpy() for group, level in zip(poses, levels, strict=True)]
     sizes = np.array([np.ptp(place, axis=0)[[0, 2]] + 2 * REACH + _GAP for place in places])  # right, forward
-    corners = _arrange_in_rows(sizes)
+    corners = arrange_in_rows(sizes)
     laid_out, axes, frame = list(panoramas), levels[0], panoramas[members[order[0]][0]].frame
     # Of each world the left front corner, and the mean height, move to those of the first one and its place in the row.
     ends = np.array([(place[:, 0].min(), place[:, 1].mean(), place[:, 2].max()) for place in places])
@@ -51,7 +51,7 @@ def lay_out(panoramas: Sequence[Panorama]) -> tuple[Panorama, ...]:
     return tuple(laid_out)
 
 
-def _arrange_in_rows(sizes: np.ndarray) -> list[tuple[float, float]]:
+def arrange_in_rows(sizes: np.ndarray) -> list[tuple[float, float]]:
     """Corners (right, backward) of boxes of these sizes in rows; the first one is at the origin."""
     width = max(_ASPECT * math.sqrt(float(sizes.prod(axis=1).sum())), float(sizes[:, 0].max()))
     corners, right, back, depth = [], 0.0, 0.0, 0.0

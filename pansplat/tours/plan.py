@@ -113,16 +113,16 @@ class Plan:
     num_walls: int
 
     @property
-    def turn(self) -> float:
-        """The angle, anticlockwise, by which plan coordinates are turned so that the longest wall is horizontal.
-
-        It is one of rooms whose places are known, if there are any: the others have directions of their own.
-        """
-        rooms = [room for room in self.rooms if room.is_placed] or self.rooms
-        sides = [np.roll(room.outline, -1, axis=0) - room.outline for room in rooms]
-        walls = np.concatenate([*sides, np.eye(2)[:1] * 1e-9])
-        x, y = walls[np.linalg.norm(walls, axis=1).argmax()]
-        return -math.remainder(math.atan2(y, x), math.pi)
+    def turns(self) -> list[float]:
+        """For each world the angle, anticlockwise, by which it is turned so that its longest wall is horizontal."""
+        worlds, turns = self.tour.worlds, []
+        for world in range(max(worlds) + 1):
+            outlines = [room.outline for room in self.rooms if worlds[room.panoramas[0]] == world]
+            sides = [np.roll(outline, -1, axis=0) - outline for outline in outlines]
+            walls = np.concatenate([*sides, np.eye(2)[:1] * 1e-9])
+            x, y = walls[np.linalg.norm(walls, axis=1).argmax()]
+            turns.append(-math.remainder(math.atan2(y, x), math.pi))
+        return turns
 
     def area_error(self, room: Room) -> float:
         """Standard deviation of a room's area, square metres, by those of the scale, of its walls and of its shape."""

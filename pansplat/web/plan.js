@@ -32,13 +32,14 @@ class Plan {
 
   // To the right and forward in metres.
   turned([right, forward]) {
-    const { turn } = HEADER.plan, [c, s] = [Math.cos(turn), Math.sin(turn)].map((value) => value / HEADER.unit);
+    const [c, s] = [Math.cos(this.turn), Math.sin(this.turn)].map((value) => value / HEADER.unit);
     return [c * right - s * forward, s * right + c * forward];
   }
 
   placeOf = (node) => this.turned([0, 2].map((k) => dot(column(HEADER.level, k), HEADER.spots[node].position)));
 
   make(world) {
+    this.turn = HEADER.plan.turns[world];
     const { worlds, rooms, doors } = HEADER.plan, nodes = [...worlds.keys()].filter((node) => worlds[node] === world);
     const outlines = rooms.map((room) => worlds[room.nodes[0]] === world ? room.outline.map((corner) => this.turned(corner)) : null);
     const places = [...nodes.map((node) => this.placeOf(node)), ...outlines.flatMap((outline) => outline || [])];
@@ -113,7 +114,7 @@ class Plan {
     if (world !== this.world) this.make(world);
     const place = this.turned([0, 2].map((k) => dot(column(HEADER.level, k), camera.position))), [x, y] = this.toPlan(place);
     this.camera.setAttribute("visibility", HEADER.plan.worlds[here] === world ? "visible" : "hidden");
-    this.camera.setAttribute("transform", `translate(${x} ${y}) rotate(${(camera.yaw - HEADER.plan.turn) / DEGREE})`);
+    this.camera.setAttribute("transform", `translate(${x} ${y}) rotate(${(camera.yaw - this.turn) / DEGREE})`);
     const [floor, ...others] = [here, ...this.marks.map(([node]) => node)].map((node) => heightOf(HEADER.spots[node].position));
     this.marks.forEach(([node, element], k) => {
       const isElsewhere = HEADER.plan.worlds[node] !== world;

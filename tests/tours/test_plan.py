@@ -154,14 +154,6 @@ def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Pa
         assert float(label.split()[0]) == pytest.approx(area, rel=0.05) and "m²" in label
 
 
-def test_the_longest_wall_of_known_place_is_horizontal() -> None:
-    plan = _plan(_make_house(WALLS, CAMERAS, turn_degrees=17))
-    oblique = np.array(L_ROOM) @ np.array(((3.0, 2.0), (-2.0, 3.0)))  # of a house of its own
-    lost = dataclasses.replace(plan.rooms[0], outline=oblique, is_placed=False)
-    assert dataclasses.replace(plan, rooms=(lost, *plan.rooms)).turn == plan.turn
-    assert math.sin(2 * (dataclasses.replace(plan, rooms=(lost,)).turn - plan.turn)) != pytest.approx(0, abs=0.1)
-
-
 def test_an_oblique_wall_stays_oblique() -> None:
     corners = [(0.0, 0.0), (5.0, 0.0), (5.0, 2.0), (3.0, 4.0), (0.0, 4.0)]
     (room,) = _plan(_make_house(_walls_around(corners), [(2.0, 1.8)])).rooms
@@ -274,6 +266,23 @@ def test_the_longest_wall_is_horizontal_and_lengths_are_read_from_below_or_the_r
     assert abs(longest[1]) < 0.02 * abs(longest[0])
     lengths = {text.text: text.angle for text in drawing.list_texts() if text.layer == "LENGTHS"}
     assert all(min(abs(angle), abs(angle - 90)) < 2 for angle in lengths.values()), lengths
+
+
+def test_a_room_that_is_not_placed_is_upright_beside_the_others_and_no_camera_hides_a_name() -> None:
+    plan = _plan(_make_house(WALLS, CAMERAS, names=("living room", "living room", "the hall of the house")))
+    c, s = math.cos(0.3), math.sin(0.3)
+    hall = plan.rooms[1].outline @ np.array(((c, s), (-s, c)))  # it would cover a part of the other room
+    lost = dataclasses.replace(plan.rooms[1], outline=hall, is_placed=False)
+    tour = dataclasses.replace(plan.tour, overlaps={(0, 1): 0.5, (2, 2): 1.0})
+    drawing = _Drawing(dataclasses.replace(plan, tour=tour, rooms=(plan.rooms[0], lost), doors=()))
+    living, hall = (drawing.outline(room) for room in drawing.plan.rooms)
+    assert hall.min(axis=0)[0] > living.max(axis=0)[0] + 1 and (np.array(drawing.size) > hall.max(axis=0)).all()
+    sides = np.diff(hall, axis=0)
+    assert np.abs(sides).min(axis=1) == pytest.approx(0, abs=1e-9)
+    assert "dashed: rooms whose places are not known" in drawing.notes
+    for text in drawing.list_texts():
+        away = np.abs(drawing.panoramas - text.place)
+        assert text.layer != "ROOMS" or (away > (0.3 * len(text.text) * text.size, 0.5 * text.size)).any(axis=1).all()
 
 
 def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:

@@ -1344,7 +1344,7 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
         outline = (positions[0] + ((-15, -20), (25, -20), (25, 20), (-15, 20))).tolist()
         room = {"name": "<i>salon and dining room", "nodes": [0], "outline": outline, "label": [*outline[3], 2]}
         rooms = [room, {**room, "nodes": [2], "name": "other world"}]
-        page.run(f"HEADER.plan.turn = 0.3; HEADER.plan.rooms = {json.dumps(rooms)}")
+        page.run(f"HEADER.plan.turns.fill(0.3); HEADER.plan.rooms = {json.dumps(rooms)}")
         page.run(f"HEADER.plan.doors = [{{ room: 0, ends: {outline[:2]} }}]")
         page.page.keyboard.press("m")
         page.settle()
@@ -1376,7 +1376,7 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
             )
         assert page.run("document.querySelector('#drawing [aria-current]').ariaLabel") == "Go to room 0"
         turned = "document.querySelector('#plan path').getAttribute('transform')"
-        page.run("pansplat.setPose({ yaw: 90 + HEADER.plan.turn * 180 / Math.PI })")
+        page.run("pansplat.setPose({ yaw: 90 + HEADER.plan.turns[0] * 180 / Math.PI })")
         page.wait(f"Math.abs({turned}.split('rotate(')[1].slice(0, -1) - 90) < 1e-3")
         x, y = (float(value) for value in page.run(turned)[10:].split(")")[0].split())
         assert (drawing["x"] + x, drawing["y"] + y) == pytest.approx(centers[0], abs=0.6)
