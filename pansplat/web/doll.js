@@ -43,11 +43,11 @@ class DollHouse {
 
   // Flies out of the panorama at the camera.
   enter() {
-    if (!this.isPossible || headset.session || !sorted) return;
+    if (headset.session || !sorted) return;
     setTouring(false);
     this.node = nearestNode(camera.position);
-    if (!HEADER.doll.boxes.some((box, view) => box && this.shows(view))) {
-      say("There is no doll's house of these rooms, because the surfaces that were found are too rough");
+    if (!this.isPossible || !HEADER.doll.boxes.some((box, view) => box && this.shows(view))) {
+      say(byId("no-doll").textContent);
       return;
     }
     takeStill();

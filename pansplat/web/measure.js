@@ -31,7 +31,8 @@ class Measure {
     this.points = [];
     byId("measure").setAttribute("aria-pressed", value);
     byId("marks").replaceChildren();
-    say(value ? "Click two points, or press Enter for the middle of the picture" : "");
+    const hint = matchMedia("(pointer: coarse)").matches ? "Tap two points" : "Click two points, or press Enter for the middle of the picture";
+    say(value ? hint : "");
     changed();
   }
 

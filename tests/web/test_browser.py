@@ -1280,6 +1280,10 @@ def test_rings_on_a_touch_screen_have_names_and_room_for_a_finger(chromium: Any,
         assert min(right) >= 0
         page.page.click("#more")
         page.page.click("#measure")
+        assert page.page.inner_text("#status") == "Tap two points"
+        page.run("HEADER.doll = null")
+        page.page.keyboard.press("KeyO")
+        assert "no floor was found" in page.page.inner_text("#status")
         box = page.page.query_selector("#status").bounding_box()
         assert box["width"] > 0.8 * 390 and box["x"] >= 0 and box["x"] + box["width"] <= 390, "a message is wide"
 
