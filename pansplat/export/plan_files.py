@@ -1,7 +1,7 @@
 """Floor plans of straight walls as drawings: SVG and PNG of one figure, and DXF for CAD programs.
 
-The longest wall is horizontal. Storeys are next to each other, the lowest on the left. Rooms that are not placed are
-dashed and beside them. All are to scale: figures are 1:50 on paper, a DXF is in metres.
+The longest wall is horizontal. Storeys are in rows, the lowest first. Rooms that are not placed are dashed, and beside
+them. All are to scale: figures are 1:50 on paper, a DXF is in metres.
 """
 
 from __future__ import annotations
@@ -153,32 +153,22 @@ class _Drawing:
 
     @cached_property
     def _layout(self) -> tuple[dict[tuple[int, int], Float[np.ndarray, "2"]], tuple[float, float]]:
-        """What each world and storey is moved by, and the size of all.
+        """What each storey of each world is moved by, so that all are in rows from (0, 0) on, and their size.
 
-        Storeys are next to each other. Worlds are in rows from (0, 0) on, the largest one in the upper left corner.
+        The lowest storey of the largest world is in the upper left corner.
         """
-        worlds = self.plan.tour.worlds
-        boxes: dict[int, list[tuple[tuple[int, int], np.ndarray, np.ndarray]]] = {}
-        for piece in sorted(set(self._pieces), key=lambda piece: (-worlds.count(piece[0]), piece)):
+        worlds, boxes = self.plan.tour.worlds, []
+        order = sorted(set(self._pieces), key=lambda piece: (-worlds.count(piece[0]), piece))
+        for piece in order:
             nodes = [node for node, own in enumerate(self._pieces) if own == piece]
             outlines = [room.outline @ self._turns[piece[0]] for room in self.plan.rooms if room.panoramas[0] in nodes]
             places = np.concatenate([self._centers[nodes], *outlines])
-            box = piece, places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN
-            boxes.setdefault(piece[0], []).append(box)
-        sizes = np.array(
-            [
-                (sum(size[0] for *_, size in row) + _GAP * (len(row) - 1), max(size[1] for *_, size in row))
-                for row in boxes.values()
-            ]
-        )
-        corners = np.array(arrange_in_rows(sizes))
+            boxes.append((places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN))
+        lows, sizes = np.array(boxes).transpose(1, 0, 2)
+        corners = np.array(arrange_in_rows(sizes + _GAP))
         width, height = (corners + sizes).max(axis=0).tolist()
-        moves = {}
-        for row, (right, back) in zip(boxes.values(), corners, strict=True):
-            for piece, low, size in row:
-                moves[piece] = np.array((right, height - back - size[1])) - low
-                right += size[0] + _GAP
-        return moves, (width, height)
+        moves = np.stack((corners[:, 0], height - (corners + sizes)[:, 1]), axis=1) - lows
+        return dict(zip(order, moves, strict=True)), (width, height)
 
     @property
     def size(self) -> tuple[float, float]:
