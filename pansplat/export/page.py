@@ -249,8 +249,9 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
         first = tour.find_start_view(0) if len(tour) else None
         start = path_poses(scene.cam2world)[0]
         level = start[:3, :3].numpy()
-        yaw, pitch = choose_heading(measure_outlook(scene, 0, level), 0.0), 0.0
-        if first is not None:
+        if first is None:
+            yaw, pitch = choose_heading(measure_outlook(scene, 0, level), 0.0), 0.0
+        else:
             yaw, pitch = find_angles(level.T @ first)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
@@ -485,7 +486,7 @@ def _describe_plan(
 ) -> dict[str, Any]:
     """The floor plan: outlines and names of rooms and the doors, to the right and forward of the origin, and the world
     of each panorama; panoramas of other worlds are elsewhere."""
-    worlds = tour.worlds if tour.overlaps else (0,) * max(len(tour), 1)
+    worlds = tour.worlds or (0,)
     if plan is None or not plan.rooms:
         return {"worlds": worlds, "turns": [0.0] * (max(worlds) + 1), "rooms": [], "doors": []}
     turn, middle = tour.level_axes[:, (0, 2)].T @ level[:, (0, 2)], origin @ level[:, (0, 2)]

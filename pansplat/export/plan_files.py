@@ -65,10 +65,6 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
         scene: with input cameras, not fused.
         path: a .svg, .png or .dxf.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"cannot write {path}: needed a name ending in {', '.join(SUFFIXES)}; rename it")
     if scene.joint:
         raise InputError(
             f"cannot write {path}: needed all that each panorama shows, got a scene with each surface once; give the "
@@ -80,9 +76,7 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
             f"cannot write {path}: needed a floor, and walls around at least one of the {len(scene.cam2world)} input "
             "cameras, got none; export a folder of upright panoramas of rooms"
         )
-    drawing = _Drawing(plan)
-    with replacing(path) as partial:
-        partial.write_bytes(_draw_dxf(drawing) if suffix == ".dxf" else _draw_figure(drawing, suffix[1:]))
+    _write(plan, Path(path))
     return plan
 
 
@@ -96,10 +90,21 @@ def write_picture(scene: Scene, path: str | Path) -> Plan | None:
     Returns:
         The plan; None if only the floors are shown, as in a scene with each surface once.
     """
-    if not scene.joint and _find_rooms(scene) is not None:
-        return write_plan(scene, path)
-    write_floor_plan(scene, path)
-    return None
+    plan = None if scene.joint else _find_rooms(scene)
+    if plan is None:
+        write_floor_plan(scene, path)
+    else:
+        _write(plan, Path(path))
+    return plan
+
+
+def _write(plan: Plan, path: Path) -> None:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"cannot write {path}: needed a name ending in {', '.join(SUFFIXES)}; rename it")
+    drawing = _Drawing(plan)
+    with replacing(path) as partial:
+        partial.write_bytes(_draw_dxf(drawing) if suffix == ".dxf" else _draw_figure(drawing, suffix[1:]))
 
 
 def _find_rooms(scene: Scene) -> Plan | None:
