@@ -440,13 +440,14 @@ def _evaluate_alphas(
     linear = torch.cat((rows, constant), dim=3).transpose(1, 2).reshape(g, num * block, 4)
     a, b, *front = (linear @ offsets).view(g, num, block, -1).unbind(1)
     q = a * a + b * b
-    peak = record[..., 10, None]
+    # The logarithm, because the gradient of exp times a large peak can overflow; the rows that pad a block are 0.
+    log_peak = record[..., 10, None].clamp_min(torch.finfo(record.dtype).tiny).log()
     if not exact:
-        return _clamp_alpha(peak * torch.exp(-0.5 * q))
+        return _clamp_alpha(torch.exp(log_peak - 0.5 * q))
     # The bound has an effect only near the plane L = 0; it keeps gradients finite there.
     plane_distance = 1 + front[0]
     bounded = plane_distance.clamp_min(torch.finfo(record.dtype).eps ** 0.5)
-    alpha = _clamp_alpha(peak * torch.exp(-0.5 * q / (bounded * bounded + record[..., 9, None] * q)))
+    alpha = _clamp_alpha(torch.exp(log_peak - 0.5 * q / (bounded * bounded + record[..., 9, None] * q)))
     if bool(plane_distance.detach().amin() > 0):  # in nearly every block
         return alpha
     return alpha * (plane_distance > 0)

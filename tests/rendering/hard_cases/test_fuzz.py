@@ -99,6 +99,12 @@ def test_extreme_numbers_give_finite_images_and_gradients(render, leaves, scene,
     _check(render, leaves, scene, options)
 
 
+@pytest.mark.torch_float32
+def test_a_distant_gaussian_of_a_huge_opacity_has_finite_gradients(render, leaves, balls):
+    options = {"layout": "pinhole", "size": (1, 14), "lowpass": "3dgs", "vertical_fov_degrees": 0.1}
+    _check(render, leaves, (balls([0.0, -0.3, 1e12], opacity=1e29), None), options)
+
+
 @settings(_QUIET, max_examples=6)
 @given(scene=_scenes(), options=_images())
 def test_extreme_numbers_give_finite_small_images_under_the_interpreter(render, leaves, scene, options):
