@@ -306,21 +306,18 @@ class _Task:
     @cached_property
     def views(self) -> Views:
         """The loaded panoramas."""
-        height = self.options.height or 0
-        views = self.source if isinstance(self.source, Views) else self.source.load_context(height)
-        centres = views.cam2world[:, :3, 3]
-        if len(centres) > 1 and float(torch.pdist(centres).max()) < ONE_POSITION * views.near:
-            warnings.warn(
-                f"{', '.join(views.names)}: the cameras are at one place, so that depth is that of each photograph "
-                "alone; check the poses.",
-                InputWarning,
-                stacklevel=4,
-            )
-        return views
+        return self.source if isinstance(self.source, Views) else self.source.load_context(self.options.height or 0)
+
+    @property
+    def cam2world(self) -> Float[Tensor, "view 4 4"]:
+        """Poses of the panoramas, which need not be loaded."""
+        if isinstance(self.source, Views):
+            return self.source.cam2world
+        return torch.stack([panorama.cam2world for panorama in self.source.context])
 
     def open_cache(self, *, refined: bool) -> CachedPrediction:
-        """The file of the prediction or of its refinement."""
-        return CachedPrediction(self.source, self.views, self.predictor, self.options, refined=refined)
+        """The entry of the prediction or of its refinement."""
+        return CachedPrediction(self.source, self.predictor, self.options, refined=refined)
 
 
 @with_progress_bar
@@ -380,7 +377,16 @@ def _prepare(
         seconds = choose_refine_seconds(settings.gaussians, joint=joint)
     height = pair.images.shape[-2] if isinstance(pair, Views) else settings.height or choose_height(pair, predictor)
     chosen = replace(settings, height=height, refine_seconds=0.0 if is_single else seconds, joint=joint)
-    return _Task(pair, predictor, chosen)
+    task = _Task(pair, predictor, chosen)
+    if not is_single and float(torch.pdist(task.cam2world[:, :3, 3]).max()) < ONE_POSITION * pair.near:
+        names = pair.names if isinstance(pair, Views) else [view.name for view in pair.context]
+        warnings.warn(
+            f"{', '.join(names)}: the cameras are at one place, so that depth is that of each photograph alone; check "
+            "the poses.",
+            InputWarning,
+            stacklevel=3,
+        )
+    return task
 
 
 def _choose_model(model: str | Path | Predictor, options: PredictOptions) -> Predictor:
@@ -389,11 +395,12 @@ def _choose_model(model: str | Path | Predictor, options: PredictOptions) -> Pre
 
 def _predict_views(task: _Task, progress: Progress) -> Scene:
     """The scene without a refinement."""
-    cached, views = task.open_cache(refined=False), task.views
+    cached = task.open_cache(refined=False)
     content = cached.read()
     if content is not None:
         progress("read from the cache", 1.0)
         return _make_scene(content, task)
+    views = task.views
     gaussians = task.predictor(
         views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
     )
@@ -803,20 +810,21 @@ def _load_only_tour(path: str | Path, progress: Progress | None) -> TourGraph:
 
 
 def _make_scene(content: CachedScene, task: _Task, joint: bool = False) -> Scene:
-    views, gaussians = task.views, content.gaussians
-    panoramas = task.source.context if isinstance(task.source, Pair) else ()
-    if len(views.images) == 1:  # predicted as of a camera at the usual height
-        gaussians = gaussians.scaled(views.camera_height / CAMERA_HEIGHT, views.cam2world[0, :3, 3])
+    source, gaussians, cam2world = task.source, content.gaussians, task.cam2world.double()
+    panoramas = source.context if isinstance(source, Pair) else ()
+    first = source if isinstance(source, Views) else source.context[0]
+    if len(cam2world) == 1:  # predicted as of a camera at the usual height
+        gaussians = gaussians.scaled(first.camera_height / CAMERA_HEIGHT, cam2world[0, :3, 3])
     return Scene(
         gaussians,
-        views.cam2world.double(),
-        near=views.near,
-        far=views.far,
-        names=tuple(panorama.label for panorama in panoramas) or views.names,
+        cam2world,
+        near=source.near,
+        far=source.far,
+        names=source.names if isinstance(source, Views) else tuple(panorama.label for panorama in panoramas),
         model=task.predictor.name,
-        height=views.images.shape[-2],
+        height=task.options.height or 0,
         gains=content.gains,
         starts=list_starts(panoramas),
         joint=joint,
-        frame=views.frame,
+        frame=first.frame,
     )

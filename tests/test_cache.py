@@ -3,13 +3,11 @@
 import dataclasses
 import itertools
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +15,11 @@ import torch
 from PIL import Image
 
 from pansplat import pipeline
-from pansplat.cache import list_cache_folders, write_cache_file
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
+from pansplat.inputs.pairs import Note, Pair
 from pansplat.pipeline import load_pairs, predict
+from pansplat.system.store import cache_folders
 
 HEIGHT = 16
 
@@ -40,7 +39,7 @@ def test_a_second_prediction_is_read_from_the_cache_bit_for_bit(pair_folder: Pat
     assert all(getattr(second, name) == getattr(first, name) for name in ("names", "near", "far", "model"))
     assert torch.equal(first.cam2world, second.cam2world)
     assert messages == ["read from the cache"]
-    assert [p.suffix for p in (pair_folder / ".pansplat").iterdir()] == [".scene"]
+    assert [p.name.split("-")[0] for p in (pair_folder / ".pansplat").iterdir()] == ["prediction"]
 
 
 def change_one_pixel(folder: Path) -> None:
@@ -75,7 +74,6 @@ def test_any_change_of_the_pair_causes_a_new_prediction(
     change(pair_folder)
     predict(pair_folder, predictor, height=HEIGHT)
     assert predictor.calls == 2
-    assert len(list((pair_folder / ".pansplat").iterdir())) == 1  # the outdated file is deleted
 
 
 def test_another_predictor_or_height_causes_a_new_prediction(pair_folder: Path, sphere_predictor) -> None:
@@ -95,20 +93,6 @@ def test_renamed_images_do_not_invalidate_the_cache(pair_folder: Path, sphere_pr
     assert predict(pair_folder, predictor, height=HEIGHT).names == ("left", "other")
 
 
-@pytest.mark.parametrize("damage", ["truncate", "flip", "empty", "other"])
-def test_a_damaged_cache_file_is_replaced(pair_folder: Path, damage: str, sphere_predictor) -> None:
-    predictor = sphere_predictor()
-    first = predict(pair_folder, predictor, height=HEIGHT)
-    (file,) = (pair_folder / ".pansplat").iterdir()
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 4
-    damaged = {"truncate": file.read_bytes()[:-9], "flip": bytes(content), "empty": b"", "other": b"x" * 99}
-    file.write_bytes(damaged[damage])
-    assert have_equal_gaussians(predict(pair_folder, predictor, height=HEIGHT), first)
-    predict(pair_folder, predictor, height=HEIGHT)
-    assert predictor.calls == 2
-
-
 def test_cache_false_reads_and_writes_no_file(pair_folder: Path, sphere_predictor) -> None:
     predictor = sphere_predictor()
     for _ in range(2):
@@ -116,30 +100,12 @@ def test_cache_false_reads_and_writes_no_file(pair_folder: Path, sphere_predicto
     assert predictor.calls == 2 and not (pair_folder / ".pansplat").exists()
 
 
-def test_a_read_only_pair_is_cached_in_the_users_cache_folder(
-    pair_folder: Path, tmp_path: Path, sphere_predictor
-) -> None:
-    # A file in place of the folder makes it unwritable, for root too.
-    (pair_folder / ".pansplat").write_text("")
-    predictor = sphere_predictor()
-    first = predict(pair_folder, predictor, height=HEIGHT)
-    assert have_equal_gaussians(predict(pair_folder, predictor, height=HEIGHT), first)
-    assert predictor.calls == 1
-    assert len(list((tmp_path / "cache" / "pansplat").rglob("*.scene"))) == 1
-
-
-def test_predict_works_without_a_writable_cache_folder(pair_folder, tmp_path, sphere_predictor) -> None:
-    (pair_folder / ".pansplat").write_text("")
-    (tmp_path / "cache").write_text("")
-    assert len(predict(pair_folder, sphere_predictor(), height=HEIGHT).gaussians)
-
-
 def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> None:
     predictor = sphere_predictor()
     pair = load_pairs(pair_folder)[0]
     views = pair.load_context(HEIGHT)
     assert have_equal_gaussians(predict(views, predictor), predict(pair, predictor, height=HEIGHT, cache=False))
-    assert not any(folder.exists() for folder in list_cache_folders(pair))
+    assert not any(folder.exists() for folder in cache_folders(pair.folder))
 
 
 @pytest.fixture
@@ -214,28 +180,40 @@ def test_an_invalid_limit_of_gaussians_is_refused_before_the_prediction(pair_fol
     assert predictor.calls == 0
 
 
-@pytest.mark.parametrize(
-    "names", [("客厅", "卧室"), ("a" * 60 + "b", "a" * 60 + "c"), ("a b", "a_b"), ("\udcff\udcfe", "\udcff_")]
-)
-def test_pairs_of_similar_names_share_a_cache_folder(pair_folder: Path, sphere_predictor, names) -> None:
-    predictor = sphere_predictor()
+def test_one_content_has_one_entry_whatever_names_and_paths_are(pair_folder: Path, sphere_predictor) -> None:
+    predictor, other = sphere_predictor(), sphere_predictor()
+    other.name = "a copy of the weights"
     (pair,) = load_pairs(pair_folder)
-    first, second = (dataclasses.replace(pair, name=name, far=pair.far + k) for k, name in enumerate(names))
-    for given in (first, second, first):
-        predict(given, predictor, height=HEIGHT)
-    assert predictor.calls == 2
+    view = dataclasses.replace(pair.context[0], title="客厅", notes=(Note(0.0, 0.0, "old"),))
+    named = dataclasses.replace(pair, name="x" * 300, context=(view, pair.context[1]))
+    scenes = [predict(each, model, height=HEIGHT) for each in (pair, named) for model in (predictor, other)]
+    assert predictor.calls + other.calls == 1 and len(list((pair_folder / ".pansplat").iterdir())) == 1
+    assert scenes[3].names == ("客厅", "right") and scenes[3].model == other.name
 
 
-def test_unfinished_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
-    code = (
-        "import os, sys\nfrom pansplat.system.atomic import replacing\n"
-        "with replacing(sys.argv[1]) as file:\n    file.write_bytes(b'half')\n    os.kill(os.getpid(), 9)\n"
-    )
-    for name in ("old.scene", "new.scene"):
-        subprocess.run([sys.executable, "-c", code, tmp_path / name], check=False)
-    (tmp_path / ".keep").write_text("")
-    old, new = (next(tmp_path.glob(f".{name}.*.scene")) for name in ("old", "new"))
-    for file in (old, tmp_path / ".keep"):
-        os.utime(file, (1e9, 1e9))
-    written = write_cache_file([tmp_path], "a.scene", b"whole")
-    assert set(tmp_path.iterdir()) == {written, new, tmp_path / ".keep"}
+@pytest.mark.usefixtures("refinement_clock")
+def test_a_cached_scene_is_opened_without_its_photographs(
+    gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "time", SimpleNamespace(process_time=itertools.count(step=100).__next__))
+    first = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_seconds=s) for s in (0.0, 1.0)]
+    monkeypatch.setattr(Pair, "load_context", lambda *_: pytest.fail("it is decoded"))
+    again = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_seconds=s) for s in (0.0, 1.0)]
+    for before, after in zip(first, again, strict=True):
+        assert have_equal_gaussians(before, after) and torch.equal(before.cam2world, after.cam2world)
+        fields = ("near", "far", "names", "model", "height", "gains", "starts", "joint", "frame")
+        assert all(getattr(before, name) == getattr(after, name) for name in fields)
+
+
+def test_a_photograph_that_changes_during_its_prediction_leaves_no_entry(
+    pair_folder: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predict_sphere = sphere_predictor.__call__
+
+    def change(*arguments: Any, **named: Any) -> Any:
+        change_one_pixel(pair_folder)
+        return predict_sphere(*arguments, **named)
+
+    monkeypatch.setattr(sphere_predictor, "__call__", change)
+    predict(pair_folder, sphere_predictor(), height=HEIGHT)
+    assert not (pair_folder / ".pansplat").exists()

@@ -1,36 +1,51 @@
-"""`pansplat batch`: many pairs and tours, on worker processes of one or many machines."""
+"""`pansplat batch`: `pansplat export` of many pairs and tours, on worker processes of one or many machines.
+
+The name of an output has a hash of all that it depends on. Outputs appear complete or not at all, and one that exists
+is not made again: Dask may repeat a task, and a stopped batch goes on where it was.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import importlib.util
+import io
 import json
+import os
+import secrets
+import signal
+import sys
 import time
+import warnings
 from collections import Counter
-from contextlib import nullcontext
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from pansplat.cli.inputs import Out, Writer
-from pansplat.errors import InputError
-from pansplat.prediction_options import PredictOptions
-from pansplat.system.console import print_message, progress_bar
+from pansplat.cli.export import Export, Page
+from pansplat.cli.inputs import Out, PairChoice, SceneOptions, ScenePrediction, Writer
+from pansplat.errors import InputError, collect_notes
+from pansplat.prediction_options import PredictOptions, ReadOptions
+from pansplat.system.console import is_out_of_memory, print_message, progress_bar
 from pansplat.system.descriptions import describe_count
-from pansplat.system.files import expand_home, require_output_folder, require_replaceable
-from pansplat.system.options import Count, Positive, Threads
+from pansplat.system.files import expand_home, make_portable_name, require_output_folder, require_replaceable
+from pansplat.system.options import Count, Threads
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from distributed import LocalCluster
 
-    from pansplat.batch import BatchOptions, ItemReport
+STEPS = ("predict", "refine", "export")
+REPORT_NAME = "report.jsonl"
+_MAX_NAME = 40  # letters of a pair's name in the name of an output
+_MEMORY = 4 << 30  # bytes of a worker; decides the default number of workers
 
 
 @dataclass(frozen=True)
 class Batch(Writer):
-    """Predict, refine and export many pairs and tours; finished items are not done again (docs/batch.md).
+    """Predict, refine and export many pairs and tours; what is up to date is not made again (docs/batch.md).
 
     An item that fails is reported and stops no other; the exit status is 1 then.
     """
@@ -41,116 +56,294 @@ class Batch(Writer):
     """Folder for the results and the report, report.jsonl."""
     do: str = "predict"
     """Steps, separated by commas: predict, refine, export."""
-    workers: Threads | None = None
-    """Number of worker processes on this machine; by default one per two cores with at least 4 GiB each."""
-    memory: str | None = None
-    """Memory of each worker, such as 4GiB; a worker that takes more is replaced. By default an equal part."""
-    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Address of a running Dask scheduler, such as tcp://host:8786, whose workers are used instead."""
-    prediction: PredictOptions = field(default_factory=PredictOptions)
-    camera_height: Positive = 1.5
-    """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
-    format: str = "html"
-    """Format of the export: html, png (a floor plan), ply, compressed.ply, spz, splat, sog or glb."""
+    format: Literal["html", "svg", "png", "dxf", "ply", "compressed.ply", "spz", "splat", "sog", "glb"] = "html"
+    """Format of the export: a web page, a floor plan (svg, png, dxf), or a scene."""
     gaussians: Count | None = None
     """For html: largest number of Gaussians, 450,000 by default."""
+    workers: Threads | None = None
+    """Number of worker processes on this machine; by default one per two cores with at least 4 GiB each."""
+    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Address of a running Dask scheduler, such as tcp://host:8786, whose workers are used instead."""
+    reading: Annotated[ReadOptions, arg(name="")] = field(default_factory=ReadOptions)
+    prediction: PredictOptions = field(default_factory=PredictOptions)
 
     def run(self) -> int:
         """Run all items, write the report and print a summary."""
-        from pansplat import batch
-
         require_output_folder("--out", self.out)
-        require_replaceable("--out", [expand_home(self.out) / batch.REPORT_NAME], self.overwrite)
-        options = self._make_options()
+        report = expand_home(self.out).absolute() / REPORT_NAME
+        require_replaceable("--out", [report], self.overwrite)
+        unknown = sorted(set(self.steps) - set(STEPS))
+        if unknown:
+            raise InputError(f"--do must be some of {','.join(STEPS)}, got {unknown[0]!r}")
+        if self.gaussians is not None and self.format != "html":
+            raise InputError(f"--gaussians is for --format html, got {self.format}; leave it out")
+        if self.scheduler is not None and self.workers is not None:
+            raise InputError("--workers is for workers of this machine; leave it out with --scheduler")
         if importlib.util.find_spec("distributed") is None:
             raise InputError(
                 "pansplat batch: needed the package distributed, got none; run pip install 'pansplat[cluster]'"
             )
-        memory = self._parse_memory()
-        items = batch.list_items(self.path)
-        batch.load_predictor(options.prediction)  # an unknown model is an error of the command, not of each item
-        out = expand_home(self.out).absolute()
-        with batch.lock_folder(out):
-            try:
-                with batch.start_workers(self.workers, memory) if self.scheduler is None else nullcontext() as local:
-                    began = time.perf_counter()  # the workers have started
-                    address = self.scheduler if local is None else local.scheduler_address
-                    found = batch.run_items(str(address), items, options, out)
-                    count, problem = _write_report(found, len(items), out / batch.REPORT_NAME)
-                    seconds = time.perf_counter() - began
-            finally:
-                if self.scheduler is None:
-                    batch.remove_unfinished(items, out)
-        counted = describe_count(len(items), "item")
-        print(
-            f"{self.out}: {counted}: {count['done']:,} done, {count['skipped']:,} already there, "
-            f"{count['failed']:,} failed, in {seconds:.1f} s; {self.out / batch.REPORT_NAME}"
-        )
-        if problem is not None:
-            print_message("error", problem)
-        return 1 if count["failed"] or problem is not None else 0
+        import locket  # Dask needs it, too
 
-    def _make_options(self) -> BatchOptions:
-        """The checked options of the steps."""
-        from pansplat import batch
-
-        steps = {word.strip() for word in self.do.split(",")}
-        unknown = sorted(steps - set(batch.STEPS))
-        if unknown:
-            raise InputError(f"--do must be some of {','.join(batch.STEPS)}, got {unknown[0]!r}")
-        suffix = f".{self.format.lower().lstrip('.')}"
-        if suffix not in batch.EXPORT_SUFFIXES:
-            known = ", ".join(name.lstrip(".") for name in batch.EXPORT_SUFFIXES)
-            raise InputError(f"--format must be one of {known}, got {self.format!r}")
-        if self.gaussians is not None and suffix != ".html":
-            raise InputError(f"--gaussians is for --format html, got {self.format}; leave it out")
-        if self.scheduler is not None and (self.workers is not None or self.memory is not None):
-            raise InputError("--workers and --memory are for workers of this machine; leave them out with --scheduler")
-        model = self.prediction.model
+        items, model = list_items(self.path), self.prediction.model
         if Path(model).suffix != "":
             model = str(expand_home(model).absolute())  # of workers in other folders
-        prediction = dataclasses.replace(self.prediction, model=model, gaussians=self.gaussians)
-        chosen = tuple(step for step in batch.STEPS if step in steps)
-        return batch.BatchOptions(chosen, prediction, self.camera_height, suffix)
-
-    def _parse_memory(self) -> int | None:
-        """The number of bytes that `--memory` states."""
-        if self.memory is None:
-            return None
-        from dask.utils import parse_bytes
-
-        from pansplat.batch import MIN_MEMORY
-
+        batch = replace(self, out=report.parent, prediction=replace(self.prediction, model=model))
+        fingerprint_work(batch.prediction)  # an unknown model is an error of the command, not of each item
+        batch.out.mkdir(parents=True, exist_ok=True)
         try:
-            memory = parse_bytes(self.memory)
-        except ValueError:
-            memory = 0
-        if not MIN_MEMORY <= memory < 1 << 50:
-            raise InputError(f"--memory must be at least {MIN_MEMORY >> 20}MiB, such as 4GiB, got {self.memory!r:.40}")
-        return memory
+            with locket.lock_file(str(batch.out / ".lock"), timeout=0):
+                began = time.perf_counter()
+                count = batch._run_items(items)
+        except locket.LockError as error:
+            message = f"--out {self.out}: needed a folder of its own, got one that another batch writes to"
+            raise InputError(message) from error
+        print(
+            f"{self.out}: {describe_count(len(items), 'item')}: {count['done']:,} done, {count['skipped']:,} already "
+            f"there, {count['failed']:,} failed, in {time.perf_counter() - began:.1f} s; {self.out / REPORT_NAME}"
+        )
+        return 1 if count["failed"] else 0
+
+    @property
+    def steps(self) -> list[str]:
+        """What is done."""
+        return [word.strip() for word in self.do.split(",")]
+
+    def _run_items(self, items: Mapping[str, Path]) -> Counter[str]:
+        """Run all items on the workers, and write a line of the report at the end of each; counts by status."""
+        count = Counter[str]()
+        try:
+            with (
+                start_workers(self.workers) if self.scheduler is None else contextlib.nullcontext() as local,
+                open(self.out / REPORT_NAME, "wb", 0) as file,
+                progress_bar() as progress,
+            ):
+                for line in run_items(str(local.scheduler_address if local else self.scheduler), items, self):
+                    file.write(json.dumps({"software": "pansplat", **line}).encode() + b"\n")
+                    count[line["status"]] += 1
+                    progress(f"{count.total()} of {len(items)}: {line['item'][-30:]}", count.total() / len(items))
+                    if line["error"] is not None:
+                        print_message("note", f"{line['item']}: {line['error']}")
+        finally:
+            for name in items if self.scheduler is None else ():
+                _remove_unfinished(self.out / name)
+        return count
+
+    def list_exports(self, folder: Path) -> dict[str, Export]:
+        """The names of the outputs of a folder, and the commands that write them."""
+        from pansplat import pipeline
+        from pansplat.inputs.content import hash_panorama, hash_pixels
+        from pansplat.inputs.pairs import Pair
+        from pansplat.system.store import hash_parts
+        from pansplat.tours.graph import find_tours
+
+        pairs, found = pipeline.load_pairs(folder, **vars(self.reading)), {}
+        tours = find_tours(pairs)
+        images = {panorama.image for tour in tours for panorama in tour.panoramas}
+        for source in (*tours, *(pair for pair in pairs if pair.context[0].image not in images)):
+            panoramas = source.context if isinstance(source, Pair) else source.panoramas
+            content = hash_pixels(panoramas, source.siblings), *map(hash_panorama, panoramas)
+            for step in (step for step in STEPS if step in self.steps):
+                options = SceneOptions(**vars(self.prediction))
+                if step == "predict" or "refine" not in self.steps:
+                    options = replace(options, refine_seconds=0.0)
+                suffix = f".{self.format}" if step == "export" else ".ply"
+                export = Export(
+                    Path(),
+                    Path(suffix),
+                    layers=step != "export",
+                    page=Page(gaussians=self.gaussians if suffix == ".html" else None),
+                    prediction=ScenePrediction(options, PairChoice(source.name, self.reading)),
+                )
+                stated = fingerprint_work(self.prediction), step, repr(export), f"{source.near} {source.far}"
+                name = make_portable_name(source.name)[:_MAX_NAME].replace(".", "_")
+                found[f"{step}-{hash_parts(*stated, *content)[:16]}-{name}{suffix}"] = replace(export, path=folder)
+        return found
 
 
-def _write_report(reports: Iterator[ItemReport], total: int, path: Path) -> tuple[Counter[str], str | None]:
-    """Write a line of the report at the end of each item. While the disk is full, lines wait, and the items go on.
+def list_items(path: Path) -> dict[str, Path]:
+    """The folders with panoramas at or below a folder, or those of a manifest, by the names of their outputs."""
+    from pansplat.inputs.folders import find_panorama_folders
+    from pansplat.system.strict_json import read_json
+
+    path = expand_home(path).absolute()
+    top = path if path.is_dir() else path.parent
+    try:
+        listed = find_panorama_folders(path) if top == path else read_json(path, dict[str, list[str]]).get("items", [])
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or path}: needed a readable folder, got '{error.strerror}'; check its permissions."
+        ) from error
+    if not listed:
+        raise InputError(f"{path}: needed folders with panoramas, got none; check it (docs/batch.md).")
+    folders = [Path(os.path.normpath(top / expand_home(name))) for name in listed]
+    inside = {f: f.relative_to(top if f.is_relative_to(top) else f.anchor).as_posix() for f in folders}
+    return {f.name if name == "." else name: f for f, name in inside.items()}
+
+
+def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict[str, Any]:
+    """Make the outputs of a folder that are missing, and remove those in whose place they are.
+
+    Args:
+        item: of `list_items`.
+        batch: with absolute paths.
+        fingerprint: of the machine that started the batch (`fingerprint_work`).
 
     Returns:
-        The number of items of each status, and a message if lines could not be written.
+        A line of the report; an error is part of it.
     """
-    count, waiting, reason = Counter[str](), b"", ""
-    with progress_bar() as progress, open(path, "wb", 0) as file:
-        for report in reports:
-            count[report.status] += 1
-            waiting += json.dumps({"software": "pansplat", **dataclasses.asdict(report)}).encode() + b"\n"
-            try:
-                waiting = waiting[file.write(waiting) :]
-            except OSError as error:
-                reason = error.strerror
-            progress(f"{count.total()} of {total}: {report.item[-30:]}", count.total() / total)
-            if report.error is not None:
-                print_message("note", f"{report.item}: {report.error}")
-    if not waiting:
-        return count, None
-    return count, (
-        f"{path}: needed free disk space for the report, got {reason!r}; the items are finished: "
-        "free some space and run the same command again"
-    )
+    began, files, num_made, error = time.perf_counter(), list[Path](), 0, None
+    folder = batch.out / item[0]
+    with collect_notes() as notes, contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            _remove_unfinished(folder)
+            if fingerprint_work(batch.prediction) != fingerprint:
+                raise InputError(
+                    f"worker: needed the predictor {batch.prediction.model} of the machine that started the batch, "
+                    "got another one; install the same version of pansplat and the same weights on all machines"
+                )
+            for name, export in batch.list_exports(item[1]).items():
+                if not (folder / name).exists():
+                    replace(export, out=folder / name).run()
+                    num_made += 1
+                files.append(folder / name)
+            for step in batch.steps:
+                suffix = batch.format if step == "export" else "ply"
+                for path in folder.glob(f"{step}-{'[0-9a-f]' * 16}-*"):
+                    if path not in files and path.name.partition(".")[2] == suffix:
+                        path.unlink()
+        except Exception as problem:  # whatever it is, other items go on
+            error = _describe(problem)
+    return {
+        "item": item[0],
+        "status": "failed" if error else "done" if num_made else "skipped",
+        "seconds": round(time.perf_counter() - began, 3),
+        "outputs": [path.relative_to(batch.out).as_posix() for path in files],
+        "notes": [" ".join(note.splitlines()) for note in notes],
+        "error": error,
+    }
+
+
+@lru_cache(maxsize=1)
+def fingerprint_work(options: PredictOptions) -> str:
+    """A hash of the code and of the weights of a batch, which all its machines have."""
+    from pansplat import __version__, pipeline
+    from pansplat.system.source_hash import hash_sources
+    from pansplat.system.store import hash_parts
+
+    return hash_parts(__version__, hash_sources(__name__), pipeline.load_predictor(options).fingerprint)
+
+
+def _describe(error: BaseException) -> str:
+    """One line about an error."""
+    text = " ".join(str(error).split())
+    if is_out_of_memory(error):
+        return f"out of memory ({text[:120]}); choose a smaller --height or fewer --workers"
+    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text[:400]}"
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Remove temporary files of workers that have ended."""
+    from pansplat.system.atomic import is_unfinished
+
+    for path in folder.glob(".*"):
+        if is_unfinished(path) and path.name.startswith(tuple(f".{step}-" for step in STEPS)):
+            path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def start_workers(workers: int | None = None) -> Iterator[LocalCluster]:
+    """Worker processes on this machine, which end with the block. They share its cores and memory.
+
+    Args:
+        workers: number of processes; by default one per two cores with at least 4 GiB each.
+    """
+    import logging
+
+    from dask import config as dask_config
+    from dask.system import CPU_COUNT
+    from distributed import LocalCluster
+    from distributed.system import MEMORY_LIMIT
+
+    workers = workers or max(1, min(CPU_COUNT // 2, MEMORY_LIMIT // _MEMORY))
+    print(f"workers: {workers}, of at most {MEMORY_LIMIT / workers / 2**30:.1f} GiB each", file=sys.stderr)
+    variables = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+    settings = {
+        # A worker's memory is the work of one task, which Dask cannot spill.
+        **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
+        "distributed.scheduler.worker-ttl": None,  # a compiled kernel may hold Python's lock for minutes
+        # Dask sets these variables in this process, too: numba fails if its number of threads changes. With Dask's
+        # MALLOC_TRIM_THRESHOLD_ each large array is returned to the system, and page faults take a quarter of the time.
+        "distributed.nanny.pre-spawn-environ": {},
+    }
+    with (
+        dask_config.set(settings),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            memory_limit=MEMORY_LIMIT // workers,
+            silence_logs=logging.CRITICAL,
+            preload=[__name__],
+            env=dict.fromkeys(variables, str(max(1, CPU_COUNT // workers))),
+        ) as cluster,
+    ):
+        yield cluster
+
+
+def dask_setup(worker: Any) -> None:
+    """Called by Dask in each local worker. Ctrl+C in a terminal reaches workers, too, and the command ends them."""
+    import torch
+
+    del worker
+    warnings.simplefilter("ignore")  # reports have the notes
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))  # it may have been imported before the variable was set
+    with contextlib.suppress(ValueError):  # only the main thread can set handlers
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def run_items(address: str, items: Mapping[str, Path], batch: Batch) -> Iterator[dict[str, Any]]:
+    """Yield the line of the report of each item when its task ends.
+
+    Args:
+        address: of the scheduler. The workers must see the items' folders and that of the batch under the same paths.
+        items: of `list_items`.
+        batch: with absolute paths.
+    """
+    import logging
+
+    from distributed import Client, KilledWorker, as_completed
+
+    for name in ("distributed", "distributed.client"):  # it logs the traceback of a lost connection
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"--scheduler {address}: needed a running Dask scheduler, got '{_describe(error)[:200]}'; "
+            "check the address, such as tcp://host:8786"
+        ) from error
+    run = secrets.token_hex(4)  # the scheduler would answer a repeated key with an old report
+    names = {f"pansplat-{run}-{name}": name for name in items}
+    arguments = {"batch": batch, "fingerprint": fingerprint_work(batch.prediction)}
+    with client:
+        futures = client.map(process_item, list(items.items()), key=list(names), pure=False, **arguments)
+        for future in as_completed(futures, loop=client.loop):
+            if future.status == "finished":
+                yield future.result()
+            elif future.status == "error":
+                text = f"worker: {_describe(future.exception())}"
+                if isinstance(future.exception(), KilledWorker):
+                    text = (
+                        "several worker processes ended during this item, probably for lack of memory; choose a "
+                        "smaller --height or fewer --workers"
+                    )
+                failed = {"item": names[future.key], "status": "failed", "seconds": 0.0, "error": text}
+                yield failed | {"outputs": [], "notes": []}
+            else:
+                raise InputError(
+                    f"--scheduler {address}: needed a scheduler that keeps running, got a lost connection; run the "
+                    "command again, finished items are kept"
+                )
+            future.release()

@@ -149,7 +149,7 @@ class _Mesh:
 
 
 @dataclass(frozen=True)
-class _Page:
+class Page:
     """For a web page."""
 
     suffixes: ClassVar = (".html", "")
@@ -357,7 +357,7 @@ class Export(Writer):
     """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
     draw all Gaussians together (docs/formats.md)."""
     scene: _SceneFile = field(default_factory=_SceneFile)
-    page: _Page = field(default_factory=_Page)
+    page: Page = field(default_factory=Page)
     plan: _FloorPlan = field(default_factory=_FloorPlan)
     mesh: _Mesh = field(default_factory=_Mesh)
     training: _TrainingSet = field(default_factory=_TrainingSet)

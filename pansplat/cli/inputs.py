@@ -40,12 +40,13 @@ class PairChoice:
     """How to read a panorama, a folder of panoramas or a web tour, and which of its pairs to use."""
 
     pair: str | None = None
-    """Name or number (from 1) of the pair, if the folder holds several; the first by default."""
+    """Name or number (from 1) of the pair, if the folder holds several; the first by default. For an export also the
+    name of a tour."""
     reading: Annotated[ReadOptions, arg(name="")] = field(default_factory=ReadOptions)
 
 
 @dataclass(frozen=True)
-class _SceneOptions(PredictOptions):
+class SceneOptions(PredictOptions):
     """How the scene of panoramas is predicted and refined; unused for a scene file."""
 
     height: Annotated[Height | None, arg(name="predict-height")] = None
@@ -55,7 +56,7 @@ class _SceneOptions(PredictOptions):
 class ScenePrediction:
     """How the scene of a path is predicted."""
 
-    options: _SceneOptions = field(default_factory=_SceneOptions)
+    options: SceneOptions = field(default_factory=SceneOptions)
     choice: PairChoice = field(default_factory=PairChoice)
 
     def open(self, path: Path) -> tuple[Scene, Pair | None]:
@@ -81,7 +82,7 @@ class ScenePrediction:
         from pansplat.tours.overlap import connect
 
         pairs = load_choice(path, self.choice)
-        tours = find_tours(pairs) if self.choice.pair is None else []
+        tours = [tour for tour in find_tours(pairs) if self.choice.pair in (None, tour.name)]
         options = replace(self.options, gaussians=gaussians, joint=joint)
         if not tours:
             pair = pick_pair(path, pairs, self.choice)

@@ -27,8 +27,8 @@ from numpy import ndarray as Array
 
 from pansplat.errors import InputError
 from pansplat.geometry.cubemap import face_of, face_rotations
-from pansplat.system.cache_folders import cache_folders, write_cache_file
 from pansplat.system.files import read_file
+from pansplat.system.store import cache_folders, write_cache_file
 from pansplat.system.strict_json import read_json
 
 CUBE_SUFFIX = ".cube.json"

@@ -104,14 +104,19 @@ def scene_mask_of_files(paths: tuple[Path, ...], height: int) -> Bool[Tensor, "h
 
     Results are cached in memory.
     """
-    if len(paths) > _MAX_IMAGES:
-        paths = tuple(paths[i] for i in np.linspace(0, len(paths) - 1, _MAX_IMAGES).round().astype(int))
-    stamped = tuple((path, _stamp(path), tuple(map(_stamp, list_masks(path)))) for path in paths if path.is_file())
+    stamped = tuple((path, _stamp(path), tuple(map(_stamp, list_masks(path)))) for path in sample_files(paths))
     scene = _cached_mask(stamped)
     if scene.all():
         return torch.ones(height, 2 * height, dtype=torch.bool)
     resized = cv2.resize(scene.astype(np.float32), (2 * height, height), interpolation=cv2.INTER_LINEAR)
     return torch.from_numpy(resized >= 0.5)
+
+
+def sample_files(paths: tuple[Path, ...]) -> list[Path]:
+    """Those of panorama files in which static content is detected."""
+    if len(paths) > _MAX_IMAGES:
+        paths = tuple(paths[i] for i in np.linspace(0, len(paths) - 1, _MAX_IMAGES).round().astype(int))
+    return [path for path in paths if path.is_file()]
 
 
 def _stamp(path: Path) -> tuple[int, int]:

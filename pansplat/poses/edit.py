@@ -38,6 +38,7 @@ from pansplat.poses.pose_file import (
 )
 from pansplat.system.atomic import replacing
 from pansplat.system.files import read_file
+from pansplat.system.store import read_entry
 from pansplat.system.strict_json import MAX_BYTES, convert, read_field, read_json
 
 POSES = "poses.json"
@@ -92,7 +93,7 @@ class PoseEditor:
         if self.file.exists():
             return read_pose_content(self.file)
         (source,) = self._sources
-        return _convert(read_json(source, Content), self._names, self._by_name)
+        return _convert(read_entry(source), self._names, self._by_name)
 
     def read_suggestions(self) -> dict[tuple[Path, Path], tuple[Suggestion, ...]]:
         """For pairs of panoramas, places of the second one relative to the first, camera heights."""

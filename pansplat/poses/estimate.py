@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import math
@@ -42,18 +43,19 @@ from pansplat.poses.learned import (
     load_matcher,
     match_learned,
 )
+from pansplat.poses.learned import default_weights as default_matcher
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
 from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
-from pansplat.poses.pose_cache import PoseCache, hash_parts
 from pansplat.poses.tour import Group, IndexPair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
 from pansplat.predictor import Progress, part_of
-from pansplat.sweep.guided_sweep import load_default_sweep
+from pansplat.sweep.guided_sweep import list_default_weights
 from pansplat.system.console import with_progress_bar
 from pansplat.system.descriptions import describe_count, describe_range, list_first
 from pansplat.system.files import require_file
 from pansplat.system.source_hash import hash_sources
+from pansplat.system.store import Store, hash_file, hash_parts
 from pansplat.system.threads import one_thread, worker_threads
 
 _HEIGHT = 1024  # pixels; larger panoramas are reduced
@@ -285,8 +287,7 @@ def estimate_poses(
         raise _no_poses(paths, unplaced | {n: "no other panorama is left" for n in kept})
     with one_thread():  # panoramas and pairs are divided among threads
         files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
-        fingerprint = "" if cache_folder is None else hash_sources(__name__) + load_default_sweep().fingerprint
-        cache = PoseCache(cache_folder, _CACHED, fingerprint)
+        cache = Store(cache_folder, _CACHED)
         count = len(kept)
         split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
         views = _describe_views(paths, files, pixels, hints, kept, cache, part_of(progress, 0.0, split))
@@ -433,12 +434,12 @@ def _describe_views(
     pixels: dict[int, Array],
     hints: Sequence[Hints],
     kept: Sequence[int],
-    cache: PoseCache,
+    cache: Store,
     report: Progress,
 ) -> list[_View]:
     headings = {hints[n].heading for n in kept} - {None}
     is_compass = len(headings) > 1  # one value for all pictures is a program's default
-    hashes = {n: hash_parts(pixels[n]) for n in kept}
+    hashes = {n: hash_parts(fingerprint_estimates(), pixels[n]) for n in kept}
     static = _find_scene_mask([paths[n] for n in kept], list(hashes.values()), cache)
     matcher = _load_matcher()
 
@@ -452,9 +453,8 @@ def _describe_views(
             scene = scene & (cv2.resize(opaque.numpy().astype(np.uint8), scene.shape[::-1]) > 0)
         image = pixels_of_view.permute(1, 2, 0).numpy()
         heading = hints[n].heading if is_compass else None
-        stated = f"{hints[n].down} {heading} {matcher is None}"
-        key = hash_parts(image, np.packbits(scene), stated)
-        return cache.get(f"view-{hashes[n]}", key, lambda: describe(n, key, scene, image, heading))
+        key = hash_parts(hashes[n], image, np.packbits(scene), f"{hints[n].down} {heading}")
+        return cache.get("view", key, lambda: describe(n, key, scene, image, heading))
 
     def describe(n: int, key: str, scene: Array, image: Array, heading: float | None) -> _View:
         grey = pixels[n]
@@ -493,7 +493,7 @@ class _SceneMask:
 _CACHED = (_View, _SceneMask, Features, LearnedFeatures, SceneAxes, Surroundings, DepthMap, RelativePose, Hypotheses)
 
 
-def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: PoseCache) -> Bool[Array, "height width"]:
+def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: Store) -> Bool[Array, "height width"]:
     """Where the panoramas show the scene; as found before, if most of them are those of before.
 
     So the features of these stay when others are added.
@@ -503,15 +503,15 @@ def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: PoseCa
         mask = scene_mask_of_files(tuple(paths), _HEIGHT).numpy()
         return _SceneMask(tuple(hashes), np.packbits(mask))
 
-    earlier = [mask for mask in cache.list_values("scene-") if set(mask.hashes) <= set(hashes)]
+    earlier = [mask for mask in cache.list_values("mask") if set(mask.hashes) <= set(hashes)]
     best = max(earlier, key=lambda mask: len(mask.hashes), default=None)
     if best is None or len(best.hashes) < _MASK_KEPT_SHARE * len(hashes):
-        best = cache.get(f"scene-{hash_parts(*hashes)}", "", detect)
+        best = cache.get("mask", hash_parts(*hashes), detect)
     return np.unpackbits(best.bits, count=2 * _HEIGHT**2).reshape(_HEIGHT, 2 * _HEIGHT).astype(bool)
 
 
 def _relate_views(
-    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], seed: int, cache: PoseCache, report: Progress
+    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], seed: int, cache: Store, report: Progress
 ) -> dict[IndexPair, RelativePose]:
     """Relative poses of the pairs that have most in common, and of those that links connect.
 
@@ -551,7 +551,7 @@ def _relate_views(
     def look_up(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
         key = hash_parts(first.key, second.key, f"{links[pair]} {seed}")
-        return cache.get(f"pair-{hash_parts(first.picture_hash, second.picture_hash)}", key, lambda: relate(pair))
+        return cache.get("pair", key, lambda: relate(pair))
 
     groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
 
@@ -574,6 +574,14 @@ def _relate_views(
                     groups = [groups[i] if group == groups[j] else group for group in groups]
                     counts[i], counts[j] = counts[i] + 1, counts[j] + 1
     return relations
+
+
+def fingerprint_estimates() -> str:
+    """A hash of the code and of the weights that poses are estimated by."""
+    files = list_default_weights()
+    with contextlib.suppress(MatcherMissingError):
+        files.append(default_matcher())
+    return hash_parts(hash_sources(__name__), *(hash_file(file) for file in files if file.is_file()))
 
 
 def _load_matcher() -> Matcher | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import warnings
@@ -16,7 +15,8 @@ import torch
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.images.cube_images import CUBE_SUFFIX
-from pansplat.images.image_files import list_masks, read_thumbnail
+from pansplat.images.image_files import read_thumbnail
+from pansplat.inputs.content import hash_pixels
 from pansplat.inputs.folders import make_names_unique
 from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
 from pansplat.inputs.placements import Placement, judge, read_ties
@@ -25,7 +25,7 @@ from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.inputs.web_tours import is_scene_of_tour
 from pansplat.poses.edit import find_kept, merge_estimate, read_pose_content, write_pose_file
-from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses
+from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses, fingerprint_estimates
 from pansplat.poses.pose_file import (
     CONVENTION,
     list_pairs,
@@ -35,13 +35,13 @@ from pansplat.poses.pose_file import (
 )
 from pansplat.predictor import Progress
 from pansplat.system.atomic import replacing
-from pansplat.system.cache_folders import cache_folders, write_cache_file
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import require_replaceable
 from pansplat.system.source_hash import hash_sources
-from pansplat.system.strict_json import read_json
+from pansplat.system.store import Store, hash_parts
 
 SUFFIXES = (".json", ".tum", ".kitti")
+_KIND = "poses"  # of entries of the store
 
 
 def require_mergeable(path: Path, images: Sequence[Path], *, overwrite: bool) -> None:
@@ -128,20 +128,18 @@ def estimate_pairs(
         on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
             panorama.
     """
-    name = f"poses-{_hash_inputs(panoramas, camera_height)}.json"
-    folders = cache_folders(folder)
-    source = next((cache / name for cache in folders if (cache / name).is_file()), None)
-    if source is None:
+    store, key = Store(folder), _hash_inputs(panoramas, camera_height)
+    content = store.read(_KIND, key)
+    if content is None:
         if on_unposed is not None:
             single = single_view_pairs(panoramas, folder, near, far, siblings=panoramas)
             on_unposed(localize_pairs(make_names_unique(single)))
         content = _estimate(folder, panoramas, camera_height, progress)
-        source = write_cache_file(folders, name, json.dumps(content).encode())
-        if source is None:
-            raise InputError(
-                f"{folder}: needed a writable cache folder for the poses, got none of {folders}; make one."
-            )
-    return _make_pairs(folder, panoramas, read_json(source), source, near, far)
+        store.write(_KIND, key, content)
+    sources = store.find(_KIND, key)
+    if not sources:
+        raise InputError(f"{folder}: needed a writable cache folder for the poses, got none; make one.")
+    return _make_pairs(folder, panoramas, content, sources[0], near, far)
 
 
 def _estimate(
@@ -246,18 +244,8 @@ def _in_brackets(title: str) -> str:
 
 
 def _hash_inputs(panoramas: Sequence[Panorama], camera_height: float) -> str:
-    """A hash of the code, of the names, by which the cached file states its poses, and of the files' states."""
-    digest = hashlib.blake2b(f"{hash_sources(__name__)} {camera_height:g}".encode(), digest_size=12)
-    for panorama in panoramas:
-        links = [(link.target, round(link.yaw, 6)) for link in panorama.links]
-        digest.update(os.fsencode(f"{panorama.name} {links};"))
-        for file in dict.fromkeys((panorama.image, panorama.mask, *list_masks(panorama.image))):
-            digest.update(os.fsencode(f"{_stamp(file)};"))
-    return digest.hexdigest()
-
-
-def _stamp(file: Path | None) -> str:
-    if file is None:
-        return "none"
-    state = file.stat()
-    return f"{file.name} {state.st_size} {state.st_mtime_ns}"
+    """A hash of the code, of the names, by which the entry states its poses, of their links and of the pictures."""
+    stated = [(view.name, [(link.target, round(link.yaw, 6)) for link in view.links]) for view in panoramas]
+    pixels = hash_pixels(panoramas, tuple(view.image for view in panoramas))
+    code = hash_sources(__name__), fingerprint_estimates()
+    return hash_parts(*code, f"{camera_height:g}", json.dumps(stated), pixels)

@@ -90,6 +90,11 @@ def default_weights() -> Path:
     return _shipped("model.safetensors")
 
 
+def list_default_weights() -> list[Path]:
+    """The files of weights of the default model."""
+    return [default_weights(), _shipped("sharpening.safetensors")]
+
+
 def _shipped(name: str) -> Path:
     return Path(str(files("pansplat.default_model").joinpath(name)))
 

@@ -30,17 +30,18 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pansplat.cache import _read_scene
+from pansplat.cache import CachedScene, _is_valid
 from pansplat.cli.render import read_poses
 from pansplat.errors import InputError
 from pansplat.gaussians.gltf import load_glb, save_glb
 from pansplat.gaussians.ply import load_ply
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.images.image_files import read_depth, read_panorama, write_image
 from pansplat.inputs.folders import load_pairs
 from pansplat.model.network import build_empty_network, load_predictor
 from pansplat.model.weights import WeightsFile, load_weights, read_checkpoint
 from pansplat.pipeline import render
+from pansplat.system.store import Store
 from pansplat.system.strict_json import read_json
 from pansplat.training.checkpoint import extract_weights, load_checkpoint
 
@@ -158,7 +159,7 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
     metadata = {"pansplat_format": "1", "model": "pansplat", "config": '{"a": [1, 2]}', "compat": "fixed"}
     tensors = {"a": torch.zeros(3), "b": torch.zeros(2, 2, dtype=torch.float16)}
     safetensors.torch.save_file(tensors, folder / "small.safetensors", metadata)
-    (folder / "cached.scene").write_bytes((folder / "cache_body").read_bytes())
+    (folder / "cached.entry").write_bytes((folder / "cache_body").read_bytes())
 
     save_glb(load_ply(scene), folder / "scene.glb")
 
@@ -171,7 +172,7 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
     def read_cached(path: Path) -> None:
         body = path.read_bytes()[:-4]  # with a valid checksum, else nothing is parsed
         path.write_bytes(body + zlib.crc32(body).to_bytes(4, "little"))
-        if _read_scene(path, 2) is None:
+        if Store(None, (CachedScene, Gaussians))._open(path, lambda content: _is_valid(content, 2)) is None:
             raise InputError("it is predicted again")
 
     def read_pair(path: Path) -> None:
@@ -190,7 +191,7 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
         "weights": (folder / "small.safetensors", lambda path: load_weights(path)),
         "training checkpoint": (folder / "training.pt", read_training),
         "official checkpoint": (folder / "official.ckpt", lambda path: read_checkpoint(path)),
-        "cache": (folder / "cached.scene", read_cached),
+        "cache": (folder / "cached.entry", read_cached),
         **{
             f"image {name}": (folder / name, lambda path: read_panorama(path, 4))
             for name in (*small, "image.exr")

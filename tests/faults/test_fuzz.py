@@ -6,15 +6,16 @@ import re
 import shutil
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 from typing import Any
 
 import pytest
-import safetensors.torch
 
+from pansplat.cache import CachedScene
 from pansplat.gaussians.ply import load_ply
+from pansplat.gaussians.scene import Gaussians
 from pansplat.inputs.reconstructions import _READERS
+from pansplat.system.store import _pack
 
 
 @pytest.mark.slow
@@ -22,9 +23,8 @@ from pansplat.inputs.reconstructions import _READERS
 def test_every_reader_survives_damaged_files(originals: Path, tmp_path: Path, small_config: Any, count: int) -> None:
     work = tmp_path / "fuzz"
     shutil.copytree(originals, work)
-    gaussians = load_ply(work / "scene.ply").gaussians
-    body = safetensors.torch.save({f.name: getattr(gaussians, f.name) for f in dataclasses.fields(gaussians)})
-    (work / "cache_body").write_bytes(body + zlib.crc32(body).to_bytes(4, "little"))
+    types = {each.__name__: each for each in (CachedScene, Gaussians)}
+    (work / "cache_body").write_bytes(_pack(CachedScene(load_ply(work / "scene.ply").gaussians), types))
     (work / "config.json").write_text(json.dumps(dataclasses.asdict(small_config)))
     program = Path(__file__).with_name("fuzz.py")
     done = subprocess.run([sys.executable, str(program), str(work), str(count)], capture_output=True, text=True)

@@ -14,7 +14,6 @@ import torch
 from PIL import Image
 
 from pansplat import pipeline
-from pansplat.batch import _hash_pair
 from pansplat.cli.pose import Pose
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.training_set import write_dataset
@@ -25,11 +24,13 @@ from pansplat.images.cube_images import CubeImage, CubeLevel, write_cube
 from pansplat.images.image_files import read_blur_mask, read_hidden, read_panorama, read_thumbnail, write_image
 from pansplat.images.rig_images import Lens
 from pansplat.images.video import write_video
+from pansplat.inputs.content import hash_context, hash_panorama
 from pansplat.inputs.folders import UnposedPanoramasError, load_pairs
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.inputs.reconstructions.colmap import write_colmap
 from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
 from pansplat.poses.files import _hash_inputs
+from pansplat.system.store import hash_parts
 from pansplat.training.sequences import LOCATIONS, read_loc360, read_video_folder
 
 HEIGHT = 64
@@ -575,6 +576,10 @@ def test_a_name_has_its_mask_in_both_forms_of_unicode(tmp_path: Path, forms: tup
 def test_scenes_training_sets_and_caches_depend_on_what_masks_leave(
     tmp_path: Path, kind: str, name: str, color_face: Callable, sphere_predictor: Callable[[], object]
 ) -> None:
+    def list_keys(pair: Pair) -> tuple[str, ...]:
+        """Those of predictions, of estimated poses, and of pages."""
+        return hash_context(pair), _hash_inputs(pair.context, 1.5), hash_parts(*map(hash_panorama, pair.context))
+
     scenes, sets, predictor = [], [], sphere_predictor()
     for person in (1, 5):
         folder = tmp_path / f"{person}"
@@ -587,14 +592,14 @@ def test_scenes_training_sets_and_caches_depend_on_what_masks_leave(
         for _ in range(2):
             (pair,) = load_pairs(folder)
             scenes.append(pipeline.predict(pair, predictor, height=HEIGHT).gaussians)  # type: ignore[arg-type]
-            keys.append((_hash_pair(pair), _hash_inputs(pair.context, 1.5), predictor.calls))  # type: ignore[attr-defined]
+            keys.append((*list_keys(pair), predictor.calls))  # type: ignore[attr-defined]
             if not mask.exists():
                 before.rename(mask)
         pipeline.predict(pair, predictor, height=HEIGHT)  # type: ignore[arg-type]
         assert predictor.calls == keys[-1][-1], "read from the cache"  # type: ignore[attr-defined]
         stated = mask.read_bytes()
         _draw_mask(mask, np.roll(COVER if kind == "set" else HIDDEN, 4, axis=0))
-        keys.append((_hash_pair(pair), _hash_inputs(pair.context, 1.5), -1))
+        keys.append((*list_keys(pair), -1))
         assert all(len(set(values)) == 3 for values in zip(*keys, strict=True)), "without, with, and with another mask"
         mask.write_bytes(stated)
         new = tmp_path / f"new{person}"

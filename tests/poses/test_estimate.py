@@ -17,6 +17,7 @@ import torch
 import pansplat
 from pansplat.cli import run
 from pansplat.inputs.poses import read_trajectory
+from pansplat.poses import estimate as estimate_module
 from pansplat.poses.axes import SceneAxes
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
@@ -34,9 +35,9 @@ from pansplat.poses.features import Features, detect_features
 from pansplat.poses.files import write_poses
 from pansplat.poses.learned import LearnedFeatures, LearnedMatches, MatcherMissingError
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
-from pansplat.poses.pose_cache import PoseCache
 from pansplat.poses.solvers import angle_between, rotation_angle
 from pansplat.poses.two_view import RelativePose
+from pansplat.system.store import Store
 
 SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
 
@@ -224,7 +225,7 @@ def test_a_linked_pair_is_compared_among_many(monkeypatch: pytest.MonkeyPatch) -
     views = [_view(_no_features(1), np.zeros((4, 8), np.float32)) for _ in range(8)]
     links = {(i, j): NO_LINKS for i in range(8) for j in range(i + 1, 8)}
     found = [
-        _relate_views(views, links | linked, 0, PoseCache(None, (), ""), lambda *_: None)
+        _relate_views(views, links | linked, 0, Store(None), lambda *_: None)
         for linked in ({}, {(4, 6): LinkDirections(back=0.5)})
     ]
     assert set(found[1]) - set(found[0]) == {(4, 6)}
@@ -249,13 +250,13 @@ def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatc
     monkeypatch.setattr("pansplat.poses.estimate.match_features", lambda *_: MagicMock())
     monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_: MagicMock())
     links = {pair: NO_LINKS for pair in itertools.combinations(range(11), 2)}
-    relations = _relate_views(views, links, 0, PoseCache(None, (), ""), lambda *_: None)
+    relations = _relate_views(views, links, 0, Store(None), lambda *_: None)
     home = {pair for pair in relations if pair[1] < 8}
     assert (0, 7) not in home and 12 <= len(home) < 23, "of 28"
     assert all(sum(n in pair for pair in home) >= 4 for n in range(8))
     assert len([pair for pair in relations if pair[0] > 7]) == 3, "nothing is left out without certain pairs"
     linked = links | {(0, 7): LinkDirections(back=0.5)}
-    assert (0, 7) in _relate_views(views, linked, 0, PoseCache(None, (), ""), lambda *_: None)
+    assert (0, 7) in _relate_views(views, linked, 0, Store(None), lambda *_: None)
 
 
 def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> None:
@@ -282,3 +283,27 @@ def test_poses_of_pictures_outside_of_their_folder_are_refused_before_the_estima
     (tmp_path / "other").mkdir()
     message = _message(capsys, "pose", str(tmp_path / "room"), "-o", str(tmp_path / "other" / "poses.json"))
     assert "poses.json: needed a file inside" in message and "copy the picture into the folder" in message
+
+
+@pytest.mark.usefixtures("few_samples")
+def test_a_further_panorama_costs_its_own_features_and_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = []
+    for name in ("left", "middle", "right"):
+        image = cv2.imread(str(next(SAMPLE.glob(f"{name}.*"))))
+        files.append(tmp_path / f"{name}.png")
+        cv2.imwrite(str(files[-1]), cv2.resize(image, (512, 256), interpolation=cv2.INTER_AREA))
+    calls: list[str] = []
+    for name in ("find_axes", "_estimate_pair"):
+        function = getattr(estimate_module, name)
+        monkeypatch.setattr(
+            estimate_module, name, lambda *a, _f=function, _n=name, **k: calls.append(_n) or _f(*a, **k)
+        )
+    first = estimate_poses(files[:2], cache_folder=tmp_path)
+    assert calls.count("find_axes") == 2
+    calls.clear()
+    every = estimate_poses(files, cache_folder=tmp_path)
+    assert calls.count("find_axes") == 1 and calls.count("_estimate_pair") <= 2 + 1, "one may be of a mirror image"
+    calls.clear()
+    again = estimate_poses(files, cache_folder=tmp_path)
+    assert calls == [] and all(np.array_equal(again.poses[file], every.poses[file]) for file in files)
+    assert set(first.poses) < set(again.poses)

@@ -41,6 +41,7 @@ FINGERPRINTS = {
     "default": lambda: hash_sources("pansplat.sweep.guided_sweep"),
     "network": lambda: hash_sources("pansplat.model.network"),
     "refinement": refinement_fingerprint,
+    "pixels": lambda: hash_sources("pansplat.inputs.pairs"),
     "poses": lambda: _hash_inputs([], 1.5),
 }
 RASTERISER = ("rasterize.py", "reference.py", "cpu/rasterize.py", "cpu/backend.py", "cuda/rasterize.py")
@@ -60,6 +61,7 @@ RASTERISER = ("rasterize.py", "reference.py", "cpu/rasterize.py", "cpu/backend.p
         ),
         *(("default", name) for name in ("sweep/guided_sweep.py", "model/layers.py", "model/weights.py")),
         *(("network", name) for name in ("model/heads.py", "gaussians/harmonics.py", "predictor.py")),
+        *(("pixels", name) for name in ("images/image_files.py", "images/blur_masks.py", "images/cube_images.py")),
         *(("poses", name) for name in ("poses/two_view.py", "networks/lightglue.py", "sweep/prior.py")),
     ],
 )
