@@ -1,4 +1,4 @@
-// GL 3.3 tier: projects one Gaussian per vertex; transform feedback captures the record.
+// Projects one Gaussian per vertex; transform feedback captures the record.
 #include "splat.glsl"
 
 in vec4 in_mean_opacity;

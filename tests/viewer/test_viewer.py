@@ -48,7 +48,7 @@ class NoRenderer:
     problem: Exception | None = None
 
     def __init__(self) -> None:
-        self.stats, self.scales = FrameStats(tier="gl33"), []
+        self.stats, self.scales = FrameStats(), []
 
     @staticmethod
     def prepare(scene: Scene, report: Callable[[float], None] = lambda done: None) -> Scene:
@@ -57,7 +57,7 @@ class NoRenderer:
     def upload(self, scene: Scene, prepared: object = None) -> None:
         if (error := NoRenderer.refuse(scene)) is not None:
             raise error
-        self.stats = FrameStats(total=len(scene.gaussians), tier="gl33")
+        self.stats = FrameStats(total=len(scene.gaussians))
 
     def render(self, cam2world: np.ndarray, size: tuple[int, int], settings: Any, *, wait: bool = True) -> Mock:
         if NoRenderer.problem is not None:

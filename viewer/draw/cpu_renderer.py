@@ -114,7 +114,7 @@ class CpuRenderer:
             ctx: the current context; without one, `render` returns no texture and `read_color` has the image.
             exact: continue behind a transmittance of 2^-10, which 8 bits do not show.
         """
-        self.stats = FrameStats(tier="cpu")
+        self.stats = FrameStats(renderer="cpu")
         self._ctx = ctx
         self._min_transmittance = EXACT_TRANSMITTANCE if exact else MIN_TRANSMITTANCE
         self._worker: BackgroundWorker[_Picture | None] = BackgroundWorker("cpu-renderer")
@@ -159,7 +159,7 @@ class CpuRenderer:
         self._selected = SelectionCache()
         self._faces.clear()
         self._picture = self._texture = self._colored = self._seen = None
-        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier="cpu")
+        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, renderer="cpu")
 
     def render(
         self,
@@ -424,7 +424,7 @@ class CpuRenderer:
             drawn=drawn,
             sort_ms=stages.get("sort", 0.0),
             frame_ms=frame_ms,
-            tier="cpu",
+            renderer="cpu",
             stages=stages,
             size=frame.size,
         )

@@ -221,13 +221,6 @@ class SortedSplats:
         return indices[radix_argsort(depth)][::-1]
 
 
-def color_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
-    """Evaluate the colours of the splats as seen from a camera position; the GPU sorts them."""
-    start = time.perf_counter()
-    colors = splats.evaluate_colors(position) if splats.base_colors is None else None
-    return SortedSplats(splats, position, np.zeros(0, np.uint32), colors, 1e3 * (time.perf_counter() - start))
-
-
 def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
     """Sort the splats by distance from a camera position and evaluate their colours."""
     start = time.perf_counter()
@@ -242,18 +235,17 @@ def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedS
 
 
 class SplatSorter:
-    """Runs `sort_splats` or `color_splats` in a worker thread; a new request replaces one that has not started."""
+    """Runs `sort_splats` in a worker thread; a new request replaces one that has not started."""
 
-    def __init__(self, sort: Callable[[Splats, tuple[float, float, float]], SortedSplats] | None = None) -> None:
-        """Create the sorter, which calls `sort` (`sort_splats`); the thread starts with the first request."""
-        self._sort = sort or sort_splats
+    def __init__(self) -> None:
+        """Create the sorter; the thread starts with the first request."""
         self._executor = ThreadPoolExecutor(1, "splat-sorter")
         self._futures: list[Future[SortedSplats]] = []
 
     def request(self, splats: Splats, position: tuple[float, float, float]) -> None:
         """Queue a sort and return at once."""
         self._futures = [future for future in self._futures if not future.cancel()]
-        self._futures.append(self._executor.submit(self._sort, splats, position))
+        self._futures.append(self._executor.submit(sort_splats, splats, position))
 
     def take(self) -> SortedSplats | None:
         """Return the newest result once, else None; raises the exception of a sort that failed."""

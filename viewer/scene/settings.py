@@ -143,7 +143,7 @@ class FrameStats:
             ready, or the last image because the new one is not ready; render again to get it.
         frame_ms: from the call of `render` until the GPU had finished. Of an image that OpenGL draws without waiting,
             this is the longer of the times on the processor and the GPU, and known when the next one is drawn.
-        timed: settings of the image that took `frame_ms` and, in tier `gl43`, has `drawn` splats; None is this one.
+        timed: settings of the image that took `frame_ms`; None is this one.
         stages: milliseconds of each stage, where the renderer measures them.
     """
 
@@ -154,7 +154,7 @@ class FrameStats:
     sort_ms: float = 0.0
     frame_ms: float = 0.0
     timed: DrawSettings | None = None
-    tier: str = "gl33"  # `gl33`, `gl43` or `cpu`
+    renderer: Literal["gl", "cpu"] = "gl"
     cached: bool = False  # whether the frame used cached layers only
     settled: bool = True
     stages: Mapping[str, float] = field(default_factory=dict)

@@ -55,7 +55,7 @@ def draw_stats(
     lines = [
         f"frame {frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
         f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
-        f"{image_size[0]} x {image_size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
+        f"{image_size[0]} x {image_size[1]}   {stats.renderer}" + ("   cached" if stats.cached else ""),
         f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
     ]
     if right_name is not None:

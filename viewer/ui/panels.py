@@ -257,16 +257,17 @@ class Panels:
         state.settings = replace(settings, opacity_threshold=threshold)
 
     def _draw_settings(self, viewer: Viewer) -> None:
-        state, settings, tier = viewer.state, viewer.state.settings, viewer.stage.renderer.stats.tier
+        state, settings = viewer.state, viewer.state.settings
+        on_processor = viewer.stage.renderer.stats.renderer == "cpu"
         _draw_row_label("preset")
-        imgui.begin_disabled(tier == "cpu")  # which draws preset exact and one eye only
+        imgui.begin_disabled(on_processor)  # which draws preset exact and one eye only
         for preset in get_args(Preset):
             imgui.same_line()
             if self.widgets.radio(preset, settings.preset == preset):
                 settings = replace(settings, preset=preset)
         imgui.end_disabled()
         _draw_row_label("stereo")
-        imgui.begin_disabled(tier == "cpu")
+        imgui.begin_disabled(on_processor)
         for label, stereo in (("off", "mono"), ("pair", "side-by-side"), ("red/cyan", "anaglyph")):
             imgui.same_line()
             if self.widgets.radio(f"{label}##stereo", settings.stereo == stereo):

@@ -15,7 +15,7 @@ import moderngl
 from imgui_bundle import imgui
 
 from pansplat.errors import InputError
-from pansplat_viewer.draw.offscreen import CONTEXT_VERSIONS, load_llvm_before_mesa
+from pansplat_viewer.draw.offscreen import load_llvm_before_mesa
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
@@ -82,12 +82,10 @@ class Window:
         glfw.window_hint(glfw.SCALE_TO_MONITOR, True)
         glfw.window_hint(glfw.VISIBLE, False)  # until the first frame: an empty window is black
         glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
-        for major, minor in CONTEXT_VERSIONS:
-            glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
-            glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
-            if handle := glfw.create_window(*size, title, None, None):
-                break
-        else:
+        glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 3)
+        glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, 3)
+        handle = glfw.create_window(*size, title, None, None)
+        if not handle:
             glfw.terminate()
             raise NoWindowError(f"the display has no OpenGL 3.3 ({errors[-1]}); {_DEBIAN}")
         glfw.make_context_current(handle)
