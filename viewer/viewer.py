@@ -26,13 +26,12 @@ from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
 from pansplat.inputs.photographs import LINKS, write_notes
 from pansplat.inputs.web_tours.entries import make_note
-from pansplat.system.files import find_scene_suffix, require_replaceable
+from pansplat.system.files import require_replaceable
 from pansplat.tours.graph import list_starts
 from pansplat.tours.route import find_angles, plan_route
 from pansplat_viewer.recorder import Recorder
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.background import Jobs
-from pansplat_viewer.scene.cleaning import CLEANING_JOB, Painting, measure_bounds, remove_floaters, save_cleaned
 from pansplat_viewer.scene.doll_house import DollHouseView
 from pansplat_viewer.scene.key_frames import read_path, write_path
 from pansplat_viewer.scene.library import Library
@@ -64,8 +63,8 @@ class Viewer:
         loaded: the scene that is shown; None before the first one.
         tour: the scenes of the tour that is shown, or whose photographs are; None for other scenes.
         stage: draws the image.
-        jobs: work in the background: films, cleaning, the doll's house.
-        doll_house, painting, placing, recorder: what else a user does with the scene.
+        jobs: work in the background: films, the doll's house.
+        doll_house, placing, recorder: what else a user does with the scene.
         hotspots: places of panoramas in the image.
         panels: the panels, with the rectangles of their widgets.
         preferences: the remembered values.
@@ -112,7 +111,6 @@ class Viewer:
         self.jobs = Jobs(self.show_error)
         self.stage = Stage(ctx, renderer, self.state, self.show_error)
         self.doll_house = DollHouseView(self.state, self.jobs, self.stage)
-        self.painting = Painting(self.state, self.show_error)
         self.placing: Placing | None = None
         self.recorder = Recorder(self.state, self.stage, self.jobs, folder, self.show_error)
         self.panels = Panels(ctx)
@@ -125,7 +123,6 @@ class Viewer:
         self._incoming: LoadedScene | None = None  # shown when it is prepared
         self._refined: Scene | None = None
         self._too_large: tuple[LoadedScene, int] | None = None  # a scene, and the number of Gaussians to offer
-        self._bounds: tuple[Scene, tuple[float, ...]] | None = None  # a scene and its box
 
     def show_error(self, message: str) -> None:
         """Show a message until the user dismisses it."""
@@ -204,16 +201,6 @@ class Viewer:
         return self.stage.comparer.describe(self.state) if self.loaded is not None and mono else None
 
     @property
-    def bounds(self) -> tuple[float, ...] | None:
-        """The box of the scene; None for tours, whose scenes are parts, and in the doll's house."""
-        scene = self.stage.slot.scene
-        if self.loaded is None or self.tour is not None or self.doll_house.house is not None or scene is None:
-            return None
-        if self._bounds is None or self._bounds[0] is not scene:
-            self._bounds = scene, measure_bounds(scene)
-        return self._bounds[1]
-
-    @property
     def panoramas(self) -> list[str]:
         """The names of the input cameras of the scene, or their numbers."""
         scene = self.stage.slot.scene
@@ -256,7 +243,7 @@ class Viewer:
         events = read_input(min(seconds, _MAX_STEP_SECONDS))  # so that after a slow frame the camera does not move far
         if self.placing is not None and state.overlay:
             events = self.placing.apply(events)
-        apply_input(self, self.painting.apply(events, stage.size))
+        apply_input(self, events)
         step = min(seconds, 2 * _MAX_STEP_SECONDS)
         self.doll_house.update(step)
         self._fly_tour(step, was_playing)
@@ -274,10 +261,6 @@ class Viewer:
             action()
         milliseconds = 1000 * (time.perf_counter() - start)
         self.frame_ms += (milliseconds - self.frame_ms) * (0.15 if self.frame_ms else 1.0)
-
-    def request_quit(self) -> None:
-        """Close the viewer, after a question if a mask is not saved."""
-        self.painting.leave(lambda: setattr(self.state, "quit", True))
 
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""
@@ -336,17 +319,14 @@ class Viewer:
     def choose(self, index: int) -> None:
         """Show another entry of the list."""
         if index != self.library.current:
-            self.painting.leave(partial(self.show, self.library.entries, index, self.library.path))
+            self.show(self.library.entries, index, self.library.path)
 
     def open_text(self, text: str) -> None:
         """Show the scenes at the path that a user has typed."""
-        self.painting.leave(partial(self.open, Path(text).expanduser()))
+        self.open(Path(text).expanduser())
 
     def reload(self) -> None:
         """Load the entry again."""
-        self.painting.leave(self._reload)
-
-    def _reload(self) -> None:
         library, current = self.library, max(self.library.current, 0)
         if library.path is None:
             self.show(library.entries, current)
@@ -377,13 +357,11 @@ class Viewer:
             self._incoming = replace(loaded, scene=keep_largest(loaded.scene, count))
 
     def _take_loaded(self) -> None:
-        """Show the scene, the entries or the error of a finished load or search, which wait during a question."""
-        if self.painting.question is not None:
-            return
+        """Show the scene, the entries or the error of a finished load or search."""
         is_ready, loader = self.stage.preparer.is_ready, self.library.loader
         if self._incoming is not None and is_ready(self._incoming.scene):
             incoming, self._incoming = self._incoming, None
-            self._show_loaded(incoming)
+            self._replace_scene(incoming)
         requested = loader.entry
         result = loader.poll() if self._incoming is None else None
         if isinstance(result, list) and loader.is_searching:
@@ -397,7 +375,7 @@ class Viewer:
             elif loaded is not None and loaded.entry is result.entry and result.is_final and not loaded.is_final:
                 self._refined = result.scene
             elif is_ready(result.scene):
-                self._show_loaded(result)
+                self._replace_scene(result)
             else:
                 self._incoming = result
         elif result is not None:
@@ -407,13 +385,6 @@ class Viewer:
             if has_failed and self.tour is not None and self.tour.is_of(requested):
                 self.tour.fail(requested.views)
             self.library.restore()
-
-    def _show_loaded(self, loaded: LoadedScene) -> None:
-        """Show a scene, after a question if that ends an unsaved mask."""
-        if self.painting.follow(loaded.entry.panoramas) is None:
-            self.painting.leave(lambda: self._replace_scene(loaded), otherwise=self.library.restore)
-        else:
-            self._replace_scene(loaded)
 
     def _replace_scene(self, loaded: LoadedScene) -> None:
         """Show a scene; if it does not fit into memory, keep the one before and offer the largest Gaussians."""
@@ -450,16 +421,11 @@ class Viewer:
         self.library.keep()
         stage.clear()
         stage.comparer.photographs.open(entry.panoramas)
-        painted = self.painting.follow(entry.panoramas)
-        if painted is None:
-            self.painting.stop()
         self.placing = Placing.open(self.placing, entry, self.library.entries)
         if entry.tour is None:
             enter_scene(state, loaded.scene, at=self._at)
         else:
             self._enter_tour(loaded, remaining)
-        if painted is not None:
-            state.photograph = painted
         tour, part = self.tour, 0 if self.tour is None else self.tour.part
         stage.scene_views = entry.views
         is_here = tour is None or tour.is_inside(np.asarray(state.camera.position), entry.views)
@@ -684,39 +650,6 @@ class Viewer:
             yield
         except (InputError, OSError) as error:
             self.show_error(str(error))
-
-    def start_painting(self) -> None:
-        """Paint a mask on the photograph of the comparison."""
-        comparer = self.stage.comparer
-        index = comparer.choose_photograph(self.state)
-        if index is not None:
-            self.painting.start(comparer.photographs.panoramas, index)
-
-    def remove_floaters(self) -> None:
-        """Show the scene without isolated Gaussians."""
-        scene = self.stage.slot.scene
-        if scene is None:
-            return
-
-        def show(result: tuple[Scene | None, str]) -> None:
-            cleaned, message = result
-            if self.loaded is not None and self.tour is None and self.stage.slot.scene is scene and cleaned is not None:
-                self._incoming, self._refined = replace(self.loaded, scene=cleaned, is_final=True), None
-            self.state.show_message(message)
-
-        self.jobs.start(CLEANING_JOB, partial(remove_floaters, scene), show, description="looking for floaters")
-
-    def save_scene(self, text: str) -> None:
-        """Write the scene without what is hidden to a file."""
-        scene, settings, path = self.stage.slot.scene, self.state.settings, Path(text).expanduser()
-        if scene is None:
-            return
-        with self._showing_errors():
-            find_scene_suffix(path)
-            require_replaceable("the scene", [path])
-            work, description = partial(save_cleaned, scene, settings, path), f"writing {path.name}"
-            start = partial(self.jobs.start, CLEANING_JOB, work, self.state.show_message, description=description)
-            self.painting.leave(start, after_saving=False)
 
     # --- preferences ---
 

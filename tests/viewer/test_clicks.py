@@ -76,7 +76,7 @@ OTHER_WIDGETS = {
     "photographs at panoramas",
     *get_args(Display), *get_args(Comparison),
     "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
-    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
+    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Camera path", "Window", "Reload",
     "Notes in the picture",
 }  # fmt: skip
 
@@ -308,62 +308,6 @@ def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
         assert file.size == (128, 64)
     user.click("off##stereo")
     assert "eye distance" not in user.panels.widgets.items
-
-
-@pytest.fixture
-def cleaning(user: User) -> Iterator[User]:
-    """The user with the section "Clean up" open, and the sections above it closed."""
-    headers = ("Clean up", "Display", "Compare", "Camera", "Gaussians")
-    for header in headers:
-        user.click(header)
-    yield user
-    user.viewer.painting.stop()
-    for header in headers[::-1]:
-        user.click(header)
-
-
-def test_a_box_hides_what_is_outside_and_buttons_write_the_scene_without_it(cleaning, tmp_path):
-    user = cleaning
-    whole = user.read_image()
-    user.click("crop to a box")
-    user.draw_frames(1)
-    assert user.state.settings.box == pytest.approx(user.viewer.bounds)
-    assert changed_fraction(whole, user.read_image()) == 0
-    user.slide("x from", 0.4, start=0.01)
-    assert user.state.settings.box[0] > user.viewer.bounds[0] + 0.5
-    assert changed_fraction(whole, user.read_image()) > 0.05
-    user.panels.cleaning.file = str(tmp_path / "small.ply")
-    user.click("Save##clean")
-    user.draw_until(lambda: (tmp_path / "small.ply").exists() and not user.viewer.jobs.is_busy, "saved scene")
-    user.click("Remove floaters")
-    user.draw_until(lambda: "floaters:" in user.state.message, "message")
-    user.settle()
-    user.click("crop to a box")
-    assert user.state.settings.box is None
-    user.show(*user.entries)
-
-
-def test_a_mask_is_painted_cleared_and_dropped_after_a_question(cleaning):
-    user, painting = cleaning, cleaning.viewer.painting
-    user.click("paint what to hide")
-    user.draw_frames(2)
-    assert user.state.comparison == "photograph" and "Save mask" in user.panels.widgets.items
-    user.slide("brush", 0.5)
-    plain = user.read_screen()
-    user.drag((400, 300), (480, 320))
-    assert painting.painter.is_changed and changed_fraction(user.read_screen(), plain) > 0, "outlines are drawn"
-    for answer in ("Go on painting", "Drop it"):
-        user.click("paint what to hide")
-        user.draw_frames(2)
-        user.click(answer)
-        assert (painting.painter is None) == (answer == "Drop it")
-    user.click("paint what to hide")
-    user.drag((400, 300), (480, 320))
-    user.click("Clear")
-    assert not painting.painter.hidden.any()
-    user.press(imgui.Key.escape)
-    user.click("Drop it")
-    assert painting.painter is None and not user.state.quit
 
 
 def test_camera_widgets_fly_orbit_and_restore_the_start(user):

@@ -15,11 +15,9 @@ import torch
 from imgui_bundle import imgui
 
 from pansplat.errors import InputError
-from pansplat.export.cleanup import find_floaters
-from pansplat.gaussians.formats import load_scene
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.path import find_direction
-from pansplat.images.image_files import read_blur_mask, write_image
+from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat_viewer.draw.frame_renderer import Pacing
@@ -510,149 +508,6 @@ def test_a_film_of_a_tour_is_cancelled_during_a_prediction(tour_app, load_house)
     assert gate.entered.wait(300)
     app.viewer.jobs.cancel("film", join=True)
     assert not gate.event.is_set(), "it waited for the prediction"
-
-
-# --- clean up ---
-
-
-def test_a_saved_scene_lacks_what_is_hidden_and_other_files_are_kept(app, small_scene, tmp_path):
-    bounds = app.viewer.bounds
-    app.state.settings = replace(app.state.settings, box=(0.2, *bounds[1:]), opacity_threshold=0.5)
-    app.viewer.save_scene(str(tmp_path / "small.ply"))
-    app.settle()
-    means, opacities = small_scene.gaussians.means, small_scene.gaussians.opacities
-    inside = (means[:, 0] >= 0.2) & (opacities >= 0.5)
-    assert len(load_scene(tmp_path / "small.ply").gaussians) == int(inside.sum())
-    assert "Gaussians left out" in app.state.message and "small.ply" in app.state.message
-    (tmp_path / "own.ply").write_bytes(b"of the user")
-    for name, message in (("small.stl", "small.stl"), (str(tmp_path / "own.ply"), "own.ply, which pansplat did not")):
-        app.viewer.save_scene(name)
-        assert message in app.viewer.error
-    assert (tmp_path / "own.ply").read_bytes() == b"of the user"
-
-
-def test_floaters_are_removed_and_the_box_stays(app, small_scene):
-    app.state.settings = replace(app.state.settings, box=app.viewer.bounds)
-    app.viewer.remove_floaters()
-    app.until(lambda: "floaters:" in app.state.message, "message")
-    expected = len(small_scene.gaussians) - int(find_floaters(small_scene).sum())
-    assert f"{len(small_scene.gaussians) - expected:,} of {len(small_scene.gaussians):,}" in app.state.message
-    app.settle()
-    assert len(app.viewer.stage.slot.scene.gaussians) == expected and app.state.settings.box is not None
-
-
-@pytest.fixture
-def painted(app, pair) -> App:
-    """The viewer with a mask that is not saved."""
-    app.show(SceneEntry(pair.name, pair=pair), SceneEntry("other", file=pair.folder / "other.ply"))
-    app.viewer.start_painting()
-    app.frame(pointer=CENTER, drag=(5.0, 0.0))
-    app.frame(pointer=(0.55, 0.52))
-    assert app.viewer.painting.painter.is_changed
-    return app
-
-
-def test_a_mask_is_painted_on_the_photograph_and_saved(app, pair):
-    mask, painting, before = pair.folder / "a_blur.png", app.viewer.painting, app.state.camera
-    app.viewer.start_painting()
-    assert app.state.comparison == "photograph" and app.state.split == 0
-    app.frame(pointer=CENTER, drag=(9.0, 3.0))
-    app.frame(pointer=(0.6, 0.52))
-    assert app.state.camera == before, "the left button paints"
-    app.frame(pan=(9.0, 3.0))
-    assert app.state.camera != before, "the right one looks around"
-    painted = painting.painter.hidden.copy()
-    assert 0 < painted.mean() < 0.2
-    app.frame(pointer=CENTER, held=frozenset({"shift"}))
-    assert painting.painter.hidden.sum() < painted.sum(), "with shift it shows again"
-    painted = painting.painter.hidden.copy()
-    try:
-        assert painting.save() and "Reload" in app.state.message
-        assert np.array_equal(read_blur_mask(mask, 512), painted)
-        painting.painter.clear()
-        assert not painting.painter.hidden.any() and painting.painter.is_changed
-        painting.stop()
-        assert app.state.comparison == "off"
-        app.viewer.start_painting()
-        assert np.array_equal(painting.painter.hidden, painted), "that of the file"
-        painting.leave(painting.stop)
-        assert painting.painter is None
-    finally:
-        mask.unlink()
-
-
-LEAVING = {
-    "Esc": lambda app: app.press("escape"),
-    "untick": lambda app: app.viewer.painting.leave(app.viewer.painting.stop),
-    "Reload": lambda app: app.viewer.reload(),
-    "another scene": lambda app: app.viewer.choose(1),
-    "another path": lambda app: app.viewer.open_text("nowhere"),
-    "export": lambda app: app.viewer.save_scene(str(app.viewer.loaded.entry.pair.folder / "clean.ply")),
-    "quit": lambda app: app.press("q", held="ctrl"),
-    "close the window": lambda app: app.viewer.request_quit(),
-}
-
-
-@pytest.mark.parametrize("leave", LEAVING.values(), ids=LEAVING)
-def test_an_unsaved_mask_is_dropped_only_after_a_question(painted, leave, pair):
-    app, painting, painter = painted, painted.viewer.painting, painted.viewer.painting.painter
-    mask, exported, hidden = pair.folder / "a_blur.png", pair.folder / "clean.ply", painter.hidden.copy()
-
-    def ask() -> None:
-        leave(app)
-        app.frames(2)
-        assert painting.question == "a.png" and painting.painter is painter and painter.is_changed
-        assert np.array_equal(painter.hidden, hidden)
-        assert not app.state.quit and not mask.exists() and not exported.exists()
-        assert app.library.loader.entry is None and not app.library.loader.is_searching and not app.viewer.jobs.is_busy
-
-    ask()
-    painting.answer("keep")
-    app.frames(2)
-    assert painting.question is None and painting.painter is painter and painter.is_changed
-    ask()
-    painting.answer("drop")
-    assert painting.painter is None and not mask.exists()
-    app.settle()
-    assert app.state.quit == (leave in (LEAVING["quit"], LEAVING["close the window"]))
-    assert exported.exists() == (leave is LEAVING["export"])
-    exported.unlink(missing_ok=True)
-
-
-def test_an_unsaved_mask_is_saved_by_the_answer(painted, pair):
-    app, painting, mask = painted, painted.viewer.painting, pair.folder / "a_blur.png"
-    hidden = painting.painter.hidden.copy()
-    try:
-        app.viewer.save_scene(str(pair.folder / "clean.ply"))
-        painting.answer("save")
-        app.settle()
-        assert np.array_equal(read_blur_mask(mask, 512), hidden) and "Reload" in app.state.message
-        assert not (pair.folder / "clean.ply").exists(), "the scene shows what the new mask hides"
-        app.press("q", held="ctrl")
-        assert app.state.quit, "there is nothing to lose"
-    finally:
-        mask.unlink(missing_ok=True)
-
-
-def test_a_mask_that_is_painted_stays_when_its_photograph_is_loaded_again(painted, pair):
-    app, painter = painted, painted.viewer.painting.painter
-    hidden, again = painter.hidden.copy(), replace(pair, context=tuple(replace(view) for view in pair.context))
-    app.show(SceneEntry(pair.name, pair=again))
-    assert app.viewer.painting.painter is painter and painter.is_changed and np.array_equal(painter.hidden, hidden)
-    assert painter.panorama is again.context[0] and app.state.photograph == 0
-
-
-def test_a_scene_that_was_loading_while_a_mask_was_painted_waits_for_the_answer(painted):
-    app, painting, shown = painted, painted.viewer.painting, painted.viewer.loaded
-    painter = painting.painter
-    for answer in ("keep", "drop"):
-        app.viewer.show(app.library.entries, 1)
-        app.until(lambda: painting.question, "question")
-        assert app.viewer.loaded is shown and painting.painter is painter
-        painting.answer(answer)
-        app.frames(2)
-        assert app.library.current == (answer == "drop")
-    assert app.viewer.loaded is not shown and painting.painter is None
 
 
 # --- the doll's house ---

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt
 
-from pansplat.gaussians.crop import are_in_box
 from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering.cpu.display import NO_LAYER, Selection, mark_in_view
@@ -140,11 +139,8 @@ class Splats:
 
     def select(self, selection: GaussianChoice, view: int | None) -> Bool[np.ndarray, "n"]:
         """Return a mask of the splats that a selection and view contain and that can be visible."""
-        levels, threshold, box = selection
+        levels, threshold = selection
         selected = self.reach > 0
-        if box is not None:
-            moved = tuple((np.reshape(box, (2, 3)) - self.origin).ravel().tolist())
-            selected &= are_in_box(torch.from_numpy(self.means), moved).numpy()
         if threshold > 0:
             selected &= self.opacities >= np.float32(threshold)
         if levels is not None:

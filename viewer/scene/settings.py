@@ -20,8 +20,8 @@ Stereo = Literal["mono", "side-by-side", "top-bottom", "anaglyph"]
 Display = Literal["color", "depth", "opacity", "normals", "levels", "views"]
 Comparison = Literal["off", "photograph", "error", "pinned"]
 
-GaussianChoice = tuple[frozenset[int] | None, float, tuple[float, ...] | None]
-"""Levels, least opacity and box of the Gaussians that are drawn."""
+GaussianChoice = tuple[frozenset[int] | None, float]
+"""Levels and least opacity of the Gaussians that are drawn."""
 
 _CHOICES = {
     "preset": Preset,
@@ -69,7 +69,6 @@ class DrawSettings:
     view_weights: tuple[float, ...] = ()
     levels: frozenset[int] | None = None  # pyramid levels to draw; None draws all
     opacity_threshold: float = 0.0  # Gaussians of lower opacity are not drawn
-    box: tuple[float, ...] | None = None  # x, y, z of two corners, metres; Gaussians with centres outside are not drawn
     display: Display = "color"
     display_max: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
@@ -111,12 +110,12 @@ class DrawSettings:
     @property
     def selection(self) -> GaussianChoice:
         """What chooses the Gaussians that are drawn, besides the view."""
-        return self.levels, self.opacity_threshold, self.box
+        return self.levels, self.opacity_threshold
 
     @property
     def shows_scene(self) -> bool:
         """Whether the colours of the whole scene are shown, to one eye."""
-        is_whole = self.selection == (None, 0.0, None) and set(self.view_weights) <= {1.0}
+        is_whole = self.selection == (None, 0.0) and set(self.view_weights) <= {1.0}
         return is_whole and self.display == "color" and self.mode != "view" and self.stereo == "mono"
 
     @property

@@ -109,7 +109,6 @@ class ViewerState:
     film_projection: Projection = "perspective"
     depth_max: float = 1.0  # distance within which most Gaussians are, metres; the range of the display of depths
     levels: tuple[int, ...] = ()  # pyramid levels of the scene, ascending
-    brush_degrees: float = 4.0  # radius of the brush that paints what to hide
     points: list[PickedPoint] = field(default_factory=list)  # the last picked points, two at most
     now: float = 0.0  # time of the frame, seconds of the viewer's clock
     message: str = ""  # a text to show until `message_until`
@@ -135,7 +134,7 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
     leave_doll_house(state)
     adapt_settings(state, scene, keep_levels=False)
-    state.settings = replace(state.settings, near=NEAR, box=None if before is None else state.settings.box)
+    state.settings = replace(state.settings, near=NEAR)
     state.context = scene.cam2world.double().numpy()
     state.tour = state.route = state.target = None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []

@@ -14,7 +14,6 @@ from imgui_bundle import imgui
 
 from pansplat_viewer.recorder import FILM_JOB
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.cleaning import MaskAnswer
 from pansplat_viewer.scene.key_frames import KeyFrame
 from pansplat_viewer.scene.settings import Comparison, Display, Preset, Projection
 from pansplat_viewer.scene.state import (
@@ -29,7 +28,6 @@ from pansplat_viewer.scene.state import (
     toggle_play,
 )
 from pansplat_viewer.scene.tour import TourScenes
-from pansplat_viewer.ui.cleaning import CleaningSection, draw_mask
 from pansplat_viewer.ui.minimap import SIZE, Minimap, describe_panorama, describe_panoramas, is_probable
 from pansplat_viewer.ui.notes import NotesSection, draw_notes
 from pansplat_viewer.ui.overlays import (
@@ -72,14 +70,13 @@ class Panels:
         path, path_file: texts of the fields of scenes and of the camera path.
         minimap: the plan of a tour.
         placing: the window in which a photograph is placed.
-        cleaning: the section "Clean up".
         notes: the section "Notes in the picture".
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.widgets = Widgets()
         self.minimap, self.placing = Minimap(ctx), PlacingWindow(ctx, self.widgets)
-        self.cleaning, self.notes = CleaningSection(self.widgets), NotesSection(self.widgets)
+        self.notes = NotesSection(self.widgets)
         self.path, self.path_file = "", "path.json"
         self._is_reset = False  # whether the default layout was chosen in this frame
 
@@ -96,8 +93,6 @@ class Panels:
             self._draw_divider(state)
         if stats.total:
             draw_legends(state)
-        if viewer.painting.painter is not None:
-            draw_mask(viewer.painting.painter, state.camera, state.brush_degrees)
         if state.overlay and state.points:
             draw_points(state)
         if state.overlay and state.hotspots:
@@ -109,9 +104,7 @@ class Panels:
             viewer.queue(viewer.reload)
         if state.help:
             state.help = _draw_help()
-        if viewer.painting.question is not None:
-            self._draw_question(viewer, viewer.painting.question)
-        elif viewer.loading:
+        if viewer.loading:
             self._draw_progress(viewer, *viewer.loading)
         elif viewer.error:
             self._draw_error(viewer, viewer.error)
@@ -185,7 +178,6 @@ class Panels:
         section("Camera", partial(self._draw_camera, viewer))
         section("Screenshot", partial(self._draw_screenshot, viewer))
         section("Drawing", partial(self._draw_settings, viewer), opened=False)
-        section("Clean up", partial(self.cleaning.draw, viewer), opened=False)
         section("Camera path", partial(self._draw_path, viewer), opened=False)
         section("Window", partial(self._draw_window, viewer), opened=False)
 
@@ -491,17 +483,6 @@ class Panels:
             if self.widgets.button(f"Show the {viewer.reduced:,} largest Gaussians###Reduce"):
                 viewer.queue(viewer.show_reduced)
             self.widgets.record("Reduce")
-        imgui.end()
-
-    def _draw_question(self, viewer: Viewer, photograph: str) -> None:
-        _place_at_center()
-        imgui.begin("Unsaved mask", None, FIXED | imgui.WindowFlags_.no_collapse.value)
-        imgui.text_unformatted(f"What is painted on {photograph} is not saved.")
-        answers: dict[str, MaskAnswer] = {"Save mask##answer": "save", "Drop it": "drop", "Go on painting": "keep"}
-        for label, answer in answers.items():
-            if self.widgets.button(label):
-                viewer.queue(viewer.painting.answer, answer)
-            imgui.same_line()
         imgui.end()
 
 

@@ -31,7 +31,6 @@ class Input:
     Attributes:
         drag: pointer movement over the image with the left button held, pixels (right, down).
         click: place of a click on the image without a drag, as fractions of width and height; None without a click.
-        pointer: place of the pointer over the image while the left button is held, in the same unit; else None.
         sticks: of a gamepad, -1 to 1: fly right, up and forward, turn right and up.
     """
 
@@ -43,7 +42,6 @@ class Input:
     scroll: float = 0.0  # wheel steps; positive is scrolling up
     height: int = 720  # of the window, pixels
     click: tuple[float, float] | None = None
-    pointer: tuple[float, float] | None = None
     sticks: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -107,7 +105,7 @@ def _escape(viewer: Viewer, _: Input) -> None:
     if viewer.state.help:
         viewer.state.help = False
     else:
-        viewer.queue(viewer.request_quit)
+        viewer.state.quit = True
 
 
 KEYS = (
@@ -196,11 +194,10 @@ def read_input(seconds: float) -> Input:
     modifiers = {"shift": io.key_shift, "alt": io.key_alt, "ctrl": io.key_ctrl}
     held |= {name for name, down in modifiers.items() if down}
     drag = pan = (0.0, 0.0)
-    scroll, click, pointer = 0.0, None, None
+    scroll, click = 0.0, None
     if not io.want_capture_mouse:
         moved = (float(io.mouse_delta.x), float(io.mouse_delta.y))
         place = (io.mouse_pos.x / max(io.display_size.x, 1), io.mouse_pos.y / max(io.display_size.y, 1))
-        pointer = place if imgui.is_mouse_down(0) else None
         if imgui.is_mouse_down(0) and not imgui.is_mouse_clicked(0):
             drag = moved
         elif imgui.is_mouse_down(1) or imgui.is_mouse_down(2):
@@ -210,16 +207,14 @@ def read_input(seconds: float) -> Input:
         if imgui.is_mouse_released(0) and max(abs(moved_since_click.x), abs(moved_since_click.y)) < _CLICK_PIXELS:
             click = place
     height = int(io.display_size.y)
-    return Input(
-        seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click, pointer, _read_sticks()
-    )
+    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click, _read_sticks())
 
 
 def apply_input(viewer: Viewer, events: Input) -> None:
     """Apply the input to the viewer's state, and queue other actions."""
     if "ctrl" in events.held:
         if "q" in events.pressed:
-            viewer.queue(viewer.request_quit)
+            viewer.state.quit = True
         return
     for key in events.pressed:
         action = _ACTIONS.get(key)

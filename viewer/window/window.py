@@ -186,12 +186,6 @@ class Window:
         """Whether the user closed the window."""
         return bool(self._glfw.window_should_close(self._handle))
 
-    def keep_open(self) -> None:
-        """Take the user's request to close back, and show a minimised window, so that a question is seen."""
-        self._glfw.set_window_should_close(self._handle, False)
-        if self._glfw.get_window_attrib(self._handle, self._glfw.ICONIFIED):
-            self._glfw.restore_window(self._handle)
-
     def set_title(self, title: str) -> None:
         """Set the window's title."""
         self._glfw.set_window_title(self._handle, title)
@@ -232,11 +226,7 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
     active_until = 0.0
     shown = False
     target = window.ctx.detect_framebuffer(0)
-    while not viewer.state.quit:
-        if window.closing:
-            window.keep_open()
-            viewer.request_quit()
-            continue
+    while not (viewer.state.quit or window.closing):
         before = time.perf_counter()
         visible = window.is_visible
         has_input = before < active_until or window.gamepad_moves or viewer.gui.has_input
