@@ -29,7 +29,6 @@ from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable
 from pansplat.tours.graph import list_starts
 from pansplat.tours.route import find_angles, plan_route
-from pansplat_viewer.recorder import Recorder
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.background import Jobs
 from pansplat_viewer.scene.doll_house import DollHouseView
@@ -42,6 +41,7 @@ from pansplat_viewer.scene.settings import RendererChoice
 from pansplat_viewer.scene.slots import keep_largest
 from pansplat_viewer.scene.state import ViewerState, advance_flight, advance_path, enter_scene, enter_tour
 from pansplat_viewer.scene.tour import DEFAULT_MEMORY, Hotspot, TourScenes, find_clicked, find_hotspots
+from pansplat_viewer.screenshots import Screenshots
 from pansplat_viewer.ui.panels import Panels
 from pansplat_viewer.ui.photographs import find_open_view
 from pansplat_viewer.ui.stage import DRAW_ERRORS, Stage, describe_error
@@ -63,8 +63,8 @@ class Viewer:
         loaded: the scene that is shown; None before the first one.
         tour: the scenes of the tour that is shown, or whose photographs are; None for other scenes.
         stage: draws the image.
-        jobs: work in the background: films, the doll's house.
-        doll_house, placing, recorder: what else a user does with the scene.
+        jobs: work in the background: the doll's house.
+        doll_house, placing, screenshots: what else a user does with the scene.
         hotspots: places of panoramas in the image.
         panels: the panels, with the rectangles of their widgets.
         preferences: the remembered values.
@@ -112,7 +112,7 @@ class Viewer:
         self.stage = Stage(ctx, renderer, self.state, self.show_error)
         self.doll_house = DollHouseView(self.state, self.jobs, self.stage)
         self.placing: Placing | None = None
-        self.recorder = Recorder(self.state, self.stage, self.jobs, folder, self.show_error)
+        self.screenshots = Screenshots(self.state, self.stage, folder, self.show_error)
         self.panels = Panels(ctx)
         self._preferences_file, self.preferences = preferences, read_preferences(preferences)
         self.gui = Gui(dpi_scale, theme=self.preferences.theme, layout=self.preferences.layout)
@@ -593,7 +593,7 @@ class Viewer:
     def write_screenshot(self, suffix: str, panorama: bool = False) -> None:
         """Write the image as PNG, or EXR with depth; or the panorama at the camera."""
         if self._has_scene() and self.loaded is not None:
-            self.recorder.write_screenshot(self.loaded, suffix, panorama=panorama)
+            self.screenshots.write(self.loaded, suffix, panorama=panorama)
 
     def _has_scene(self) -> bool:
         """Whether a scene is shown; while a photograph is, a message says so."""
@@ -627,7 +627,7 @@ class Viewer:
             if self.loaded is not None:
                 require_replaceable("the camera path", [file])
                 write_path(self.state.path.map_places(self.loaded.scene.frame.globalize_places), file)
-                self.state.show_message(f"wrote {text}")
+                self.state.show_message(f"wrote {text}; pansplat-view SCENE --path {text} --out film.mp4 draws it")
 
     def open_path(self, text: str) -> None:
         """Read the key frames of a camera path."""
@@ -636,12 +636,6 @@ class Viewer:
                 path = read_path(Path(text).expanduser())
                 self.state.path = path.map_places(self.loaded.scene.frame.localize_places)
                 self.state.path_seconds, self.state.path_playing = 0.0, False
-
-    def start_film(self) -> None:
-        """Write the film of the camera path in the background."""
-        with self._showing_errors():
-            if self.loaded is not None:
-                self.recorder.start_film(self.loaded, self.tour, self.library.loader)
 
     @contextlib.contextmanager
     def _showing_errors(self) -> Iterator[None]:

@@ -293,7 +293,7 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
 
 @opengl
 def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.recorder.PANORAMA_HEIGHT", 64)
+    monkeypatch.setattr("pansplat_viewer.screenshots.PANORAMA_HEIGHT", 64)
     user.click("pair##stereo")
     user.settle()
     image = user.viewer.stage.slot.image
@@ -304,7 +304,7 @@ def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
     user.slide("eye distance", 0.9)
     assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
     user.click("360 PNG")
-    with Image.open(user.viewer.recorder.files[-1]) as file:
+    with Image.open(user.viewer.screenshots.files[-1]) as file:
         assert file.size == (128, 64)
     user.click("off##stereo")
     assert "eye distance" not in user.panels.widgets.items
@@ -584,11 +584,11 @@ def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_
 
 @both
 def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.recorder.PANORAMA_HEIGHT", 128)
+    monkeypatch.setattr("pansplat_viewer.screenshots.PANORAMA_HEIGHT", 128)
     image = user.read_image()
     user.click("PNG")
     user.click("360 PNG")
-    png, panorama = user.viewer.recorder.files[-2:]
+    png, panorama = user.viewer.screenshots.files[-2:]
     with Image.open(png) as file:
         assert file.size == SIZE
         pixels = np.asarray(file).astype(int)
@@ -604,7 +604,7 @@ def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
 def test_exr_screenshot_holds_color_and_radial_depth(user):
     user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
     user.click("EXR + depth")
-    by_key, path = user.viewer.recorder.files[-2:]
+    by_key, path = user.viewer.screenshots.files[-2:]
     assert by_key.suffix == path.suffix == ".exr"
     with OpenEXR.File(str(path)) as file:
         depth = file.channels()["Z"].pixels
@@ -1168,43 +1168,11 @@ def test_the_path_is_played_and_its_time_is_dragged(path_user):
     assert changed_fraction(before, user.read_image()) > 0.1
 
 
-@pytest.mark.slow
-def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
+def test_the_path_is_saved_and_loaded(path_user, tmp_path):
     user, path = path_user, path_user.state.path
     user.panels.path_file = str(tmp_path / "walk.json")
     user.click("Save")
+    assert "--path" in user.state.message, "the command that draws the film"
     user.click("Delete##0")
     user.click("Load")
     assert user.state.path == path
-    user.state.film_fps = 2.0
-    user.click(".png")
-    user.click("Write film")
-    user.settle()
-    files = user.viewer.recorder.files[-3:]
-    assert [file.name[-9:] for file in files] == [f"_{i:04d}.png" for i in range(3)]
-    user.state.message = ""
-    shown = user.read_image()
-    with Image.open(files[-1]) as file:
-        assert np.abs(np.asarray(file).astype(int)[IMAGE] - shown).max() <= 3, "the last frame is the last key frame"
-    user.state.path = path.add(replace(path.key_frames[0], seconds=600.0))
-    user.click("Write film")
-    assert 0 <= user.viewer.jobs.progress("film")[1] < 1
-    user.click("Cancel##film")
-    user.settle()
-    assert user.viewer.jobs.progress("film") is user.viewer.error is None and user.viewer.recorder.files[-3:] == files
-
-
-def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
-    user, films = path_user, []
-    monkeypatch.setattr(
-        "pansplat_viewer.capture.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
-    )
-    user.slide("frames per second", 0.6)
-    for suffix, projection in ((".webm", "equirect"), (".exr", "cubemap"), (".mp4", "perspective")):
-        user.click(suffix)
-        user.click(projection)
-        user.click("Write film")
-        user.settle()
-        frames, path, _, file, fps, _ = films.pop()
-        assert (frames.image_format.projection, file.suffix) == (projection, suffix)
-        assert path == user.state.path and fps == user.state.film_fps != 24

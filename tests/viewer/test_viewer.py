@@ -21,7 +21,7 @@ from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
+from pansplat_viewer.scene.key_frames import CameraPath
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, load_entry
 from pansplat_viewer.scene.settings import FrameStats
 from pansplat_viewer.viewer import Viewer
@@ -466,10 +466,10 @@ def test_a_scene_without_photographs_has_no_comparison_with_one(app):
 
 
 def test_a_screenshot_without_memory_is_reported(app, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.capture.write_screenshot", Mock(side_effect=MemoryError("no memory")))
+    monkeypatch.setattr("pansplat_viewer.screenshots.write_image", Mock(side_effect=MemoryError("no memory")))
     app.press("p")
     assert app.viewer.error == "no screenshot written: the memory is exhausted (MemoryError: no memory)"
-    assert app.viewer.recorder.files == []
+    assert app.viewer.screenshots.files == []
 
 
 @pytest.fixture
@@ -497,17 +497,6 @@ def test_a_path_is_saved_and_loaded_and_other_files_are_kept(path_app, tmp_path)
         act(str(tmp_path / name))
         assert name in viewer.error
     assert own.read_text() == "{}"
-
-
-def test_a_film_of_a_tour_is_cancelled_during_a_prediction(tour_app, load_house):
-    app, gate = tour_app, Gate(load_house, "searching depth", 0.5)
-    app.viewer.tour._loaded.clear()
-    app.viewer.state.path = CameraPath((KeyFrame.of_camera(app.state.camera, 0.0),))
-    app.load = gate
-    app.viewer.start_film()
-    assert gate.entered.wait(300)
-    app.viewer.jobs.cancel("film", join=True)
-    assert not gate.event.is_set(), "it waited for the prediction"
 
 
 # --- the doll's house ---

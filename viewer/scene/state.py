@@ -22,7 +22,7 @@ from pansplat.tours.route import Route
 from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.scene.picking import PickedPoint
-from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Projection
+from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings
 
 FLIGHT_SECONDS = 6.0
 GLIDE_SECONDS = 1.6
@@ -73,7 +73,6 @@ class ViewerState:
         overlay, help: whether panels and key help are shown.
         context: poses of the input cameras; empty for a file without cameras. Of a tour, of all panoramas.
         minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
-        film_suffix, film_fps, film_projection: of the film of the path.
     """
 
     camera: Camera = field(default_factory=Camera)  # the current camera; `home` is the camera that R restores
@@ -104,9 +103,6 @@ class ViewerState:
     path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
     path_seconds: float = 0.0  # time on the path that the panel shows
     path_playing: bool = False  # whether the camera moves along the path
-    film_suffix: str = ".mp4"
-    film_fps: float = 24.0
-    film_projection: Projection = "perspective"
     depth_max: float = 1.0  # distance within which most Gaussians are, metres; the range of the display of depths
     levels: tuple[int, ...] = ()  # pyramid levels of the scene, ascending
     points: list[PickedPoint] = field(default_factory=list)  # the last picked points, two at most

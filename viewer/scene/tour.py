@@ -5,7 +5,6 @@ Imports no OpenGL: the film and the window use the same objects.
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -130,15 +129,6 @@ class TourScenes:
             )
 
         return gather
-
-    def copy(self) -> TourScenes:
-        """A copy with the scenes that are in memory, for a film in another thread."""
-        scenes = copy.copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, (dict, list, set)):
-                setattr(scenes, name, value.copy())
-        scenes._is_placed = False
-        return scenes
 
     @property
     def views(self) -> ViewNumbers:

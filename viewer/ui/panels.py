@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, get_args
 import moderngl
 from imgui_bundle import imgui
 
-from pansplat_viewer.recorder import FILM_JOB
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.key_frames import KeyFrame
-from pansplat_viewer.scene.settings import Comparison, Display, Preset, Projection
+from pansplat_viewer.scene.settings import Comparison, Display, Preset
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
     ViewerState,
@@ -421,7 +420,7 @@ class Panels:
 
     def _draw_path(self, viewer: Viewer) -> None:
         """Draw the editor of key frames."""
-        state, film = viewer.state, viewer.jobs.progress(FILM_JOB)
+        state = viewer.state
         if self.widgets.button("Add key frame"):
             add_key_frame(state)
         if len(state.path):
@@ -453,24 +452,6 @@ class Panels:
         imgui.same_line()
         if self.widgets.button("Load"):
             viewer.queue(viewer.open_path, self.path_file)
-        if film is not None:
-            if self.widgets.button("Cancel##film"):
-                viewer.queue(partial(viewer.jobs.cancel, FILM_JOB, join=True))
-            imgui.same_line()
-            imgui.progress_bar(film[1], (-1, 0), f"film {100 * film[1]:.0f}%")
-        elif len(state.path):
-            for suffix in (".mp4", ".webm", ".png", ".exr"):
-                if self.widgets.radio(suffix, state.film_suffix == suffix):
-                    state.film_suffix = suffix
-                imgui.same_line()
-            if self.widgets.button("Write film"):
-                viewer.queue(viewer.start_film)
-            for projection in get_args(Projection):
-                if self.widgets.radio(projection, state.film_projection == projection):
-                    state.film_projection = projection
-                imgui.same_line()
-            imgui.new_line()
-            state.film_fps = self.widgets.slider("frames per second", state.film_fps, 1.0, 60.0, "%.0f")
 
     def _draw_error(self, viewer: Viewer, error: str) -> None:
         _place_at_center(width=560)
