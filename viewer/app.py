@@ -75,7 +75,7 @@ class Options:
     projection: Projection = "perspective"
     """What the frames of --out show: a perspective image, or all directions as a panorama or as six cube faces."""
     stereo: Stereo = "mono"
-    """Images for two eyes, in the window and in --out: next to each other, left above right, or red and cyan."""
+    """Images for two eyes, in the window and in --out: next to each other, or left above right."""
     ipd: EyeDistance = EYE_DISTANCE
     """Distance of the eyes, metres."""
     size: str | None = None

@@ -387,10 +387,10 @@ def write_path_film(
         return frames.draw(camera.cam2world, camera.vertical_fov_degrees, frame / fps, with_depth=with_depth)
 
     projection, stereo = frames.image_format.projection, frames.image_format.stereo
-    panorama = False if projection == "perspective" or stereo == "anaglyph" else projection
+    panorama = False if projection == "perspective" else projection
     if file.suffix.lower() in VIDEO_SUFFIXES:
         images = (to_bytes(draw(frame)[0]) for frame in range(num_frames))
-        write_video(file, images, fps, panorama=panorama, stereo="mono" if stereo == "anaglyph" else stereo)
+        write_video(file, images, fps, panorama=panorama, stereo=stereo)
         written.append(file)
     else:
         for frame in range(num_frames):

@@ -30,8 +30,6 @@ from pansplat.system.files import require_replaceable
 from pansplat.tours.graph import list_starts
 from pansplat.tours.route import find_angles, plan_route
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.background import Jobs
-from pansplat_viewer.scene.doll_house import DollHouseView
 from pansplat_viewer.scene.key_frames import read_path, write_path
 from pansplat_viewer.scene.library import Library
 from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader
@@ -44,7 +42,7 @@ from pansplat_viewer.scene.tour import DEFAULT_MEMORY, Hotspot, TourScenes, find
 from pansplat_viewer.screenshots import Screenshots
 from pansplat_viewer.ui.panels import Panels
 from pansplat_viewer.ui.photographs import find_open_view
-from pansplat_viewer.ui.stage import DRAW_ERRORS, Stage, describe_error
+from pansplat_viewer.ui.stage import Stage
 from pansplat_viewer.window.gui import Gui
 from pansplat_viewer.window.input import apply_input, read_input
 from pansplat_viewer.window.preferences import Theme, read_preferences, write_preferences
@@ -63,8 +61,7 @@ class Viewer:
         loaded: the scene that is shown; None before the first one.
         tour: the scenes of the tour that is shown, or whose photographs are; None for other scenes.
         stage: draws the image.
-        jobs: work in the background: the doll's house.
-        doll_house, placing, screenshots: what else a user does with the scene.
+        placing, screenshots: what else a user does with the scene.
         hotspots: places of panoramas in the image.
         panels: the panels, with the rectangles of their widgets.
         preferences: the remembered values.
@@ -108,9 +105,7 @@ class Viewer:
         self.frame_ms = 0.0
         self._at, self._memory, self._clock = at, memory, clock
         self.library = Library(loader, find)
-        self.jobs = Jobs(self.show_error)
         self.stage = Stage(ctx, renderer, self.state, self.show_error)
-        self.doll_house = DollHouseView(self.state, self.jobs, self.stage)
         self.placing: Placing | None = None
         self.screenshots = Screenshots(self.state, self.stage, folder, self.show_error)
         self.panels = Panels(ctx)
@@ -141,7 +136,7 @@ class Viewer:
         loading = loader.entry is not None or loader.is_searching or self.stage.comparer.photographs.is_reading
         loading = loading or self._incoming is not None or preparer.progress is not None
         placing = self.placing is not None and self.placing.is_busy
-        return self.moving or loading or placing or self.jobs.is_busy
+        return self.moving or loading or placing
 
     @property
     def moving(self) -> bool:
@@ -209,13 +204,11 @@ class Viewer:
 
     def _find_hotspots(self) -> list[Hotspot]:
         """The places of panoramas in the image, in points of the window, which may have several pixels."""
-        camera, house, fade = self.state.camera, self.doll_house.house, self.stage.fade
+        camera, fade = self.state.camera, self.stage.fade
         if self.stage.eye_size != self.stage.size:
             return []
         size = imgui.get_io().display_size
         points = int(size.x), int(size.y)
-        if house is not None:
-            return [] if self.state.glide is not None else house.find_marks(camera, points)
         has_arrived = self.tour is not None and fade.parts[fade.front] == self.tour.part
         return find_hotspots(self.tour, camera, points) if self.tour is not None and has_arrived else []
 
@@ -230,7 +223,6 @@ class Viewer:
         _, _, width, height = target.viewport
         state.now, stage.size = self._clock(), (width, height)
         self._take_loaded()
-        self.jobs.poll()
         self.library.watch.look(state.now)
         self._exchange_scene()
         if self.placing is not None:
@@ -245,7 +237,6 @@ class Viewer:
             events = self.placing.apply(events)
         apply_input(self, events)
         step = min(seconds, 2 * _MAX_STEP_SECONDS)
-        self.doll_house.update(step)
         self._fly_tour(step, was_playing)
         advance_path(state, step)
         self._update_tour()
@@ -265,7 +256,6 @@ class Viewer:
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""
         self._save_layout(changed=False)
-        self.jobs.close()
         if self.placing is not None:
             self.placing.close()
         self.library.loader.close()
@@ -403,7 +393,7 @@ class Viewer:
     def _exchange_scene(self) -> None:
         """Show the refined scene or the prediction, whichever is chosen, while the camera stands still."""
         stage, loaded, refined = self.stage, self.loaded, self._refined
-        if loaded is None or refined is None or self._incoming is not None or stage.outside is not None or self.moving:
+        if loaded is None or refined is None or self._incoming is not None or self.moving:
             return
         scene = refined if self.state.refined else loaded.scene
         if scene is stage.slot.scene or not stage.preparer.is_ready(scene):
@@ -416,7 +406,6 @@ class Viewer:
         stage, state, entry = self.stage, self.state, loaded.entry
         photograph = stage.photograph if self.loaded is None else None
         remaining = self._list_remaining() if self.loaded is None else ()
-        self.doll_house.reset()
         self.loaded, self._refined, self.tour = loaded, None, None
         self.library.keep()
         stage.clear()
@@ -495,10 +484,9 @@ class Viewer:
         if tour is None:
             return
         route = state.route if state.playing else None
-        if not state.doll_house:
-            tour.move(np.asarray(state.camera.position), route, state.flight)
-            self._show_place(tour)
-            self.stage.fade.move(state.camera.cam2world, tour.part)
+        tour.move(np.asarray(state.camera.position), route, state.flight)
+        self._show_place(tour)
+        self.stage.fade.move(state.camera.cam2world, tour.part)
         if self._loads_for_tour:
             loader = self.library.loader
             request = tour.choose_request(tour.list_next(route, state.flight), loader.entry)
@@ -543,11 +531,6 @@ class Viewer:
 
     # --- actions of keys and panels ---
 
-    def toggle_doll_house(self) -> None:
-        """Fly out of the rooms, or back into them."""
-        if self.loaded is not None:
-            self.doll_house.toggle(self.tour, self.panoramas)
-
     def focus_center(self) -> None:
         """Orbit the point in the centre of the last image."""
         distance, camera = self.stage.measure_center_depth(), self.state.camera
@@ -558,8 +541,6 @@ class Viewer:
     def click(self, place: tuple[float, float]) -> None:
         """Fly to the panorama of the hotspot at a place, or show the point there; fractions of width and height."""
         state, stage, scene = self.state, self.stage, self.stage.slot.scene
-        if state.glide is not None:
-            return
         if state.hotspots and state.overlay:
             points = imgui.get_io().display_size
             state.target = find_clicked(self.hotspots, (place[0] * points.x, place[1] * points.y))
@@ -568,27 +549,11 @@ class Viewer:
         (width, height), size = stage.size, stage.eye_size
         pixel = place[0] * width % size[0], place[1] * height % size[1]
         point = pick_point(scene, *compute_pixel_ray(state.camera, pixel, size), state.settings)
-        if point is not None and state.doll_house:
-            state.target = point.view
-        elif point is None:
+        if point is None:
             state.points = []
             state.show_message("no Gaussian there")
         else:
             state.points = [*state.points[-1:], point]
-
-    def pin(self) -> None:
-        """Keep this image as the right side of a comparison."""
-        scene, state = self.stage.slot.scene, self.state
-        if not self._has_scene() or scene is None or self.loaded is None:
-            return
-        name = f"{self.loaded.entry.name}, {state.settings.mode}, {state.settings.display}"
-        try:
-            self.stage.comparer.pin(scene, state.settings, name)
-        except DRAW_ERRORS as error:
-            self.show_error(f"not pinned: {describe_error(error)}")
-            return
-        state.comparison = "pinned"
-        state.show_message("pinned; changes show left of the line")
 
     def write_screenshot(self, suffix: str, panorama: bool = False) -> None:
         """Write the image as PNG, or EXR with depth; or the panorama at the camera."""

@@ -97,7 +97,7 @@ def test_without_the_libraries_of_window_and_opengl_a_fly_through_is_written(roo
         (["room.ply", "--projection", "equirect", "--size", "64x64"], "must be 2:1 for projection equirect"),
         (["room.ply", "--projection", "cubemap", "--size", "64x32"], "must be 3:2, of an even height"),
         (["room.ply", "--preset", "3dgs", "--renderer", "cpu"], "--preset 3dgs needs OpenGL, got --renderer cpu"),
-        (["room.ply", "--stereo", "anaglyph", "--renderer", "cpu"], "--stereo in a window needs OpenGL"),
+        (["room.ply", "--stereo", "side-by-side", "--renderer", "cpu"], "--stereo in a window needs OpenGL"),
         (["room.ply", "--ipd", "0"], "--ipd: needed a number > 0"),
         (["room.ply", "--refine", "-1"], "--refine: needed a number >= 0"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),

@@ -30,7 +30,6 @@ from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
 from pansplat.rendering.cpu.display import DisplayScene
 from pansplat.tours.graph import find_tours
-from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
@@ -40,11 +39,10 @@ from pansplat_viewer.scene.loader import (
     SceneEntry,
     SceneLoader,
 )
-from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Preset
+from pansplat_viewer.scene.settings import Display, DrawSettings, Preset
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
-from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.viewer import Viewer
 from pansplat_viewer.window.preferences import Preferences
 
@@ -59,23 +57,23 @@ SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_
 IMAGE_WIDGETS = (
     "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
     "min. opacity", "exact", "3dgs", "black", "grey", "white", "field of view",
-    "off##stereo", "pair##stereo", "red/cyan##stereo",
+    "off##stereo", "pair##stereo",
     "2##panorama", "##flight",
 )  # fmt: skip
-OF_OPENGL = (*get_args(Preset), "off##stereo", "pair##stereo", "red/cyan##stereo")  # the processor does not offer them
+OF_OPENGL = (*get_args(Preset), "off##stereo", "pair##stereo")  # the processor does not offer them
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
     "joint": {"mode": "deferred"},
     "exact": {"preset": "3dgs"},
-    "off##stereo": {"stereo": "anaglyph"},
+    "off##stereo": {"stereo": "side-by-side"},
     "black": {"background": (1.0, 1.0, 1.0)},
 }
 # Widgets whose effect has its own test.
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
     "photographs at panoramas",
-    *get_args(Display), *get_args(Comparison),
-    "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
+    *get_args(Display), "photograph right of a line",
+    "fly", "orbit", "Reset", "speed", "1##panorama", "Fly", "Display", "Compare",
     "Screenshot", "PNG", "EXR + depth", "360 PNG", "Camera path", "Window", "Reload",
     "Notes in the picture",
 }  # fmt: skip
@@ -299,13 +297,12 @@ def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
     image = user.viewer.stage.slot.image
     left, right = np.split(np.frombuffer(image.read(), np.float32).reshape(*SIZE[::-1], 4), 2, axis=1)
     assert np.abs(left - right).max() > 0.1
-    user.click("red/cyan##stereo")
     near = user.read_image()
     user.slide("eye distance", 0.9)
     assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
     user.click("360 PNG")
     with Image.open(user.viewer.screenshots.files[-1]) as file:
-        assert file.size == (128, 64)
+        assert file.size == (128, 128), "the left eye above the right one"
     user.click("off##stereo")
     assert "eye distance" not in user.panels.widgets.items
 
@@ -446,7 +443,7 @@ def test_an_error_is_shown_until_it_is_dismissed(user):
 
 def test_the_photograph_is_shown_in_the_viewing_direction(user):
     state = user.state
-    state.comparison, state.split = "photograph", 0.0
+    state.comparing, state.split = True, 0.0
     state.settings = replace(state.settings, levels=frozenset())  # saves time: the photograph covers the rendering
     state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=40)
     image = user.read_image()
@@ -468,9 +465,9 @@ def test_rendering_at_an_input_camera_looks_like_its_photograph(user, pair):
     state = user.state
     for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
         state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
-        state.comparison = "off"
+        state.comparing = False
         rendered = user.read_image()
-        state.comparison, state.split = "photograph", 0.0
+        state.comparing, state.split = True, 0.0
         photograph = user.read_image()
         assert np.abs(rendered - photograph).mean() < 4
         assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "not mirrored"
@@ -487,48 +484,18 @@ def assert_split(rendered: np.ndarray, compared: np.ndarray, split: float, right
 @both
 def test_a_drag_moves_the_divider_between_rendering_and_photograph(user):
     rendered, camera = user.read_image(), user.state.camera
-    user.click("photograph")
+    user.click("photograph right of a line")
     user.state.split = 0.75
     assert_split(rendered, user.read_image(), 0.75, right=0.9)
     user.drag((0.75 * SIZE[0], 300), (0.75 * SIZE[0] + 60, 300))
     assert user.state.split == pytest.approx(0.75 + 60 / SIZE[0]) and user.state.camera == camera
     assert_split(rendered, user.read_image(), user.state.split, right=0.9)
     user.press(imgui.Key.c)
-    assert user.state.comparison == "off" and changed_fraction(rendered, user.read_image()) == 0
-
-
-def test_the_error_is_the_mapped_difference_from_the_photograph(user):
-    state = user.state
-    state.split, state.comparison = 0.0, "off"
-    rendered = user.read_image()
-    state.comparison = "photograph"
-    photograph = user.read_image()
-    user.click("error")
-    state.max_error = 0.4
-    expected = map_values(np.abs(rendered - photograph).mean(axis=2) / 255, 0.4, ERROR_MAP)
-    assert (np.abs(user.read_image() - expected).max(axis=2) <= 12).mean() > 0.98, "up to the steps of 8 bits"
-    user.slide("error up to", 0.05)
-    assert state.max_error < 0.2 and user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
-
-
-def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
-    rendered = user.read_image()
-    user.press(imgui.Key.x)
-    assert user.state.comparison == "pinned" and user.viewer.right_name == "first, joint, color"
-    user.state.split, user.state.message = 0.8, ""
-    user.click("view 0")
-    compared = user.read_image()
-    column = round(0.8 * SIZE[0]) - IMAGE[1].start
-    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) > 0.2
-    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) == 0
-    user.show(SceneEntry("sphere", pair=user.entries[0].pair), SceneEntry("other"))
-    assert user.viewer.right_name == "first, joint, color"
-    user.click("Pin this image")
-    assert user.viewer.right_name == "sphere, view, color"
+    assert not user.state.comparing and changed_fraction(rendered, user.read_image()) == 0
 
 
 def test_the_photograph_of_the_comparison_is_chosen_in_a_list(user):
-    user.state.comparison, user.state.photograph = "photograph", 1
+    user.state.comparing, user.state.photograph = True, 1
     user.draw_frames(2)
     comparer = user.viewer.stage.comparer
     assert user.viewer.right_name == "photograph b.png" and comparer.measure_distance(user.state) == pytest.approx(0.5)
@@ -866,16 +833,6 @@ def fly(user: User, seconds: float = 1 / 5) -> list[float]:
     return steps
 
 
-def test_the_dolls_house_is_shown_and_left(user):
-    image = user.read_image()
-    user.click("doll's house")
-    user.draw_until(lambda: user.state.doll_house and user.state.glide is None, "doll's house", 1 / 5)
-    outside = user.read_image()
-    assert changed_fraction(image, outside) > 0.3 and (outside[0] < 20).all()
-    user.click("Reset")
-    assert not user.state.doll_house and changed_fraction(image, user.read_image()) == 0
-
-
 def find_node(user: User) -> int:
     return int(np.linalg.norm(user.viewer.tour.tour.positions - user.state.camera.position, axis=1).argmin())
 
@@ -928,10 +885,10 @@ def match_photograph(user: User, node: int) -> float:
     """The mean difference of the screen from a photograph in the direction of the camera."""
     user.draw_frames(3, SETTLE_AFTER)
     shown = user.read_screen()
-    user.state.comparison, user.state.split, user.state.photograph = "photograph", 0.0, node
+    user.state.comparing, user.state.split, user.state.photograph = True, 0.0, node
     user.draw_frames(3)
     difference = np.abs(user.read_screen() - shown).mean()
-    user.state.comparison, user.state.photograph = "off", None
+    user.state.comparing, user.state.photograph = False, None
     return float(difference)
 
 

@@ -499,68 +499,10 @@ def test_a_path_is_saved_and_loaded_and_other_files_are_kept(path_app, tmp_path)
     assert own.read_text() == "{}"
 
 
-# --- the doll's house ---
-
-
-def enter_doll_house(app: App) -> None:
-    app.press("o")
-    app.until(lambda: app.state.doll_house and app.state.glide is None, "doll's house", 1 / 5)
-
-
 def click_on(app: App, node: int) -> None:
-    """Click on the mark or hotspot of a panorama."""
+    """Click on the hotspot of a panorama."""
     (spot,) = [spot for spot in app.viewer.hotspots if spot.node == node]
     app.frame(click=(spot.center[0] / SIZE[0], spot.center[1] / SIZE[1]))
-
-
-def test_o_flies_out_to_the_dolls_house_and_a_click_on_a_mark_flies_in(app):
-    inside = app.state.camera
-    enter_doll_house(app)
-    assert np.degrees(app.state.camera.pitch_radians) == pytest.approx(-45)
-    app.frame(drag=(40.0, -20.0))
-    turned = app.state.camera
-    assert turned.yaw_radians != 0 and np.linalg.norm(turned.orbit_center - inside.position) < 3
-    for down in (580.0, -1160.0):
-        app.frame(drag=(0.0, down))
-        assert np.degrees(app.state.camera.pitch_radians) < -7, "the camera stays above the floor"
-    app.state.camera = turned
-    app.frame()
-    click_on(app, 1)
-    app.until(lambda: not app.state.doll_house, "end of the flight", 1 / 5)
-    assert app.state.camera.position == (0, 0, 0.5) and app.viewer.doll_house.house is None
-    assert app.state.camera.vertical_fov_degrees == inside.vertical_fov_degrees
-
-
-def test_the_start_and_another_scene_leave_the_dolls_house(app):
-    enter_doll_house(app)
-    app.press("r")
-    assert not app.state.doll_house and app.state.camera == app.state.home and app.viewer.doll_house.house is None
-    enter_doll_house(app)
-    app.show(app.entries[1])
-    assert not app.state.doll_house and not app.viewer.doll_house.is_on and app.viewer.stage.outside is None
-
-
-def test_a_scene_without_rooms_has_a_message(app, small_scene):
-    hidden = replace(small_scene.gaussians, opacities=torch.zeros(1200))
-    app.load = lambda entry, *_: LoadedScene(entry, replace(small_scene, gaussians=hidden))
-    app.show(SceneEntry("empty"))
-    app.viewer.toggle_doll_house()
-    app.settle()
-    assert not app.state.doll_house and (
-        app.state.message.startswith("no doll's house: no surfaces") or app.viewer.error
-    )
-
-
-def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titles(tour_app):
-    app = tour_app
-    app.until(lambda: len(app.viewer.tour.loaded) == 3, "all scenes")
-    enter_doll_house(app)
-    house = app.viewer.doll_house.house
-    assert house.nodes == (0, 1, 2, 3) and set(house.scene.gaussians.views.tolist()) == {0, 1, 2, 3}
-    assert {mark.label for mark in app.viewer.hotspots} <= {"room0", "room1", "room2", "room3"}
-    app.press("4")
-    app.until(lambda: not app.state.doll_house, "end of the flight", 1 / 5)
-    assert app.node == 3
 
 
 @pytest.mark.parametrize("found", [{"poor": [(1, 2)]}, {"walls": [(1, 2)]}])

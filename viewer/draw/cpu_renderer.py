@@ -16,9 +16,8 @@ from dataclasses import dataclass, field, replace
 import moderngl
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt32
+from jaxtyping import Float, Int, UInt32
 
-from pansplat.constants import FRONT_COSINE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.rendering.cpu.display import (
@@ -122,8 +121,6 @@ class CpuRenderer:
         self._splats: Splats | None = None
         self._scene: DisplayScene | None = None
         self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
-        # Of the doll's house: rays from the cameras of the views, and normals towards these.
-        self._seen: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None
         self._groups: dict[Hashable, tuple[Int[np.ndarray, "n"], int]] = {}
         self._selected = SelectionCache()
         self._faces: OrderedDict[Hashable, _FaceSet] = OrderedDict()
@@ -158,7 +155,7 @@ class CpuRenderer:
         self._groups.clear()
         self._selected = SelectionCache()
         self._faces.clear()
-        self._picture = self._texture = self._colored = self._seen = None
+        self._picture = self._texture = self._colored = None
         self.stats = FrameStats(total=len(splats), dropped=splats.dropped, renderer="cpu")
 
     def render(
@@ -284,25 +281,7 @@ class CpuRenderer:
                 labels[splats.select(settings.selection, view)] = layer
             self._groups[key] = labels, int(np.count_nonzero(labels != NO_LAYER))
         labels, visible = self._groups[key]
-        if settings.outside:
-            labels = np.where(self._find_fronts(frame.position), labels, np.int16(NO_LAYER))
-            visible = int(np.count_nonzero(labels != NO_LAYER))
         return _Groups(labels, np.array(list(layer_weights.values()), np.float32), visible)
-
-    def _find_fronts(self, position: tuple[float, float, float]) -> Bool[np.ndarray, "n"]:
-        """`pansplat.tours.doll_house.find_fronts` for a position in the moved frame."""
-        assert self._splats is not None and self._scene is not None
-        splats, scene = self._splats, self._scene
-        if self._seen is None:
-            cameras = (splats.view_positions - splats.origin).astype(np.float32)
-            arrays = scene.means, scene.quats, scene.scales, splats.levels, splats.views, cameras
-            normals = 2 * color_by_property("normals", *arrays) - 1  # towards the camera of the view
-            seen = scene.means - cameras[splats.views]
-            self._seen = seen / np.linalg.norm(seen, axis=1, keepdims=True), normals
-        (seen, normals), ray = self._seen, scene.means - np.array(position, np.float32)
-        cosines = np.einsum("ni,ni->n", ray, seen)
-        is_ahead = cosines >= np.float32(FRONT_COSINE) * np.linalg.norm(ray, axis=1)
-        return is_ahead & (np.einsum("ni,ni->n", ray, normals) <= 0)
 
     def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
         """Draw the image of a frame."""

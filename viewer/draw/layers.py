@@ -25,7 +25,6 @@ from pansplat_viewer.scene.settings import DrawSettings
 
 _MAX_CACHED_FACE_SIZE = 2048  # pixels; six faces take 200 MB at 16 bits
 _MAX_SELECTIONS = 8
-_CAMERAS_UNIT = 9  # texture unit
 _CHUNK_SIZE = 1 << 20  # records that are made and drawn together; limits their memory to 100 MB
 
 Viewport = tuple[int, int, int, int]  # left, bottom, width, height, pixels
@@ -121,7 +120,7 @@ class Frame:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
         key = (splats, self.position, s.preset, *s.selection, s.near)
-        key += (s.splat_colors, s.outside)
+        key += (s.splat_colors,)
         if self.storage == LayerStorage.IMAGE:
             return (*key, self.rotation.tobytes(), self.focal)
         return (*key, self.faces_to_world.tobytes())
@@ -321,9 +320,6 @@ class SplatRasterizer:
         self._colors = keep(ctx.buffer(reserve=max(16 * len(splats), 16), dynamic=True))
         if splats.base_colors is not None:
             self.write_colors(splats.base_colors)
-        cameras = np.zeros((max(len(splats.view_positions), 1), 4), np.float32)
-        cameras[: len(splats.view_positions), :3] = splats.view_positions - splats.origin
-        self._cameras = keep(ctx.texture((len(cameras), 1), 4, cameras, dtype="f4"))
         self._records = keep(ctx.buffer(reserve=RECORD_BYTES * self._capacity, dynamic=True))
         self._quads = keep(ctx.vertex_array(programs.splat(), [(self._records, "4f " * len(RECORD) + "/i", *RECORD)]))
         self._indices = keep(ctx.buffer(reserve=4 * self._capacity, dynamic=True))
@@ -388,10 +384,7 @@ class SplatRasterizer:
             filter_variance=compute_filter_variance(settings, camera.focal),
             half_size=camera.half_size,
             margin=0.02 / camera.focal,
-            outside=settings.outside,
-            cameras=_CAMERAS_UNIT,
         )
-        self._cameras.use(_CAMERAS_UNIT)
         x, y, width, height = place
         set_uniforms(
             self._programs.splat(),

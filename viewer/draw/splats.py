@@ -48,7 +48,7 @@ class Splats:
     extent: Float[np.ndarray, "n"]  # reach times the largest standard deviation, metres
     levels: Int[np.ndarray, "n"]
     views: Int[np.ndarray, "n"]
-    geometry: Float[np.ndarray, "n 12"]  # rows that the shaders read: mean, opacity; quaternion; scales, view
+    geometry: Float[np.ndarray, "n 12"]  # rows that the shaders read: mean, opacity; quaternion; scales, 0
     harmonics: Float[np.ndarray, "k 3 n"]
     base_colors: Float[np.ndarray, "n 4"] | None  # colours if they do not depend on the direction (degree 0), else None
     view_positions: Float[np.ndarray, "view 3"]  # camera centres of the context views in the world
@@ -105,7 +105,7 @@ class Splats:
                 return
             geometry = splats.geometry[part]
             geometry[:, 0:3], geometry[:, 3] = splats.means[part], splats.opacities[part]
-            geometry[:, 4:8], geometry[:, 8:11], geometry[:, 11] = quats, scales, splats.views[part]
+            geometry[:, 4:8], geometry[:, 8:11] = quats, scales
             splats.harmonics[..., part] = harmonics.transpose(1, 2, 0)
             if splats.base_colors is not None:
                 colors = 0.5 + splats.harmonics[0, :, part].T / (2 * math.sqrt(math.pi))

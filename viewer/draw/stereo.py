@@ -33,7 +33,6 @@ _DEFAULT_SIZES = {"perspective": (1920, 1080), "equirect": (2880, 1440), "cubema
 MAX_TURN = math.radians(20)  # of the camera before the eyes follow, while cached faces are read
 _STEREO_FACE_OVERSAMPLING = 1.5  # of the panorama that the faces of stereo cubemaps are interpolated in
 
-_ARRANGEMENTS = ("side-by-side", "top-bottom", "anaglyph")  # as in shaders/arrange.frag
 _MAX_TARGETS = 4
 
 
@@ -43,8 +42,8 @@ class ImageFormat:
 
     Attributes:
         projection: a perspective image, or all directions as an equirectangular panorama or as six cube faces.
-        stereo: one eye, both eyes next to each other, the left above the right eye, or the left eye in red and the
-            right in green and blue. Both eyes of a panorama are omni-directional stereo (docs/rendering.md, section 9).
+        stereo: one eye, both eyes next to each other, or the left above the right eye. Both eyes of a panorama are
+            omni-directional stereo (docs/rendering.md, section 9).
         eye_distance: metres.
     """
 
@@ -99,7 +98,7 @@ def render_image(
         size: (width, height) of the image of one eye, pixels.
         settings: draw settings; the format replaces their layout.
         image_format: a perspective image of one eye by default.
-        with_depth: whether depth is returned; that of an anaglyph is the left eye's.
+        with_depth: whether depth is returned.
 
     Returns:
         Colour in [0, 1], and radial depth in metres.
@@ -113,8 +112,6 @@ def render_image(
     if not with_depth:
         return color, None
     depths = [depth[..., None] for _, depth in eyes if depth is not None]
-    if image_format.stereo == "anaglyph":
-        return color, depths[0][..., 0]
     return color, arrange_eyes(depths, image_format.stereo)[..., 0]
 
 
@@ -124,8 +121,6 @@ def arrange_eyes(
     """The image of one eye, or of the left and the right eye."""
     if stereo == "mono":
         return eyes[0]
-    if stereo == "anaglyph":
-        return np.concatenate((eyes[0][..., :1], eyes[1][..., 1:]), axis=-1)
     return np.concatenate(eyes, axis=1 if stereo == "side-by-side" else 0)
 
 
@@ -310,7 +305,7 @@ class StereoRenderer:
             self._programs = Programs(self._ctx)
             self._triangle = self._ctx.vertex_array(self._programs.arrange(), [])
         target.use()
-        set_uniforms(self._programs.arrange(), left=0, right=1, arrangement=_ARRANGEMENTS.index(stereo))
+        set_uniforms(self._programs.arrange(), left=0, right=1, is_stacked=stereo == "top-bottom")
         left.use(0)
         right.use(1)
         self._ctx.enable_only(moderngl.NOTHING)

@@ -16,9 +16,8 @@ Mode = Literal["joint", "view", "deferred"]
 Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Projection = Literal["perspective", "equirect", "cubemap"]
-Stereo = Literal["mono", "side-by-side", "top-bottom", "anaglyph"]
+Stereo = Literal["mono", "side-by-side", "top-bottom"]
 Display = Literal["color", "depth", "opacity", "normals", "levels", "views"]
-Comparison = Literal["off", "photograph", "error", "pinned"]
 
 GaussianChoice = tuple[frozenset[int] | None, float]
 """Levels and least opacity of the Gaussians that are drawn."""
@@ -52,10 +51,8 @@ class DrawSettings:
         display_max: of `depth` and `opacity`, the number with the last colour of the map; the first is 0.
         eye_offset: of layout `equirect`: radius of the viewing circle of omni-directional stereo, metres; negative for
             the left eye. `CpuRenderer` only.
-        stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, the left above the right,
-            or the left in red and the right in green and blue.
-        outside: the doll's house view: Gaussians that show their back to the camera are not drawn (docs/rendering.md,
-            section 10).
+        stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, or the left above the
+            right.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
             camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
             would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
@@ -78,7 +75,6 @@ class DrawSettings:
     eye_offset: float = 0.0
     stereo: Stereo = "mono"
     eye_distance: float = EYE_DISTANCE  # metres
-    outside: bool = False
     cached: bool = False
     scale: float = 1.0
 

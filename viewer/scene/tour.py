@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -96,39 +96,6 @@ class TourScenes:
         if edges:  # else it is a prediction of a part
             scenes.edge, scenes._is_placed = max(edges, key=lambda edge: entry.start in edge), True
         return scenes
-
-    def gather_part(self) -> Callable[[], Scene]:
-        """A function, for any thread, that makes one scene of the panoramas of the part whose Gaussians are in memory.
-
-        It has the cameras and edges of the whole tour. The Gaussians of a panorama are from the prediction that is made
-        for it, or from any other one.
-        """
-        tour, sources = self.tour, {}
-        every = [loaded for scenes in (self._loaded, self._selected) for loaded in scenes.values()]
-        for node in tour.list_parts()[self.part]:
-            of_node = [loaded for loaded in every if node in loaded.entry.views]
-            provider = self._loaded.get(self._providers.get(node, ()))
-            if provider is not None or of_node:
-                sources[node] = provider or of_node[0]
-
-        def gather() -> Scene:
-            parts = []
-            for node, loaded in sources.items():
-                gaussians = loaded.scene.gaussians
-                part = gaussians.select(gaussians.views == loaded.entry.views.index(node))
-                parts.append(replace(part, views=torch.full_like(part.views, node, dtype=torch.int64)))
-            return replace(
-                every[0].scene,
-                gaussians=Gaussians.cat(parts),
-                cam2world=tour.cam2world,
-                names=tuple(panorama.label for panorama in tour.panoramas),
-                overlaps=tour.list_overlaps(),
-                gains=(),
-                links=(),
-                starts=(),
-            )
-
-        return gather
 
     @property
     def views(self) -> ViewNumbers:

@@ -14,7 +14,7 @@ from imgui_bundle import imgui
 
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.key_frames import KeyFrame
-from pansplat_viewer.scene.settings import Comparison, Display, Preset
+from pansplat_viewer.scene.settings import Display, Preset
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
     ViewerState,
@@ -34,7 +34,7 @@ from pansplat_viewer.ui.overlays import (
     MARGIN,
     UNITS,
     draw_hotspots,
-    draw_legends,
+    draw_legend,
     draw_message,
     draw_points,
     draw_stats,
@@ -91,7 +91,7 @@ class Panels:
         if viewer.right_name is not None:
             self._draw_divider(state)
         if stats.total:
-            draw_legends(state)
+            draw_legend(state)
         if state.overlay and state.points:
             draw_points(state)
         if state.overlay and state.hotspots:
@@ -168,12 +168,14 @@ class Panels:
         if placing is not None and placing.is_listed:
             opened = any(view.placement.state != "placed" for view in placing.panoramas)
             section("Photographs", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
-        if len(viewer.stage.comparer.photographs):
+        has_photographs = len(viewer.stage.comparer.photographs) > 0
+        if has_photographs:
             section("Notes in the picture", partial(self.notes.draw, viewer), opened=False)
         if viewer.stage.renderer.stats.total:
             section("Gaussians", partial(self._draw_gaussians, viewer.state))
         section("Display", partial(self._draw_display, viewer.state))
-        section("Compare", partial(self._draw_comparison, viewer))
+        if has_photographs:
+            section("Compare", partial(self._draw_comparison, viewer))
         section("Camera", partial(self._draw_camera, viewer))
         section("Screenshot", partial(self._draw_screenshot, viewer))
         section("Drawing", partial(self._draw_settings, viewer), opened=False)
@@ -259,7 +261,7 @@ class Panels:
         imgui.end_disabled()
         _draw_row_label("stereo")
         imgui.begin_disabled(on_processor)
-        for label, stereo in (("off", "mono"), ("pair", "side-by-side"), ("red/cyan", "anaglyph")):
+        for label, stereo in (("off", "mono"), ("pair", "side-by-side")):
             imgui.same_line()
             if self.widgets.radio(f"{label}##stereo", settings.stereo == stereo):
                 settings = replace(settings, stereo=stereo)
@@ -282,7 +284,7 @@ class Panels:
         state.stops = self.widgets.check("photographs at panoramas", state.stops)
 
     def _draw_camera(self, viewer: Viewer) -> None:
-        state, is_on = viewer.state, viewer.doll_house.is_on
+        state = viewer.state
         if self.widgets.radio("fly", not state.orbiting):
             state.orbiting = False
         imgui.same_line()
@@ -291,10 +293,6 @@ class Panels:
         imgui.same_line()
         if self.widgets.button("Reset"):
             go_home(state)
-        if viewer.loaded is not None and len(state.context):
-            imgui.same_line()
-            if self.widgets.check("doll's house", is_on) != is_on:
-                viewer.queue(viewer.toggle_doll_house)
         fov = state.camera.vertical_fov_degrees
         chosen = self.widgets.slider("field of view", fov, cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES, "%.0f deg")
         if chosen != fov:
@@ -338,33 +336,21 @@ class Panels:
 
     def _draw_comparison(self, viewer: Viewer) -> None:
         state, comparer = viewer.state, viewer.stage.comparer
-        photographs = comparer.photographs.names
-        for comparison in get_args(Comparison):
-            if comparison in ("photograph", "error"):
-                imgui.same_line()
-            is_there = comparer.pinned if comparison == "pinned" else comparison == "off" or photographs
-            imgui.begin_disabled(not is_there)
-            if self.widgets.radio(comparison, state.comparison == comparison):
-                state.comparison = comparison
-            imgui.end_disabled()
+        state.comparing = self.widgets.check("photograph right of a line", state.comparing)
+        if not state.comparing:
+            return
+        chosen = 0 if state.photograph is None else state.photograph + 1
+        changed, chosen = imgui.combo("##photograph", chosen, ["nearest photograph", *comparer.photographs.names])
+        self.widgets.record("photographs")
+        if changed:
+            state.photograph = chosen - 1 if chosen else None
         imgui.same_line()
-        if self.widgets.button("Pin this image"):
-            viewer.queue(viewer.pin)
-        if state.comparison in ("photograph", "error") and photographs:
-            chosen = 0 if state.photograph is None else state.photograph + 1
-            changed, chosen = imgui.combo("##photograph", chosen, ["nearest photograph", *photographs])
-            self.widgets.record("photographs")
-            if changed:
-                state.photograph = chosen - 1 if chosen else None
-            imgui.same_line()
-            distance = comparer.measure_distance(state)
-            imgui.begin_disabled(distance == 0)
-            if self.widgets.button(f"Go {distance:.2f} m###Go"):
-                viewer.queue(comparer.go_to_photograph, state)
-            self.widgets.record("Go")
-            imgui.end_disabled()
-        if state.comparison == "error":
-            state.max_error = self.widgets.slider("error up to", state.max_error, 0.01, 1.0, "%.2f")
+        distance = comparer.measure_distance(state)
+        imgui.begin_disabled(distance == 0)
+        if self.widgets.button(f"Go {distance:.2f} m###Go"):
+            viewer.queue(comparer.go_to_photograph, state)
+        self.widgets.record("Go")
+        imgui.end_disabled()
 
     def _draw_window(self, viewer: Viewer) -> None:
         for theme in get_args(Theme):

@@ -81,10 +81,6 @@ def _write_screenshot(viewer: Viewer, events: Input) -> None:
     viewer.queue(viewer.write_screenshot, "exr" if "shift" in events.held else "png")
 
 
-def _compare(state: ViewerState) -> None:
-    state.comparison = "off" if state.comparison == "photograph" else "photograph"
-
-
 def _toggle_plan(state: ViewerState) -> None:
     state.minimap = state.hotspots = not state.minimap
 
@@ -128,12 +124,10 @@ KEYS = (
     ),
     KeyRow("Space", "play the flight between them", {"space": _change(toggle_play)}),
     KeyRow("M", "floor plan and hotspots of a tour", {"m": _change(_toggle_plan)}),
-    KeyRow("O", "doll's house: all rooms from outside", {"o": _queue("toggle_doll_house")}),
     KeyRow(
         ", .", "step along the flight (placing: turn)", {",": _change(step_flight, -1), ".": _change(step_flight, 1)}
     ),
-    KeyRow("C", "compare with the nearest photograph", {"c": _change(_compare)}),
-    KeyRow("X", "pin the image, to compare others with it", {"x": _queue("pin")}),
+    KeyRow("C", "compare with the nearest photograph", {"c": _toggle("comparing")}),
     KeyRow("B", "before or after the refinement", {"b": _toggle("refined")}),
     KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
     KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),
@@ -220,8 +214,7 @@ def apply_input(viewer: Viewer, events: Input) -> None:
         action = _ACTIONS.get(key)
         if action is not None:
             action(viewer, events)
-    if viewer.state.glide is None:
-        _move_camera(viewer.state, events)
+    _move_camera(viewer.state, events)
     if events.click is not None:
         viewer.queue(viewer.click, events.click)
 
@@ -240,9 +233,9 @@ def _move_camera(state: ViewerState, events: Input) -> None:
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
     turn = np.array(events.sticks[3:]) * TURN_SPEED * events.seconds
-    if turn.any() and not (state.orbiting or state.doll_house):
+    if turn.any() and not state.orbiting:
         camera = cameras.turn(camera, *turn)
-    if state.orbiting or state.doll_house:
+    if state.orbiting:
         pixels = ORBIT_KEY_PIXELS * events.seconds * factor * events.height / 1000
         across = axes[:2] + events.sticks[3:]
         if across.any():

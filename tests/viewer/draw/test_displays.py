@@ -92,7 +92,6 @@ def test_each_display_mode_and_projection_looks_as_in_the_golden_image(make_rend
     for mode in get_args(Mode)[1:]:
         images[mode] = render_image(renderer, pose, SIZE, DrawSettings(mode=mode))[0]
     for size, options in (
-        (SIZE, {"stereo": "anaglyph"}),
         ((32, SIZE[1]), {"stereo": "side-by-side"}),
         ((96, 48), {"projection": "equirect"}),
         ((72, 48), {"projection": "cubemap"}),

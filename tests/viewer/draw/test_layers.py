@@ -73,7 +73,6 @@ def test_narrow_field_of_view_is_drawn_directly(make_renderer, random_scene, pos
         {"mode": "view"},
         {"levels": frozenset({1, 2})},
         {"opacity_threshold": 0.5},
-        {"box": (0.0, -5.0, -5.0, 5.0, 5.0, 5.0)},
         {"near": 1.9},
     ],
     ids=str,

@@ -10,7 +10,7 @@ import torch
 from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene
 from pansplat_viewer.window.input import FAST, FLY_SPEED, KEYS, SLOW, Input, apply_input
 
-METHODS = "write_screenshot", "focus_center", "pin", "toggle_doll_house", "click"
+METHODS = "write_screenshot", "focus_center", "click"
 
 
 @pytest.fixture
@@ -146,7 +146,7 @@ def test_comma_and_period_step_along_the_flight_and_stop_at_its_ends(state):
     assert state.flight == 1
 
 
-@pytest.mark.parametrize(("key", "name"), [("tab", "overlay"), ("h", "help")])
+@pytest.mark.parametrize(("key", "name"), [("tab", "overlay"), ("h", "help"), ("c", "comparing")])
 def test_key_toggles_what_is_shown(state, key, name):
     before = getattr(state, name)
     press(state, key)
@@ -166,8 +166,6 @@ def test_keys_and_clicks_queue_actions_of_the_viewer(state):
     assert press(state, "p") == [("write_screenshot", "png")]
     assert press(state, "p", held=("shift",)) == [("write_screenshot", "exr")]
     assert press(state, "f") == [("focus_center",)]
-    assert press(state, "x") == [("pin",)]
-    assert press(state, "o") == [("toggle_doll_house",)]
     assert send(state, click=(0.5, 0.25)) == [("click", (0.5, 0.25))]
     assert press(state) == []
 
