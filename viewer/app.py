@@ -341,10 +341,10 @@ def _find_part(entry: SceneEntry) -> float:
 
 def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":
     """Return an OpenGL context, or None if the renderer does not need one and there is none."""
-    from pansplat_viewer.draw.offscreen import create_context
-
     if renderer == "cpu":
         return None
+    from pansplat_viewer.draw.offscreen import create_context
+
     try:
         return create_context()
     except InputError:

@@ -38,6 +38,14 @@ def test_help_needs_neither_torch_nor_opengl():
     assert "--offscreen" in result.stdout
 
 
+def test_drawing_on_the_processor_imports_no_opengl(room):
+    arguments = [str(room), "--offscreen", "out", "--renderer", "cpu", "--size", "32x32", "--seconds", "0.1"]
+    code = f"import sys\nfrom pansplat_viewer import run\nassert run({arguments}) == 0\n"
+    code += "assert 'moderngl' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], cwd=room.parent, timeout=600, check=True)
+    assert (room.parent / "out" / "view_000.png").exists()
+
+
 @pytest.mark.gl
 def test_without_a_display_a_fly_through_is_written(room, capsys):
     assert run([str(room), "--size", "96x64", "--seconds", "0.5", "--fps", "12"]) == 0

@@ -12,8 +12,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, TimeoutError
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
-import moderngl
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt32
@@ -40,12 +40,16 @@ from pansplat.rendering.rasterize import RasterOptions
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.displays import color_by_property
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.layers import Frame, LayerStorage
-from pansplat_viewer.draw.renderer import SplatRenderer, choose_layer_weights, is_software
+from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
 from pansplat_viewer.draw.splats import Splats, drop_not_finite
 from pansplat_viewer.scene.background import BackgroundWorker, Report
 from pansplat_viewer.scene.camera import Pinhole
 from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from pansplat_viewer.draw.renderer import SplatRenderer
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
 _POLL_SECONDS = 0.02  # wait for an image in the background, so that a window does not draw the old one again
@@ -445,9 +449,13 @@ class CpuRenderer:
 
 def choose_renderer(ctx: moderngl.Context | None, choice: RendererChoice) -> RendererChoice:
     """Return `gl` or `cpu`; `auto` is `cpu` where there is no OpenGL or OpenGL is software."""
-    if choice == "auto":
-        return "cpu" if ctx is None or is_software(ctx) else "gl"
-    return choice
+    if choice != "auto":
+        return choice
+    if ctx is None:
+        return "cpu"
+    from pansplat_viewer.draw.renderer import is_software
+
+    return "cpu" if is_software(ctx) else "gl"
 
 
 def create_renderer(
@@ -458,6 +466,8 @@ def create_renderer(
         return CpuRenderer(ctx)
     if ctx is None:
         raise InputError("renderer `gl` needs an OpenGL context; use `cpu`")
+    from pansplat_viewer.draw.renderer import SplatRenderer
+
     return SplatRenderer(ctx, color_bits=color_bits)
 
 

@@ -14,15 +14,14 @@ from typing import Literal
 
 import moderngl
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.pose import blend_weights
-from pansplat_viewer.draw.color_maps import create_table_texture
+from pansplat_viewer.draw.color_maps import get_table
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
+from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
+from pansplat_viewer.draw.layers import Layer, LayerPainter, Target, TargetStore
 from pansplat_viewer.draw.programs import Programs, set_uniforms
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.draw.splats import SortedSplats, Splats, SplatSorter, sort_splats
@@ -246,31 +245,6 @@ class SplatRenderer:
         self._targets.invalidate()
 
 
-def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dict[int | None, float]:
-    """Return each layer's weight by its view (None: all Gaussians)."""
-    settings, num_views = frame.settings, splats.num_views
-    mode = settings.mode
-    if mode == "joint":
-        return {None: 1.0}
-    if mode == "view" and not 0 <= settings.view < max(num_views, 1):
-        raise InputError(f"`view` must be 0..{max(num_views, 1) - 1} in this scene, got {settings.view}")
-    if mode == "view":
-        return {settings.view: 1.0}
-    if num_views < 2:
-        return {None: 1.0}
-    positions = splats.view_positions
-    if len(positions) != num_views:
-        raise InputError(
-            f"mode deferred needs the camera of each context view, the scene has {len(positions)} cameras "
-            f"for {num_views} views; use mode joint"
-        )
-    weights = blend_weights(torch.from_numpy(frame.world_position.copy()), torch.from_numpy(positions))
-    factors = (settings.view_weights + (1.0,) * num_views)[:num_views]
-    factors = factors if any(factors) else (1.0,) * num_views
-    weighted = enumerate(zip(weights.tolist(), factors, strict=True))
-    return {view: max(weight * factor, min_weight) for view, (weight, factor) in weighted if factor > 0}
-
-
 class Compositor:
     """Adds weighted layers, normalises the sum and puts it over the background."""
 
@@ -316,7 +290,7 @@ class Compositor:
         if name is None:
             return
         if name not in self._tables:
-            self._tables[name] = create_table_texture(self._ctx, name)
+            self._tables[name] = _create_table_texture(self._ctx, name)
         self._tables[name].use(_COLOR_MAP_UNIT)
 
     def _add_layers(self, frame: Frame, weighted: Sequence[tuple[Layer, float]], with_depth: bool) -> Target:
@@ -351,6 +325,14 @@ class Compositor:
             # An unused sampler still needs a texture of its type.
             (texture or next(iter(textures.values()))).use(location=unit)  # type: ignore[union-attr]
             set_uniforms(program, **{name: unit})
+
+
+def _create_table_texture(ctx: moderngl.Context, name: str) -> moderngl.Texture:
+    """A colour map as a texture of one row, for look-ups of the nearest colour."""
+    table = get_table(name)
+    texture = ctx.texture((table.shape[0], 1), 3, table.tobytes(), alignment=1)
+    texture.filter, texture.repeat_x = (moderngl.NEAREST, moderngl.NEAREST), False
+    return texture
 
 
 def bind(framebuffer: moderngl.Framebuffer | None) -> None:

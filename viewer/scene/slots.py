@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.draw.stereo import WindowRenderer
+from pansplat_viewer.draw.window_renderer import WindowRenderer
 from pansplat_viewer.scene.background import BackgroundWorker
 from pansplat_viewer.scene.settings import DrawSettings
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
-from pansplat_viewer.draw.stereo import WindowRenderer, create_window_renderer, get_eye_size
+from pansplat_viewer.draw.window_renderer import WindowRenderer, create_window_renderer, get_eye_size
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.loader import LoadedScene
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice

@@ -14,7 +14,8 @@ from pansplat.errors import InputError
 from pansplat_viewer import run
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.renderer import SplatRenderer
-from pansplat_viewer.draw.stereo import ImageFormat, StereoRenderer, arrange_eyes, get_eye_size, move_eye, render_image
+from pansplat_viewer.draw.stereo import ImageFormat, arrange_eyes, move_eye, render_image
+from pansplat_viewer.draw.window_renderer import StereoRenderer, get_eye_size
 from pansplat_viewer.scene.settings import DrawSettings
 
 SIZE = (48, 24)
