@@ -244,7 +244,7 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
             preferences=find_file(),
         )
         if loader.is_searching:
-            viewer.expect(entries, source, options.pair)
+            viewer.scenes.expect(entries, source, options.pair)
         else:
             viewer.show(entries, first, source)
         try:

@@ -107,7 +107,7 @@ class User:
 
     def wait_for_progress(self, *expected: object) -> None:
         """Draw frames until the panel shows this progress: name, description, fraction."""
-        self.draw_until(lambda: self.viewer.loading == expected, f"progress {expected}", 0.01)
+        self.draw_until(lambda: self.viewer.scenes.loading == expected, f"progress {expected}", 0.01)
 
     def settle(self, *, refining: bool = False) -> None:
         """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
@@ -650,12 +650,14 @@ def test_a_refinement_is_cancelled_or_compared_with_its_prediction(user, small_s
     user.load = load
     for _ in range(2):
         user.viewer.show([SceneEntry("kitchen")], 0)
-        user.draw_until(lambda: user.viewer.refinement is not None, "refinement")
+        user.draw_until(lambda: user.viewer.scenes.refinement is not None, "refinement")
         user.draw_frames(2)
         if not go.is_set():
             user.click("Cancel")
             user.settle()
-            assert user.viewer.refinement is user.viewer.error is None and user.viewer.loaded.scene is small_scene
+            assert (
+                user.viewer.scenes.refinement is user.viewer.error is None and user.viewer.loaded.scene is small_scene
+            )
             predicted = user.read_image()
             go.set()
     user.settle()
@@ -676,13 +678,13 @@ def test_a_prediction_is_cancelled_by_a_button_below_the_image(user):
 
     user.load = load
     user.click("Reload")
-    user.draw_until(lambda: user.viewer.loading is not None, "progress")
+    user.draw_until(lambda: user.viewer.scenes.loading is not None, "progress")
     user.draw_frames(2)
     left, top, right, bottom = user.panels.widgets.items["Cancel##loading"]
     assert 0 < left < right < SIZE[0] and 0 < top < bottom < SIZE[1], "next to a progress bar at the bottom"
     user.click("Cancel##loading")
     user.settle()
-    assert user.viewer.loading is user.viewer.error is None
+    assert user.viewer.scenes.loading is user.viewer.error is None
 
 
 def test_the_largest_gaussians_of_a_scene_beyond_the_memory_make_the_picture(user, small_scene, monkeypatch):

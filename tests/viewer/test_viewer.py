@@ -221,7 +221,7 @@ def test_a_path_is_remembered_and_an_entry_is_chosen_by_its_name(app, pair):
     app.settle()
     assert app.library.current == 1 and app.library.path == Path("kitchen")
     assert app.viewer.preferences.recent == (str(Path("kitchen").absolute()),)
-    app.viewer.choose(0)
+    app.viewer.scenes.choose(0)
     app.settle()
     assert app.viewer.loaded.entry.name == "a"
 
@@ -238,7 +238,7 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
     app.viewer.open(Path("home"))
     app.until(lambda: app.viewer.tour is not None, "photographs")
     assert app.library.names == ["unplaced"] and isinstance(app.content, int) and app.viewer.loaded is None
-    app.until(lambda: app.viewer.loading == ("home", "pairs of panoramas", 0.3), "progress")
+    app.until(lambda: app.viewer.scenes.loading == ("home", "pairs of panoramas", 0.3), "progress")
     assert app.library.loader.entry is None, "nothing is predicted from panoramas that may get poses"
     gate.open()
     app.settle()
@@ -246,7 +246,7 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
     gate.event.clear()
     shown = app.viewer.loaded
     app.viewer.open(Path("another"))
-    app.until(lambda: app.viewer.loading == ("another", "pairs of panoramas", 0.3), "progress")
+    app.until(lambda: app.viewer.scenes.loading == ("another", "pairs of panoramas", 0.3), "progress")
     app.frames(2)
     assert app.viewer.loaded is shown and app.library.names == ["placed"]
     gate.open()
@@ -255,12 +255,12 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
 def test_progress_is_shown_and_input_accepted_while_a_scene_is_loaded(app, small_scene):
     app.load = gate = Gate(lambda entry: LoadedScene(entry, small_scene), "searching depth", 0.5)
     app.viewer.show([SceneEntry("slow")], 0)
-    app.until(lambda: app.viewer.loading == ("slow", "searching depth", 0.5), "progress")
+    app.until(lambda: app.viewer.scenes.loading == ("slow", "searching depth", 0.5), "progress")
     app.frame(held=frozenset("w"))
     assert app.state.camera.position[2] > 0
     gate.open()
     app.settle()
-    assert app.viewer.loading is None and app.viewer.loaded.entry.name == "slow"
+    assert app.viewer.scenes.loading is None and app.viewer.loaded.entry.name == "slow"
     assert app.library.loader.poll() is app.library.loader.progress is None, "the result is handed over once"
 
 
@@ -268,15 +268,15 @@ def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
     gate = Gate(lambda entry: LoadedScene(entry, small_scene), "estimating poses", 0.3)
     app.find = lambda path, progress, show: gate(path, progress, None)
     app.viewer.open(Path("unposed"))
-    app.until(lambda: app.viewer.loading == ("unposed", "estimating poses", 0.3), "search")
-    app.viewer.cancel_loading()
-    assert app.viewer.loading is None and app.library.current == 0, "the scene is still the current one"
+    app.until(lambda: app.viewer.scenes.loading == ("unposed", "estimating poses", 0.3), "search")
+    app.viewer.scenes.cancel_loading()
+    assert app.viewer.scenes.loading is None and app.library.current == 0, "the scene is still the current one"
     app.load = gate
-    app.viewer.reload()
-    app.until(lambda: app.viewer.loading == ("first", "estimating poses", 0.3), "prediction")
-    app.viewer.cancel_loading()
+    app.viewer.scenes.reload()
+    app.until(lambda: app.viewer.scenes.loading == ("first", "estimating poses", 0.3), "prediction")
+    app.viewer.scenes.cancel_loading()
     app.settle()
-    assert app.viewer.loading is app.viewer.error is None
+    assert app.viewer.scenes.loading is app.viewer.error is None
     app.until(lambda: gate.ended == 2, "end of both threads")
 
 
@@ -291,14 +291,14 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
 
     app.load = load
     app.viewer.show([SceneEntry("kitchen")], 0)
-    app.until(lambda: app.viewer.refinement == 0.5, "refinement")
-    assert app.viewer.loading is None and not app.viewer.loaded.is_final
+    app.until(lambda: app.viewer.scenes.refinement == 0.5, "refinement")
+    assert app.viewer.scenes.loading is None and not app.viewer.loaded.is_final
     app.frame(held=frozenset("w"))
     camera, stage = app.state.camera, app.viewer.stage
     go.set()
     app.until(lambda: app.library.loader.refinement is None, "refined scene")
     app.settle()
-    assert app.viewer.refinement == 1 and stage.slot.scene is refined and app.state.camera == camera
+    assert app.viewer.scenes.refinement == 1 and stage.slot.scene is refined and app.state.camera == camera
     assert app.library.loader.poll() is None
     for expected in (small_scene, refined):
         app.press("b")
@@ -312,7 +312,7 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(app, sm
     monkeypatch.setattr(NoRenderer, "refuse", refuse)
     app.load = lambda entry, *_: LoadedScene(entry, twice)
     app.show(SceneEntry("large"))
-    assert "the memory is exhausted" in app.viewer.error and app.viewer.reduced == len(twice.gaussians) // 4
+    assert "the memory is exhausted" in app.viewer.error and app.viewer.scenes.reduced == len(twice.gaussians) // 4
     assert app.library.names == ["large"]
     app.viewer.dismiss_error()
     assert app.viewer.stage.slot.scene is small_scene and app.library.names == ["first", "second"]
@@ -327,7 +327,7 @@ def test_an_error_of_opengl_is_not_called_exhausted_memory(app, monkeypatch):
     error = moderngl.Error("GLSL Compiler failed")
     monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: error))
     app.show(SceneEntry("refused"))
-    assert app.viewer.error == "refused: OpenGL failed: GLSL Compiler failed" and app.viewer.reduced is None
+    assert app.viewer.error == "refused: OpenGL failed: GLSL Compiler failed" and app.viewer.scenes.reduced is None
 
 
 def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(app, monkeypatch):
@@ -355,13 +355,13 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(make_app, pai
     app.show(SceneEntry("first", pair=pair))
     app.load = lambda entry, *_: LoadedScene(entry, other)
     app.viewer.show([SceneEntry("large")], 0)
-    app.until(lambda: app.viewer.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
+    app.until(lambda: app.viewer.scenes.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
     assert app.viewer.busy and app.viewer.stage.slot.scene is small_scene
     app.frame(drag=(30.0, 0.0))
     assert app.state.camera.yaw_radians != 0
     go.set()
     app.settle()
-    assert app.viewer.stage.slot.scene is other and app.viewer.loading is None
+    assert app.viewer.stage.slot.scene is other and app.viewer.scenes.loading is None
 
 
 def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(app, monkeypatch):
@@ -383,7 +383,7 @@ def test_a_changed_file_is_announced_and_read_again(app, room):
     room.write_bytes(room.read_bytes() + b"0")
     app.frames(2, 3.0)
     assert app.library.watch.changed
-    app.viewer.reload()
+    app.viewer.scenes.reload()
     app.settle()
     assert not app.library.watch.changed
     room.unlink()
@@ -413,7 +413,7 @@ def test_a_folder_that_changes_is_announced_and_searched_again(app, pair, tmp_pa
         (folder / name).write_bytes(b"1")
         app.frames(2, 3.0)
         assert app.library.watch.changed, name
-        app.viewer.reload()
+        app.viewer.scenes.reload()
         app.settle()
         (folder / ".pansplat").rmdir()
     assert found == [folder] * 3
@@ -684,7 +684,7 @@ def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(tour_app, l
         requested.append(entry.name)
         return LoadedScene(entry, small_scene) if entry.tour is None else load_house(entry)
 
-    app.viewer.tour._loaded.popitem()  # a scene of the tour is still missing
+    next(life for life in app.viewer.tour._lives.values() if life.loaded).drop()  # a scene of the tour is still missing
     is_ready = app.viewer.stage.preparer.is_ready
     monkeypatch.setattr(
         app.viewer.stage.preparer,

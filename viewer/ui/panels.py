@@ -100,11 +100,11 @@ class Panels:
         if state.overlay and viewer.tour is not None:
             self._draw_tour(viewer, viewer.tour)
         if state.overlay and placing is not None and placing.node is not None and self.placing.draw(placing):
-            viewer.queue(viewer.reload)
+            viewer.queue(viewer.scenes.reload)
         if state.help:
             state.help = _draw_help()
-        if viewer.loading:
-            self._draw_progress(viewer, *viewer.loading)
+        if viewer.scenes.loading:
+            self._draw_progress(viewer, *viewer.scenes.loading)
         elif viewer.error:
             self._draw_error(viewer, viewer.error)
         if state.message and state.now < state.message_until:
@@ -144,8 +144,8 @@ class Panels:
         else:
             self.widgets.record("visit")
         imgui.text_unformatted(f"{len(tour.loaded)} of {tour.num_scenes} scenes in memory")
-        if viewer.background is not None:
-            task, fraction = viewer.background
+        if viewer.scenes.background is not None:
+            task, fraction = viewer.scenes.background
             draw_wrapped(task)
             imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
         imgui.end()
@@ -190,34 +190,34 @@ class Panels:
             changed, index = imgui.combo("##pair", max(library.current, 0), names)
             self.widgets.record("pair")
             if changed:
-                viewer.queue(viewer.choose, index)
+                viewer.queue(viewer.scenes.choose, index)
         imgui.set_next_item_width(width)
         hint, flags = "folder or scene, or drop it here", imgui.InputTextFlags_.enter_returns_true.value
         entered, self.path = imgui.input_text_with_hint("##path", hint, self.path, flags)
         self.widgets.record("path")
         imgui.same_line()
         if (self.widgets.button("Open") or entered) and self.path.strip():
-            viewer.queue(viewer.open_text, self.path.strip())
+            viewer.queue(viewer.scenes.open_text, self.path.strip())
         if recent:
             imgui.set_next_item_width(width)
             if imgui.begin_combo("##recent", "recent"):
                 for path in recent:
                     if imgui.selectable(path, False)[0]:
-                        viewer.queue(viewer.open_text, path)
+                        viewer.queue(viewer.scenes.open_text, path)
                 imgui.end_combo()
             self.widgets.record("recent")
             imgui.same_line()
         if library.entries and self.widgets.button("Reload"):
-            viewer.queue(viewer.reload)
+            viewer.queue(viewer.scenes.reload)
         if library.watch.changed:
             imgui.text_unformatted("changed on disk")
-        if viewer.refinement == 1:
+        if viewer.scenes.refinement == 1:
             viewer.state.refined = self.widgets.check("refined", viewer.state.refined)
-        elif viewer.refinement is not None:
+        elif viewer.scenes.refinement is not None:
             if self.widgets.button("Cancel"):
-                viewer.queue(library.loader.cancel)
+                viewer.queue(viewer.scenes.cancel_refinement)
             imgui.same_line()
-            imgui.progress_bar(viewer.refinement, (-1, 0), f"refining {100 * viewer.refinement:.0f}%")
+            imgui.progress_bar(viewer.scenes.refinement, (-1, 0), f"refining {100 * viewer.scenes.refinement:.0f}%")
 
     def _draw_gaussians(self, state: ViewerState) -> None:
         settings, num_views = state.settings, state.num_views
@@ -391,7 +391,7 @@ class Panels:
         imgui.progress_bar(fraction, (-80 * imgui.get_style().font_scale_dpi, 0), f"{100 * fraction:.0f}%")
         imgui.same_line()
         if self.widgets.button("Cancel##loading"):
-            viewer.queue(viewer.cancel_loading)
+            viewer.queue(viewer.scenes.cancel_loading)
         imgui.end()
 
     def _draw_screenshot(self, viewer: Viewer) -> None:
@@ -445,9 +445,9 @@ class Panels:
         draw_wrapped(error)
         if self.widgets.button("OK"):
             viewer.queue(viewer.dismiss_error)
-        if viewer.reduced is not None:
+        if viewer.scenes.reduced is not None:
             imgui.same_line()
-            if self.widgets.button(f"Show the {viewer.reduced:,} largest Gaussians###Reduce"):
+            if self.widgets.button(f"Show the {viewer.scenes.reduced:,} largest Gaussians###Reduce"):
                 viewer.queue(viewer.show_reduced)
             self.widgets.record("Reduce")
         imgui.end()
