@@ -18,7 +18,7 @@ def load_shader(name: str, version: str, **defines: float | str) -> str:
 
     Args:
         name: file of this package.
-        version: of the language: "330 core", "430 core", or "300 es" (WebGL 2), where all numbers get high precision.
+        version: of the language: "330 core", or "300 es" (WebGL 2), where all numbers get high precision.
         defines: constants in addition to those of `pansplat.constants`.
     """
     text = _INCLUDE.sub(lambda match: _read(match[1]), _read(name))

@@ -1,20 +1,14 @@
 // The images of both eyes in one image.
 uniform sampler2D left;
 uniform sampler2D right;
-uniform int arrangement;    // 0 next to each other, 1 left above right, 2 anaglyph
+uniform bool is_stacked;    // the left above the right, else next to each other
 
 layout(location = 0) out vec4 out_color;
 
 void main() {
     ivec2 pixel = ivec2(gl_FragCoord.xy), size = textureSize(left, 0);
-    if (arrangement == 0) {
-        bool is_left = pixel.x < size.x;
-        out_color = is_left ? texelFetch(left, pixel, 0) : texelFetch(right, pixel - ivec2(size.x, 0), 0);
-    } else if (arrangement == 1) {
-        bool is_left = pixel.y >= size.y;
-        out_color = is_left ? texelFetch(left, pixel - ivec2(0, size.y), 0) : texelFetch(right, pixel, 0);
-    } else {
-        vec4 first = texelFetch(left, pixel, 0), second = texelFetch(right, pixel, 0);
-        out_color = vec4(first.r, second.gb, max(first.a, second.a));
-    }
+    ivec2 offset = is_stacked ? ivec2(0, size.y) : ivec2(size.x, 0);
+    bool is_second = is_stacked ? pixel.y >= size.y : pixel.x >= size.x;
+    ivec2 place = is_second ? pixel - offset : pixel;
+    out_color = is_second == is_stacked ? texelFetch(left, place, 0) : texelFetch(right, place, 0);
 }

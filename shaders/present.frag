@@ -1,11 +1,8 @@
-// The rendered image on the screen, and right of `split` what it is compared with, in the same directions.
+// The rendered image on the screen, and right of `split` a photograph in the same directions.
 uniform sampler2D image;            // bottom row first
 uniform sampler2D fading;           // the image of another scene, bottom row first
 uniform float weight;               // of `image` against `fading`
-uniform sampler2D right;            // a photograph (equirectangular, top row first), or an image (bottom row first)
-uniform int comparison;             // 1 the photograph, 2 its mean absolute difference from the image, 3 the image
-uniform sampler2D table;            // colours of differences
-uniform float max_error;            // the difference with the last colour
+uniform sampler2D right;            // the photograph: equirectangular, top row first
 uniform float split;                // fraction of the width
 uniform vec2 tangent;               // of half the horizontal and vertical field of view
 uniform mat3 camera_to_photo;       // rotation, OpenCV axes
@@ -29,17 +26,5 @@ vec3 sample_photograph() {
 }
 
 void main() {
-    vec3 rgb;
-    if (uv.x < split) {
-        rgb = sample_image();
-    } else if (comparison == 3) {
-        rgb = texture(right, uv).rgb;
-    } else {
-        rgb = sample_photograph();
-        if (comparison == 2) {
-            float error = dot(abs(rgb - clamp(sample_image(), 0.0, 1.0)), vec3(1.0 / 3.0));
-            rgb = textureLod(table, vec2(error / max_error, 0.5), 0.0).rgb;
-        }
-    }
-    color = vec4(rgb, 1.0);
+    color = vec4(uv.x < split ? sample_image() : sample_photograph(), 1.0);
 }

@@ -1,4 +1,4 @@
-// GL 3.3 tier: projects one Gaussian per vertex; transform feedback captures the record.
+// Projects one Gaussian per vertex; transform feedback captures the record.
 #include "splat.glsl"
 
 in vec4 in_mean_opacity;
@@ -14,7 +14,7 @@ out vec4 row_l;         // l, peak (0: not visible)
 out vec4 color;         // RGB, 0
 
 void main() {
-    Gaussian gaussian = Gaussian(in_mean_opacity.xyz, in_mean_opacity.w, in_quat, in_scale.xyz, int(in_scale.w));
+    Gaussian gaussian = Gaussian(in_mean_opacity.xyz, in_mean_opacity.w, in_quat, in_scale.xyz, 0);
     Footprint f;
     bool visible = project_gaussian(gaussian, f);
     quad_1 = visible ? vec4(f.center, f.half_axis_1) : vec4(0.0);

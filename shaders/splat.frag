@@ -1,11 +1,6 @@
 // Alpha of one footprint at one pixel: docs/rendering.md, sections 3 and 4.
-#ifdef PARTS
-uniform float focal;        // pixels
-flat in vec2 v_principal;   // window coordinates of the centre of the part
-#else
 uniform vec2 focal;         // pixels; those of a headset may not be square
 uniform vec2 principal;     // window coordinates of the optical axis
-#endif
 flat in vec2 v_base;
 flat in vec4 v_a;           // a, thickness
 flat in vec4 v_b;           // b, distance
@@ -16,9 +11,6 @@ layout(location = 0) out vec4 out_color;    // premultiplied
 layout(location = 1) out vec4 out_depth;    // alpha x radial distance
 
 void main() {
-#ifdef PARTS
-    vec2 principal = v_principal;
-#endif
     vec2 ray = (gl_FragCoord.xy - principal) / focal;
     vec2 delta = vec2(ray.x, -ray.y) - v_base;
     float p = v_a.x + dot(v_a.yz, delta);

@@ -1,12 +1,7 @@
 // Projects one Gaussian to its footprint on a pinhole image: docs/rendering.md, sections 1 to 3 and 5, in float32.
 // Image-plane units: x right, y down, pixel coordinates divided by the focal length, z = 1.
 
-#ifdef PARTS
-uniform mat3 rotations[6];       // world to camera, of each part of a layer
-int part;
-#else
 uniform mat3 world_to_camera;
-#endif
 uniform vec3 position;           // camera centre, in the moved frame of the means
 uniform float near;              // smallest radial distance, metres
 uniform bool exact;              // the exact response, order and filter, or those of 3DGS
@@ -163,9 +158,6 @@ bool project_gaussian(Gaussian gaussian, out Footprint f) {
     if (outside && is_back(gaussian, offset)) return false;
     f.distance = length(offset);
     if (!(f.distance >= near && f.distance > 0.0)) return false;
-#ifdef PARTS
-    mat3 world_to_camera = rotations[part];
-#endif
     vec3 n = world_to_camera * (offset / f.distance);
     vec3 k = gaussian.scale / f.distance;
     mat3 unit = world_to_camera * rotation_from_quat(gaussian.quat);

@@ -75,7 +75,7 @@ class Options:
     projection: Projection = "perspective"
     """What the frames of --out show: a perspective image, or all directions as a panorama or as six cube faces."""
     stereo: Stereo = "mono"
-    """Images for two eyes, in the window and in --out: next to each other, left above right, or red and cyan."""
+    """Images for two eyes, in the window and in --out: next to each other, or left above right."""
     ipd: EyeDistance = EYE_DISTANCE
     """Distance of the eyes, metres."""
     size: str | None = None
@@ -244,7 +244,7 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
             preferences=find_file(),
         )
         if loader.is_searching:
-            viewer.expect(entries, source, options.pair)
+            viewer.scenes.expect(entries, source, options.pair)
         else:
             viewer.show(entries, first, source)
         try:
@@ -341,10 +341,10 @@ def _find_part(entry: SceneEntry) -> float:
 
 def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":
     """Return an OpenGL context, or None if the renderer does not need one and there is none."""
-    from pansplat_viewer.draw.offscreen import create_context
-
     if renderer == "cpu":
         return None
+    from pansplat_viewer.draw.offscreen import create_context
+
     try:
         return create_context()
     except InputError:

@@ -1,4 +1,4 @@
-"""Files that the viewer writes: screenshots, the fly-through of a pair, and films of tours and of camera paths."""
+"""Files that `pansplat-view` writes without a window: the fly-through of a pair, films of tours and of camera paths."""
 
 from __future__ import annotations
 
@@ -38,33 +38,6 @@ _FADING_COST = 0.2  # of a still in the first moment of a fade, as a distance fr
 FILM_SECONDS = 4.0  # of a pair
 STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the flight
 _NO_PHOTOGRAPHS = FilmPhotographs((), torch.zeros(0, 4, 4))
-
-
-def write_screenshot(
-    folder: Path,
-    suffix: str,
-    color: Float[np.ndarray, "height width 3"],
-    depth: Float[np.ndarray, "height width"] | None = None,
-    *,
-    panorama: bool = False,
-) -> Path:
-    """Write an image (RGB in [0, 1]) as PNG, or as EXR with radial depth in metres; returns its path.
-
-    The file is the first of `view_001.png`, `view_002.png`, ... (`panorama_001.png`, ...) that does not exist.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = find_free_name(folder, "panorama" if panorama else "view", f".{suffix}")
-    marked = panorama and color.shape[1] == 2 * color.shape[0]  # there is no property for stereo
-    write_image(path, np.clip(color, 0, 1), depth=depth, panorama=marked)
-    return path
-
-
-def find_free_name(folder: Path, stem: str, suffix: str) -> Path:
-    """The first of STEM_001, STEM_002, ... of which there is neither a file nor a sequence."""
-    number = 1
-    while (path := folder / f"{stem}_{number:03d}{suffix}").exists() or name_frame(path, 0).exists():
-        number += 1
-    return path
 
 
 @dataclass(frozen=True)
@@ -414,10 +387,10 @@ def write_path_film(
         return frames.draw(camera.cam2world, camera.vertical_fov_degrees, frame / fps, with_depth=with_depth)
 
     projection, stereo = frames.image_format.projection, frames.image_format.stereo
-    panorama = False if projection == "perspective" or stereo == "anaglyph" else projection
+    panorama = False if projection == "perspective" else projection
     if file.suffix.lower() in VIDEO_SUFFIXES:
         images = (to_bytes(draw(frame)[0]) for frame in range(num_frames))
-        write_video(file, images, fps, panorama=panorama, stereo="mono" if stereo == "anaglyph" else stereo)
+        write_video(file, images, fps, panorama=panorama, stereo=stereo)
         written.append(file)
     else:
         for frame in range(num_frames):

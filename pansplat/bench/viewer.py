@@ -1,6 +1,6 @@
 """`pansplat bench viewer`: times of the viewer's frames by stage, and their errors, over counts of Gaussians.
 
-A case is a renderer (OpenGL's two tiers, the processor), a view and a mode. The scenes are synthetic rooms. The viewer
+A case is a renderer (OpenGL, the processor), a view and a mode. The scenes are synthetic rooms. The viewer
 runs as a command because no module may import it.
 
 Values of a row: `frame_ms` is the median time of a frame, `spread_ms` half the range between the quartiles, `best_ms`
@@ -42,7 +42,7 @@ View = Literal["perspective", "coarse", "look-around", "panorama"]
 Mode = Literal["joint", "deferred"]
 
 FOV_DEGREES = 75.0
-RENDERERS = ("cpu", "gl33", "gl43")
+RENDERERS = ("cpu", "gl")
 _PANORAMA_SIZE = (1024, 512)  # pixels
 _MAX_REFERENCE = 1_000_000  # Gaussians; float64 takes a minute beyond
 _VIEWER_PACKAGE = "pansplat_viewer"
@@ -54,7 +54,7 @@ class ViewerCase:
     """A frame of the viewer.
 
     Attributes:
-        renderer: `cpu`, `gl33` or `gl43`.
+        renderer: `cpu` or `gl`.
         view: `perspective` moves; `coarse` moves at half the resolution; `look-around` turns and reads cube faces;
             `panorama` has all directions; OpenGL stitches it from six cube faces.
         mode: `joint` or `deferred`.
@@ -85,7 +85,7 @@ def list_viewer_cases(size: tuple[int, int], renderers: Sequence[str] = RENDERER
 
     Args:
         size: width and height of the window, pixels.
-        renderers: some of `cpu`, `gl33` and `gl43`.
+        renderers: some of `cpu` and `gl`.
     """
     sizes: dict[View, tuple[int, int]] = {
         "perspective": size,
@@ -129,7 +129,7 @@ def measure_viewer(height: int, cases: Sequence[ViewerCase], *, repeats: int, th
                 "size": [chosen[0].width, chosen[0].height],
                 "repeats": repeats if renderer == "cpu" else max(repeats // 3, 1),
                 "folder": folder,
-                "tiers": [renderer],
+                "renderers": [renderer],
                 "settings": [case.settings() for case in chosen],
             }
             job.write_text(json.dumps(content), "utf-8")
@@ -141,7 +141,7 @@ def measure_viewer(height: int, cases: Sequence[ViewerCase], *, repeats: int, th
                     "spread_ms": quartile_range(times) / 2,
                     "best_ms": min(times),
                     "stages": line["stages"],
-                    "device": line["renderer"],
+                    "device": line["device"],
                 }
                 if case.image_key in images:
                     image = torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1)
@@ -184,10 +184,9 @@ def list_findings(rows: Sequence[Row]) -> list[str]:
     for count in dict.fromkeys(row.get("num_gaussians") for row in rows):
         of_scene = [row for row in rows if row.get("num_gaussians") == count]
         best = {tuple(map(row.get, ("renderer", "view", "mode"))): row.get("best_ms") for row in of_scene}
-        cpu, parts = best.get(("cpu", "perspective", "joint")), []
-        gl = [best[key] for name in ("gl33", "gl43") if (key := (name, "perspective", "joint")) in best]
+        cpu, gl, parts = *(best.get((name, "perspective", "joint")) for name in RENDERERS), []
         if cpu and gl:
-            parts.append(f"cpu draws a frame in {cpu:.0f} ms, OpenGL in {min(gl):.0f} ms")
+            parts.append(f"cpu draws a frame in {cpu:.0f} ms, OpenGL in {gl:.0f} ms")
         if cpu and (deferred := best.get(("cpu", "perspective", "deferred"))):
             parts.append(f"deferred blending takes {deferred / cpu:.2f} times as long as joint")
         if turning := best.get(("cpu", "look-around", "deferred")):

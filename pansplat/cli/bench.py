@@ -205,7 +205,7 @@ class BenchViewer(_Options):
     """Heights of the panoramas whose lattices hold the Gaussians: 221,642, 886,580 and 3,546,326; multiples of 8."""
     size: tuple[_WindowSide, _WindowSide] = (1280, 720)
     """Width and height of the window, pixels."""
-    renderers: tuple[Literal["cpu", "gl33", "gl43"], ...] = ("cpu", "gl33", "gl43")
+    renderers: tuple[Literal["cpu", "gl"], ...] = ("cpu", "gl")
     """Renderers to measure, for a run in pieces."""
     quick: bool = False
     """The smallest height only, few frames."""

@@ -105,12 +105,6 @@ def find_blur_mask(image: Path) -> Path | None:
     return find_masks_beside([place], BLUR_SUFFIX).get(place)
 
 
-def name_blur_mask(image: Path) -> Path:
-    """The file of the blur mask of a panorama, which need not exist."""
-    place = locate_panorama(image)
-    return find_blur_mask(image) or place.with_name(f"{place.stem}{BLUR_SUFFIX}.png")
-
-
 def resize_hidden(
     white: Bool[NDArray[Any], "rows columns"], height: int, width: int
 ) -> Bool[NDArray[Any], "height width"]:

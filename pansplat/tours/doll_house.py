@@ -42,7 +42,6 @@ _NEAREST = 2.0  # a Gaussian is drawn up to this multiple of the distance to the
 _COARSEST = 1  # pyramid level; coarser Gaussians lie behind the surfaces
 _SHOWN = 0.9  # of the surfaces of a view without walls and floor
 _OUTLIERS = 0.005  # of the Gaussians on each side of the box around the rooms
-_MARGIN = 1.05  # of the distance from which a box fills the image
 _SAMPLES = 20_000  # Gaussians of each view that the rooms are found by
 _ROUGH = 0.505  # of `measure_roughness`: living_room has .49, 19 other storeys .42 at most, a heap .52
 _NEIGHBORS, _PLACES = 12, 4000  # by which roughness is measured
@@ -193,22 +192,3 @@ def measure_box(
     """The least and the greatest coordinates, along level axes, of nearly all of some Gaussians."""
     places = means.double().cpu().numpy() @ level
     return np.quantile(places, _OUTLIERS, axis=0), np.quantile(places, 1 - _OUTLIERS, axis=0)
-
-
-def fit_box(
-    low: Float[np.ndarray, "3"],
-    high: Float[np.ndarray, "3"],
-    rotation: Float[np.ndarray, "3 3"],
-    tangents: tuple[float, float],
-) -> float:
-    """The distance from the middle of a box at which it fills the image of a camera.
-
-    Args:
-        low, high: corners of the box.
-        rotation: of the camera, to the axes of the box.
-        tangents: half the width and the height of the image at distance 1.
-    """
-    signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), axis=-1).reshape(-1, 3)
-    corners = signs * (high - low) @ rotation
-    across = np.abs(corners[:, :2]) / tangents
-    return _MARGIN * float((across.max(axis=1) - corners[:, 2]).max())

@@ -82,14 +82,14 @@ def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, in
 
 @pytest.fixture
 def make_renderer(ctx, _renderers) -> Callable[..., FrameRenderer]:
-    """Returns a renderer with a newly uploaded scene; `tier` may be `cpu`, `slot` selects one of several."""
+    """Returns a renderer with a newly uploaded scene; `name` may be `cpu`, `slot` selects one of several."""
 
-    def get(scene: Scene, tier: str = "gl33", color_bits: int = 32, slot: int = 0) -> FrameRenderer:
-        key = (tier, color_bits, slot)
-        if key not in _renderers and tier == "cpu":
+    def get(scene: Scene, name: str = "gl", color_bits: int = 32, slot: int = 0) -> FrameRenderer:
+        key = (name, color_bits, slot)
+        if key not in _renderers and name == "cpu":
             _renderers[key] = CpuRenderer(ctx, exact=True)
         elif key not in _renderers:
-            _renderers[key] = SplatRenderer(ctx, tier=tier, color_bits=color_bits)
+            _renderers[key] = SplatRenderer(ctx, color_bits=color_bits)
         _renderers[key].upload(scene)
         return _renderers[key]
 
@@ -198,7 +198,7 @@ def assert_matches() -> Callable[..., None]:
 
 @pytest.fixture
 def assert_reference(make_renderer, reference, assert_matches) -> Callable[..., None]:
-    """Checks that OpenGL 3.3 and the processor render a scene as the reference does; see `test_both_tiers_...`."""
+    """Checks that OpenGL and the processor render a scene as the reference does."""
 
     def check(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
         expected = reference(scene, cam2world, size, settings)

@@ -38,6 +38,14 @@ def test_help_needs_neither_torch_nor_opengl():
     assert "--offscreen" in result.stdout
 
 
+def test_drawing_on_the_processor_imports_no_opengl(room):
+    arguments = [str(room), "--offscreen", "out", "--renderer", "cpu", "--size", "32x32", "--seconds", "0.1"]
+    code = f"import sys\nfrom pansplat_viewer import run\nassert run({arguments}) == 0\n"
+    code += "assert 'moderngl' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], cwd=room.parent, timeout=600, check=True)
+    assert (room.parent / "out" / "view_000.png").exists()
+
+
 @pytest.mark.gl
 def test_without_a_display_a_fly_through_is_written(room, capsys):
     assert run([str(room), "--size", "96x64", "--seconds", "0.5", "--fps", "12"]) == 0
@@ -97,7 +105,7 @@ def test_without_the_libraries_of_window_and_opengl_a_fly_through_is_written(roo
         (["room.ply", "--projection", "equirect", "--size", "64x64"], "must be 2:1 for projection equirect"),
         (["room.ply", "--projection", "cubemap", "--size", "64x32"], "must be 3:2, of an even height"),
         (["room.ply", "--preset", "3dgs", "--renderer", "cpu"], "--preset 3dgs needs OpenGL, got --renderer cpu"),
-        (["room.ply", "--stereo", "anaglyph", "--renderer", "cpu"], "--stereo in a window needs OpenGL"),
+        (["room.ply", "--stereo", "side-by-side", "--renderer", "cpu"], "--stereo in a window needs OpenGL"),
         (["room.ply", "--ipd", "0"], "--ipd: needed a number > 0"),
         (["room.ply", "--refine", "-1"], "--refine: needed a number >= 0"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),

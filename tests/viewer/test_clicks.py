@@ -30,7 +30,6 @@ from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
 from pansplat.rendering.cpu.display import DisplayScene
 from pansplat.tours.graph import find_tours
-from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
@@ -40,11 +39,10 @@ from pansplat_viewer.scene.loader import (
     SceneEntry,
     SceneLoader,
 )
-from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Preset
+from pansplat_viewer.scene.settings import Display, DrawSettings, Preset
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
-from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.viewer import Viewer
 from pansplat_viewer.window.preferences import Preferences
 
@@ -59,24 +57,24 @@ SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_
 IMAGE_WIDGETS = (
     "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
     "min. opacity", "exact", "3dgs", "black", "grey", "white", "field of view",
-    "off##stereo", "pair##stereo", "red/cyan##stereo",
+    "off##stereo", "pair##stereo",
     "2##panorama", "##flight",
 )  # fmt: skip
-OF_OPENGL = (*get_args(Preset), "off##stereo", "pair##stereo", "red/cyan##stereo")  # the processor does not offer them
+OF_OPENGL = (*get_args(Preset), "off##stereo", "pair##stereo")  # the processor does not offer them
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
     "joint": {"mode": "deferred"},
     "exact": {"preset": "3dgs"},
-    "off##stereo": {"stereo": "anaglyph"},
+    "off##stereo": {"stereo": "side-by-side"},
     "black": {"background": (1.0, 1.0, 1.0)},
 }
 # Widgets whose effect has its own test.
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
     "photographs at panoramas",
-    *get_args(Display), *get_args(Comparison),
-    "fly", "orbit", "Reset", "doll's house", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
-    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Clean up", "Camera path", "Window", "Reload",
+    *get_args(Display), "photograph right of a line",
+    "fly", "orbit", "Reset", "speed", "1##panorama", "Fly", "Display", "Compare",
+    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Camera path", "Window", "Reload",
     "Notes in the picture",
 }  # fmt: skip
 
@@ -109,7 +107,7 @@ class User:
 
     def wait_for_progress(self, *expected: object) -> None:
         """Draw frames until the panel shows this progress: name, description, fraction."""
-        self.draw_until(lambda: self.viewer.loading == expected, f"progress {expected}", 0.01)
+        self.draw_until(lambda: self.viewer.scenes.loading == expected, f"progress {expected}", 0.01)
 
     def settle(self, *, refining: bool = False) -> None:
         """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
@@ -293,77 +291,20 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
 
 @opengl
 def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.recorder.PANORAMA_HEIGHT", 64)
+    monkeypatch.setattr("pansplat_viewer.screenshots.PANORAMA_HEIGHT", 64)
     user.click("pair##stereo")
     user.settle()
     image = user.viewer.stage.slot.image
     left, right = np.split(np.frombuffer(image.read(), np.float32).reshape(*SIZE[::-1], 4), 2, axis=1)
     assert np.abs(left - right).max() > 0.1
-    user.click("red/cyan##stereo")
     near = user.read_image()
     user.slide("eye distance", 0.9)
     assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
     user.click("360 PNG")
-    with Image.open(user.viewer.recorder.files[-1]) as file:
-        assert file.size == (128, 64)
+    with Image.open(user.viewer.screenshots.files[-1]) as file:
+        assert file.size == (128, 128), "the left eye above the right one"
     user.click("off##stereo")
     assert "eye distance" not in user.panels.widgets.items
-
-
-@pytest.fixture
-def cleaning(user: User) -> Iterator[User]:
-    """The user with the section "Clean up" open, and the sections above it closed."""
-    headers = ("Clean up", "Display", "Compare", "Camera", "Gaussians")
-    for header in headers:
-        user.click(header)
-    yield user
-    user.viewer.painting.stop()
-    for header in headers[::-1]:
-        user.click(header)
-
-
-def test_a_box_hides_what_is_outside_and_buttons_write_the_scene_without_it(cleaning, tmp_path):
-    user = cleaning
-    whole = user.read_image()
-    user.click("crop to a box")
-    user.draw_frames(1)
-    assert user.state.settings.box == pytest.approx(user.viewer.bounds)
-    assert changed_fraction(whole, user.read_image()) == 0
-    user.slide("x from", 0.4, start=0.01)
-    assert user.state.settings.box[0] > user.viewer.bounds[0] + 0.5
-    assert changed_fraction(whole, user.read_image()) > 0.05
-    user.panels.cleaning.file = str(tmp_path / "small.ply")
-    user.click("Save##clean")
-    user.draw_until(lambda: (tmp_path / "small.ply").exists() and not user.viewer.jobs.is_busy, "saved scene")
-    user.click("Remove floaters")
-    user.draw_until(lambda: "floaters:" in user.state.message, "message")
-    user.settle()
-    user.click("crop to a box")
-    assert user.state.settings.box is None
-    user.show(*user.entries)
-
-
-def test_a_mask_is_painted_cleared_and_dropped_after_a_question(cleaning):
-    user, painting = cleaning, cleaning.viewer.painting
-    user.click("paint what to hide")
-    user.draw_frames(2)
-    assert user.state.comparison == "photograph" and "Save mask" in user.panels.widgets.items
-    user.slide("brush", 0.5)
-    plain = user.read_screen()
-    user.drag((400, 300), (480, 320))
-    assert painting.painter.is_changed and changed_fraction(user.read_screen(), plain) > 0, "outlines are drawn"
-    for answer in ("Go on painting", "Drop it"):
-        user.click("paint what to hide")
-        user.draw_frames(2)
-        user.click(answer)
-        assert (painting.painter is None) == (answer == "Drop it")
-    user.click("paint what to hide")
-    user.drag((400, 300), (480, 320))
-    user.click("Clear")
-    assert not painting.painter.hidden.any()
-    user.press(imgui.Key.escape)
-    user.click("Drop it")
-    assert painting.painter is None and not user.state.quit
 
 
 def test_camera_widgets_fly_orbit_and_restore_the_start(user):
@@ -502,7 +443,7 @@ def test_an_error_is_shown_until_it_is_dismissed(user):
 
 def test_the_photograph_is_shown_in_the_viewing_direction(user):
     state = user.state
-    state.comparison, state.split = "photograph", 0.0
+    state.comparing, state.split = True, 0.0
     state.settings = replace(state.settings, levels=frozenset())  # saves time: the photograph covers the rendering
     state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=40)
     image = user.read_image()
@@ -524,9 +465,9 @@ def test_rendering_at_an_input_camera_looks_like_its_photograph(user, pair):
     state = user.state
     for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
         state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
-        state.comparison = "off"
+        state.comparing = False
         rendered = user.read_image()
-        state.comparison, state.split = "photograph", 0.0
+        state.comparing, state.split = True, 0.0
         photograph = user.read_image()
         assert np.abs(rendered - photograph).mean() < 4
         assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "not mirrored"
@@ -543,48 +484,18 @@ def assert_split(rendered: np.ndarray, compared: np.ndarray, split: float, right
 @both
 def test_a_drag_moves_the_divider_between_rendering_and_photograph(user):
     rendered, camera = user.read_image(), user.state.camera
-    user.click("photograph")
+    user.click("photograph right of a line")
     user.state.split = 0.75
     assert_split(rendered, user.read_image(), 0.75, right=0.9)
     user.drag((0.75 * SIZE[0], 300), (0.75 * SIZE[0] + 60, 300))
     assert user.state.split == pytest.approx(0.75 + 60 / SIZE[0]) and user.state.camera == camera
     assert_split(rendered, user.read_image(), user.state.split, right=0.9)
     user.press(imgui.Key.c)
-    assert user.state.comparison == "off" and changed_fraction(rendered, user.read_image()) == 0
-
-
-def test_the_error_is_the_mapped_difference_from_the_photograph(user):
-    state = user.state
-    state.split, state.comparison = 0.0, "off"
-    rendered = user.read_image()
-    state.comparison = "photograph"
-    photograph = user.read_image()
-    user.click("error")
-    state.max_error = 0.4
-    expected = map_values(np.abs(rendered - photograph).mean(axis=2) / 255, 0.4, ERROR_MAP)
-    assert (np.abs(user.read_image() - expected).max(axis=2) <= 12).mean() > 0.98, "up to the steps of 8 bits"
-    user.slide("error up to", 0.05)
-    assert state.max_error < 0.2 and user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
-
-
-def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
-    rendered = user.read_image()
-    user.press(imgui.Key.x)
-    assert user.state.comparison == "pinned" and user.viewer.right_name == "first, joint, color"
-    user.state.split, user.state.message = 0.8, ""
-    user.click("view 0")
-    compared = user.read_image()
-    column = round(0.8 * SIZE[0]) - IMAGE[1].start
-    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) > 0.2
-    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) == 0
-    user.show(SceneEntry("sphere", pair=user.entries[0].pair), SceneEntry("other"))
-    assert user.viewer.right_name == "first, joint, color"
-    user.click("Pin this image")
-    assert user.viewer.right_name == "sphere, view, color"
+    assert not user.state.comparing and changed_fraction(rendered, user.read_image()) == 0
 
 
 def test_the_photograph_of_the_comparison_is_chosen_in_a_list(user):
-    user.state.comparison, user.state.photograph = "photograph", 1
+    user.state.comparing, user.state.photograph = True, 1
     user.draw_frames(2)
     comparer = user.viewer.stage.comparer
     assert user.viewer.right_name == "photograph b.png" and comparer.measure_distance(user.state) == pytest.approx(0.5)
@@ -640,11 +551,11 @@ def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_
 
 @both
 def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.recorder.PANORAMA_HEIGHT", 128)
+    monkeypatch.setattr("pansplat_viewer.screenshots.PANORAMA_HEIGHT", 128)
     image = user.read_image()
     user.click("PNG")
     user.click("360 PNG")
-    png, panorama = user.viewer.recorder.files[-2:]
+    png, panorama = user.viewer.screenshots.files[-2:]
     with Image.open(png) as file:
         assert file.size == SIZE
         pixels = np.asarray(file).astype(int)
@@ -660,7 +571,7 @@ def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
 def test_exr_screenshot_holds_color_and_radial_depth(user):
     user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
     user.click("EXR + depth")
-    by_key, path = user.viewer.recorder.files[-2:]
+    by_key, path = user.viewer.screenshots.files[-2:]
     assert by_key.suffix == path.suffix == ".exr"
     with OpenEXR.File(str(path)) as file:
         depth = file.channels()["Z"].pixels
@@ -739,12 +650,14 @@ def test_a_refinement_is_cancelled_or_compared_with_its_prediction(user, small_s
     user.load = load
     for _ in range(2):
         user.viewer.show([SceneEntry("kitchen")], 0)
-        user.draw_until(lambda: user.viewer.refinement is not None, "refinement")
+        user.draw_until(lambda: user.viewer.scenes.refinement is not None, "refinement")
         user.draw_frames(2)
         if not go.is_set():
             user.click("Cancel")
             user.settle()
-            assert user.viewer.refinement is user.viewer.error is None and user.viewer.loaded.scene is small_scene
+            assert (
+                user.viewer.scenes.refinement is user.viewer.error is None and user.viewer.loaded.scene is small_scene
+            )
             predicted = user.read_image()
             go.set()
     user.settle()
@@ -765,13 +678,13 @@ def test_a_prediction_is_cancelled_by_a_button_below_the_image(user):
 
     user.load = load
     user.click("Reload")
-    user.draw_until(lambda: user.viewer.loading is not None, "progress")
+    user.draw_until(lambda: user.viewer.scenes.loading is not None, "progress")
     user.draw_frames(2)
     left, top, right, bottom = user.panels.widgets.items["Cancel##loading"]
     assert 0 < left < right < SIZE[0] and 0 < top < bottom < SIZE[1], "next to a progress bar at the bottom"
     user.click("Cancel##loading")
     user.settle()
-    assert user.viewer.loading is user.viewer.error is None
+    assert user.viewer.scenes.loading is user.viewer.error is None
 
 
 def test_the_largest_gaussians_of_a_scene_beyond_the_memory_make_the_picture(user, small_scene, monkeypatch):
@@ -922,16 +835,6 @@ def fly(user: User, seconds: float = 1 / 5) -> list[float]:
     return steps
 
 
-def test_the_dolls_house_is_shown_and_left(user):
-    image = user.read_image()
-    user.click("doll's house")
-    user.draw_until(lambda: user.state.doll_house and user.state.glide is None, "doll's house", 1 / 5)
-    outside = user.read_image()
-    assert changed_fraction(image, outside) > 0.3 and (outside[0] < 20).all()
-    user.click("Reset")
-    assert not user.state.doll_house and changed_fraction(image, user.read_image()) == 0
-
-
 def find_node(user: User) -> int:
     return int(np.linalg.norm(user.viewer.tour.tour.positions - user.state.camera.position, axis=1).argmin())
 
@@ -984,10 +887,10 @@ def match_photograph(user: User, node: int) -> float:
     """The mean difference of the screen from a photograph in the direction of the camera."""
     user.draw_frames(3, SETTLE_AFTER)
     shown = user.read_screen()
-    user.state.comparison, user.state.split, user.state.photograph = "photograph", 0.0, node
+    user.state.comparing, user.state.split, user.state.photograph = True, 0.0, node
     user.draw_frames(3)
     difference = np.abs(user.read_screen() - shown).mean()
-    user.state.comparison, user.state.photograph = "off", None
+    user.state.comparing, user.state.photograph = False, None
     return float(difference)
 
 
@@ -1224,43 +1127,11 @@ def test_the_path_is_played_and_its_time_is_dragged(path_user):
     assert changed_fraction(before, user.read_image()) > 0.1
 
 
-@pytest.mark.slow
-def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
+def test_the_path_is_saved_and_loaded(path_user, tmp_path):
     user, path = path_user, path_user.state.path
     user.panels.path_file = str(tmp_path / "walk.json")
     user.click("Save")
+    assert "--path" in user.state.message, "the command that draws the film"
     user.click("Delete##0")
     user.click("Load")
     assert user.state.path == path
-    user.state.film_fps = 2.0
-    user.click(".png")
-    user.click("Write film")
-    user.settle()
-    files = user.viewer.recorder.files[-3:]
-    assert [file.name[-9:] for file in files] == [f"_{i:04d}.png" for i in range(3)]
-    user.state.message = ""
-    shown = user.read_image()
-    with Image.open(files[-1]) as file:
-        assert np.abs(np.asarray(file).astype(int)[IMAGE] - shown).max() <= 3, "the last frame is the last key frame"
-    user.state.path = path.add(replace(path.key_frames[0], seconds=600.0))
-    user.click("Write film")
-    assert 0 <= user.viewer.jobs.progress("film")[1] < 1
-    user.click("Cancel##film")
-    user.settle()
-    assert user.viewer.jobs.progress("film") is user.viewer.error is None and user.viewer.recorder.files[-3:] == files
-
-
-def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
-    user, films = path_user, []
-    monkeypatch.setattr(
-        "pansplat_viewer.capture.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
-    )
-    user.slide("frames per second", 0.6)
-    for suffix, projection in ((".webm", "equirect"), (".exr", "cubemap"), (".mp4", "perspective")):
-        user.click(suffix)
-        user.click(projection)
-        user.click("Write film")
-        user.settle()
-        frames, path, _, file, fps, _ = films.pop()
-        assert (frames.image_format.projection, file.suffix) == (projection, suffix)
-        assert path == user.state.path and fps == user.state.film_fps != 24

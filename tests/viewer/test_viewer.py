@@ -15,15 +15,13 @@ import torch
 from imgui_bundle import imgui
 
 from pansplat.errors import InputError
-from pansplat.export.cleanup import find_floaters
-from pansplat.gaussians.formats import load_scene
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.path import find_direction
-from pansplat.images.image_files import read_blur_mask, write_image
+from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
+from pansplat_viewer.scene.key_frames import CameraPath
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, load_entry
 from pansplat_viewer.scene.settings import FrameStats
 from pansplat_viewer.viewer import Viewer
@@ -48,7 +46,7 @@ class NoRenderer:
     problem: Exception | None = None
 
     def __init__(self) -> None:
-        self.stats, self.scales = FrameStats(tier="gl33"), []
+        self.stats, self.scales = FrameStats(), []
 
     @staticmethod
     def prepare(scene: Scene, report: Callable[[float], None] = lambda done: None) -> Scene:
@@ -57,7 +55,7 @@ class NoRenderer:
     def upload(self, scene: Scene, prepared: object = None) -> None:
         if (error := NoRenderer.refuse(scene)) is not None:
             raise error
-        self.stats = FrameStats(total=len(scene.gaussians), tier="gl33")
+        self.stats = FrameStats(total=len(scene.gaussians))
 
     def render(self, cam2world: np.ndarray, size: tuple[int, int], settings: Any, *, wait: bool = True) -> Mock:
         if NoRenderer.problem is not None:
@@ -223,7 +221,7 @@ def test_a_path_is_remembered_and_an_entry_is_chosen_by_its_name(app, pair):
     app.settle()
     assert app.library.current == 1 and app.library.path == Path("kitchen")
     assert app.viewer.preferences.recent == (str(Path("kitchen").absolute()),)
-    app.viewer.choose(0)
+    app.viewer.scenes.choose(0)
     app.settle()
     assert app.viewer.loaded.entry.name == "a"
 
@@ -240,7 +238,7 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
     app.viewer.open(Path("home"))
     app.until(lambda: app.viewer.tour is not None, "photographs")
     assert app.library.names == ["unplaced"] and isinstance(app.content, int) and app.viewer.loaded is None
-    app.until(lambda: app.viewer.loading == ("home", "pairs of panoramas", 0.3), "progress")
+    app.until(lambda: app.viewer.scenes.loading == ("home", "pairs of panoramas", 0.3), "progress")
     assert app.library.loader.entry is None, "nothing is predicted from panoramas that may get poses"
     gate.open()
     app.settle()
@@ -248,7 +246,7 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
     gate.event.clear()
     shown = app.viewer.loaded
     app.viewer.open(Path("another"))
-    app.until(lambda: app.viewer.loading == ("another", "pairs of panoramas", 0.3), "progress")
+    app.until(lambda: app.viewer.scenes.loading == ("another", "pairs of panoramas", 0.3), "progress")
     app.frames(2)
     assert app.viewer.loaded is shown and app.library.names == ["placed"]
     gate.open()
@@ -257,12 +255,12 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
 def test_progress_is_shown_and_input_accepted_while_a_scene_is_loaded(app, small_scene):
     app.load = gate = Gate(lambda entry: LoadedScene(entry, small_scene), "searching depth", 0.5)
     app.viewer.show([SceneEntry("slow")], 0)
-    app.until(lambda: app.viewer.loading == ("slow", "searching depth", 0.5), "progress")
+    app.until(lambda: app.viewer.scenes.loading == ("slow", "searching depth", 0.5), "progress")
     app.frame(held=frozenset("w"))
     assert app.state.camera.position[2] > 0
     gate.open()
     app.settle()
-    assert app.viewer.loading is None and app.viewer.loaded.entry.name == "slow"
+    assert app.viewer.scenes.loading is None and app.viewer.loaded.entry.name == "slow"
     assert app.library.loader.poll() is app.library.loader.progress is None, "the result is handed over once"
 
 
@@ -270,15 +268,15 @@ def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
     gate = Gate(lambda entry: LoadedScene(entry, small_scene), "estimating poses", 0.3)
     app.find = lambda path, progress, show: gate(path, progress, None)
     app.viewer.open(Path("unposed"))
-    app.until(lambda: app.viewer.loading == ("unposed", "estimating poses", 0.3), "search")
-    app.viewer.cancel_loading()
-    assert app.viewer.loading is None and app.library.current == 0, "the scene is still the current one"
+    app.until(lambda: app.viewer.scenes.loading == ("unposed", "estimating poses", 0.3), "search")
+    app.viewer.scenes.cancel_loading()
+    assert app.viewer.scenes.loading is None and app.library.current == 0, "the scene is still the current one"
     app.load = gate
-    app.viewer.reload()
-    app.until(lambda: app.viewer.loading == ("first", "estimating poses", 0.3), "prediction")
-    app.viewer.cancel_loading()
+    app.viewer.scenes.reload()
+    app.until(lambda: app.viewer.scenes.loading == ("first", "estimating poses", 0.3), "prediction")
+    app.viewer.scenes.cancel_loading()
     app.settle()
-    assert app.viewer.loading is app.viewer.error is None
+    assert app.viewer.scenes.loading is app.viewer.error is None
     app.until(lambda: gate.ended == 2, "end of both threads")
 
 
@@ -293,14 +291,14 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
 
     app.load = load
     app.viewer.show([SceneEntry("kitchen")], 0)
-    app.until(lambda: app.viewer.refinement == 0.5, "refinement")
-    assert app.viewer.loading is None and not app.viewer.loaded.is_final
+    app.until(lambda: app.viewer.scenes.refinement == 0.5, "refinement")
+    assert app.viewer.scenes.loading is None and not app.viewer.loaded.is_final
     app.frame(held=frozenset("w"))
     camera, stage = app.state.camera, app.viewer.stage
     go.set()
     app.until(lambda: app.library.loader.refinement is None, "refined scene")
     app.settle()
-    assert app.viewer.refinement == 1 and stage.slot.scene is refined and app.state.camera == camera
+    assert app.viewer.scenes.refinement == 1 and stage.slot.scene is refined and app.state.camera == camera
     assert app.library.loader.poll() is None
     for expected in (small_scene, refined):
         app.press("b")
@@ -314,7 +312,7 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(app, sm
     monkeypatch.setattr(NoRenderer, "refuse", refuse)
     app.load = lambda entry, *_: LoadedScene(entry, twice)
     app.show(SceneEntry("large"))
-    assert "the memory is exhausted" in app.viewer.error and app.viewer.reduced == len(twice.gaussians) // 4
+    assert "the memory is exhausted" in app.viewer.error and app.viewer.scenes.reduced == len(twice.gaussians) // 4
     assert app.library.names == ["large"]
     app.viewer.dismiss_error()
     assert app.viewer.stage.slot.scene is small_scene and app.library.names == ["first", "second"]
@@ -329,7 +327,7 @@ def test_an_error_of_opengl_is_not_called_exhausted_memory(app, monkeypatch):
     error = moderngl.Error("GLSL Compiler failed")
     monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: error))
     app.show(SceneEntry("refused"))
-    assert app.viewer.error == "refused: OpenGL failed: GLSL Compiler failed" and app.viewer.reduced is None
+    assert app.viewer.error == "refused: OpenGL failed: GLSL Compiler failed" and app.viewer.scenes.reduced is None
 
 
 def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(app, monkeypatch):
@@ -357,13 +355,13 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(make_app, pai
     app.show(SceneEntry("first", pair=pair))
     app.load = lambda entry, *_: LoadedScene(entry, other)
     app.viewer.show([SceneEntry("large")], 0)
-    app.until(lambda: app.viewer.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
+    app.until(lambda: app.viewer.scenes.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
     assert app.viewer.busy and app.viewer.stage.slot.scene is small_scene
     app.frame(drag=(30.0, 0.0))
     assert app.state.camera.yaw_radians != 0
     go.set()
     app.settle()
-    assert app.viewer.stage.slot.scene is other and app.viewer.loading is None
+    assert app.viewer.stage.slot.scene is other and app.viewer.scenes.loading is None
 
 
 def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(app, monkeypatch):
@@ -385,7 +383,7 @@ def test_a_changed_file_is_announced_and_read_again(app, room):
     room.write_bytes(room.read_bytes() + b"0")
     app.frames(2, 3.0)
     assert app.library.watch.changed
-    app.viewer.reload()
+    app.viewer.scenes.reload()
     app.settle()
     assert not app.library.watch.changed
     room.unlink()
@@ -415,7 +413,7 @@ def test_a_folder_that_changes_is_announced_and_searched_again(app, pair, tmp_pa
         (folder / name).write_bytes(b"1")
         app.frames(2, 3.0)
         assert app.library.watch.changed, name
-        app.viewer.reload()
+        app.viewer.scenes.reload()
         app.settle()
         (folder / ".pansplat").rmdir()
     assert found == [folder] * 3
@@ -468,10 +466,10 @@ def test_a_scene_without_photographs_has_no_comparison_with_one(app):
 
 
 def test_a_screenshot_without_memory_is_reported(app, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.capture.write_screenshot", Mock(side_effect=MemoryError("no memory")))
+    monkeypatch.setattr("pansplat_viewer.screenshots.write_image", Mock(side_effect=MemoryError("no memory")))
     app.press("p")
     assert app.viewer.error == "no screenshot written: the memory is exhausted (MemoryError: no memory)"
-    assert app.viewer.recorder.files == []
+    assert app.viewer.screenshots.files == []
 
 
 @pytest.fixture
@@ -501,222 +499,10 @@ def test_a_path_is_saved_and_loaded_and_other_files_are_kept(path_app, tmp_path)
     assert own.read_text() == "{}"
 
 
-def test_a_film_of_a_tour_is_cancelled_during_a_prediction(tour_app, load_house):
-    app, gate = tour_app, Gate(load_house, "searching depth", 0.5)
-    app.viewer.tour._loaded.clear()
-    app.viewer.state.path = CameraPath((KeyFrame.of_camera(app.state.camera, 0.0),))
-    app.load = gate
-    app.viewer.start_film()
-    assert gate.entered.wait(300)
-    app.viewer.jobs.cancel("film", join=True)
-    assert not gate.event.is_set(), "it waited for the prediction"
-
-
-# --- clean up ---
-
-
-def test_a_saved_scene_lacks_what_is_hidden_and_other_files_are_kept(app, small_scene, tmp_path):
-    bounds = app.viewer.bounds
-    app.state.settings = replace(app.state.settings, box=(0.2, *bounds[1:]), opacity_threshold=0.5)
-    app.viewer.save_scene(str(tmp_path / "small.ply"))
-    app.settle()
-    means, opacities = small_scene.gaussians.means, small_scene.gaussians.opacities
-    inside = (means[:, 0] >= 0.2) & (opacities >= 0.5)
-    assert len(load_scene(tmp_path / "small.ply").gaussians) == int(inside.sum())
-    assert "Gaussians left out" in app.state.message and "small.ply" in app.state.message
-    (tmp_path / "own.ply").write_bytes(b"of the user")
-    for name, message in (("small.stl", "small.stl"), (str(tmp_path / "own.ply"), "own.ply, which pansplat did not")):
-        app.viewer.save_scene(name)
-        assert message in app.viewer.error
-    assert (tmp_path / "own.ply").read_bytes() == b"of the user"
-
-
-def test_floaters_are_removed_and_the_box_stays(app, small_scene):
-    app.state.settings = replace(app.state.settings, box=app.viewer.bounds)
-    app.viewer.remove_floaters()
-    app.until(lambda: "floaters:" in app.state.message, "message")
-    expected = len(small_scene.gaussians) - int(find_floaters(small_scene).sum())
-    assert f"{len(small_scene.gaussians) - expected:,} of {len(small_scene.gaussians):,}" in app.state.message
-    app.settle()
-    assert len(app.viewer.stage.slot.scene.gaussians) == expected and app.state.settings.box is not None
-
-
-@pytest.fixture
-def painted(app, pair) -> App:
-    """The viewer with a mask that is not saved."""
-    app.show(SceneEntry(pair.name, pair=pair), SceneEntry("other", file=pair.folder / "other.ply"))
-    app.viewer.start_painting()
-    app.frame(pointer=CENTER, drag=(5.0, 0.0))
-    app.frame(pointer=(0.55, 0.52))
-    assert app.viewer.painting.painter.is_changed
-    return app
-
-
-def test_a_mask_is_painted_on_the_photograph_and_saved(app, pair):
-    mask, painting, before = pair.folder / "a_blur.png", app.viewer.painting, app.state.camera
-    app.viewer.start_painting()
-    assert app.state.comparison == "photograph" and app.state.split == 0
-    app.frame(pointer=CENTER, drag=(9.0, 3.0))
-    app.frame(pointer=(0.6, 0.52))
-    assert app.state.camera == before, "the left button paints"
-    app.frame(pan=(9.0, 3.0))
-    assert app.state.camera != before, "the right one looks around"
-    painted = painting.painter.hidden.copy()
-    assert 0 < painted.mean() < 0.2
-    app.frame(pointer=CENTER, held=frozenset({"shift"}))
-    assert painting.painter.hidden.sum() < painted.sum(), "with shift it shows again"
-    painted = painting.painter.hidden.copy()
-    try:
-        assert painting.save() and "Reload" in app.state.message
-        assert np.array_equal(read_blur_mask(mask, 512), painted)
-        painting.painter.clear()
-        assert not painting.painter.hidden.any() and painting.painter.is_changed
-        painting.stop()
-        assert app.state.comparison == "off"
-        app.viewer.start_painting()
-        assert np.array_equal(painting.painter.hidden, painted), "that of the file"
-        painting.leave(painting.stop)
-        assert painting.painter is None
-    finally:
-        mask.unlink()
-
-
-LEAVING = {
-    "Esc": lambda app: app.press("escape"),
-    "untick": lambda app: app.viewer.painting.leave(app.viewer.painting.stop),
-    "Reload": lambda app: app.viewer.reload(),
-    "another scene": lambda app: app.viewer.choose(1),
-    "another path": lambda app: app.viewer.open_text("nowhere"),
-    "export": lambda app: app.viewer.save_scene(str(app.viewer.loaded.entry.pair.folder / "clean.ply")),
-    "quit": lambda app: app.press("q", held="ctrl"),
-    "close the window": lambda app: app.viewer.request_quit(),
-}
-
-
-@pytest.mark.parametrize("leave", LEAVING.values(), ids=LEAVING)
-def test_an_unsaved_mask_is_dropped_only_after_a_question(painted, leave, pair):
-    app, painting, painter = painted, painted.viewer.painting, painted.viewer.painting.painter
-    mask, exported, hidden = pair.folder / "a_blur.png", pair.folder / "clean.ply", painter.hidden.copy()
-
-    def ask() -> None:
-        leave(app)
-        app.frames(2)
-        assert painting.question == "a.png" and painting.painter is painter and painter.is_changed
-        assert np.array_equal(painter.hidden, hidden)
-        assert not app.state.quit and not mask.exists() and not exported.exists()
-        assert app.library.loader.entry is None and not app.library.loader.is_searching and not app.viewer.jobs.is_busy
-
-    ask()
-    painting.answer("keep")
-    app.frames(2)
-    assert painting.question is None and painting.painter is painter and painter.is_changed
-    ask()
-    painting.answer("drop")
-    assert painting.painter is None and not mask.exists()
-    app.settle()
-    assert app.state.quit == (leave in (LEAVING["quit"], LEAVING["close the window"]))
-    assert exported.exists() == (leave is LEAVING["export"])
-    exported.unlink(missing_ok=True)
-
-
-def test_an_unsaved_mask_is_saved_by_the_answer(painted, pair):
-    app, painting, mask = painted, painted.viewer.painting, pair.folder / "a_blur.png"
-    hidden = painting.painter.hidden.copy()
-    try:
-        app.viewer.save_scene(str(pair.folder / "clean.ply"))
-        painting.answer("save")
-        app.settle()
-        assert np.array_equal(read_blur_mask(mask, 512), hidden) and "Reload" in app.state.message
-        assert not (pair.folder / "clean.ply").exists(), "the scene shows what the new mask hides"
-        app.press("q", held="ctrl")
-        assert app.state.quit, "there is nothing to lose"
-    finally:
-        mask.unlink(missing_ok=True)
-
-
-def test_a_mask_that_is_painted_stays_when_its_photograph_is_loaded_again(painted, pair):
-    app, painter = painted, painted.viewer.painting.painter
-    hidden, again = painter.hidden.copy(), replace(pair, context=tuple(replace(view) for view in pair.context))
-    app.show(SceneEntry(pair.name, pair=again))
-    assert app.viewer.painting.painter is painter and painter.is_changed and np.array_equal(painter.hidden, hidden)
-    assert painter.panorama is again.context[0] and app.state.photograph == 0
-
-
-def test_a_scene_that_was_loading_while_a_mask_was_painted_waits_for_the_answer(painted):
-    app, painting, shown = painted, painted.viewer.painting, painted.viewer.loaded
-    painter = painting.painter
-    for answer in ("keep", "drop"):
-        app.viewer.show(app.library.entries, 1)
-        app.until(lambda: painting.question, "question")
-        assert app.viewer.loaded is shown and painting.painter is painter
-        painting.answer(answer)
-        app.frames(2)
-        assert app.library.current == (answer == "drop")
-    assert app.viewer.loaded is not shown and painting.painter is None
-
-
-# --- the doll's house ---
-
-
-def enter_doll_house(app: App) -> None:
-    app.press("o")
-    app.until(lambda: app.state.doll_house and app.state.glide is None, "doll's house", 1 / 5)
-
-
 def click_on(app: App, node: int) -> None:
-    """Click on the mark or hotspot of a panorama."""
+    """Click on the hotspot of a panorama."""
     (spot,) = [spot for spot in app.viewer.hotspots if spot.node == node]
     app.frame(click=(spot.center[0] / SIZE[0], spot.center[1] / SIZE[1]))
-
-
-def test_o_flies_out_to_the_dolls_house_and_a_click_on_a_mark_flies_in(app):
-    inside = app.state.camera
-    enter_doll_house(app)
-    assert np.degrees(app.state.camera.pitch_radians) == pytest.approx(-45)
-    app.frame(drag=(40.0, -20.0))
-    turned = app.state.camera
-    assert turned.yaw_radians != 0 and np.linalg.norm(turned.orbit_center - inside.position) < 3
-    for down in (580.0, -1160.0):
-        app.frame(drag=(0.0, down))
-        assert np.degrees(app.state.camera.pitch_radians) < -7, "the camera stays above the floor"
-    app.state.camera = turned
-    app.frame()
-    click_on(app, 1)
-    app.until(lambda: not app.state.doll_house, "end of the flight", 1 / 5)
-    assert app.state.camera.position == (0, 0, 0.5) and app.viewer.doll_house.house is None
-    assert app.state.camera.vertical_fov_degrees == inside.vertical_fov_degrees
-
-
-def test_the_start_and_another_scene_leave_the_dolls_house(app):
-    enter_doll_house(app)
-    app.press("r")
-    assert not app.state.doll_house and app.state.camera == app.state.home and app.viewer.doll_house.house is None
-    enter_doll_house(app)
-    app.show(app.entries[1])
-    assert not app.state.doll_house and not app.viewer.doll_house.is_on and app.viewer.stage.outside is None
-
-
-def test_a_scene_without_rooms_has_a_message(app, small_scene):
-    hidden = replace(small_scene.gaussians, opacities=torch.zeros(1200))
-    app.load = lambda entry, *_: LoadedScene(entry, replace(small_scene, gaussians=hidden))
-    app.show(SceneEntry("empty"))
-    app.viewer.toggle_doll_house()
-    app.settle()
-    assert not app.state.doll_house and (
-        app.state.message.startswith("no doll's house: no surfaces") or app.viewer.error
-    )
-
-
-def test_the_dolls_house_of_a_tour_has_all_panoramas_of_the_part_with_their_titles(tour_app):
-    app = tour_app
-    app.until(lambda: len(app.viewer.tour.loaded) == 3, "all scenes")
-    enter_doll_house(app)
-    house = app.viewer.doll_house.house
-    assert house.nodes == (0, 1, 2, 3) and set(house.scene.gaussians.views.tolist()) == {0, 1, 2, 3}
-    assert {mark.label for mark in app.viewer.hotspots} <= {"room0", "room1", "room2", "room3"}
-    app.press("4")
-    app.until(lambda: not app.state.doll_house, "end of the flight", 1 / 5)
-    assert app.node == 3
 
 
 @pytest.mark.parametrize("found", [{"poor": [(1, 2)]}, {"walls": [(1, 2)]}])
@@ -898,7 +684,7 @@ def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(tour_app, l
         requested.append(entry.name)
         return LoadedScene(entry, small_scene) if entry.tour is None else load_house(entry)
 
-    app.viewer.tour._loaded.popitem()  # a scene of the tour is still missing
+    next(life for life in app.viewer.tour._lives.values() if life.loaded).drop()  # a scene of the tour is still missing
     is_ready = app.viewer.stage.preparer.is_ready
     monkeypatch.setattr(
         app.viewer.stage.preparer,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 
-import moderngl
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -17,13 +16,6 @@ def get_table(name: str) -> UInt8[np.ndarray, "256 3"]:
     from matplotlib import colormaps
 
     return (colormaps[name]((np.arange(SIZE) + 0.5) / SIZE)[:, :3] * 255 + 0.5).astype(np.uint8)
-
-
-def create_table_texture(ctx: moderngl.Context, name: str) -> moderngl.Texture:
-    """A table as a texture of one row, for look-ups of the nearest colour."""
-    texture = ctx.texture((SIZE, 1), 3, get_table(name).tobytes(), alignment=1)
-    texture.filter, texture.repeat_x = (moderngl.NEAREST, moderngl.NEAREST), False
-    return texture
 
 
 def map_values(values: Float[np.ndarray, "*shape"], largest: float, name: str) -> UInt8[np.ndarray, "*shape 3"]:

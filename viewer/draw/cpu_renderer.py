@@ -12,13 +12,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, TimeoutError
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
-import moderngl
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt32
+from jaxtyping import Float, Int, UInt32
 
-from pansplat.constants import FRONT_COSINE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.rendering.cpu.display import (
@@ -41,12 +40,16 @@ from pansplat.rendering.rasterize import RasterOptions
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.displays import color_by_property
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.layers import Frame, LayerStorage
-from pansplat_viewer.draw.renderer import SplatRenderer, choose_layer_weights, is_software
+from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
 from pansplat_viewer.draw.splats import Splats, drop_not_finite
 from pansplat_viewer.scene.background import BackgroundWorker, Report
 from pansplat_viewer.scene.camera import Pinhole
 from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from pansplat_viewer.draw.renderer import SplatRenderer
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
 _POLL_SECONDS = 0.02  # wait for an image in the background, so that a window does not draw the old one again
@@ -114,7 +117,7 @@ class CpuRenderer:
             ctx: the current context; without one, `render` returns no texture and `read_color` has the image.
             exact: continue behind a transmittance of 2^-10, which 8 bits do not show.
         """
-        self.stats = FrameStats(tier="cpu")
+        self.stats = FrameStats(renderer="cpu")
         self._ctx = ctx
         self._min_transmittance = EXACT_TRANSMITTANCE if exact else MIN_TRANSMITTANCE
         self._worker: BackgroundWorker[_Picture | None] = BackgroundWorker("cpu-renderer")
@@ -122,8 +125,6 @@ class CpuRenderer:
         self._splats: Splats | None = None
         self._scene: DisplayScene | None = None
         self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
-        # Of the doll's house: rays from the cameras of the views, and normals towards these.
-        self._seen: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None
         self._groups: dict[Hashable, tuple[Int[np.ndarray, "n"], int]] = {}
         self._selected = SelectionCache()
         self._faces: OrderedDict[Hashable, _FaceSet] = OrderedDict()
@@ -158,8 +159,8 @@ class CpuRenderer:
         self._groups.clear()
         self._selected = SelectionCache()
         self._faces.clear()
-        self._picture = self._texture = self._colored = self._seen = None
-        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier="cpu")
+        self._picture = self._texture = self._colored = None
+        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, renderer="cpu")
 
     def render(
         self,
@@ -284,25 +285,7 @@ class CpuRenderer:
                 labels[splats.select(settings.selection, view)] = layer
             self._groups[key] = labels, int(np.count_nonzero(labels != NO_LAYER))
         labels, visible = self._groups[key]
-        if settings.outside:
-            labels = np.where(self._find_fronts(frame.position), labels, np.int16(NO_LAYER))
-            visible = int(np.count_nonzero(labels != NO_LAYER))
         return _Groups(labels, np.array(list(layer_weights.values()), np.float32), visible)
-
-    def _find_fronts(self, position: tuple[float, float, float]) -> Bool[np.ndarray, "n"]:
-        """`pansplat.tours.doll_house.find_fronts` for a position in the moved frame."""
-        assert self._splats is not None and self._scene is not None
-        splats, scene = self._splats, self._scene
-        if self._seen is None:
-            cameras = (splats.view_positions - splats.origin).astype(np.float32)
-            arrays = scene.means, scene.quats, scene.scales, splats.levels, splats.views, cameras
-            normals = 2 * color_by_property("normals", *arrays) - 1  # towards the camera of the view
-            seen = scene.means - cameras[splats.views]
-            self._seen = seen / np.linalg.norm(seen, axis=1, keepdims=True), normals
-        (seen, normals), ray = self._seen, scene.means - np.array(position, np.float32)
-        cosines = np.einsum("ni,ni->n", ray, seen)
-        is_ahead = cosines >= np.float32(FRONT_COSINE) * np.linalg.norm(ray, axis=1)
-        return is_ahead & (np.einsum("ni,ni->n", ray, normals) <= 0)
 
     def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
         """Draw the image of a frame."""
@@ -424,7 +407,7 @@ class CpuRenderer:
             drawn=drawn,
             sort_ms=stages.get("sort", 0.0),
             frame_ms=frame_ms,
-            tier="cpu",
+            renderer="cpu",
             stages=stages,
             size=frame.size,
         )
@@ -466,9 +449,13 @@ class CpuRenderer:
 
 def choose_renderer(ctx: moderngl.Context | None, choice: RendererChoice) -> RendererChoice:
     """Return `gl` or `cpu`; `auto` is `cpu` where there is no OpenGL or OpenGL is software."""
-    if choice == "auto":
-        return "cpu" if ctx is None or is_software(ctx) else "gl"
-    return choice
+    if choice != "auto":
+        return choice
+    if ctx is None:
+        return "cpu"
+    from pansplat_viewer.draw.renderer import is_software
+
+    return "cpu" if is_software(ctx) else "gl"
 
 
 def create_renderer(
@@ -479,6 +466,8 @@ def create_renderer(
         return CpuRenderer(ctx)
     if ctx is None:
         raise InputError("renderer `gl` needs an OpenGL context; use `cpu`")
+    from pansplat_viewer.draw.renderer import SplatRenderer
+
     return SplatRenderer(ctx, color_bits=color_bits)
 
 

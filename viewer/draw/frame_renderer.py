@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import moderngl
 import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
 from pansplat_viewer.scene.settings import DrawSettings, FrameStats
+
+if TYPE_CHECKING:
+    import moderngl
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,6 @@ import moderngl
 
 from pansplat.errors import InputError
 
-CONTEXT_VERSIONS = (4, 3), (3, 3)
-"""Versions of OpenGL that are requested, in this order.
-
-NVIDIA's drivers create a context of exactly the requested version, Mesa's drivers one of the highest version.
-"""
-
 _EGL_PACKAGES = "libegl1 libgl1-mesa-dri libgl1"
 _OSMESA_PACKAGE = "libosmesa6"
 
@@ -36,9 +30,9 @@ def create_context(backend: Literal["auto", "egl", "osmesa", "system"] = "auto")
             (GPU or software), then OSMesa (software only).
     """
     makers = {
-        "egl": lambda: _create_newest(backend="egl"),
+        "egl": lambda: moderngl.create_context(require=330, standalone=True, backend="egl"),
         "osmesa": lambda: moderngl.create_context(require=330, context=_OsMesa()),
-        "system": _create_newest,
+        "system": lambda: moderngl.create_context(require=330, standalone=True),
     }
     if backend != "auto" and backend not in makers:
         raise InputError(f"`backend` must be auto, egl, osmesa or system, got {backend!r}")
@@ -55,14 +49,6 @@ def create_context(backend: Literal["auto", "egl", "osmesa", "system"] = "auto")
         advice = f"on Debian or Ubuntu install `apt-get install {_EGL_PACKAGES}`, "
         advice += f"or for software rendering without EGL `{_OSMESA_PACKAGE}`"
     raise InputError(f"drawing needs OpenGL 3.3, and none could be started ({'; '.join(failures)}); {advice}")
-
-
-def _create_newest(**options: str) -> moderngl.Context:
-    best, oldest = (100 * major + 10 * minor for major, minor in CONTEXT_VERSIONS)
-    try:
-        return moderngl.create_context(require=best, standalone=True, **options)
-    except Exception:  # see `create_context`
-        return moderngl.create_context(require=oldest, standalone=True, **options)
 
 
 def load_llvm_before_mesa() -> None:

@@ -9,40 +9,18 @@ from typing import Any
 
 import moderngl
 
-from pansplat.errors import InputError
 from pansplat.shaders import load_shader
 
-# Members of a record, in the order of shaders/project.vert and project.comp.
+# Members of a record, in the order of shaders/project.vert.
 RECORD = ("quad_1", "quad_2", "row_a", "row_b", "row_l", "color")
 RECORD_BYTES = 16 * len(RECORD)
-STORED_BYTES = 48  # of one Gaussian in the largest buffer, `Splats.geometry`
-
-DIGITS = 64  # of the radix sort, and its threads in a work group
-TILE_SIZE = 1024  # keys or splats of a work group
 _UNIFORM = re.compile(r"^uniform \w+ (\w+)", re.MULTILINE)
 _MAX_ERRORS = 8  # that OpenGL can report at once
 
 
-def choose_tier(ctx: moderngl.Context, tier: str, count: int = 0) -> str:
-    """Return `gl43` if the context has compute shaders for `count` Gaussians and `tier` allows it, else `gl33`."""
-    if tier not in ("auto", "gl33", "gl43"):
-        raise InputError(f"`tier` must be auto, gl33 or gl43, got {tier!r}")
-    if tier == "gl33":
-        return tier
-    missing = None
-    if ctx.version_code < 430:
-        version = f"{ctx.version_code // 100}.{ctx.version_code // 10 % 10}"
-        missing = f"OpenGL 4.3, this context has {version}"
-    elif (size := count * STORED_BYTES) > (limit := ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]):
-        missing = f"a storage buffer of {size:,} bytes for {count:,} Gaussians, this GPU's limit is {limit:,}"
-    if missing is not None and tier == "gl43":
-        raise InputError(f"tier gl43 needs {missing}; use tier gl33 or auto")
-    return "gl43" if missing is None else "gl33"
-
-
-def read_source(name: str, version: int, **defines: float | str) -> str:
-    """Return the text of a shader for OpenGL `version` (330 or 430), with the displays that web pages do not have."""
-    return load_shader(name, f"{version} core", INSPECT=1, **defines)
+def read_source(name: str, **defines: float | str) -> str:
+    """Return the text of a shader for OpenGL 3.3, with the displays that web pages do not have."""
+    return load_shader(name, "330 core", INSPECT=1, **defines)
 
 
 @contextlib.contextmanager
@@ -120,29 +98,13 @@ class Programs:
         self._compiled: dict[tuple[object, ...], Any] = {}
 
     def project(self) -> moderngl.Program:
-        """Gaussians to records by transform feedback (GL 3.3)."""
+        """Gaussians to records by transform feedback."""
         capture: Any = {"varyings": RECORD, "varyings_capture_mode": "interleaved"}
-        return self._compile(lambda source: self._ctx.program(vertex_shader=source, **capture), 330, "project.vert")
-
-    def project_compute(self) -> moderngl.ComputeShader:
-        """Gaussians to records by a compute shader (GL 4.3)."""
-        return self.compute("project.comp", PARTS=1)
-
-    def compute(self, name: str, **defines: int) -> moderngl.ComputeShader:
-        """The compute shader of this file (GL 4.3)."""
-        return self._compile(self._ctx.compute_shader, 430, name, TILE_SIZE=TILE_SIZE, DIGITS=DIGITS, **defines)
-
-    def compile_compute(self) -> None:
-        """Compile all compute shaders at once: a driver may refuse one although it offers OpenGL 4.3."""
-        for name in ("arguments", "scan", "sort_count", "sort_keys", "sort_scatter"):
-            self.compute(f"{name}.comp")
-        for write in range(2):
-            self.compute("cull.comp", WRITE=write)
-        self.project_compute()
+        return self._compile(lambda source: self._ctx.program(vertex_shader=source, **capture), "project.vert")
 
     def splat(self) -> moderngl.Program:
         """The program that draws records into a layer."""
-        return self._compile_pair("splat.vert", "splat.frag", PARTS=1)
+        return self._compile_pair("splat.vert", "splat.frag")
 
     def accumulate(self, storage: int) -> moderngl.Program:
         """One weighted layer to the sum of layers; `storage` is a `LayerStorage`."""
@@ -170,13 +132,13 @@ class Programs:
         def compile_pair(*sources: str) -> moderngl.Program:
             return self._ctx.program(vertex_shader=sources[0], fragment_shader=sources[1])
 
-        return self._compile(compile_pair, 330, vertex, fragment, **defines)
+        return self._compile(compile_pair, vertex, fragment, **defines)
 
-    def _compile(self, compile_sources: Callable[..., Any], version: int, *files: str, **defines: int) -> Any:
+    def _compile(self, compile_sources: Callable[..., Any], *files: str, **defines: int) -> Any:
         """The program of these files; `extra` is the set of its uniforms, for `set_uniforms`."""
         key = (*files, *defines.items())
         if key not in self._compiled:
-            sources = [read_source(file, version, **defines) for file in files]
+            sources = [read_source(file, **defines) for file in files]
             program = self._compiled[key] = compile_sources(*sources)
             program.extra = {name for source in sources for name in _UNIFORM.findall(source)}
         return self._compiled[key]

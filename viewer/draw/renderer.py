@@ -14,18 +14,17 @@ from typing import Literal
 
 import moderngl
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.pose import blend_weights
-from pansplat_viewer.draw.color_maps import create_table_texture
+from pansplat_viewer.draw.color_maps import get_table
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
-from pansplat_viewer.draw.programs import Programs, choose_tier, set_uniforms
+from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
+from pansplat_viewer.draw.layers import Layer, LayerPainter, Target, TargetStore
+from pansplat_viewer.draw.programs import Programs, set_uniforms
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
-from pansplat_viewer.draw.splats import SortedSplats, Splats, SplatSorter, color_splats, sort_splats
+from pansplat_viewer.draw.splats import SortedSplats, Splats, SplatSorter, sort_splats
 from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats
 
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
@@ -44,30 +43,21 @@ _COLOR_MAP_UNIT = 8  # texture unit, after those of the layers
 
 
 class SplatRenderer:
-    """Renders scenes of 3D Gaussians on an OpenGL 3.3 or 4.3 context; see `FrameRenderer`.
+    """Renders scenes of 3D Gaussians on a context of OpenGL 3.3; see `FrameRenderer`.
 
     Each call leaves blending disabled and restores the framebuffer binding.
 
     Attributes:
         stats: counts and times of the last frame.
-        tier: `gl33` or `gl43`; both draw the same image. A renderer that may choose uses `gl33` for a scene beyond the
-            GPU's storage buffers, and from the first error on of a driver that offers compute shaders.
     """
 
     pacing = Pacing(min_size=(1, 1), settle_seconds=SETTLE_AFTER, turn_ms=BUDGET_MS, waits_while_moving=False)
 
-    def __init__(
-        self,
-        ctx: moderngl.Context,
-        *,
-        tier: Literal["auto", "gl33", "gl43"] = "auto",
-        color_bits: Literal[16, 32] | None = None,
-    ) -> None:
+    def __init__(self, ctx: moderngl.Context, *, color_bits: Literal[16, 32] | None = None) -> None:
         """Create the renderer without a scene.
 
         Args:
             ctx: the current context.
-            tier: `gl33` culls and sorts on the processor; `gl43` does it by compute shaders.
             color_bits: bits per channel of the render targets. None is 16 on a GPU, and 32 on software OpenGL, which
                 truncates half floats (images get darker with every layer) and is not slower with 32.
         """
@@ -75,13 +65,12 @@ class SplatRenderer:
             color_bits = 32 if is_software(ctx) else 16
         if color_bits not in (16, 32):
             raise InputError(f"`color_bits` must be 16 or 32, got {color_bits}")
-        self.tier = choose_tier(ctx, tier)
-        self.stats = FrameStats(tier=self.tier)
-        self._ctx, self._requested = ctx, tier
+        self.stats = FrameStats()
+        self._ctx = ctx
         self._programs = Programs(ctx)
         self._targets = TargetStore(ctx, color_bits=color_bits)
         self._compositor = Compositor(ctx, self._programs, self._targets)
-        self._sorter = SplatSorter(self._sort)
+        self._sorter = SplatSorter()
         self._splats: Splats | None = None
         self._painter: LayerPainter | None = None
         self._sorted: SortedSplats | None = None
@@ -94,7 +83,7 @@ class SplatRenderer:
 
     def create_sibling(self) -> SplatRenderer:
         """A renderer with a copy of this scene on the GPU."""
-        sibling = SplatRenderer(self._ctx, tier=self.tier, color_bits=self._targets.color_bits)
+        sibling = SplatRenderer(self._ctx, color_bits=self._targets.color_bits)
         if self._splats is not None:
             sibling._upload(self._splats)
         return sibling
@@ -123,22 +112,12 @@ class SplatRenderer:
         self._show(splats, painter)
 
     def _create_painter(self, splats: Splats) -> LayerPainter:
-        tier = choose_tier(self._ctx, self._requested, len(splats))
-        try:
-            return LayerPainter(self._ctx, self._programs, self._targets, splats, tier)
-        except moderngl.Error:
-            if tier == "gl33" or self._requested != "auto":
-                raise
-            self._requested = "gl33"
-            return self._create_painter(splats)
+        return LayerPainter(self._ctx, self._programs, self._targets, splats)
 
     def _show(self, splats: Splats, painter: LayerPainter) -> None:
-        self._splats, self._painter, self.tier = splats, painter, painter.rasterizer.tier
+        self._splats, self._painter = splats, painter
         self._unread = None
-        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
-
-    def _sort(self, splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
-        return (color_splats if self.tier == "gl43" else sort_splats)(splats, position)  # the GPU sorts in tier gl43
+        self.stats = FrameStats(total=len(splats), dropped=splats.dropped)
 
     def render(
         self,
@@ -167,16 +146,12 @@ class SplatRenderer:
         bind(bound)
         self._unread = settings, 1e3 * (time.perf_counter() - start)
         known = self._read_times() if waits else before
-        # Tier gl33 counts while it draws, gl43 on the GPU: `known` has its count, without `waits` of the frame before.
-        drawn = self.stats.drawn + known.drawn
-        self.stats = dataclasses.replace(
-            self.stats, settled=settled, drawn=drawn, frame_ms=known.frame_ms, timed=known.timed
-        )
+        self.stats = dataclasses.replace(self.stats, settled=settled, frame_ms=known.frame_ms, timed=known.timed)
         return image.color
 
     def _read_times(self) -> FrameStats:
-        """Time and splats of the frame that is not read yet, for whose end on the GPU this waits."""
-        if self._unread is None or self._painter is None:
+        """Time of the frame that is not read yet, for whose end on the GPU this waits."""
+        if self._unread is None:
             return FrameStats()
         (settings, milliseconds), self._unread = self._unread, None
         start = time.perf_counter()
@@ -184,8 +159,7 @@ class SplatRenderer:
         waited = 1e3 * (time.perf_counter() - start)  # the timer has 32 bits: 4.3 s
         if elapsed == 0:  # some drivers of macOS do not measure: wait for the end of each frame from now on
             self._timer = None
-        drawn = self._painter.rasterizer.take_drawn()
-        return FrameStats(frame_ms=max(milliseconds, elapsed, waited), drawn=drawn, timed=settings)
+        return FrameStats(frame_ms=max(milliseconds, elapsed, waited), timed=settings)
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""
@@ -197,11 +171,8 @@ class SplatRenderer:
         `render` draws no depth. The first call after it draws the frame again with depth.
         """
         if self._image is not None and self._frame is not None and self._image.depth is None:
-            self._read_times()
             bound, stats = self._ctx.fbo, self.stats
             self._draw(self._frame, with_depth=True)
-            assert self._painter is not None
-            self._painter.rasterizer.take_drawn()  # not of a new frame
             self.stats = stats
             bind(bound)
         return self._read(attachment=1, components=1)[..., 0]
@@ -231,7 +202,6 @@ class SplatRenderer:
             visible=sum(layer.visible for layer in layers),
             drawn=sum(layer.drawn for layer in layers),
             sort_ms=splats.milliseconds,
-            tier=self.tier,
             cached=all(layer.cached for layer in layers),
             size=frame.size,
         )
@@ -240,9 +210,8 @@ class SplatRenderer:
     def _update_order(self, position: tuple[float, float, float], wait: bool) -> bool:
         """Sort for this position, here or in the worker thread; returns whether the order fits the position."""
         assert self._splats is not None
-        needs_work = self.tier == "gl33" or self._splats.base_colors is None
-        if self._sorted is None or ((wait or not needs_work) and self._sorted.position != position):
-            self._sorted = self._sort(self._splats, position)
+        if self._sorted is None or (wait and self._sorted.position != position):
+            self._sorted = sort_splats(self._splats, position)
         elif self._sorted.position != position:
             ready = self._sorter.take()
             if ready is not None and ready.splats is self._splats:
@@ -274,31 +243,6 @@ class SplatRenderer:
             self._painter.release()
         self._splats = self._painter = self._sorted = self._color_key = self._frame = self._image = None
         self._targets.invalidate()
-
-
-def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dict[int | None, float]:
-    """Return each layer's weight by its view (None: all Gaussians)."""
-    settings, num_views = frame.settings, splats.num_views
-    mode = settings.mode
-    if mode == "joint":
-        return {None: 1.0}
-    if mode == "view" and not 0 <= settings.view < max(num_views, 1):
-        raise InputError(f"`view` must be 0..{max(num_views, 1) - 1} in this scene, got {settings.view}")
-    if mode == "view":
-        return {settings.view: 1.0}
-    if num_views < 2:
-        return {None: 1.0}
-    positions = splats.view_positions
-    if len(positions) != num_views:
-        raise InputError(
-            f"mode deferred needs the camera of each context view, the scene has {len(positions)} cameras "
-            f"for {num_views} views; use mode joint"
-        )
-    weights = blend_weights(torch.from_numpy(frame.world_position.copy()), torch.from_numpy(positions))
-    factors = (settings.view_weights + (1.0,) * num_views)[:num_views]
-    factors = factors if any(factors) else (1.0,) * num_views
-    weighted = enumerate(zip(weights.tolist(), factors, strict=True))
-    return {view: max(weight * factor, min_weight) for view, (weight, factor) in weighted if factor > 0}
 
 
 class Compositor:
@@ -346,7 +290,7 @@ class Compositor:
         if name is None:
             return
         if name not in self._tables:
-            self._tables[name] = create_table_texture(self._ctx, name)
+            self._tables[name] = _create_table_texture(self._ctx, name)
         self._tables[name].use(_COLOR_MAP_UNIT)
 
     def _add_layers(self, frame: Frame, weighted: Sequence[tuple[Layer, float]], with_depth: bool) -> Target:
@@ -381,6 +325,14 @@ class Compositor:
             # An unused sampler still needs a texture of its type.
             (texture or next(iter(textures.values()))).use(location=unit)  # type: ignore[union-attr]
             set_uniforms(program, **{name: unit})
+
+
+def _create_table_texture(ctx: moderngl.Context, name: str) -> moderngl.Texture:
+    """A colour map as a texture of one row, for look-ups of the nearest colour."""
+    table = get_table(name)
+    texture = ctx.texture((table.shape[0], 1), 3, table.tobytes(), alignment=1)
+    texture.filter, texture.repeat_x = (moderngl.NEAREST, moderngl.NEAREST), False
+    return texture
 
 
 def bind(framebuffer: moderngl.Framebuffer | None) -> None:

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt
 
-from pansplat.gaussians.crop import are_in_box
 from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering.cpu.display import NO_LAYER, Selection, mark_in_view
@@ -49,7 +48,7 @@ class Splats:
     extent: Float[np.ndarray, "n"]  # reach times the largest standard deviation, metres
     levels: Int[np.ndarray, "n"]
     views: Int[np.ndarray, "n"]
-    geometry: Float[np.ndarray, "n 12"]  # rows that the shaders read: mean, opacity; quaternion; scales, view
+    geometry: Float[np.ndarray, "n 12"]  # rows that the shaders read: mean, opacity; quaternion; scales, 0
     harmonics: Float[np.ndarray, "k 3 n"]
     base_colors: Float[np.ndarray, "n 4"] | None  # colours if they do not depend on the direction (degree 0), else None
     view_positions: Float[np.ndarray, "view 3"]  # camera centres of the context views in the world
@@ -106,7 +105,7 @@ class Splats:
                 return
             geometry = splats.geometry[part]
             geometry[:, 0:3], geometry[:, 3] = splats.means[part], splats.opacities[part]
-            geometry[:, 4:8], geometry[:, 8:11], geometry[:, 11] = quats, scales, splats.views[part]
+            geometry[:, 4:8], geometry[:, 8:11] = quats, scales
             splats.harmonics[..., part] = harmonics.transpose(1, 2, 0)
             if splats.base_colors is not None:
                 colors = 0.5 + splats.harmonics[0, :, part].T / (2 * math.sqrt(math.pi))
@@ -140,11 +139,8 @@ class Splats:
 
     def select(self, selection: GaussianChoice, view: int | None) -> Bool[np.ndarray, "n"]:
         """Return a mask of the splats that a selection and view contain and that can be visible."""
-        levels, threshold, box = selection
+        levels, threshold = selection
         selected = self.reach > 0
-        if box is not None:
-            moved = tuple((np.reshape(box, (2, 3)) - self.origin).ravel().tolist())
-            selected &= are_in_box(torch.from_numpy(self.means), moved).numpy()
         if threshold > 0:
             selected &= self.opacities >= np.float32(threshold)
         if levels is not None:
@@ -221,13 +217,6 @@ class SortedSplats:
         return indices[radix_argsort(depth)][::-1]
 
 
-def color_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
-    """Evaluate the colours of the splats as seen from a camera position; the GPU sorts them."""
-    start = time.perf_counter()
-    colors = splats.evaluate_colors(position) if splats.base_colors is None else None
-    return SortedSplats(splats, position, np.zeros(0, np.uint32), colors, 1e3 * (time.perf_counter() - start))
-
-
 def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
     """Sort the splats by distance from a camera position and evaluate their colours."""
     start = time.perf_counter()
@@ -242,18 +231,17 @@ def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedS
 
 
 class SplatSorter:
-    """Runs `sort_splats` or `color_splats` in a worker thread; a new request replaces one that has not started."""
+    """Runs `sort_splats` in a worker thread; a new request replaces one that has not started."""
 
-    def __init__(self, sort: Callable[[Splats, tuple[float, float, float]], SortedSplats] | None = None) -> None:
-        """Create the sorter, which calls `sort` (`sort_splats`); the thread starts with the first request."""
-        self._sort = sort or sort_splats
+    def __init__(self) -> None:
+        """Create the sorter; the thread starts with the first request."""
         self._executor = ThreadPoolExecutor(1, "splat-sorter")
         self._futures: list[Future[SortedSplats]] = []
 
     def request(self, splats: Splats, position: tuple[float, float, float]) -> None:
         """Queue a sort and return at once."""
         self._futures = [future for future in self._futures if not future.cancel()]
-        self._futures.append(self._executor.submit(self._sort, splats, position))
+        self._futures.append(self._executor.submit(sort_splats, splats, position))
 
     def take(self) -> SortedSplats | None:
         """Return the newest result once, else None; raises the exception of a sort that failed."""

@@ -3,17 +3,17 @@
 `pansplat bench viewer` runs this command, because no other package may import the viewer. Needs no window. A job is
 
     {"scene": "scene.ply", "pose": 4x4 cam2world, "size": [width, height], "repeats": 5, "folder": "images",
-     "tiers": ["gl33", "gl43", "cpu"], "settings": [{"preset": "exact", "layout": "equirect", ...}, ...]}
+     "renderers": ["gl", "cpu"], "settings": [{"preset": "exact", "layout": "equirect", ...}, ...]}
 
-with the fields of `DrawSettings`, and optionally a "size" of its own. For each tier and settings, one line of JSON is
-printed:
+with the fields of `DrawSettings`, and optionally a "size" of its own. For each renderer and settings, one line of JSON
+is printed:
 
-    {"tier": "gl33", "settings": 0, "renderer": "llvmpipe ...", "frame_ms": [...], "sort_ms": 3.1,
+    {"renderer": "gl", "settings": 0, "device": "llvmpipe ...", "frame_ms": [...], "sort_ms": 3.1,
      "stages": {"project": 2.1, ...}, "image": FILE.npy}
 
 `frame_ms` are times of frames of a moving camera and include the sort; with "cached" the camera turns in place.
-`stages` are medians in milliseconds. Tiers that the context does not support for the scene are skipped. The
-image is float32, RGB and coverage, top row first; with tier `cpu` and "cached", what the screen shows, with 8 bits.
+`stages` are medians in milliseconds. The image is float32, RGB and coverage, top row first; of `cpu` with "cached" it
+is what the screen shows, with 8 bits.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from pansplat.gaussians.ply import load_ply
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
-from pansplat_viewer.draw.programs import choose_tier
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
 
 _TURN_RADIANS = 5e-3  # between frames of a camera that turns
@@ -58,19 +57,15 @@ def run_job(job: dict[str, Any]) -> Iterator[dict[str, object]]:
     ]
     ctx = create_context()
     try:
-        for tier in job["tiers"]:
-            try:
-                choose_tier(ctx, "auto" if tier == "cpu" else tier, len(scene.gaussians))
-            except InputError:
-                continue
-            renderer = CpuRenderer(ctx) if tier == "cpu" else SplatRenderer(ctx, tier=tier, color_bits=32)
+        for name in job["renderers"]:
+            renderer = CpuRenderer(ctx) if name == "cpu" else SplatRenderer(ctx, color_bits=32)
             try:
                 renderer.upload(scene)
                 for index, (each, size) in enumerate(zip(settings, sizes, strict=True)):
-                    file = Path(job["folder"]) / f"{tier}_{index}.npy"
+                    file = Path(job["folder"]) / f"{name}_{index}.npy"
                     measured = _measure(renderer, pose, size, each, job["repeats"], file)
-                    device = "numba" if tier == "cpu" else ctx.info["GL_RENDERER"]
-                    yield {"tier": tier, "settings": index, "renderer": device, **measured}
+                    device = "numba" if name == "cpu" else ctx.info["GL_RENDERER"]
+                    yield {"renderer": name, "settings": index, "device": device, **measured}
             finally:
                 renderer.release()
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 Result = TypeVar("Result")
 Report = Callable[..., None]  # description of the work, fraction done
@@ -84,65 +84,3 @@ class BackgroundWorker(Generic[Result]):
         """Cancel the work and wait for the thread."""
         self.cancel()
         self._executor.shutdown()
-
-
-class Jobs:
-    """Named work in threads, one piece of each name at a time; its results and errors arrive in the window's thread."""
-
-    def __init__(self, show_error: Callable[[str], None]) -> None:
-        """`show_error` shows a message to the user."""
-        self._show_error = show_error
-        self._workers: dict[str, BackgroundWorker[Any]] = {}
-        self._ends: dict[str, tuple[Callable[[Any], None], str]] = {}
-
-    def start(
-        self,
-        name: str,
-        work: Callable[[Report], Result],
-        then: Callable[[Result], None],
-        *,
-        description: str = "starting",
-        failure: str = "",
-    ) -> None:
-        """Start work in place of that of the same name.
-
-        Args:
-            name: of the job and its thread.
-            work: called in the thread, as by `BackgroundWorker.start`.
-            then: called with the result by `poll`.
-            description: of the work before its first report.
-            failure: of the message of an error, before the reason.
-        """
-        self._workers.setdefault(name, BackgroundWorker(name)).start(work, description)
-        self._ends[name] = then, failure
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether there is work, or a result that `poll` has not taken."""
-        return any(worker.future is not None for worker in self._workers.values())
-
-    def progress(self, name: str) -> tuple[str, float] | None:
-        """Description of the work of this name and the fraction done; None without work."""
-        return self._workers[name].progress if name in self._workers else None
-
-    def poll(self) -> None:
-        """Hand over the results of finished work, or show its errors."""
-        for name, worker in list(self._workers.items()):
-            future = worker.future
-            if future is not None and future.done():
-                worker.poll()
-                then, failure = self._ends[name]
-                error = future.exception()
-                if error is None:
-                    then(future.result())
-                else:
-                    self._show_error(f"{failure}{error}")
-
-    def cancel(self, name: str, *, join: bool = False) -> bool:
-        """Make the work of this name end; with `join`, wait for its end. Returns whether there was work."""
-        return name in self._workers and self._workers[name].cancel(join=join)
-
-    def close(self) -> None:
-        """Cancel all work and wait for the threads."""
-        for worker in self._workers.values():
-            worker.close()

@@ -342,10 +342,6 @@ class SceneLoader:
         request = self._request = _Request(entry)
         self._loading.start(lambda report: self._load(entry, report, request.show))
 
-    def load(self, entry: SceneEntry, progress: Progress) -> LoadedScene:
-        """Load an entry in the calling thread, without regard to requests; `progress` may raise to end it."""
-        return self._load(entry, progress, lambda loaded: None)
-
     @property
     def is_searching(self) -> bool:
         """Whether entries are being looked for."""

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float
 
 from pansplat.constants import ALPHA_CUT, MAX_ALPHA
-from pansplat.gaussians.crop import are_in_box
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat_viewer.scene.camera import Camera
@@ -123,8 +122,6 @@ def _select(scene: Scene, settings: DrawSettings) -> Bool[np.ndarray, "n"]:
     selected = gaussians.opacities.numpy() >= settings.opacity_threshold
     if settings.levels is not None:
         selected &= np.isin(gaussians.levels.numpy(), list(settings.levels))
-    if settings.box is not None:
-        selected &= are_in_box(gaussians.means, settings.box).numpy()
     if settings.mode == "view":
         selected &= gaussians.views.numpy() == settings.view
     return selected

@@ -16,12 +16,11 @@ Mode = Literal["joint", "view", "deferred"]
 Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Projection = Literal["perspective", "equirect", "cubemap"]
-Stereo = Literal["mono", "side-by-side", "top-bottom", "anaglyph"]
+Stereo = Literal["mono", "side-by-side", "top-bottom"]
 Display = Literal["color", "depth", "opacity", "normals", "levels", "views"]
-Comparison = Literal["off", "photograph", "error", "pinned"]
 
-GaussianChoice = tuple[frozenset[int] | None, float, tuple[float, ...] | None]
-"""Levels, least opacity and box of the Gaussians that are drawn."""
+GaussianChoice = tuple[frozenset[int] | None, float]
+"""Levels and least opacity of the Gaussians that are drawn."""
 
 _CHOICES = {
     "preset": Preset,
@@ -52,10 +51,8 @@ class DrawSettings:
         display_max: of `depth` and `opacity`, the number with the last colour of the map; the first is 0.
         eye_offset: of layout `equirect`: radius of the viewing circle of omni-directional stereo, metres; negative for
             the left eye. `CpuRenderer` only.
-        stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, the left above the right,
-            or the left in red and the right in green and blue.
-        outside: the doll's house view: Gaussians that show their back to the camera are not drawn (docs/rendering.md,
-            section 10).
+        stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, or the left above the
+            right.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
             camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
             would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
@@ -69,7 +66,6 @@ class DrawSettings:
     view_weights: tuple[float, ...] = ()
     levels: frozenset[int] | None = None  # pyramid levels to draw; None draws all
     opacity_threshold: float = 0.0  # Gaussians of lower opacity are not drawn
-    box: tuple[float, ...] | None = None  # x, y, z of two corners, metres; Gaussians with centres outside are not drawn
     display: Display = "color"
     display_max: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
@@ -79,7 +75,6 @@ class DrawSettings:
     eye_offset: float = 0.0
     stereo: Stereo = "mono"
     eye_distance: float = EYE_DISTANCE  # metres
-    outside: bool = False
     cached: bool = False
     scale: float = 1.0
 
@@ -111,12 +106,12 @@ class DrawSettings:
     @property
     def selection(self) -> GaussianChoice:
         """What chooses the Gaussians that are drawn, besides the view."""
-        return self.levels, self.opacity_threshold, self.box
+        return self.levels, self.opacity_threshold
 
     @property
     def shows_scene(self) -> bool:
         """Whether the colours of the whole scene are shown, to one eye."""
-        is_whole = self.selection == (None, 0.0, None) and set(self.view_weights) <= {1.0}
+        is_whole = self.selection == (None, 0.0) and set(self.view_weights) <= {1.0}
         return is_whole and self.display == "color" and self.mode != "view" and self.stereo == "mono"
 
     @property
@@ -143,7 +138,7 @@ class FrameStats:
             ready, or the last image because the new one is not ready; render again to get it.
         frame_ms: from the call of `render` until the GPU had finished. Of an image that OpenGL draws without waiting,
             this is the longer of the times on the processor and the GPU, and known when the next one is drawn.
-        timed: settings of the image that took `frame_ms` and, in tier `gl43`, has `drawn` splats; None is this one.
+        timed: settings of the image that took `frame_ms`; None is this one.
         stages: milliseconds of each stage, where the renderer measures them.
     """
 
@@ -154,7 +149,7 @@ class FrameStats:
     sort_ms: float = 0.0
     frame_ms: float = 0.0
     timed: DrawSettings | None = None
-    tier: str = "gl33"  # `gl33`, `gl43` or `cpu`
+    renderer: Literal["gl", "cpu"] = "gl"
     cached: bool = False  # whether the frame used cached layers only
     settled: bool = True
     stages: Mapping[str, float] = field(default_factory=dict)

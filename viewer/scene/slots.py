@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.draw.stereo import WindowRenderer
+from pansplat_viewer.draw.window_renderer import WindowRenderer
 from pansplat_viewer.scene.background import BackgroundWorker
 from pansplat_viewer.scene.settings import DrawSettings
 
@@ -73,7 +73,7 @@ class SceneSlot:
         self.image = self.renderer.render(cam2world, size, settings, wait=self._waits and (wait or self.image is None))
         self._waits = self._waits or self.image is not None
         self._key = key
-        if not wait and not settings.cached and not settings.outside and self.renderer.stats.settled:
+        if not wait and not settings.cached and self.renderer.stats.settled:
             self.renderer.draw_faces(cam2world, size, settings)
         return self.renderer.stats.frame_ms
 

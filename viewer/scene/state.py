@@ -9,7 +9,6 @@ from jaxtyping import Float
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import (
-    ease_in_out,
     find_direction,
     fly_pose,
     level_pose,
@@ -22,74 +21,39 @@ from pansplat.tours.route import Route
 from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
 from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.scene.picking import PickedPoint
-from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Projection
+from pansplat_viewer.scene.settings import Display, DrawSettings
 
 FLIGHT_SECONDS = 6.0
-GLIDE_SECONDS = 1.6
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
 _MAX_SAMPLES = 100_000  # Gaussians that percentiles are measured on
 
 
-@dataclass(frozen=True)
-class Glide:
-    """A flight of the camera straight to another place.
-
-    Attributes:
-        start, end: cameras.
-        is_entry: whether it ends in a panorama.
-        seconds: that have passed.
-    """
-
-    start: Camera
-    end: Camera
-    is_entry: bool
-    seconds: float = 0.0
-
-    @property
-    def camera(self) -> Camera:
-        """The camera of the flight at this time."""
-        part = ease_in_out(self.seconds / GLIDE_SECONDS)
-        a, b = self.start, self.end
-        x, y, z = (p + part * (q - p) for p, q in zip(a.position, b.position, strict=True))
-        return replace(
-            b,
-            position=(x, y, z),
-            yaw_radians=a.yaw_radians + part * (b.yaw_radians - a.yaw_radians),
-            pitch_radians=a.pitch_radians + part * (b.pitch_radians - a.pitch_radians),
-            vertical_fov_degrees=a.vertical_fov_degrees + part * (b.vertical_fov_degrees - a.vertical_fov_degrees),
-        )
-
-
 @dataclass
 class ViewerState:
     """Everything that a user can change, and the scene's cameras and levels.
 
-    The camera moves in three ways without input: along the flight between panoramas (`flight`, in a tour along
-    `route`), along the path of key frames (`path`), and out of the rooms and back (`glide`).
+    The camera moves in two ways without input: along the flight between panoramas (`flight`, in a tour along
+    `route`), and along the path of key frames (`path`).
 
     Attributes:
         overlay, help: whether panels and key help are shown.
         context: poses of the input cameras; empty for a file without cameras. Of a tour, of all panoramas.
         minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
-        film_suffix, film_fps, film_projection: of the film of the path.
     """
 
     camera: Camera = field(default_factory=Camera)  # the current camera; `home` is the camera that R restores
     home: Camera = field(default_factory=Camera)
     orbiting: bool = False  # whether the camera orbits (True) or flies (False)
-    doll_house: bool = False  # whether the rooms are seen from outside; the camera orbits then
-    glide: Glide | None = None  # the flight out of the rooms or into one, which input does not stop
     settings: DrawSettings = field(default_factory=DrawSettings)  # draw settings; the field of view is the camera's
     flight: float = 0.0  # fraction of the flight between the panoramas, in [0, 1]
     playing: bool = False  # whether this flight goes on
     overlay: bool = True
     help: bool = False
-    comparison: Comparison = "off"  # what is shown right of the divider at `split` (fraction of the width)
+    comparing: bool = False  # whether a photograph is shown right of the divider at `split` (fraction of the width)
     split: float = 0.5
     photograph: int | None = None  # number of the photograph of the comparison; None is the nearest one
-    max_error: float = 0.25  # the difference from a photograph with the last colour of the map
     refined: bool = True  # whether the refined scene is shown, where there is one, or the prediction
     stops: bool = True  # whether the photograph is shown where the camera stands at a panorama
     adaptive: bool = True  # whether the resolution is lowered while the camera moves
@@ -104,12 +68,8 @@ class ViewerState:
     path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
     path_seconds: float = 0.0  # time on the path that the panel shows
     path_playing: bool = False  # whether the camera moves along the path
-    film_suffix: str = ".mp4"
-    film_fps: float = 24.0
-    film_projection: Projection = "perspective"
     depth_max: float = 1.0  # distance within which most Gaussians are, metres; the range of the display of depths
     levels: tuple[int, ...] = ()  # pyramid levels of the scene, ascending
-    brush_degrees: float = 4.0  # radius of the brush that paints what to hide
     points: list[PickedPoint] = field(default_factory=list)  # the last picked points, two at most
     now: float = 0.0  # time of the frame, seconds of the viewer's clock
     message: str = ""  # a text to show until `message_until`
@@ -119,8 +79,7 @@ class ViewerState:
     @property
     def draw_settings(self) -> DrawSettings:
         """The settings of the next frame, with the camera's field of view."""
-        settings = replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
-        return replace(settings, mode="joint", outside=True) if self.doll_house else settings
+        return replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
 
     def show_message(self, message: str) -> None:
         """Show a message for four seconds."""
@@ -133,9 +92,8 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     In a scene of the same cameras as the one before, the camera stays where it is.
     """
     before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
-    leave_doll_house(state)
     adapt_settings(state, scene, keep_levels=False)
-    state.settings = replace(state.settings, near=NEAR, box=None if before is None else state.settings.box)
+    state.settings = replace(state.settings, near=NEAR)
     state.context = scene.cam2world.double().numpy()
     state.tour = state.route = state.target = None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
@@ -204,7 +162,7 @@ def jump_to_view(state: ViewerState, view: int) -> None:
     """
     if view >= len(state.context):
         return
-    if state.route is not None or state.doll_house:
+    if state.route is not None:
         state.target = view
         return
     up = up_direction(torch.from_numpy(state.context))
@@ -216,18 +174,11 @@ def jump_to_view(state: ViewerState, view: int) -> None:
 
 def go_home(state: ViewerState) -> None:
     """Move the camera to the start of the scene."""
-    leave_doll_house(state)
     state.playing, state.camera = False, state.home
-
-
-def leave_doll_house(state: ViewerState) -> None:
-    """Show the scene from inside; the camera stays where it is."""
-    state.doll_house, state.glide = False, None
 
 
 def fly_to(state: ViewerState, fraction: float) -> None:
     """Move the camera to a fraction of the flight."""
-    leave_doll_house(state)
     state.flight = min(max(fraction, 0.0), 1.0)
     if state.route is not None:
         state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
@@ -270,7 +221,6 @@ def add_key_frame(state: ViewerState) -> None:
 
 def show_path(state: ViewerState, seconds: float) -> None:
     """Move the camera to a time of the path."""
-    leave_doll_house(state)
     state.playing, state.path_seconds = False, max(seconds, 0.0)
     if len(state.path):
         state.camera = state.path.interpolate(state.path_seconds, state.camera, state.tour)

@@ -5,10 +5,9 @@ Imports no OpenGL: the film and the window use the same objects.
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGra
 from pansplat.tours.links import find_link_ring, link_parts
 from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
 from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 from pansplat_viewer.scene.picking import project_point
 
@@ -76,15 +76,15 @@ class TourScenes:
             views: tuple(dict.fromkeys(self._providers.get(node, views) for node in views))
             for views in self._views.values()
         }
-        self._predictions = {source for sources in self._sources.values() for source in sources}
+        predictions = dict.fromkeys(source for sources in self._sources.values() for source in sources)
         self._budget = memory * 2**30
-        self._loaded: OrderedDict[ViewNumbers, LoadedScene] = OrderedDict()  # predictions
+        # Predictions, the least recently used one first.
+        self._lives = OrderedDict((views, SceneLife(SceneEntry("", tour=tour, views=views))) for views in predictions)
         self._selected: OrderedDict[ViewNumbers, LoadedScene] = OrderedDict()  # from predictions, and the first one
-        self._known: set[ViewNumbers] = set()  # predictions that have been loaded
-        self._failed: set[ViewNumbers] = set()
         self._following: tuple[Edge, list[ViewNumbers]] | None = None
         if merged is not None:
-            self._loaded[everything] = LoadedScene(SceneEntry(tour.name, tour=tour, views=everything), merged)
+            entry = SceneEntry(tour.name, tour=tour, views=everything)
+            self._lives.setdefault(everything, SceneLife(entry)).receive(LoadedScene(entry, merged))
 
     @staticmethod
     def start(loaded: LoadedScene, memory: float = DEFAULT_MEMORY) -> TourScenes:
@@ -96,48 +96,6 @@ class TourScenes:
         edges = [edge for edge, views in scenes._views.items() if views == entry.views]
         if edges:  # else it is a prediction of a part
             scenes.edge, scenes._is_placed = max(edges, key=lambda edge: entry.start in edge), True
-        return scenes
-
-    def gather_part(self) -> Callable[[], Scene]:
-        """A function, for any thread, that makes one scene of the panoramas of the part whose Gaussians are in memory.
-
-        It has the cameras and edges of the whole tour. The Gaussians of a panorama are from the prediction that is made
-        for it, or from any other one.
-        """
-        tour, sources = self.tour, {}
-        every = [loaded for scenes in (self._loaded, self._selected) for loaded in scenes.values()]
-        for node in tour.list_parts()[self.part]:
-            of_node = [loaded for loaded in every if node in loaded.entry.views]
-            provider = self._loaded.get(self._providers.get(node, ()))
-            if provider is not None or of_node:
-                sources[node] = provider or of_node[0]
-
-        def gather() -> Scene:
-            parts = []
-            for node, loaded in sources.items():
-                gaussians = loaded.scene.gaussians
-                part = gaussians.select(gaussians.views == loaded.entry.views.index(node))
-                parts.append(replace(part, views=torch.full_like(part.views, node, dtype=torch.int64)))
-            return replace(
-                every[0].scene,
-                gaussians=Gaussians.cat(parts),
-                cam2world=tour.cam2world,
-                names=tuple(panorama.label for panorama in tour.panoramas),
-                overlaps=tour.list_overlaps(),
-                gains=(),
-                links=(),
-                starts=(),
-            )
-
-        return gather
-
-    def copy(self) -> TourScenes:
-        """A copy with the scenes that are in memory, for a film in another thread."""
-        scenes = copy.copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, (dict, list, set)):
-                setattr(scenes, name, value.copy())
-        scenes._is_placed = False
         return scenes
 
     @property
@@ -163,10 +121,14 @@ class TourScenes:
     @property
     def missing(self) -> list[ViewNumbers]:
         """The predictions that the scene of the camera needs and that are not in memory."""
-        return [source for source in self._sources[self.views] if source not in self._loaded]
+        return [source for source in self._sources[self.views] if self._find(source) is None]
 
     def _has_sources(self, views: ViewNumbers) -> bool:
-        return all(source in self._loaded for source in self._sources[views])
+        return all(self._find(source) is not None for source in self._sources[views])
+
+    def _find(self, views: ViewNumbers) -> LoadedScene | None:
+        """A prediction that is in memory."""
+        return self._lives[views].loaded if views in self._lives else None
 
     def make_entry(self, views: ViewNumbers) -> SceneEntry:
         """The prediction of these panoramas as an entry for the loader."""
@@ -185,13 +147,11 @@ class TourScenes:
         self._block(loaded.walls)
         if poor := set(loaded.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
             self._change(replace(self.tour, poor=(*self.tour.poor, *sorted(poor))))
-        if views not in self._predictions:
+        if views not in self._lives:
             self._selected[views] = loaded
             return
-        self._loaded[views] = loaded
-        self._loaded.move_to_end(views)
-        self._known.add(views)
-        self._failed.discard(views)
+        self._lives[views].receive(loaded, keep_prediction=False)
+        self._lives.move_to_end(views)
         for scene in [scene for scene in self._selected if views in self._sources[scene] and self._has_sources(scene)]:
             del self._selected[scene]
         self._drop(views)
@@ -218,28 +178,33 @@ class TourScenes:
 
     def _drop(self, newest: ViewNumbers) -> None:
         """Drop what was not used for the longest time, until the memory is not exceeded."""
-        total = sum(measure_bytes(each.scene) for each in (*self._loaded.values(), *self._selected.values()))
+        kept = [views for views, life in self._lives.items() if life.loaded is not None]
+        every = (*self._selected.values(), *filter(None, map(self._find, kept)))
+        total = sum(measure_bytes(each.scene) for each in every)
         needed = {newest, self.views, *self._sources[self.views]}
-        for scenes, fewest in ((self._selected, 0), (self._loaded, 2)):
-            for other in [other for other in scenes if other not in needed]:
-                if total <= self._budget or len(scenes) <= fewest:
-                    break
-                total -= measure_bytes(scenes.pop(other).scene)
+        for other in [other for other in self._selected if other not in needed]:
+            if total > self._budget:
+                total -= measure_bytes(self._selected.pop(other).scene)
+        may_go = [other for other in kept if other not in needed][: max(len(kept) - 2, 0)]
+        for other in may_go:
+            if total > self._budget:
+                total -= measure_bytes(self._lives[other].drop().scene)
 
     def fail(self, views: ViewNumbers) -> None:
         """Do not request a prediction again, because it could not be loaded or refined."""
-        self._failed.add(views)
+        if views in self._lives:
+            self._lives[views].fail()
 
     def get(self, views: ViewNumbers) -> LoadedScene | None:
         """The scene of an edge if it is in memory; it becomes the most recently used."""
-        if views in self._predictions:
-            loaded = self._loaded.get(views)
+        if views in self._lives:
+            loaded = self._find(views)
         elif views not in self._selected and self._has_sources(views):
             loaded = self._selected[views] = self._select(views)
             self._drop(views)
         else:
             loaded = self._selected.get(views)
-        for scenes in (self._selected, self._loaded):
+        for scenes in (self._selected, self._lives):
             for each in (views, *self._sources[views]):
                 if each in scenes:
                     scenes.move_to_end(each)
@@ -250,7 +215,9 @@ class TourScenes:
         parts: list[Gaussians] = []
         for source in self._sources[views]:
             nodes = [node for node in views if self._providers[node] == source]
-            scene = select_views(self._loaded[source].scene, tuple(source.index(node) for node in nodes))
+            loaded = self._find(source)
+            assert loaded is not None
+            scene = select_views(loaded.scene, tuple(source.index(node) for node in nodes))
             labels = torch.tensor([views.index(node) for node in nodes])
             parts.append(replace(scene.gaussians, views=labels[scene.gaussians.views.long()]))
         cam2world, names = self.tour.cam2world[list(views)], tuple(self.tour.panoramas[node].label for node in views)
@@ -303,20 +270,23 @@ class TourScenes:
         Predictions come before refinements. A refinement ends if a prediction that the camera needs is missing; a
         prediction is finished, so that none is lost. One that was dropped from memory is read again when it is needed.
         """
-        wanted = [views for views in wanted if views not in self._failed]
-        for views in reversed(wanted[: 1 + _NEXT_SCENES]):
-            if views in self._loaded:
-                self._loaded.move_to_end(views)
-        missing = [views for views in wanted if views not in self._loaded]
-        missing = [views for views in missing if views not in self._known or views in self.missing]
-        if current is not None and (current.views in wanted or not missing):
-            is_refined = current.views in self._loaded
+        lives = {views: self._lives[views] for views in wanted if self._lives[views].state != "failed"}
+        for views in reversed(list(lives)[: 1 + _NEXT_SCENES]):
+            self._lives.move_to_end(views)
+        missing = [views for views, life in lives.items() if life.loaded is None]
+        missing = [views for views in missing if not lives[views].is_known or views in self.missing]
+        if current is not None and (current.views in lives or not missing):
+            is_refined = self._find(current.views) is not None
             if not missing or missing[0] not in self.missing or not is_refined:
                 return None
-        if missing:
-            return self.make_entry(missing[0])
-        unrefined = (views for views in wanted if views in self._loaded and not self._loaded[views].is_final)
-        return next((self.make_entry(views) for views in unrefined), None)
+        unrefined = (views for views, life in lives.items() if life.loaded is not None and not life.loaded.is_final)
+        views = missing[0] if missing else next(unrefined, None)
+        if views is None:
+            return None
+        if current is not None and current.views in self._lives:
+            self._lives[current.views].cancel()
+        self._lives[views].request()
+        return self.make_entry(views)
 
     def plan_route(self, camera: Float[np.ndarray, "4 4"], remaining: Sequence[int] = ()) -> Route:
         """A route from a pose through the remaining panoramas; without any, through all of them."""

@@ -23,7 +23,7 @@ def draw_notes(viewer: Viewer) -> None:
     position = np.asarray(camera.position)
     index = photographs.find_stop(position)
     is_mono = viewer.stage.eye_size == viewer.stage.size
-    if index is None or viewer.state.doll_house or not is_mono:
+    if index is None or not is_mono:
         return
     size, radius = imgui.get_io().display_size, _RADIUS * imgui.get_style().font_scale_dpi
     black, white = (imgui.color_convert_float4_to_u32((*rgb, 0.85)) for rgb in ((0.0,) * 3, (1.0,) * 3))
@@ -53,7 +53,7 @@ class NotesSection:
     def draw(self, viewer: Viewer) -> None:
         """Draw the field and the buttons, or what to do where there are none."""
         photographs = viewer.stage.comparer.photographs
-        if photographs.find_stop(np.asarray(viewer.state.camera.position)) is None or viewer.state.doll_house:
+        if photographs.find_stop(np.asarray(viewer.state.camera.position)) is None:
             draw_wrapped("Go to a panorama to put a note there.", is_disabled=True)
             return
         self._text = self._widgets.text_field("note", self._text)

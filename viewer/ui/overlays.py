@@ -11,7 +11,6 @@ from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.settings import SCALAR_MAPS, FrameStats
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.scene.tour import Hotspot
-from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.window.gui import PANEL_WIDTH
 
 MARGIN = 10.0  # from the border of the window, pixels
@@ -55,7 +54,7 @@ def draw_stats(
     lines = [
         f"frame {frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
         f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
-        f"{image_size[0]} x {image_size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
+        f"{image_size[0]} x {image_size[1]}   {stats.renderer}" + ("   cached" if stats.cached else ""),
         f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
     ]
     if right_name is not None:
@@ -122,30 +121,20 @@ def _draw_outlined(canvas: imgui.ImDrawList, place: tuple[float, float], color: 
     canvas.add_text(place, color, text)
 
 
-def draw_legends(state: ViewerState) -> None:
-    """Draw the colour maps that are shown, with their ranges: that of the image left, that of the error right."""
+def draw_legend(state: ViewerState) -> None:
+    """Draw the colour map of the display with its name and range at the bottom left, if it has one."""
     settings, size, scale = state.settings, imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-    if settings.display in SCALAR_MAPS:
-        left = PANEL_WIDTH * scale + MARGIN if state.overlay else MARGIN
-        unit = UNITS.get(settings.display, "")
-        _draw_legend((left, size.y - 3 * MARGIN), settings.display, f"{settings.display_max:.3g}{unit}")
-    if state.comparison == "error":
-        left = size.x - (_LEGEND_WIDTH * scale + MARGIN)
-        _draw_legend((left, size.y - 3 * MARGIN), "error", f"{state.max_error:.3g}", ERROR_MAP)
-
-
-def _draw_legend(corner: tuple[float, float], label: str, largest: str, name: str = "") -> None:
-    """Draw a colour map with its name and range, above a corner."""
-    canvas, scale = imgui.get_background_draw_list(), imgui.get_style().font_scale_dpi
-    table = get_table(name or SCALAR_MAPS[label])  # pyright: ignore[reportArgumentType]
+    if settings.display not in SCALAR_MAPS:
+        return
+    left, top = PANEL_WIDTH * scale + MARGIN if state.overlay else MARGIN, size.y - 3 * MARGIN
+    canvas, table = imgui.get_background_draw_list(), get_table(SCALAR_MAPS[settings.display])
     step, height = _LEGEND_WIDTH * scale / 64, 10 * scale
     for index in range(64):
         red, green, blue = (table[4 * index + 2] / 255).tolist()
-        x = corner[0] + index * step
+        x = left + index * step
         color = imgui.color_convert_float4_to_u32((red, green, blue, 1.0))
-        canvas.add_rect_filled((x, corner[1]), (x + step, corner[1] + height), color)
-    white = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 1.0))
-    above, text = corner[1] - 18 * scale, (f"{label}: 0", largest)
-    _draw_outlined(canvas, (corner[0], above), white, text[0])
-    right = corner[0] + 64 * step - imgui.calc_text_size(largest).x
-    _draw_outlined(canvas, (right, above), white, text[1])
+        canvas.add_rect_filled((x, top), (x + step, top + height), color)
+    white, above = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 1.0)), top - 18 * scale
+    largest = f"{settings.display_max:.3g}{UNITS.get(settings.display, '')}"
+    _draw_outlined(canvas, (left, above), white, f"{settings.display}: 0")
+    _draw_outlined(canvas, (left + 64 * step - imgui.calc_text_size(largest).x, above), white, largest)

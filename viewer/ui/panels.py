@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING, get_args
 import moderngl
 from imgui_bundle import imgui
 
-from pansplat_viewer.recorder import FILM_JOB
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.cleaning import MaskAnswer
 from pansplat_viewer.scene.key_frames import KeyFrame
-from pansplat_viewer.scene.settings import Comparison, Display, Preset, Projection
+from pansplat_viewer.scene.settings import Display, Preset
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
     ViewerState,
@@ -29,7 +27,6 @@ from pansplat_viewer.scene.state import (
     toggle_play,
 )
 from pansplat_viewer.scene.tour import TourScenes
-from pansplat_viewer.ui.cleaning import CleaningSection, draw_mask
 from pansplat_viewer.ui.minimap import SIZE, Minimap, describe_panorama, describe_panoramas, is_probable
 from pansplat_viewer.ui.notes import NotesSection, draw_notes
 from pansplat_viewer.ui.overlays import (
@@ -37,7 +34,7 @@ from pansplat_viewer.ui.overlays import (
     MARGIN,
     UNITS,
     draw_hotspots,
-    draw_legends,
+    draw_legend,
     draw_message,
     draw_points,
     draw_stats,
@@ -72,14 +69,13 @@ class Panels:
         path, path_file: texts of the fields of scenes and of the camera path.
         minimap: the plan of a tour.
         placing: the window in which a photograph is placed.
-        cleaning: the section "Clean up".
         notes: the section "Notes in the picture".
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.widgets = Widgets()
         self.minimap, self.placing = Minimap(ctx), PlacingWindow(ctx, self.widgets)
-        self.cleaning, self.notes = CleaningSection(self.widgets), NotesSection(self.widgets)
+        self.notes = NotesSection(self.widgets)
         self.path, self.path_file = "", "path.json"
         self._is_reset = False  # whether the default layout was chosen in this frame
 
@@ -95,9 +91,7 @@ class Panels:
         if viewer.right_name is not None:
             self._draw_divider(state)
         if stats.total:
-            draw_legends(state)
-        if viewer.painting.painter is not None:
-            draw_mask(viewer.painting.painter, state.camera, state.brush_degrees)
+            draw_legend(state)
         if state.overlay and state.points:
             draw_points(state)
         if state.overlay and state.hotspots:
@@ -106,13 +100,11 @@ class Panels:
         if state.overlay and viewer.tour is not None:
             self._draw_tour(viewer, viewer.tour)
         if state.overlay and placing is not None and placing.node is not None and self.placing.draw(placing):
-            viewer.queue(viewer.reload)
+            viewer.queue(viewer.scenes.reload)
         if state.help:
             state.help = _draw_help()
-        if viewer.painting.question is not None:
-            self._draw_question(viewer, viewer.painting.question)
-        elif viewer.loading:
-            self._draw_progress(viewer, *viewer.loading)
+        if viewer.scenes.loading:
+            self._draw_progress(viewer, *viewer.scenes.loading)
         elif viewer.error:
             self._draw_error(viewer, viewer.error)
         if state.message and state.now < state.message_until:
@@ -152,8 +144,8 @@ class Panels:
         else:
             self.widgets.record("visit")
         imgui.text_unformatted(f"{len(tour.loaded)} of {tour.num_scenes} scenes in memory")
-        if viewer.background is not None:
-            task, fraction = viewer.background
+        if viewer.scenes.background is not None:
+            task, fraction = viewer.scenes.background
             draw_wrapped(task)
             imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
         imgui.end()
@@ -176,16 +168,17 @@ class Panels:
         if placing is not None and placing.is_listed:
             opened = any(view.placement.state != "placed" for view in placing.panoramas)
             section("Photographs", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
-        if len(viewer.stage.comparer.photographs):
+        has_photographs = len(viewer.stage.comparer.photographs) > 0
+        if has_photographs:
             section("Notes in the picture", partial(self.notes.draw, viewer), opened=False)
         if viewer.stage.renderer.stats.total:
             section("Gaussians", partial(self._draw_gaussians, viewer.state))
         section("Display", partial(self._draw_display, viewer.state))
-        section("Compare", partial(self._draw_comparison, viewer))
+        if has_photographs:
+            section("Compare", partial(self._draw_comparison, viewer))
         section("Camera", partial(self._draw_camera, viewer))
         section("Screenshot", partial(self._draw_screenshot, viewer))
         section("Drawing", partial(self._draw_settings, viewer), opened=False)
-        section("Clean up", partial(self.cleaning.draw, viewer), opened=False)
         section("Camera path", partial(self._draw_path, viewer), opened=False)
         section("Window", partial(self._draw_window, viewer), opened=False)
 
@@ -197,34 +190,34 @@ class Panels:
             changed, index = imgui.combo("##pair", max(library.current, 0), names)
             self.widgets.record("pair")
             if changed:
-                viewer.queue(viewer.choose, index)
+                viewer.queue(viewer.scenes.choose, index)
         imgui.set_next_item_width(width)
         hint, flags = "folder or scene, or drop it here", imgui.InputTextFlags_.enter_returns_true.value
         entered, self.path = imgui.input_text_with_hint("##path", hint, self.path, flags)
         self.widgets.record("path")
         imgui.same_line()
         if (self.widgets.button("Open") or entered) and self.path.strip():
-            viewer.queue(viewer.open_text, self.path.strip())
+            viewer.queue(viewer.scenes.open_text, self.path.strip())
         if recent:
             imgui.set_next_item_width(width)
             if imgui.begin_combo("##recent", "recent"):
                 for path in recent:
                     if imgui.selectable(path, False)[0]:
-                        viewer.queue(viewer.open_text, path)
+                        viewer.queue(viewer.scenes.open_text, path)
                 imgui.end_combo()
             self.widgets.record("recent")
             imgui.same_line()
         if library.entries and self.widgets.button("Reload"):
-            viewer.queue(viewer.reload)
+            viewer.queue(viewer.scenes.reload)
         if library.watch.changed:
             imgui.text_unformatted("changed on disk")
-        if viewer.refinement == 1:
+        if viewer.scenes.refinement == 1:
             viewer.state.refined = self.widgets.check("refined", viewer.state.refined)
-        elif viewer.refinement is not None:
+        elif viewer.scenes.refinement is not None:
             if self.widgets.button("Cancel"):
-                viewer.queue(library.loader.cancel)
+                viewer.queue(viewer.scenes.cancel_refinement)
             imgui.same_line()
-            imgui.progress_bar(viewer.refinement, (-1, 0), f"refining {100 * viewer.refinement:.0f}%")
+            imgui.progress_bar(viewer.scenes.refinement, (-1, 0), f"refining {100 * viewer.scenes.refinement:.0f}%")
 
     def _draw_gaussians(self, state: ViewerState) -> None:
         settings, num_views = state.settings, state.num_views
@@ -257,17 +250,18 @@ class Panels:
         state.settings = replace(settings, opacity_threshold=threshold)
 
     def _draw_settings(self, viewer: Viewer) -> None:
-        state, settings, tier = viewer.state, viewer.state.settings, viewer.stage.renderer.stats.tier
+        state, settings = viewer.state, viewer.state.settings
+        on_processor = viewer.stage.renderer.stats.renderer == "cpu"
         _draw_row_label("preset")
-        imgui.begin_disabled(tier == "cpu")  # which draws preset exact and one eye only
+        imgui.begin_disabled(on_processor)  # which draws preset exact and one eye only
         for preset in get_args(Preset):
             imgui.same_line()
             if self.widgets.radio(preset, settings.preset == preset):
                 settings = replace(settings, preset=preset)
         imgui.end_disabled()
         _draw_row_label("stereo")
-        imgui.begin_disabled(tier == "cpu")
-        for label, stereo in (("off", "mono"), ("pair", "side-by-side"), ("red/cyan", "anaglyph")):
+        imgui.begin_disabled(on_processor)
+        for label, stereo in (("off", "mono"), ("pair", "side-by-side")):
             imgui.same_line()
             if self.widgets.radio(f"{label}##stereo", settings.stereo == stereo):
                 settings = replace(settings, stereo=stereo)
@@ -290,7 +284,7 @@ class Panels:
         state.stops = self.widgets.check("photographs at panoramas", state.stops)
 
     def _draw_camera(self, viewer: Viewer) -> None:
-        state, is_on = viewer.state, viewer.doll_house.is_on
+        state = viewer.state
         if self.widgets.radio("fly", not state.orbiting):
             state.orbiting = False
         imgui.same_line()
@@ -299,10 +293,6 @@ class Panels:
         imgui.same_line()
         if self.widgets.button("Reset"):
             go_home(state)
-        if viewer.loaded is not None and len(state.context):
-            imgui.same_line()
-            if self.widgets.check("doll's house", is_on) != is_on:
-                viewer.queue(viewer.toggle_doll_house)
         fov = state.camera.vertical_fov_degrees
         chosen = self.widgets.slider("field of view", fov, cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES, "%.0f deg")
         if chosen != fov:
@@ -346,33 +336,21 @@ class Panels:
 
     def _draw_comparison(self, viewer: Viewer) -> None:
         state, comparer = viewer.state, viewer.stage.comparer
-        photographs = comparer.photographs.names
-        for comparison in get_args(Comparison):
-            if comparison in ("photograph", "error"):
-                imgui.same_line()
-            is_there = comparer.pinned if comparison == "pinned" else comparison == "off" or photographs
-            imgui.begin_disabled(not is_there)
-            if self.widgets.radio(comparison, state.comparison == comparison):
-                state.comparison = comparison
-            imgui.end_disabled()
+        state.comparing = self.widgets.check("photograph right of a line", state.comparing)
+        if not state.comparing:
+            return
+        chosen = 0 if state.photograph is None else state.photograph + 1
+        changed, chosen = imgui.combo("##photograph", chosen, ["nearest photograph", *comparer.photographs.names])
+        self.widgets.record("photographs")
+        if changed:
+            state.photograph = chosen - 1 if chosen else None
         imgui.same_line()
-        if self.widgets.button("Pin this image"):
-            viewer.queue(viewer.pin)
-        if state.comparison in ("photograph", "error") and photographs:
-            chosen = 0 if state.photograph is None else state.photograph + 1
-            changed, chosen = imgui.combo("##photograph", chosen, ["nearest photograph", *photographs])
-            self.widgets.record("photographs")
-            if changed:
-                state.photograph = chosen - 1 if chosen else None
-            imgui.same_line()
-            distance = comparer.measure_distance(state)
-            imgui.begin_disabled(distance == 0)
-            if self.widgets.button(f"Go {distance:.2f} m###Go"):
-                viewer.queue(comparer.go_to_photograph, state)
-            self.widgets.record("Go")
-            imgui.end_disabled()
-        if state.comparison == "error":
-            state.max_error = self.widgets.slider("error up to", state.max_error, 0.01, 1.0, "%.2f")
+        distance = comparer.measure_distance(state)
+        imgui.begin_disabled(distance == 0)
+        if self.widgets.button(f"Go {distance:.2f} m###Go"):
+            viewer.queue(comparer.go_to_photograph, state)
+        self.widgets.record("Go")
+        imgui.end_disabled()
 
     def _draw_window(self, viewer: Viewer) -> None:
         for theme in get_args(Theme):
@@ -413,7 +391,7 @@ class Panels:
         imgui.progress_bar(fraction, (-80 * imgui.get_style().font_scale_dpi, 0), f"{100 * fraction:.0f}%")
         imgui.same_line()
         if self.widgets.button("Cancel##loading"):
-            viewer.queue(viewer.cancel_loading)
+            viewer.queue(viewer.scenes.cancel_loading)
         imgui.end()
 
     def _draw_screenshot(self, viewer: Viewer) -> None:
@@ -428,7 +406,7 @@ class Panels:
 
     def _draw_path(self, viewer: Viewer) -> None:
         """Draw the editor of key frames."""
-        state, film = viewer.state, viewer.jobs.progress(FILM_JOB)
+        state = viewer.state
         if self.widgets.button("Add key frame"):
             add_key_frame(state)
         if len(state.path):
@@ -460,24 +438,6 @@ class Panels:
         imgui.same_line()
         if self.widgets.button("Load"):
             viewer.queue(viewer.open_path, self.path_file)
-        if film is not None:
-            if self.widgets.button("Cancel##film"):
-                viewer.queue(partial(viewer.jobs.cancel, FILM_JOB, join=True))
-            imgui.same_line()
-            imgui.progress_bar(film[1], (-1, 0), f"film {100 * film[1]:.0f}%")
-        elif len(state.path):
-            for suffix in (".mp4", ".webm", ".png", ".exr"):
-                if self.widgets.radio(suffix, state.film_suffix == suffix):
-                    state.film_suffix = suffix
-                imgui.same_line()
-            if self.widgets.button("Write film"):
-                viewer.queue(viewer.start_film)
-            for projection in get_args(Projection):
-                if self.widgets.radio(projection, state.film_projection == projection):
-                    state.film_projection = projection
-                imgui.same_line()
-            imgui.new_line()
-            state.film_fps = self.widgets.slider("frames per second", state.film_fps, 1.0, 60.0, "%.0f")
 
     def _draw_error(self, viewer: Viewer, error: str) -> None:
         _place_at_center(width=560)
@@ -485,22 +445,11 @@ class Panels:
         draw_wrapped(error)
         if self.widgets.button("OK"):
             viewer.queue(viewer.dismiss_error)
-        if viewer.reduced is not None:
+        if viewer.scenes.reduced is not None:
             imgui.same_line()
-            if self.widgets.button(f"Show the {viewer.reduced:,} largest Gaussians###Reduce"):
+            if self.widgets.button(f"Show the {viewer.scenes.reduced:,} largest Gaussians###Reduce"):
                 viewer.queue(viewer.show_reduced)
             self.widgets.record("Reduce")
-        imgui.end()
-
-    def _draw_question(self, viewer: Viewer, photograph: str) -> None:
-        _place_at_center()
-        imgui.begin("Unsaved mask", None, FIXED | imgui.WindowFlags_.no_collapse.value)
-        imgui.text_unformatted(f"What is painted on {photograph} is not saved.")
-        answers: dict[str, MaskAnswer] = {"Save mask##answer": "save", "Drop it": "drop", "Go on painting": "keep"}
-        for label, answer in answers.items():
-            if self.widgets.button(label):
-                viewer.queue(viewer.painting.answer, answer)
-            imgui.same_line()
         imgui.end()
 
 

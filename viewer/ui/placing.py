@@ -86,7 +86,7 @@ def draw_photographs(viewer: Viewer, placing: Placing, widgets: Widgets) -> None
         if placing.can_undo:
             imgui.same_line()
         if widgets.button("Load the changed poses"):
-            viewer.queue(viewer.reload)
+            viewer.queue(viewer.scenes.reload)
 
 
 class PlacingWindow:

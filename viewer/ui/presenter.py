@@ -1,36 +1,25 @@
-"""The image on the screen, and right of a divider what it is compared with: a photograph, an error, another image."""
+"""The image on the screen, and right of a divider the photograph that it is compared with."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import get_args
 
 import moderngl
 import numpy as np
 from jaxtyping import Float
 
-from pansplat_viewer.draw.color_maps import create_table_texture
 from pansplat_viewer.draw.programs import Programs
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.settings import Comparison
-
-ERROR_MAP = "inferno"
 
 
 @dataclass(frozen=True)
 class RightSide:
-    """What is shown right of the divider.
+    """A photograph right of the divider."""
 
-    Attributes:
-        comparison: `photograph`; `error`, its mean absolute difference from the image; or `pinned`, another image.
-    """
-
-    comparison: Comparison
-    texture: moderngl.Texture  # the photograph, top row first, or the other image
-    pose: Float[np.ndarray, "4 4"] | None = None  # of the photograph, camera to world
-    split: float = 0.5  # place of the divider, a fraction of the width
-    max_error: float = 0.25  # the difference with the last colour of the map
+    texture: moderngl.Texture  # top row first
+    pose: Float[np.ndarray, "4 4"]  # camera to world
+    split: float = 0.0  # place of the divider, a fraction of the width
 
 
 class Presenter:
@@ -42,8 +31,7 @@ class Presenter:
         self._programs = Programs(ctx)
         self._program = self._programs.present()
         self._triangle = ctx.vertex_array(self._program, [])
-        self._program["image"], self._program["fading"], self._program["right"], self._program["table"] = range(4)
-        self._table: moderngl.Texture | None = None  # of the first error: matplotlib takes .2 s of a window that opens
+        self._program["image"], self._program["fading"], self._program["right"] = range(3)
 
     def draw(
         self,
@@ -69,19 +57,14 @@ class Presenter:
         for unit, texture in enumerate((image, fading or image, side)):
             texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
             texture.use(unit)
-        if right is not None and right.comparison == "error":
-            self._table = self._table or create_table_texture(self.ctx, ERROR_MAP)
-            self._table.use(3)
         self._program["weight"] = weight
-        self._program["comparison"] = 0 if right is None else get_args(Comparison).index(right.comparison)
         self._program["split"] = 2.0 if right is None else right.split
-        if right is not None and right.pose is not None:
+        if right is not None:
             rotation = right.pose[:3, :3].T @ camera.rotation
             self._program["camera_to_photo"] = tuple(rotation.T.ravel().tolist())  # column by column
             width, height = target.viewport[2:]
             tangent = math.tan(math.radians(camera.vertical_fov_degrees) / 2)
             self._program["tangent"] = (tangent * width / height, tangent)
-            self._program["max_error"] = right.max_error
         self._triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def draw_photograph(self, photograph: RightSide, target: moderngl.Framebuffer, camera: cameras.Camera) -> None:
@@ -97,8 +80,6 @@ class Presenter:
 
     def release(self) -> None:
         """Free the GL objects."""
-        if self._table is not None:
-            self._table.release()
         self._triangle.release()
         self._programs.release()
 

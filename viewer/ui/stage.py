@@ -1,4 +1,4 @@
-"""What the window shows: scenes and photographs that fade into each other, the doll's house, and a comparison."""
+"""What the window shows: scenes and photographs that fade into each other, and a comparison with a photograph."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
-from pansplat_viewer.draw.stereo import WindowRenderer, create_window_renderer, get_eye_size
+from pansplat_viewer.draw.window_renderer import WindowRenderer, create_window_renderer, get_eye_size
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.loader import LoadedScene
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
@@ -34,11 +34,10 @@ class Stage:
     Attributes:
         slots: renderers of a scene and of that which it fades to; the second one is for tours.
         scene_views: the panoramas in its tour of the scene that was shown last.
-        outside: the doll's house; None inside of the rooms.
         fade: what is shown, and what it fades from.
         stop: the photograph over the scene while the camera stands at a panorama.
         preparer: converts large scenes.
-        comparer: the photographs and the pinned image.
+        comparer: the photographs.
         resolution: of the frames.
         size: of the window, pixels.
         image_size: of the rendered image, pixels; smaller than the window while the camera moves.
@@ -55,11 +54,10 @@ class Stage:
         self.slots = [self._create_slot()]
         self._scene_slot = 0  # that of the scene that was shown last
         self.scene_views: tuple[int, ...] = ()
-        self.outside: SceneSlot | None = None
         self.fade, self.stop = CrossFade(), StopFade()
         self.preparer = ScenePreparer(self.renderer.prepare)
         self.presenter = Presenter(ctx)
-        self.comparer = Comparer(ctx, lambda: create_window_renderer(ctx, choice), show_error)
+        self.comparer = Comparer(ctx, show_error)
         self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
         self._stop_layer, self._cut_layer = PhotographLayer(self.presenter), PhotographLayer(self.presenter)
         self._stop_camera = state.camera  # of the last frame before a cut
@@ -79,7 +77,7 @@ class Stage:
     @property
     def slot(self) -> SceneSlot:
         """The scene that is shown, or that was shown before a photograph."""
-        return self.slots[self._scene_slot] if self.outside is None else self.outside
+        return self.slots[self._scene_slot]
 
     @property
     def renderer(self) -> WindowRenderer:
@@ -95,30 +93,25 @@ class Stage:
     def photograph(self) -> int | None:
         """Number of the photograph that is shown, because there is no scene of the camera's place yet; else None."""
         content = self.fade.contents[self.fade.front]
-        return content if self.outside is None and isinstance(content, int) else None
-
-    @property
-    def _shown_slots(self) -> list[SceneSlot]:
-        slots = [] if self.photograph is not None else [self.slot]
-        return slots if self.comparer.pinned is None else [*slots, self.comparer.pinned.slot]
+        return content if isinstance(content, int) else None
 
     def is_animated(self, now: float) -> bool:
         """Whether the image changes with the time alone."""
         state = self._state
         fading = self.fade.compute_weight(now) < 1
         fading = fading or self.stop.weight not in (0, 1)
-        return fading or state.path_playing or state.playing or state.glide is not None
+        return fading or state.path_playing or state.playing
 
     def is_moving(self, now: float) -> bool:
         """Whether the image is still changing, so that a window draws as often as it can."""
         recently = now - self.resolution.last_motion < 2 * self.resolution.settle_after
-        unsettled = any(slot.scene is not None and not slot.renderer.stats.settled for slot in self._shown_slots)
+        unsettled = self.photograph is None and self.slot.scene is not None and not self.renderer.stats.settled
         return self.is_animated(now) or recently or (unsettled and not self.has_failed)
 
     @property
     def pending(self) -> Future[Any] | None:
         """The image that is drawn in the background."""
-        return next((slot.renderer.pending for slot in self._shown_slots if slot.renderer.pending is not None), None)
+        return None if self.photograph is not None else self.renderer.pending
 
     # --- what is shown ---
 
@@ -170,21 +163,6 @@ class Stage:
         if index is not None and slot is not None and self.comparer.get_photograph(self._state, index) is not None:
             self.fade.show(slot, index, self._state.now, part)
 
-    def show_outside(self, scene: Scene) -> bool:
-        """Show a doll's house; returns whether that was possible."""
-        slot = self._create_slot()
-        if self.upload(slot, scene, "doll's house") is not None:
-            slot.renderer.release()
-            return False
-        self.outside, self.resolution = slot, self._create_resolution()
-        return True
-
-    def hide_outside(self) -> None:
-        """Show the scene from inside."""
-        if self.outside is not None:
-            self.outside.renderer.release()
-            self.outside, self.resolution = None, self._create_resolution()
-
     # --- frames ---
 
     def draw(self, target: moderngl.Framebuffer) -> Exception | None:
@@ -206,38 +184,29 @@ class Stage:
 
     def _draw_image(self, target: moderngl.Framebuffer) -> None:
         state, plan, weight, fading = self._state, self._plan_resolution(), 1.0, None
-        if self.outside is not None:
-            milliseconds = self._render(self.outside, state.camera.cam2world, state.draw_settings, plan)
-            image = self.outside.image
-        else:
-            (stop, before), milliseconds = self._draw_stop(), 0.0
-            if stop is None or (self.stop.weight < 1 and before is None) or not plan.moving:
-                weight = self.fade.compute_weight(state.now)
-                image, milliseconds = self._draw_content(self.fade.front, plan)
-                if weight < 1:
-                    fading, more = self._draw_content(1 - self.fade.front, plan)
-                    milliseconds += more
-                if image is None:  # the first one of a large scene is not finished
-                    image, fading = fading, None
-            if stop is not None:
-                below = None if self.stop.weight >= 1 else image if before is None else before
-                image, fading, weight = stop, below, self.stop.weight
+        (stop, before), milliseconds = self._draw_stop(), 0.0
+        if stop is None or (self.stop.weight < 1 and before is None) or not plan.moving:
+            weight = self.fade.compute_weight(state.now)
+            image, milliseconds = self._draw_content(self.fade.front, plan)
+            if weight < 1:
+                fading, more = self._draw_content(1 - self.fade.front, plan)
+                milliseconds += more
+            if image is None:  # the first one of a large scene is not finished
+                image, fading = fading, None
+        if stop is not None:
+            below = None if self.stop.weight >= 1 else image if before is None else before
+            image, fading, weight = stop, below, self.stop.weight
         self._record_time(plan, milliseconds)
         if image is None:
-            photograph = self.comparer.get_photograph(state) if self.outside is None else None
+            photograph = self.comparer.get_photograph(state)
             if photograph is None:
                 self._draw_background(target)
             else:
                 self.presenter.draw_photograph(photograph, target, state.camera)
             return
         self.image_size = self.size if self.photograph is not None else self.renderer.stats.size
-
-        def draw_pinned(slot: SceneSlot, settings: DrawSettings) -> moderngl.Texture | None:
-            self._render(slot, state.camera.cam2world, settings, plan)
-            return slot.image
-
-        can_compare = self.outside is None and state.settings.stereo == "mono"
-        right = self.comparer.get_right_side(state, draw_pinned) if can_compare else None
+        is_compared = state.comparing and state.settings.stereo == "mono"
+        right = self.comparer.get_photograph(state, split=state.split) if is_compared else None
         self.presenter.draw(image, target, state.camera, right=right, fading=fading, weight=weight)
 
     def _draw_stop(self) -> tuple[moderngl.Texture | None, moderngl.Texture | None]:
@@ -261,7 +230,7 @@ class Stage:
     def _find_stop(self) -> int | None:
         """The panorama at which the camera stands, if its scene is shown as it is."""
         state, settings = self._state, self._state.settings
-        is_whole = settings.shows_scene and state.comparison == "off" and self.photograph is None
+        is_whole = settings.shows_scene and not state.comparing and self.photograph is None
         if not (state.stops and is_whole):
             return None
         return self.comparer.photographs.find_stop(np.asarray(state.camera.position))
@@ -327,7 +296,6 @@ class Stage:
             layer.release()
         self.presenter.release()
         self.comparer.release()
-        self.hide_outside()
         for slot in self.slots:
             slot.renderer.release()
 

@@ -31,7 +31,6 @@ class Input:
     Attributes:
         drag: pointer movement over the image with the left button held, pixels (right, down).
         click: place of a click on the image without a drag, as fractions of width and height; None without a click.
-        pointer: place of the pointer over the image while the left button is held, in the same unit; else None.
         sticks: of a gamepad, -1 to 1: fly right, up and forward, turn right and up.
     """
 
@@ -43,7 +42,6 @@ class Input:
     scroll: float = 0.0  # wheel steps; positive is scrolling up
     height: int = 720  # of the window, pixels
     click: tuple[float, float] | None = None
-    pointer: tuple[float, float] | None = None
     sticks: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -83,10 +81,6 @@ def _write_screenshot(viewer: Viewer, events: Input) -> None:
     viewer.queue(viewer.write_screenshot, "exr" if "shift" in events.held else "png")
 
 
-def _compare(state: ViewerState) -> None:
-    state.comparison = "off" if state.comparison == "photograph" else "photograph"
-
-
 def _toggle_plan(state: ViewerState) -> None:
     state.minimap = state.hotspots = not state.minimap
 
@@ -107,7 +101,7 @@ def _escape(viewer: Viewer, _: Input) -> None:
     if viewer.state.help:
         viewer.state.help = False
     else:
-        viewer.queue(viewer.request_quit)
+        viewer.state.quit = True
 
 
 KEYS = (
@@ -130,12 +124,10 @@ KEYS = (
     ),
     KeyRow("Space", "play the flight between them", {"space": _change(toggle_play)}),
     KeyRow("M", "floor plan and hotspots of a tour", {"m": _change(_toggle_plan)}),
-    KeyRow("O", "doll's house: all rooms from outside", {"o": _queue("toggle_doll_house")}),
     KeyRow(
         ", .", "step along the flight (placing: turn)", {",": _change(step_flight, -1), ".": _change(step_flight, 1)}
     ),
-    KeyRow("C", "compare with the nearest photograph", {"c": _change(_compare)}),
-    KeyRow("X", "pin the image, to compare others with it", {"x": _queue("pin")}),
+    KeyRow("C", "compare with the nearest photograph", {"c": _toggle("comparing")}),
     KeyRow("B", "before or after the refinement", {"b": _toggle("refined")}),
     KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
     KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),
@@ -196,11 +188,10 @@ def read_input(seconds: float) -> Input:
     modifiers = {"shift": io.key_shift, "alt": io.key_alt, "ctrl": io.key_ctrl}
     held |= {name for name, down in modifiers.items() if down}
     drag = pan = (0.0, 0.0)
-    scroll, click, pointer = 0.0, None, None
+    scroll, click = 0.0, None
     if not io.want_capture_mouse:
         moved = (float(io.mouse_delta.x), float(io.mouse_delta.y))
         place = (io.mouse_pos.x / max(io.display_size.x, 1), io.mouse_pos.y / max(io.display_size.y, 1))
-        pointer = place if imgui.is_mouse_down(0) else None
         if imgui.is_mouse_down(0) and not imgui.is_mouse_clicked(0):
             drag = moved
         elif imgui.is_mouse_down(1) or imgui.is_mouse_down(2):
@@ -210,23 +201,20 @@ def read_input(seconds: float) -> Input:
         if imgui.is_mouse_released(0) and max(abs(moved_since_click.x), abs(moved_since_click.y)) < _CLICK_PIXELS:
             click = place
     height = int(io.display_size.y)
-    return Input(
-        seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click, pointer, _read_sticks()
-    )
+    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click, _read_sticks())
 
 
 def apply_input(viewer: Viewer, events: Input) -> None:
     """Apply the input to the viewer's state, and queue other actions."""
     if "ctrl" in events.held:
         if "q" in events.pressed:
-            viewer.queue(viewer.request_quit)
+            viewer.state.quit = True
         return
     for key in events.pressed:
         action = _ACTIONS.get(key)
         if action is not None:
             action(viewer, events)
-    if viewer.state.glide is None:
-        _move_camera(viewer.state, events)
+    _move_camera(viewer.state, events)
     if events.click is not None:
         viewer.queue(viewer.click, events.click)
 
@@ -245,9 +233,9 @@ def _move_camera(state: ViewerState, events: Input) -> None:
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
     turn = np.array(events.sticks[3:]) * TURN_SPEED * events.seconds
-    if turn.any() and not (state.orbiting or state.doll_house):
+    if turn.any() and not state.orbiting:
         camera = cameras.turn(camera, *turn)
-    if state.orbiting or state.doll_house:
+    if state.orbiting:
         pixels = ORBIT_KEY_PIXELS * events.seconds * factor * events.height / 1000
         across = axes[:2] + events.sticks[3:]
         if across.any():

@@ -15,7 +15,7 @@ import moderngl
 from imgui_bundle import imgui
 
 from pansplat.errors import InputError
-from pansplat_viewer.draw.offscreen import CONTEXT_VERSIONS, load_llvm_before_mesa
+from pansplat_viewer.draw.offscreen import load_llvm_before_mesa
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
@@ -82,12 +82,10 @@ class Window:
         glfw.window_hint(glfw.SCALE_TO_MONITOR, True)
         glfw.window_hint(glfw.VISIBLE, False)  # until the first frame: an empty window is black
         glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
-        for major, minor in CONTEXT_VERSIONS:
-            glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
-            glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
-            if handle := glfw.create_window(*size, title, None, None):
-                break
-        else:
+        glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 3)
+        glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, 3)
+        handle = glfw.create_window(*size, title, None, None)
+        if not handle:
             glfw.terminate()
             raise NoWindowError(f"the display has no OpenGL 3.3 ({errors[-1]}); {_DEBIAN}")
         glfw.make_context_current(handle)
@@ -188,12 +186,6 @@ class Window:
         """Whether the user closed the window."""
         return bool(self._glfw.window_should_close(self._handle))
 
-    def keep_open(self) -> None:
-        """Take the user's request to close back, and show a minimised window, so that a question is seen."""
-        self._glfw.set_window_should_close(self._handle, False)
-        if self._glfw.get_window_attrib(self._handle, self._glfw.ICONIFIED):
-            self._glfw.restore_window(self._handle)
-
     def set_title(self, title: str) -> None:
         """Set the window's title."""
         self._glfw.set_window_title(self._handle, title)
@@ -234,11 +226,7 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
     active_until = 0.0
     shown = False
     target = window.ctx.detect_framebuffer(0)
-    while not viewer.state.quit:
-        if window.closing:
-            window.keep_open()
-            viewer.request_quit()
-            continue
+    while not (viewer.state.quit or window.closing):
         before = time.perf_counter()
         visible = window.is_visible
         has_input = before < active_until or window.gamepad_moves or viewer.gui.has_input

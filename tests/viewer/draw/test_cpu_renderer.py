@@ -152,7 +152,7 @@ def test_software_opengl_is_replaced_by_the_processor_unless_chosen(ctx):
 
 
 def test_the_preset_3dgs_and_two_eyes_are_refused(renderer, pose):
-    for name, value, message in (("preset", "3dgs", "preset exact"), ("stereo", "anaglyph", "one eye of a window")):
+    for name, value, message in (("preset", "3dgs", "preset exact"), ("stereo", "side-by-side", "one eye of a window")):
         with pytest.raises(InputError, match=f"draws {message}, got {value}; use renderer gl"):
             renderer.render(pose, SIZE, replace(SETTINGS, **{name: value}))
 

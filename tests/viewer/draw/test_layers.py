@@ -73,7 +73,6 @@ def test_narrow_field_of_view_is_drawn_directly(make_renderer, random_scene, pos
         {"mode": "view"},
         {"levels": frozenset({1, 2})},
         {"opacity_threshold": 0.5},
-        {"box": (0.0, -5.0, -5.0, 5.0, 5.0, 5.0)},
         {"near": 1.9},
     ],
     ids=str,
@@ -177,3 +176,17 @@ def test_release_leaves_the_context_usable(ctx, random_scene, pose):
         renderer.render(pose, SIZE, CACHED)
         renderer.release()
         assert ctx.error == "GL_NO_ERROR"
+
+
+def test_splats_in_chunks_are_the_image_of_one_chunk_and_no_splat_is_none(ctx, random_scene, pose, monkeypatch):
+    images = []
+    for size in (300, 20):
+        monkeypatch.setattr("pansplat_viewer.draw.layers._CHUNK_SIZE", size)
+        renderer = SplatRenderer(ctx, color_bits=32)
+        renderer.upload(random_scene())
+        images.append(render_image(renderer, pose, DrawSettings()))
+        assert renderer.stats.drawn > 60, "more than three chunks"
+        nothing = render_image(renderer, pose, DrawSettings(opacity_threshold=1.0))
+        assert renderer.stats.drawn == 0 and not nothing.any()
+        renderer.release()
+    assert images[0].max() > 0.4 and np.array_equal(*images)

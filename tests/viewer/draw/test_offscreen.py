@@ -15,7 +15,6 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat_viewer.draw import offscreen
-from pansplat_viewer.draw.programs import choose_tier
 from pansplat_viewer.draw.renderer import DrawSettings
 
 pytestmark = pytest.mark.gl
@@ -48,7 +47,7 @@ def render_images(renderer, pose):
     return images
 
 
-# Writes the images of the given scene, the OpenGL version and the tier.
+# Writes the images of the given scene, and the OpenGL version.
 _SCRIPT = f"""
 import sys
 import numpy as np, torch
@@ -64,7 +63,7 @@ renderer = SplatRenderer(ctx, color_bits=32)
 renderer.upload(Scene(Gaussians(**scene["gaussians"]), scene["cam2world"], 0.45, 10.0))
 images = render_images(renderer, scene["pose"].numpy())
 assert ctx.error == "GL_NO_ERROR", ctx.error
-np.savez(out, version=ctx.version_code, tier=renderer.tier, **images)
+np.savez(out, version=ctx.version_code, **images)
 """
 
 
@@ -99,7 +98,7 @@ def test_old_opengl_and_osmesa_render_the_same_images(make_renderer, random_scen
         assert process.returncode == 0, errors
         with np.load(tmp_path / f"{name}.npz") as images:
             if name != "osmesa":
-                assert images["version"] == int(name) and images["tier"] == "gl33"
+                assert images["version"] == int(name)
             for key, image in expected.items():
                 assert np.abs(images[key] - image).max() <= 1e-5, (name, key)
 
@@ -109,20 +108,6 @@ def test_missing_opengl_is_reported_with_the_packages(monkeypatch):
     monkeypatch.setattr(offscreen, "_load_osmesa", Mock(side_effect=OSError("libOSMesa is not installed")))
     with pytest.raises(InputError, match=r"libEGL not loaded.*libOSMesa.*apt-get install libegl1.*libosmesa6"):
         offscreen.create_context()
-
-
-def test_the_newest_version_is_asked_for_first(monkeypatch):
-    """NVIDIA's drivers return exactly the version that is asked for."""
-    asked = []
-
-    def create(require, **_):
-        asked.append(require)
-        if require > 410:
-            raise Exception("cannot create context")
-        return SimpleNamespace(version_code=require)
-
-    monkeypatch.setattr(moderngl, "create_context", create)
-    assert offscreen.create_context("egl").version_code == 330 and asked == [430, 330]
 
 
 @pytest.mark.parametrize("system", ["win32", "darwin"])
@@ -148,21 +133,6 @@ def test_windows_and_macos_have_contexts_of_their_own(monkeypatch, system):
 def test_unknown_backend_is_refused():
     with pytest.raises(InputError, match="auto, egl, osmesa or system, got 'wgl'"):
         offscreen.create_context("wgl")
-
-
-def test_tier_follows_the_version_and_the_limit_of_the_context():
-    old = SimpleNamespace(version_code=410)
-    new = SimpleNamespace(version_code=430, info={"GL_MAX_SHADER_STORAGE_BLOCK_SIZE": 48 * 1000})
-    assert choose_tier(old, "auto") == "gl33"
-    assert choose_tier(new, "auto") == "gl43"
-    assert choose_tier(new, "gl33") == "gl33"
-    with pytest.raises(InputError, match=r"needs OpenGL 4.3, this context has 4.1; use tier gl33"):
-        choose_tier(old, "gl43")
-    assert choose_tier(new, "auto", 1000) == "gl43" and choose_tier(new, "auto", 1001) == "gl33"
-    with pytest.raises(InputError, match=r"storage buffer of 48,048 bytes for 1,001 Gaussians, .* limit is 48,000"):
-        choose_tier(new, "gl43", 1001)
-    with pytest.raises(InputError, match="auto, gl33 or gl43, got 'gl21'"):
-        choose_tier(new, "gl21")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not available for this system")

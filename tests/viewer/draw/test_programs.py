@@ -12,7 +12,7 @@ from pansplat.geometry.cubemap import face_rotations
 from pansplat_viewer.draw.programs import Programs, read_source
 
 FOLDER = resources.files("pansplat.shaders")
-SOURCES = sorted(path.name for path in FOLDER.iterdir() if path.name.endswith((".glsl", ".vert", ".frag", ".comp")))
+SOURCES = sorted(path.name for path in FOLDER.iterdir() if path.name.endswith((".glsl", ".vert", ".frag")))
 
 
 def test_readme_names_every_file_uniform_and_input():
@@ -28,7 +28,7 @@ def test_readme_names_every_file_uniform_and_input():
 
 def test_source_has_the_version_first_then_constants_and_no_includes():
     for name in SOURCES:
-        lines = read_source(name, 330, LAYER_STORAGE=2).splitlines()
+        lines = read_source(name, LAYER_STORAGE=2).splitlines()
         defines = [line for line in lines if line.startswith("#define")]
         assert lines[: len(defines) + 1] == ["#version 330 core", *defines]
         assert {f"#define ALPHA_CUT {ALPHA_CUT}", "#define LAYER_STORAGE 2"} <= set(defines)
@@ -46,23 +46,22 @@ def test_faces_are_those_of_the_cubemap():
 @pytest.mark.gl
 def test_every_program_compiles_once(ctx):
     programs = Programs(ctx)
-    compiled = [programs.project(), programs.project_compute(), programs.splat(), programs.resolve()]
+    compiled = [programs.project(), programs.splat(), programs.resolve()]
     compiled += [programs.present(), *(programs.accumulate(storage) for storage in range(3))]
-    assert len({program.glo for program in compiled}) == 8
+    assert len({program.glo for program in compiled}) == 7
     assert programs.accumulate(1) is programs.accumulate(1)
     programs.release()
 
 
 def test_qualifiers_of_layouts_are_signed_literals():
-    """GLSL 4.30 has no other integers there; expressions and unsigned literals came with 4.40."""
+    """GLSL 3.30 has no other integers there; expressions and unsigned literals came with 4.40."""
     sources = []
 
     def compile_program(*stages, **options):
         sources.extend([*stages, *(text for name, text in options.items() if name.endswith("_shader"))])
         return SimpleNamespace()
 
-    programs = Programs(SimpleNamespace(program=compile_program, compute_shader=compile_program))
-    programs.compile_compute()
+    programs = Programs(SimpleNamespace(program=compile_program))
     for build in (programs.project, programs.splat, programs.resolve, programs.arrange, programs.present):
         build()
     programs.accumulate(0)
@@ -71,5 +70,5 @@ def test_qualifiers_of_layouts_are_signed_literals():
         defines = dict(re.findall(r"^#define (\w+) (.*)$", source, re.MULTILINE))
         for qualifiers in re.findall(r"^layout\(([^)]*)\)", source, re.MULTILINE):
             values += [defines.get(value, value) for value in re.findall(r"= *([^,]+)", qualifiers)]
-    assert len(sources) == 19 and len(values) > 40
+    assert len(sources) == 11 and len(values) > 5
     assert all(re.fullmatch(r"\d+", value) for value in values), values

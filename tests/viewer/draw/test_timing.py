@@ -35,7 +35,7 @@ def test_lines_have_times_and_the_image_of_the_reference(run_job, random_scene, 
         "size": [48, 24],
         "repeats": 3,
         "folder": str(tmp_path),
-        "tiers": ["gl33", "gl43", "cpu"],
+        "renderers": ["gl", "cpu"],
         "settings": [
             {"layout": "equirect", "size": [192, 96]},
             {"mode": "deferred"},
@@ -47,10 +47,10 @@ def test_lines_have_times_and_the_image_of_the_reference(run_job, random_scene, 
     lines = [json.loads(line) for line in output.splitlines()]
     assert [line["settings"] for line in lines[:3]] == [0, 1, 2]
     assert np.load(lines[2]["image"]).shape == (32, 64, 4)
-    assert lines[0]["tier"] == "gl33" and lines[0]["renderer"]
+    assert lines[0]["renderer"] == "gl" and lines[0]["device"]
     for line in lines:
         assert len(line["frame_ms"]) == 3 and "sort_ms" in line
-    cpu = [line for line in lines if line["tier"] == "cpu"]
+    cpu = [line for line in lines if line["renderer"] == "cpu"]
     assert {"project", "rasterize", "blend"} <= set(cpu[0]["stages"]) and "sample" in cpu[2]["stages"]
     for line in cpu:
         difference = np.load(line["image"])[..., :3] - np.load(lines[line["settings"]]["image"])[..., :3]

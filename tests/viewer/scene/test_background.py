@@ -1,9 +1,8 @@
 """Work in a thread, one piece after the other."""
 
 import threading
-import time
 
-from pansplat_viewer.scene.background import BackgroundWorker, Jobs
+from pansplat_viewer.scene.background import BackgroundWorker
 
 
 def test_cancelled_work_ends_before_the_next_begins_and_work_that_waits_is_never_begun():
@@ -48,41 +47,3 @@ def test_joining_waits_for_all_cancelled_work():
     assert worker.cancel(join=True)
     assert order == ["first has ended"]
     worker.close()
-
-
-def test_jobs_of_several_names_hand_over_their_results_and_show_their_errors(wait_until):
-    results, errors = [], []
-    jobs = Jobs(errors.append)
-
-    def fail(report) -> None:
-        raise OSError("disk full")
-
-    jobs.start("film", lambda report: report("drawing", 0.5) or 3, results.append)
-    jobs.start("page", fail, results.append, failure="no page written: ")
-    assert jobs.is_busy and jobs.progress("other") is None and not jobs.cancel("other")
-
-    def has_ended() -> bool:
-        jobs.poll()
-        return not jobs.is_busy
-
-    wait_until(has_ended, "results")
-    assert results == [3] and errors == ["no page written: disk full"] and jobs.progress("film") is None
-    jobs.close()
-
-
-def test_a_job_that_is_cancelled_hands_over_nothing(wait_until):
-    results, errors, started = [], [], threading.Event()
-    jobs = Jobs(errors.append)
-
-    def work(report) -> None:
-        while True:
-            report("writing", 0.2)
-            started.set()
-            time.sleep(0.002)
-
-    jobs.start("film", work, results.append)
-    assert started.wait(300) and jobs.progress("film") == ("writing", 0.2)
-    assert jobs.cancel("film", join=True)
-    jobs.poll()
-    assert results == errors == [] and not jobs.is_busy
-    jobs.close()

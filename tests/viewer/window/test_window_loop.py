@@ -24,23 +24,8 @@ def make_window(**values: object) -> Mock:
 def make_viewer() -> Mock:
     """A viewer that quits in its first frame."""
     viewer = Mock(moving=True, pending=None, state=Mock(quit=False), library=Mock(current=-1))
-    viewer.frame.side_effect = viewer.request_quit.side_effect = lambda *_: setattr(viewer.state, "quit", True)
+    viewer.frame.side_effect = lambda *_: setattr(viewer.state, "quit", True)
     return viewer
-
-
-def test_a_window_that_the_user_closes_stays_open_until_the_viewer_agrees():
-    window, viewer = make_window(), make_viewer()
-    window.closing, answers = True, []
-
-    def ask() -> None:
-        answers.append(len(answers) == 1)
-        viewer.state.quit = answers[-1]
-
-    window.keep_open.side_effect = lambda: setattr(window, "closing", not answers)
-    viewer.request_quit.side_effect = ask
-    _run_loop(window, viewer)
-    assert answers == [False, True] and window.keep_open.call_count == 2
-    viewer.frame.assert_not_called()
 
 
 def test_a_dropped_path_is_opened():

@@ -1,0 +1,424 @@
+"""The scenes of the window: which one is shown, which one comes next, and those of a tour.
+
+`Scenes` follows the loader: each scene has a `SceneLife`. The stage draws them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene, empty_gaussians
+from pansplat.geometry.path import find_direction
+from pansplat.tours.graph import list_starts
+from pansplat.tours.route import plan_route
+from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.library import Library
+from pansplat_viewer.scene.life import SceneLife
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.scene.slots import keep_largest
+from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene, enter_tour
+from pansplat_viewer.scene.tour import TourScenes
+from pansplat_viewer.ui.photographs import find_open_view
+from pansplat_viewer.ui.stage import Stage
+
+
+class Scenes:
+    """Shows what the loader finds, predicts and refines.
+
+    Attributes:
+        shown: the scene that is shown, of a tour the first one; None before the first one.
+        coming: the scene that replaces it when it is predicted and prepared; None if there is none.
+        tour: the scenes of the tour that is shown, or whose photographs are; None for other scenes.
+    """
+
+    def __init__(
+        self,
+        state: ViewerState,
+        stage: Stage,
+        library: Library,
+        *,
+        at: float,
+        memory: float,
+        show_error: Callable[[str], None],
+        listed: Callable[[Path | None], None],
+        entered: Callable[[SceneEntry], None],
+    ) -> None:
+        """Show nothing yet.
+
+        Args:
+            state: of the viewer.
+            stage: draws the image.
+            library: the scenes to choose from, and their loader.
+            at: fraction of the flight at which a scene is entered.
+            memory: limit of the scenes of a tour, GiB.
+            show_error: shows a message.
+            listed: called when other entries are listed, with the path at which they were found.
+            entered: called when a scene is shown.
+        """
+        self._state, self._stage, self._library = state, stage, library
+        self._at, self._memory = at, memory
+        self._show_error, self._listed, self._entered = show_error, listed, entered
+        self.shown: SceneLife | None = None
+        self.coming: SceneLife | None = None
+        self.tour: TourScenes | None = None
+
+    # --- what the panels read ---
+
+    @property
+    def loaded(self) -> LoadedScene | None:
+        """The scene that is shown."""
+        return None if self.shown is None else self.shown.loaded
+
+    @property
+    def _waiting(self) -> LoadedScene | None:
+        """The scene that is shown when the renderer's form of it is prepared."""
+        coming = self.coming
+        return coming.loaded if coming is not None and coming.is_known else None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether something is looked for, made or prepared."""
+        loader = self._library.loader
+        is_loading = loader.entry is not None or loader.is_searching
+        return is_loading or self._waiting is not None or self._stage.preparer.progress is not None
+
+    @property
+    def loading(self) -> tuple[str, str, float] | None:
+        """Name, task and fraction done of the search, or of the scene that will be shown; None without them."""
+        if self._loads_for_tour and not self._library.loader.is_searching:
+            return None
+        progress, waiting = self._stage.preparer.progress, self._waiting
+        if waiting is not None and progress is not None:
+            return waiting.entry.name, f"preparing {len(waiting.scene.gaussians):,} Gaussians", progress
+        return self._library.loader.progress
+
+    @property
+    def refinement(self) -> float | None:
+        """Fraction of the refinement that is done; 1 if the refined scene is there, None without a refinement."""
+        if self._loads_for_tour:
+            return None
+        has_both = self.shown is not None and self.shown.prediction is not None
+        return 1.0 if has_both else self._library.loader.refinement
+
+    @property
+    def background(self) -> tuple[str, float] | None:
+        """Work of the loader on the tour, and the fraction done."""
+        loader = self._library.loader
+        if not self._loads_for_tour or loader.entry is None:
+            return None
+        if loader.progress is not None:
+            return f"next: {loader.entry.name}", loader.progress[2]
+        return f"refining: {loader.entry.name}", loader.refinement or 0.0
+
+    @property
+    def _loads_for_tour(self) -> bool:
+        """Whether the loader works for the tour that is shown, and not for a scene that the user has chosen."""
+        entry = self._library.loader.entry
+        if self.tour is None or self.shown is None:
+            return False
+        return self._waiting is None if entry is None else self.tour.is_of(entry)
+
+    @property
+    def _too_large(self) -> SceneLife | None:
+        lives = (life for life in (self.coming, self.shown) if life is not None and life.state == "too large")
+        return next(lives, None)
+
+    @property
+    def reduced(self) -> int | None:
+        """Number of Gaussians that are offered in place of a scene that did not fit; None if there is none."""
+        return None if self._too_large is None else self._too_large.reduced
+
+    # --- what a user does ---
+
+    def show(self, entries: list[SceneEntry], index: int, path: Path | None = None) -> None:
+        """List these entries and load one of them.
+
+        Args:
+            entries: to choose from.
+            index: of the entry to load.
+            path: where they were found, so that a reload finds new ones; None if they are only loaded again.
+        """
+        self._library.offer(entries, index, path)
+        self._listed(path)
+        if self.shown is None:
+            self._preview(entries[index])
+        else:
+            self.shown.cancel()
+        self.coming = SceneLife(entries[index])
+        self.coming.request()
+        self._library.loader.request(entries[index])
+
+    def expect(self, entries: list[SceneEntry], path: Path, name: str | None) -> None:
+        """Show panoramas while their poses are estimated by a search of the loader, which has begun.
+
+        Args:
+            entries: the panoramas, none of which is placed.
+            path: where they are.
+            name: name or number of the entry to show when the search ends; None for the first.
+        """
+        self._library.expect(path, name)
+        self._show_unplaced(entries)
+
+    def _show_unplaced(self, entries: list[SceneEntry]) -> None:
+        if self.shown is None and entries:
+            self._library.offer(entries, 0, None)
+            self._preview(entries[0])
+
+    def choose(self, index: int) -> None:
+        """Show another entry of the list."""
+        if index != self._library.current:
+            self.show(self._library.entries, index, self._library.path)
+
+    def open_text(self, text: str) -> None:
+        """Show the scenes at the path that a user has typed."""
+        self._library.search(Path(text).expanduser())
+
+    def reload(self) -> None:
+        """Load the entry again."""
+        library, current = self._library, max(self._library.current, 0)
+        if library.path is None:
+            self.show(library.entries, current)
+        else:
+            library.search(library.path, library.entries[current].name)
+
+    def cancel_loading(self) -> None:
+        """End the search for scenes, else the prediction."""
+        loader = self._library.loader
+        if not loader.cancel_search():
+            loader.cancel()
+            self._stage.preparer.stop()
+            self.coming, self._library.current = None, -1
+            self._library.restore()
+
+    def cancel_refinement(self) -> None:
+        """End the refinement of the scene that is shown."""
+        self._library.loader.cancel()
+        if self.shown is not None:
+            self.shown.cancel()
+
+    def dismiss(self) -> None:
+        """Go on with the scene that is shown after an error."""
+        too_large = self._too_large
+        if too_large is not None:
+            too_large.dismiss()
+        if too_large is self.coming:
+            self.coming = None
+        self._stage.has_failed = False
+        self._library.restore()
+
+    def show_reduced(self) -> None:
+        """Show the largest Gaussians of the scene that did not fit."""
+        too_large = self._too_large
+        if too_large is not None:
+            self._stage.has_failed = False
+            if self._library.loader.entry is too_large.entry:
+                self._library.loader.cancel()
+            self.coming = too_large.reduce(keep_largest)
+
+    # --- frames ---
+
+    def poll(self) -> None:
+        """Show the scene, the entries or the error of a finished load or search."""
+        loader, coming, waiting = self._library.loader, self.coming, self._waiting
+        if coming is not None and waiting is not None and self._stage.preparer.is_ready(waiting.scene):
+            self._replace(coming, waiting)
+        requested = loader.entry
+        result = loader.poll() if self._waiting is None else None
+        if isinstance(result, list) and loader.is_searching:
+            self._show_unplaced(result)
+        elif isinstance(result, list):
+            self.show(result, *self._library.choose_found(result))
+        elif isinstance(result, LoadedScene):
+            self._receive(result)
+        elif result is not None:
+            known = isinstance(result, (InputError, OSError))  # else a defect, or out of memory
+            self._show_error(str(result) if known else f"{type(result).__name__}: {result}")
+            if requested is not None and loader.entry is None:  # else the search
+                self._fail(requested)
+            self._library.restore()
+
+    def _receive(self, result: LoadedScene) -> None:
+        """Take a prediction or a refined scene of the loader."""
+        shown, coming = self.shown, self.coming
+        if shown is not None and self.tour is not None and self.tour.is_of(result.entry):
+            self.tour.add(result)
+            return
+        if shown is not None and shown.state == "refining" and self.loaded and self.loaded.entry is result.entry:
+            shown.receive(result)
+            return
+        if coming is None or coming.state != "predicting":
+            coming = self.coming = SceneLife(result.entry)
+            coming.request()
+        coming.receive(result)
+        if self._stage.preparer.is_ready(result.scene):
+            self._replace(coming, result)
+
+    def _fail(self, requested: SceneEntry) -> None:
+        """The loader could not make an entry."""
+        if self.tour is not None and self.tour.is_of(requested):
+            self.tour.fail(requested.views)
+        elif self.coming is not None and self.coming.entry is requested:
+            self.coming.fail()
+        elif self.shown is not None and self.shown.entry is requested:
+            self.shown.cancel()
+
+    def _replace(self, life: SceneLife, loaded: LoadedScene) -> None:
+        """Show a scene; if it does not fit into memory, keep the one before and offer the largest Gaussians."""
+        error = self._stage.upload(self._stage.slots[0], loaded.scene, loaded.entry.name)
+        if error is None:
+            self._stage.has_failed, self.coming = False, None
+            self._enter(life, loaded)
+        elif isinstance(error, MemoryError) and life.reduced:
+            life.exhaust()
+        else:
+            life.fail()
+            self.coming = None
+
+    def offer_reduced(self, error: Exception) -> None:
+        """Offer the largest Gaussians of the scene that is shown, if drawing it has exhausted the memory."""
+        if self.shown is not None and self.tour is None and isinstance(error, MemoryError) and self.shown.reduced:
+            self.shown.exhaust()
+
+    def exchange(self) -> None:
+        """Show the refined scene or the prediction, whichever is chosen, while the camera stands still."""
+        stage, life, loaded = self._stage, self.shown, self.loaded
+        if life is None or loaded is None or life.prediction is None or self._waiting is not None:
+            return
+        scene = loaded.scene if self._state.refined else life.prediction
+        if scene is stage.slot.scene or not stage.preparer.is_ready(scene):
+            return
+        if stage.upload(stage.slot, scene, loaded.entry.name) is not None:
+            life.revert()
+
+    def _enter(self, life: SceneLife, loaded: LoadedScene) -> None:
+        """Show a scene that is uploaded, and go to its start."""
+        stage, state, entry = self._stage, self._state, loaded.entry
+        photograph = stage.photograph if self.shown is None else None
+        remaining = self._list_remaining() if self.shown is None else ()
+        self.shown, self.tour = life, None
+        self._library.keep()
+        stage.clear()
+        stage.comparer.photographs.open(entry.panoramas)
+        self._entered(entry)
+        if entry.tour is None:
+            enter_scene(state, loaded.scene, at=self._at)
+        else:
+            self._enter_tour(loaded, remaining)
+        tour, part = self.tour, 0 if self.tour is None else self.tour.part
+        stage.scene_views = entry.views
+        is_here = tour is None or tour.is_inside(np.asarray(state.camera.position), entry.views)
+        if photograph is not None:
+            stage.fade.show(1 if is_here else 0, photograph, state.now, part)
+        if is_here or photograph is None:
+            stage.fade.show(0, loaded.scene, state.now, part)
+        stage.last_camera = state.camera
+        state.show_message(f"{entry.name}   (H shows the keys)")
+
+    def _preview(self, entry: SceneEntry) -> None:
+        """Show the photographs of an entry until its scene is there; the camera can turn and fly."""
+        comparer = self._stage.comparer
+        comparer.photographs.open(entry.panoramas)
+        self._stage.clear()
+        self.tour = None
+        source = entry.tour or entry.pair
+        if source is None:
+            return
+        panoramas = entry.panoramas if entry.pair is None else entry.pair.context
+        poses = torch.stack([panorama.cam2world for panorama in panoramas])
+        starts, frame = list_starts(panoramas), panoramas[0].frame
+        scene = Scene(empty_gaussians(), poses, source.near, source.far, starts=starts, frame=frame)
+        if entry.tour is None:
+            enter_scene(self._state, scene, at=self._at)
+        else:
+            enter_tour(self._state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
+            self.tour = TourScenes(entry.tour)
+        nearest = comparer.choose_photograph(self._state)
+        if nearest is not None:
+            comparer.photographs.wait(nearest)  # else the first frames are black
+            self._face_open_view(entry, nearest)
+        self._stage.last_camera = self._state.camera
+
+    def _face_open_view(self, entry: SceneEntry, index: int) -> None:
+        """Turn the start to a wide view, if the panorama has neither a neighbour to look at nor a start view."""
+        panorama, camera = entry.panoramas[index], self._state.camera
+        is_alone = len(entry.panoramas) == 1 if entry.tour is None else not entry.tour.neighbours(index)
+        if is_alone and panorama.start is None and camera == self._state.home:
+            try:
+                forward = find_direction(panorama.cam2world, find_open_view(panorama), 0.0).numpy()
+            except InputError:  # it is shown when the photograph is
+                return
+            self._state.camera = self._state.home = cameras.focus_on_point(camera, camera.position + forward)
+
+    # --- tours ---
+
+    def _enter_tour(self, loaded: LoadedScene, remaining: tuple[int, ...]) -> None:
+        """Enter a tour; a flight over its photographs goes on through the remaining panoramas."""
+        tour, state = loaded.entry.tour, self._state
+        assert tour is not None
+        self._stage.add_slot()
+        self.tour = TourScenes.start(loaded, self._memory)
+        enter_tour(state, tour, loaded.scene, plan_route(tour, tour.plan_walk(loaded.entry.start)), at=self._at)
+        self.tour.move(np.asarray(state.camera.position))
+        if remaining:
+            state.route, state.playing = self.tour.plan_route(state.camera.cam2world, remaining), True
+
+    def _list_remaining(self) -> tuple[int, ...]:
+        """The panoramas that a flight through a tour still visits; none if there is no flight."""
+        route, state = self._state.route, self._state
+        return route.walk[route.leg(state.flight) + 1 :] if route is not None and state.playing else ()
+
+    def update(self) -> None:
+        """Show the scene of the camera's place, and load those that are next."""
+        tour, state = self.tour, self._state
+        if tour is None:
+            return
+        route = state.route if state.playing else None
+        tour.move(np.asarray(state.camera.position), route, state.flight)
+        self._show_place(tour)
+        self._stage.fade.move(state.camera.cam2world, tour.part)
+        if self._loads_for_tour:
+            loader = self._library.loader
+            request = tour.choose_request(tour.list_next(route, state.flight), loader.entry)
+            if request is not None:
+                loader.request(request)
+
+    def _show_place(self, tour: TourScenes) -> None:
+        """Start to fade to the scene of the camera's place; without it, to the nearest photograph.
+
+        Until then another scene stays within its panoramas.
+        """
+        stage, position = self._stage, np.asarray(self._state.camera.position)
+        stage.fade.compute_weight(self._state.now)
+        loaded = tour.get(tour.views)
+        if loaded is not None and stage.fade_to_scene(loaded, tour.part, can_wait=self._waiting is None):
+            return
+        shows_scene = stage.photograph is None and stage.fade.parts[stage.fade.front] == tour.part
+        if self.shown is None or not (shows_scene and tour.is_inside(position, stage.scene_views)):
+            for end in tour.edge:  # that of the other end is read before it is needed
+                stage.comparer.get_photograph(self._state, end)
+            stage.fade_to_photograph(tour.find_nearest(position), tour.part)
+
+    def fly(self, seconds: float, was_playing: bool) -> None:
+        """Advance the flight; in a tour from wherever the camera is."""
+        state, tour = self._state, self.tour
+        if tour is not None and state.route is not None:
+            pose = state.camera.cam2world
+            if state.target is not None:
+                state.route, state.flight, state.playing = tour.plan_way(pose, state.target), 0.0, True
+            elif state.playing and not was_playing:
+                if state.flight == 0:
+                    state.route = tour.plan_route(pose)
+                elif not np.allclose(pose, state.route.pose(state.flight), atol=1e-4):
+                    state.route = tour.plan_route(pose, state.route.walk[state.route.leg(state.flight) + 1 :])
+                    state.flight = 0.0
+            state.target = None
+            if state.playing:  # photographs are read before they are shown
+                leg = state.route.leg(state.flight)
+                for node in state.route.walk[leg + 1 : leg + 3]:
+                    self._stage.comparer.get_photograph(state, node)
+        advance_flight(state, seconds)
