@@ -19,6 +19,7 @@ const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
 const NEAR = HEADER.speed;          // metres: a second's walk
 const DIRECTIONS = 24;              // of the bits of `blank`
 const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
+const PHOTO_WAIT_MS = 2000;         // of a fade along a poor edge, at most, for the photograph where it ends
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
 
 // The heading after a fade: away from the link back, or the start view; else that of before, or from another world, whose
@@ -229,7 +230,7 @@ export let still = null;
 export function takeStill(zoom = null) {
   if (!renderer || !sorted) return;
   if (headset.session) {  // it fades from black
-    still = { began: null, left: 1, position: null, zoom: null };
+    still = { taken: null, began: null, left: 1, position: null, zoom: null };
     return;
   }
   const size = fullSize();  // a photograph is drawn fast
@@ -239,16 +240,17 @@ export function takeStill(zoom = null) {
   context.globalAlpha = still && isSame ? 1 - still.left : 1;
   if (!isSame) [stillCanvas.width, stillCanvas.height] = size;
   context.drawImage(canvas, 0, 0, ...size);
-  still = { began: null, left: 1, position: null, zoom };
+  still = { taken: null, began: null, left: 1, position: null, zoom };
   showStill();
   changed();
 }
 
 export function updateStill(now) {
   if (!still) return;
+  still.taken ??= now;
   still.position = still.position || [...camera.position];
   const isSorted = isSortedAs() && distanceOf(sorted.position, still.position) < NEAR;
-  const isThere = still.zoom === null || !HEADER.photographs.length || photographs.isOpaque;
+  const isThere = still.zoom === null || !photographs.isExpected || now - still.taken > PHOTO_WAIT_MS;
   if (still.began === null && isSorted && isThere && isSeen()) still.began = now;
   if (still.began !== null) {
     const t = clamp((now - still.began) / (still.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);

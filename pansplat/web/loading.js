@@ -52,8 +52,8 @@ export function loadAround() {
     canvas.ariaBusy = true;
     for (const file of HEADER.folder === null ? [] : HEADER.views[view].files) {
       const script = document.createElement("script");
-      Object.assign(script, { src: `${HEADER.folder}/${file}`, async: false });  // in this order
-      script.onerror = () => onMissing(new Error("A part of the scene is missing. Copy the whole folder."));
+      const end = () => { if (script.isConnected) onMissing(new Error("A part of the scene is missing. Copy the whole folder.")); };
+      Object.assign(script, { src: `${HEADER.folder}/${file}`, async: false, onload: end, onerror: end });  // in this order
       document.head.append(script);
     }
   }

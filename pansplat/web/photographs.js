@@ -4,6 +4,7 @@
 
 import { camera, GRAPH, nodeHere, rotationOf, tangentOf } from "./camera.js";
 import { doll } from "./doll.js";
+import { say } from "./dom.js";
 import { flight } from "./flight.js";
 import { clamp, column, distanceOf, dot, multiply, scaled } from "./graph.js";
 import { changed, fullSize, refresh, renderer } from "./loop.js";
@@ -15,6 +16,7 @@ const PHOTO_FADE = 0.2;             // seconds
 const DENSITY = 0.8;                // texels of a pixel in the middle of a face, at least
 const KEPT = 3;                     // photographs whose textures are kept
 const AT_ONCE = 6;                  // tiles that are read at the same time
+const TRIES = 3, PAUSE_AFTER_ERROR = 2000;  // of a tile that does not arrive, ms between them
 const SMALL_FACE = 2048;            // largest face on a phone, texels
 // Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number among those of OpenGL.
 const FACES = [
@@ -22,7 +24,7 @@ const FACES = [
   [[0, 0, 1], [0, 1, 0], [-1, 0, 0], 1], [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2], [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
 ];
 const texts = new Map();            // of a page in one file: base64 of the tiles that have arrived
-const requests = new Map();         // of other pages: what takes the text of a tile
+const requests = new Map();         // of other pages: what takes the text of a tile that has not arrived
 
 // A script for each tile calls this; in a page of one file, one for the smallest tiles of a photograph and one for the others,
 // which are in the element before.
@@ -41,10 +43,13 @@ function readText(key) {
   if (HEADER.folder === null) return Promise.resolve(texts.get(key));
   return new Promise((resolve, reject) => {
     const script = document.createElement("script");
+    const end = () => {
+      script.remove();
+      requests.delete(key);  // it holds the text
+      reject(new Error(`${script.src} is missing, or is no tile`));  // unless it has arrived
+    };
     requests.set(key, resolve);
-    script.src = `${HEADER.folder}/${key}.js`;
-    script.onload = () => script.remove();
-    script.onerror = () => reject(new Error(`${script.src} is missing`));
+    Object.assign(script, { src: `${HEADER.folder}/${key}.js`, onload: end, onerror: end });
     document.head.append(script);
   });
 }
@@ -56,7 +61,8 @@ async function readTile(key) {
   return image;
 }
 
-// One size of a photograph. `state` of a tile: null, or "reading", "ready" or "failed".
+// One size of a photograph. `state` of a tile: null, or "reading", "ready" or "failed", which is after the last one of its `tries`; `due`:
+// the time of the next one.
 class Level {
   constructor(name, rotation, first, [size, step]) {
     Object.assign(this, { size, texture: null, isFresh: true, tiles: [] });
@@ -68,7 +74,7 @@ class Level {
           const ray = [0, 1, 2].map((k) => x * right[k] + y * down[k] + forward[k]);
           const direction = scaled(rotation.map((axis) => dot(axis, ray)), 1 / Math.hypot(...ray));
           const reach = Math.atan(Math.SQRT2 * step / size);
-          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, state: null });
+          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, state: null, tries: 0, due: 0 });
         }
       }
     });
@@ -105,7 +111,7 @@ class Level {
   release() {
     if (this.texture && !renderer.gl.isContextLost()) renderer.gl.deleteTexture(this.texture);
     this.texture = null;
-    this.tiles.forEach((tile) => { tile.state = null; });
+    this.tiles.forEach((tile) => Object.assign(tile, { state: null, tries: 0, due: 0 }));
   }
 }
 
@@ -204,7 +210,8 @@ class Photographs {
       this.made.delete(old);
     }
     const levels = this.levelsOf(node);
-    const tiles = this.listMissing(node, size).filter(({ key, state }) => !state && (HEADER.folder !== null || texts.has(key)));
+    const isThere = ({ key }) => HEADER.folder !== null || texts.has(key), now = performance.now();
+    const tiles = this.listMissing(node, size).filter((tile) => !tile.state && tile.due <= now && isThere(tile));
     tiles.slice(0, Math.max(AT_ONCE - this.reading, 0)).forEach(async (tile) => {
       const level = levels.find(({ tiles: each }) => each.includes(tile));
       tile.state = "reading";
@@ -217,8 +224,10 @@ class Photographs {
           refresh();
         }
       } catch (error) {
-        tile.state = "failed";
+        tile.tries += 1;
+        Object.assign(tile, { state: tile.tries < TRIES ? null : "failed", due: performance.now() + PAUSE_AFTER_ERROR });
         console.warn(error);
+        if (tile.state === "failed") say(`A part of the photograph of ${HEADER.spots[node].name} cannot be loaded`);
       }
       this.reading -= 1;
       if (this.wanted === node && this.renderer === renderer) this.read(node, size);
