@@ -140,10 +140,10 @@ class Photographs {
     return !doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
   }
 
-  // Whether the photograph at the camera, which is not shown yet, may arrive.
+  // Whether the photograph at the camera, which is not shown yet, may arrive soon.
   get isExpected() {
     const node = HEADER.photographs.length ? this.findNode() : null;
-    return node !== null && renderer !== null && !this.isOpaque && this.levelsOf(node)[0].tiles.every(({ state }) => state !== "failed");
+    return node !== null && renderer !== null && !this.isOpaque && this.levelsOf(node)[0].tiles.every(({ tries }) => !tries);
   }
 
   // The levels of a photograph that the device can hold, the smallest first.
