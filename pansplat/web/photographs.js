@@ -2,13 +2,10 @@
 // docs/web.md describes it. Tiles of cube faces arrive as text in scripts: a page from disk may not read the pixels of
 // image files. A large level is drawn over the smallest one, as far as it has arrived.
 
-import { camera, GRAPH, nodeHere, rotationOf, tangentOf } from "./camera.js";
-import { doll } from "./doll.js";
-import { say } from "./dom.js";
-import { flight } from "./flight.js";
+import { nodeHere, rotationOf, tangentOf } from "./camera.js";
+import { fullSize, say } from "./dom.js";
 import { clamp, column, distanceOf, dot, multiply, scaled } from "./graph.js";
-import { changed, fullSize, refresh, renderer } from "./loop.js";
-import { headset } from "./xr.js";
+import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
 const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
 const GONE = 0.3;                   // metres from a panorama, where its photograph has faded at any rate
@@ -61,7 +58,7 @@ async function readTile(key) {
   return image;
 }
 
-// One size of a photograph. `state` of a tile: null, or "reading", "ready" or "failed", which is after the last one of its `tries`; `due`:
+// One size of a photograph. `status` of a tile: null, or "reading", "ready" or "failed", which is after the last one of its `tries`; `due`:
 // the time of the next one.
 class Level {
   constructor(name, rotation, first, [size, step]) {
@@ -74,25 +71,25 @@ class Level {
           const ray = [0, 1, 2].map((k) => x * right[k] + y * down[k] + forward[k]);
           const direction = scaled(rotation.map((axis) => dot(axis, ray)), 1 / Math.hypot(...ray));
           const reach = Math.atan(Math.SQRT2 * step / size);
-          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, state: null, tries: 0, due: 0 });
+          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, status: null, tries: 0, due: 0 });
         }
       }
     });
   }
 
   get isReady() {
-    return this.tiles.every(({ state }) => state === "ready");
+    return this.tiles.every(({ status }) => status === "ready");
   }
 
   take(tile, image) {
-    const { gl } = renderer;
+    const { gl } = state.renderer;
     gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture || this.makeTexture());
     gl.texSubImage2D(gl.TEXTURE_CUBE_MAP_POSITIVE_X + tile.face, 0, tile.x, tile.y, gl.RGBA, gl.UNSIGNED_BYTE, image);
     this.isFresh = false;
   }
 
   makeTexture() {
-    const { gl } = renderer;
+    const { gl } = state.renderer;
     this.texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture);
     gl.texStorage2D(gl.TEXTURE_CUBE_MAP, Math.floor(Math.log2(this.size)) + 1, gl.RGBA8, this.size, this.size);
@@ -101,7 +98,7 @@ class Level {
   }
 
   bind(unit) {
-    const { gl } = renderer;
+    const { gl } = state.renderer;
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture);
     if (!this.isFresh) gl.generateMipmap(gl.TEXTURE_CUBE_MAP);
@@ -109,9 +106,9 @@ class Level {
   }
 
   release() {
-    if (this.texture && !renderer.gl.isContextLost()) renderer.gl.deleteTexture(this.texture);
+    if (this.texture && !state.renderer.gl.isContextLost()) state.renderer.gl.deleteTexture(this.texture);
     this.texture = null;
-    this.tiles.forEach((tile) => Object.assign(tile, { state: null, tries: 0, due: 0 }));
+    this.tiles.forEach((tile) => Object.assign(tile, { status: null, tries: 0, due: 0 }));
   }
 }
 
@@ -127,29 +124,29 @@ class Photographs {
 
   // Whether the picture has all of the photograph that it needs.
   isFinal(size = fullSize()) {
-    if (!HEADER.photographs.length || headset.session) return true;
-    if (this.last === null || this.renderer !== renderer || distanceOf(camera.position, this.last) > 0) return false;
+    if (!HEADER.photographs.length || state.headset.session) return true;
+    if (this.last === null || this.renderer !== state.renderer || distanceOf(camera.position, this.last) > 0) return false;
     const node = this.findNode(), isDue = node !== null && this.levelsOf(node)[0].isReady;
     if (this.target !== Number(isDue) || this.opacity !== this.target) return false;
-    return node === null || this.listMissing(node, size, true).every(({ state }) => state === "failed");
+    return node === null || this.listMissing(node, size, true).every(({ status }) => status === "failed");
   }
 
   // The panorama at which the camera stands.
   findNode() {
     const node = nodeHere();
-    return !doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
+    return !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
   }
 
   // Whether the photograph at the camera, which is not shown yet, may arrive soon.
   get isExpected() {
     const node = HEADER.photographs.length ? this.findNode() : null;
-    return node !== null && renderer !== null && !this.isOpaque && this.levelsOf(node)[0].tiles.every(({ tries }) => !tries);
+    return node !== null && state.renderer !== null && !this.isOpaque && this.levelsOf(node)[0].tiles.every(({ tries }) => !tries);
   }
 
   // The levels of a photograph that the device can hold, the smallest first.
   levelsOf(node) {
     if (!this.made.has(node)) {
-      const { name, levels, rotation } = HEADER.photographs[node], { gl } = renderer;
+      const { name, levels, rotation } = HEADER.photographs[node], { gl } = state.renderer;
       const most = Math.min(gl.getParameter(gl.MAX_CUBE_MAP_TEXTURE_SIZE), matchMedia("(pointer: coarse)").matches ? SMALL_FACE : Infinity);
       let first = 0;
       const made = levels.map((level) => {
@@ -174,7 +171,7 @@ class Photographs {
     const corner = Math.atan(Math.hypot(tangent, tangent * size[0] / size[1]));
     const away = ({ direction, reach }) => Math.acos(clamp(dot(direction, forward), -1, 1)) - reach - corner;
     const [preview] = this.levelsOf(node), level = this.chooseLevel(node, size);
-    const tiles = [...preview.tiles, ...(level === preview ? [] : level.tiles)].filter(({ state }) => state !== "ready");
+    const tiles = [...preview.tiles, ...(level === preview ? [] : level.tiles)].filter(({ status }) => status !== "ready");
     const found = tiles.map((tile) => ({ tile, isPreview: preview.tiles.includes(tile), angle: away(tile) }));
     found.sort((a, b) => b.isPreview - a.isPreview || a.angle - b.angle);
     return found.filter(({ isPreview, angle }) => !isOnlySeen || isPreview || angle < 0).map(({ tile }) => tile);
@@ -182,18 +179,18 @@ class Photographs {
 
   // Reads what the photograph at the camera needs, or that where a flight ends, and fades; `seconds` after the last time.
   update(seconds, size = fullSize()) {
-    if (!HEADER.photographs.length || !renderer) return;
-    if (this.renderer !== renderer) {  // the graphics were lost
+    if (!HEADER.photographs.length || !state.renderer) return;
+    if (this.renderer !== state.renderer) {  // the graphics were lost
       this.made.clear();
-      Object.assign(this, { renderer, program: renderer.link(SHADERS.photograph), opacity: 0 });
+      Object.assign(this, { renderer: state.renderer, program: state.renderer.link(SHADERS.photograph), opacity: 0 });
     }
     const node = this.findNode(), isStill = this.last !== null && distanceOf(camera.position, this.last) === 0;
     this.last = [...camera.position];
-    this.wanted = node !== null || !flight ? nodeHere() : flight.spot;
+    this.wanted = node !== null || !state.flight ? nodeHere() : state.flight.spot;
     this.read(this.wanted, size);
-    const isShown = isStill && node !== null && !headset.session && this.levelsOf(node)[0].isReady;
+    const isShown = isStill && node !== null && !state.headset.session && this.levelsOf(node)[0].isReady;
     if (this.node !== null && node !== this.node) {
-      const most = headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / (GONE * HEADER.unit);
+      const most = state.headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / (GONE * HEADER.unit);
       this.opacity = clamp(this.opacity, 0, Math.max(most, 0));
     }
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
@@ -211,33 +208,33 @@ class Photographs {
     }
     const levels = this.levelsOf(node);
     const isThere = ({ key }) => HEADER.folder !== null || texts.has(key), now = performance.now();
-    const tiles = this.listMissing(node, size).filter((tile) => !tile.state && tile.due <= now && isThere(tile));
+    const tiles = this.listMissing(node, size).filter((tile) => !tile.status && tile.due <= now && isThere(tile));
     tiles.slice(0, Math.max(AT_ONCE - this.reading, 0)).forEach(async (tile) => {
       const level = levels.find(({ tiles: each }) => each.includes(tile));
-      tile.state = "reading";
+      tile.status = "reading";
       this.reading += 1;
       try {
         const image = await readTile(tile.key);
-        if (this.made.get(node) === levels && this.renderer === renderer) {
+        if (this.made.get(node) === levels && this.renderer === state.renderer) {
           level.take(tile, image);
-          tile.state = "ready";
+          tile.status = "ready";
           refresh();
         }
       } catch (error) {
         tile.tries += 1;
-        Object.assign(tile, { state: tile.tries < TRIES ? null : "failed", due: performance.now() + PAUSE_AFTER_ERROR });
+        Object.assign(tile, { status: tile.tries < TRIES ? null : "failed", due: performance.now() + PAUSE_AFTER_ERROR });
         console.warn(error);
-        if (tile.state === "failed") say(`A part of the photograph of ${HEADER.spots[node].name} cannot be loaded`);
+        if (tile.status === "failed") say(`A part of the photograph of ${HEADER.spots[node].name} cannot be loaded`);
       }
       this.reading -= 1;
-      if (this.wanted === node && this.renderer === renderer) this.read(node, size);
+      if (this.wanted === node && this.renderer === state.renderer) this.read(node, size);
     });
   }
 
   // Draws over the viewport of the canvas; `seen` is a camera of Renderer.draw.
   draw({ rotation, center, half }, width, height) {
     if (!this.opacity) return;
-    const { gl, screen } = renderer, { program, places } = this.program, levels = this.levelsOf(this.node);
+    const { gl, screen } = state.renderer, { program, places } = this.program, levels = this.levelsOf(this.node);
     const chosen = this.chooseLevel(this.node, [width, height]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
