@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import msgspec
 import numpy as np
 import scipy
 import shapely
@@ -34,7 +35,7 @@ from torch import Tensor
 from pansplat import constants, pipeline
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.film import FilmPhotographs
-from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
+from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, PageHeader, count_bytes, pack_gaussians
 from pansplat.export.photographs import PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
@@ -401,7 +402,7 @@ def _describe_scene(
     flights: _Flights,
     tour: TourGraph,
 ) -> dict[str, Any]:
-    """The numbers of a page, without those of single Gaussians; its modules read them as HEADER."""
+    """The numbers of a page, without those of single Gaussians; a part of `PageHeader`."""
     level = flights.level
     positions = scene.cam2world[:, :3, 3].numpy() - origin
     known = [find_camera_height(scene, view, level) for view in range(len(positions))]
@@ -624,7 +625,7 @@ def _write_files(
             for call, part in zip(calls, parts, strict=True)
         ]
     folder = path.with_name(f"{path.stem}_files")
-    address = quote(os.fsencode(folder.name))
+    folder_address = quote(os.fsencode(folder.name)) if split else None
     elements: list[str] = []
     if split:
         for picture in pictures:
@@ -642,7 +643,7 @@ def _write_files(
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
         count=f"{count:,}",
-        header=_to_script(header | {"folder": address if split else None}),
+        header=_to_script(msgspec.to_builtins(msgspec.convert(header | {"folder": folder_address}, PageHeader))),
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         worker=_to_script("".join(map(_read, _WORKER))),
         programs=_bundle_programs(),
@@ -715,14 +716,12 @@ def _bundle_programs() -> str:
 
     Modules follow those that they import, as in a browser. All share one scope, so their names differ.
     """
-    seen: set[str] = set()
     texts: dict[str, str] = {}
 
     def add(name: str) -> None:
-        seen.add(name)  # modules may import each other
         text = _read(name)
         for other in _IMPORT.findall(text):
-            if other not in seen:
+            if other not in texts:
                 add(other)
         texts[name] = _EXPORT.sub("", _IMPORT.sub("", text))
 

@@ -1,6 +1,6 @@
-"""The Gaussians of a page as compressed bytes, which page.js reads.
+"""The data of a page: `PageHeader`, which its modules read as HEADER, and the Gaussians as compressed bytes.
 
-The layout is in docs/web.md.
+The layout of the bytes is in docs/web.md.
 """
 
 from __future__ import annotations
@@ -10,7 +10,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeAlias
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -22,6 +24,164 @@ MAX_DEGREE = 3  # of the harmonics of a page
 _CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
 _MORTON_BITS = 10  # of each coordinate
 _CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
+
+
+Vector: TypeAlias = tuple[float, float, float]  # in the scene's world, relative to the page's origin
+
+
+class _Record(msgspec.Struct, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=True):
+    """A JSON object of a page."""
+
+
+class PageView(_Record):
+    """The Gaussians of a view: their camera, the first one, their number, and the files that hold them."""
+
+    position: Vector
+    start: int
+    count: int
+    files: tuple[str, ...]
+
+
+class PageNote(_Record):
+    """A note of the tour, in a direction of the scene's world."""
+
+    direction: Vector
+    text: str
+    addresses: tuple[str, ...]
+
+
+class PageSpot(_Record):
+    """A panorama: its camera, the mark and the radius of its ring on the floor, and where there is something to see.
+
+    Attributes:
+        blank: bits of the directions in which a camera faces a wall.
+        ahead: yaw of the widest view, radians.
+        hidden: panoramas whose marks surfaces hide.
+        start: yaw and pitch of the start view, radians.
+    """
+
+    name: str
+    position: Vector
+    mark: Vector
+    radius: float
+    notes: tuple[PageNote, ...]
+    blank: int
+    ahead: float
+    hidden: tuple[int, ...]
+    start: tuple[float, float] | msgspec.UnsetType = msgspec.UNSET
+
+
+class PageLink(_Record):
+    """A link of the tour; one to another part has a ring, and a place and a yaw with which the fade begins."""
+
+    source: int = msgspec.field(name="from")
+    target: int = msgspec.field(name="to")
+    text: str
+    mark: Vector | msgspec.UnsetType = msgspec.UNSET
+    leave: Vector | msgspec.UnsetType = msgspec.UNSET
+    yaw: float | msgspec.UnsetType = msgspec.UNSET
+
+
+class PageStart(_Record):
+    """The first camera; radians, and degrees of the vertical field of view."""
+
+    position: Vector
+    yaw: float
+    pitch: float
+    fov: float
+
+
+class PagePhotograph(_Record):
+    """The tiles of a photograph: the size of a face and of a tile of each level, and its rotation to the world."""
+
+    name: str
+    levels: tuple[tuple[int, int], ...]
+    rotation: tuple[Vector, Vector, Vector]
+
+
+class PageRoom(_Record):
+    """A room of the floor plan; `label` is the middle and the width of its name. To the right and forward."""
+
+    name: str
+    nodes: tuple[int, ...]
+    outline: tuple[tuple[float, float], ...]
+    label: Vector
+
+
+class PageDoor(_Record):
+    """A door of a room of the plan."""
+
+    room: int
+    ends: tuple[tuple[float, float], ...]
+
+
+class PagePlan(_Record):
+    """The floor plan: the world of each panorama, and the angle that turns each world."""
+
+    worlds: tuple[int, ...]
+    turns: tuple[float, ...]
+    rooms: tuple[PageRoom, ...]
+    doors: tuple[PageDoor, ...]
+
+
+class PageDoll(_Record):
+    """The doll's house: (view, first, count) of its Gaussians, and the storey and the box of each view."""
+
+    ranges: tuple[tuple[int, int, int], ...]
+    storeys: tuple[int, ...]
+    boxes: tuple[tuple[Vector, Vector] | None, ...]
+
+
+class PageHeader(_Record):
+    """All numbers of a page but those of single Gaussians.
+
+    Attributes:
+        count, degree, color_range, harmonics_scale: of the Gaussians (`PackedGaussians`).
+        loading: views in the order of their data.
+        level: axes of a level camera (columns right, down, forward).
+        parts, groups, edges, hysteresis, reach, next, poor: the graph of the tour (graph.js).
+        route_rate, route, jumps: the flight through all panoramas: position, yaw and pitch at each sample.
+        batch, near, filter_variance, tallest: of the picture.
+        unit: of a metre in the page.
+        speed: of a walk, a second.
+        limits: how far the camera may go in each part.
+        rough: panoramas whose surfaces are too rough for distances.
+        folder: address of the folder with the files; None of a page in one file.
+    """
+
+    count: int
+    degree: int
+    color_range: tuple[float, float]
+    harmonics_scale: float
+    views: tuple[PageView, ...]
+    loading: tuple[int, ...]
+    spots: tuple[PageSpot, ...]
+    links: tuple[PageLink, ...]
+    level: tuple[Vector, Vector, Vector]
+    start: PageStart
+    parts: tuple[int, ...]
+    groups: tuple[tuple[int, ...], ...]
+    edges: tuple[tuple[int, int, int], ...]
+    hysteresis: float
+    reach: float
+    next: tuple[tuple[int, ...], ...]
+    poor: tuple[tuple[int, int], ...]
+    route_rate: int
+    route: tuple[tuple[float, float, float, float, float], ...]
+    jumps: tuple[int, ...]
+    batch: int
+    near: float
+    unit: float
+    tallest: float
+    filter_variance: float
+    speed: float
+    limits: tuple[float, ...]
+    embed: tuple[str, ...]
+    doll: PageDoll | None
+    photographs: tuple[PagePhotograph, ...]
+    rough: tuple[int, ...]
+    plan: PagePlan
+    folder: str | None
 
 
 @dataclass(frozen=True, eq=False)

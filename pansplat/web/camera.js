@@ -2,19 +2,14 @@
 // OpenCV axes (x right, y down, z forward), as everywhere in pansplat. Positions are in the scene's world, moved by its
 // origin. Matrices are arrays of rows.
 
-import { doll } from "./doll.js";
 import {
-  clamp, closestOnEdge, distanceOf, dot, followEdge, indexOfLeast, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
+  clamp, closestOnEdge, DEGREE, distanceOf, dot, followEdge, indexOfLeast, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
 } from "./graph.js";
-import { changed, sorted } from "./loop.js";
-import { DEGREE } from "./share.js";
+import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, state } from "./state.js";
 
 export const MAX_PITCH = 89.9 * Math.PI / 180;
 export const MIN_FOV = 20, MAX_FOV = 110;  // degrees, vertical
 const SOFT = 0.3;                   // of the way to the limit of the camera, in which steps become shorter
-
-export const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
-export const camera = makeStart();
 
 // Camera to world; positive yaw turns right, positive pitch up (viewer/scene/camera.py). The device's motion adds a roll.
 export function rotationOf({ yaw, pitch, roll }) {
@@ -41,7 +36,7 @@ export function turn(yaw, pitch) {
 // Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part, or
 // near the panoramas of a scene without edges; steps away from them become shorter near the limit.
 export function walk(right, up, forward) {
-  if (doll.isOn || !sorted) return;
+  if (state.doll.isOn || !state.sorted) return;
   const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
   const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
   const target = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
@@ -59,7 +54,7 @@ export function nearestNode(position) {
 }
 
 // The panorama at the camera, or that from which it looked at the doll's house.
-export const nodeHere = () => doll.isOn ? doll.node : nearestNode(camera.position);
+export const nodeHere = () => state.doll.isOn ? state.doll.node : nearestNode(camera.position);
 
 // A camera for a pose of share.js, some of whose values may be missing; its position is within the limits.
 export function cameraFor({ position, yaw, pitch, fov }) {
@@ -69,9 +64,9 @@ export function cameraFor({ position, yaw, pitch, fov }) {
   };
   if (position !== undefined) {
     check("position", [0, 1, 2].map((k) => position[k]));
-    const edge = edges.length ? nearestEdge(GRAPH, position) : null;
-    const from = edge === null ? findSpot(position).position : closestOnEdge(GRAPH, edge, position);
-    const limit = HEADER.limits[edge === null ? 0 : partOfEdge(GRAPH, edge)], away = distanceOf(position, from);
+    const near = edges.length ? nearestEdge(GRAPH, position) : null;
+    const from = near === null ? findSpot(position).position : closestOnEdge(GRAPH, near, position);
+    const limit = HEADER.limits[near === null ? 0 : partOfEdge(GRAPH, near)], away = distanceOf(position, from);
     found.position = plus(from, scaled(minus(position, from), Math.min(limit / Math.max(away, 1e-9), 1)));
   }
   check("angles", [yaw, pitch, fov].filter((value) => value !== undefined));
@@ -87,17 +82,13 @@ export const findSpot = (position) => HEADER.spots[nearestNode(position)];
 export function floorPoint(position) {
   if (!edges.length) return findSpot(position).mark;
   const [from, to] = endsOfEdge(), [start, end] = [from, to].map((node) => GRAPH.positions[node]);
-  const part = distanceOf(closestOnEdge(GRAPH, edge, position), start) / Math.max(distanceOf(start, end), 1e-6);
+  const part = distanceOf(closestOnEdge(GRAPH, state.edge, position), start) / Math.max(distanceOf(start, end), 1e-6);
   return plus(HEADER.spots[from].mark, scaled(minus(HEADER.spots[to].mark, HEADER.spots[from].mark), part));
 }
 
 const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
 export const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
 export const DOLLY_MS = 500;               // of a fade along a poor edge
-
-export const { edges, parts } = HEADER;
-export const GRAPH = { ...HEADER, positions: HEADER.spots.map((spot) => spot.position) };
-export let edge = 0, group = edges.length ? edges[0][2] : 0, fade = null;
 
 // Weights of the views of a group at a position: normalised inverse distances (docs/rendering.md, section 7). Other
 // views have weight 0.
@@ -114,15 +105,15 @@ function groupWeights(group, position) {
 // The views of the edge at the camera, and for a second after a change also those of the edge before. A view fades in
 // when it has arrived.
 export function blendWeights(position) {
-  if (doll.isOn) return null;
-  const weights = groupWeights(group, position), old = fade ? groupWeights(fade.group, position) : weights;
+  if (state.doll.isOn) return null;
+  const { fade } = state, weights = groupWeights(state.group, position), old = fade ? groupWeights(fade.group, position) : weights;
   const done = fade ? fade.done : 1;
   return weights.map((weight, view) => shown[view] * (done * weight + (1 - done) * old[view]));
 }
 
-// How far each view has faded in. The first ones are there at once.
-export const shown = HEADER.views.map(() => 0);
+// The views that are sorted fade in.
 export function showViews(step) {
+  const { sorted } = state;
   if (!sorted || !sorted.views.some((view) => shown[view] < 1)) return;
   const isFirst = !sorted.views.some((view) => shown[view] && HEADER.views[view].count);
   sorted.views.forEach((view) => { shown[view] = isFirst ? 1 : Math.min(shown[view] + step, 1); });
@@ -131,31 +122,27 @@ export function showViews(step) {
 
 // Chooses the edge at the camera; its views fade in.
 export function updateEdge(now) {
+  const { fade } = state;
   if (fade) {
     const t = clamp((now - fade.began) / FADE_MS, 0, 1);
     fade.done = t * t * (3 - 2 * t);
-    if (t === 1) fade = null;
+    if (t === 1) state.fade = null;
     changed();
     return;
   }
-  const chosen = followEdge(GRAPH, camera.position, edge);
-  if (chosen === edge) return;
-  const old = group, part = currentPart();
+  const chosen = followEdge(GRAPH, camera.position, state.edge);
+  if (chosen === state.edge) return;
+  const old = state.group, part = currentPart();
   settle(chosen);
-  if (group !== old && part === currentPart()) fade = { group: old, began: now, done: 0 };
+  if (state.group !== old && part === currentPart()) state.fade = { group: old, began: now, done: 0 };
   changed();
 }
 
 // Shows the views of an edge at once.
 function settle(number) {
-  edge = number;
-  group = edges[number][2];
-  fade = null;
+  Object.assign(state, { edge: number, group: edges[number][2], fade: null });
 }
 
 export function settleAt(position) {
   if (edges.length) settle(nearestEdge(GRAPH, position));
 }
-
-export const currentPart = () => edges.length ? partOfEdge(GRAPH, edge) : 0;
-export const endsOfEdge = () => edges.length ? edges[edge].slice(0, 2) : [];

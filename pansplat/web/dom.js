@@ -30,3 +30,12 @@ export function make(tag, className, ...children) {
   element.append(...children);
   return element;
 }
+
+const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
+
+// Of the canvas at the full resolution.
+export function fullSize() {
+  const { clientWidth, clientHeight } = canvas, ratio = Math.min(devicePixelRatio || 1, 2);
+  const full = Math.min(ratio, Math.sqrt(MAX_PIXELS / (clientWidth * clientHeight || 1)));
+  return [clientWidth, clientHeight].map((side) => Math.max(Math.round(side * full), 1));
+}

@@ -1,24 +1,22 @@
 // Ways of the camera that need no hand: flights along edges, the flight through all panoramas, and jumps, which fade: the
 // image of the camera before covers the new one until that is sorted, then it fades out.
 
-import {
-  camera, cameraFor, currentPart, DOLLY_MS, edge, edges, FADE_MS, GRAPH, group, makeStart, nearestNode, nodeHere, parts,
-  rotationOf, settleAt, turn,
-} from "./camera.js";
-import { doll } from "./doll.js";
-import { byId, calm, canvas } from "./dom.js";
+import { cameraFor, DOLLY_MS, FADE_MS, nearestNode, nodeHere, rotationOf, settleAt, turn } from "./camera.js";
+import { frameDoll, isInDoll, listBoxes, nearestInDoll } from "./doll.js";
+import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import {
   clamp, column, distanceOf, dot, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
 } from "./graph.js";
-import { isComplete } from "./loading.js";
-import { changed, drawAt, fullSize, isSortedAs, renderer, sorted } from "./loop.js";
 import { photographs } from "./photographs.js";
-import { headset } from "./xr.js";
+import { drawAt, measureAt, rayOf } from "./picture.js";
+import { camera, changed, currentPart, edges, GRAPH, isComplete, isSortedAs, makeStart, parts, state } from "./state.js";
 
+const DOLL_SECONDS = 1.6;            // of a flight out of the rooms, or into one
 const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
 const NEAR = HEADER.speed;          // metres: a second's walk
 const DIRECTIONS = 24;              // of the bits of `blank`
 const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
+const PHOTO_WAIT_MS = 2000;         // of a fade along a poor edge, at most, for the photograph where it ends
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
 
 // The heading after a fade: away from the link back, or the start view; else that of before, or from another world, whose
@@ -45,9 +43,9 @@ export function jump(position, { yaw, pitch }, zoom = null) {
 }
 
 function place(pose) {
-  if (doll.isOn) doll.setOn(false);  // before the pose, which may have a field of view
+  if (state.doll.isOn) setDoll(false);  // before the pose, which may have a field of view
   Object.assign(camera, pose);
-  headset.turnTo(camera.yaw);
+  state.headset.turnTo(camera.yaw);
   settleAt(camera.position);
   changed();
 }
@@ -58,21 +56,95 @@ export function setPose(pose) {
   goToPose(next);
 }
 
+// ---- the doll's house ----
+
+export function toggleDoll() {
+  const { doll } = state;
+  if (doll.isOn) visit(doll.node, doll.heading);
+  else enterDoll();
+}
+
+// Flies out of the panorama at the camera.
+function enterDoll() {
+  const { doll } = state;
+  if (state.headset.session || !state.sorted) return;
+  setTouring(false);
+  doll.node = nearestNode(camera.position);
+  if (!listBoxes().length) {
+    say(byId("no-doll").textContent);
+    return;
+  }
+  takeStill();
+  setDoll(true);
+  camera.roll = 0;
+  Object.assign(doll, { fov: camera.fov, heading: { yaw: camera.yaw, pitch: camera.pitch } });
+  flyDoll(frameDoll([innerWidth, innerHeight]));
+}
+
+// Flies into a panorama, and ends there; by default it looks where the camera looks from outside.
+function visit(node, heading = { yaw: lookOn(node, camera.yaw), pitch: 0 }) {
+  if (!isInDoll(node)) {
+    jumpTo(node);
+    return;
+  }
+  state.doll.node = node;
+  flyDoll({ position: [...HEADER.spots[node].position], ...heading, fov: state.doll.fov }, () => {
+    jump(HEADER.spots[node].position, heading);
+  });
+}
+
+// Goes to the panorama nearest to what a point of the window shows.
+export function enterAt(left, top) {
+  const distance = measureAt(left, top);
+  if (state.doll.flight || distance === null) return;
+  visit(nearestInDoll(plus(camera.position, scaled(rayOf(left, top), distance))));
+}
+
+// Without a flight.
+function setDoll(value) {
+  const { doll } = state;
+  if (doll.isOn && !value) camera.fov = doll.fov;
+  Object.assign(doll, { isOn: value, flight: null });
+  byId("doll").setAttribute("aria-pressed", value);
+  changed();
+}
+
+function flyDoll(target, then = () => {}) {
+  const start = { ...camera, position: [...camera.position] };
+  state.doll.flight = { start, target, then, began: null, seconds: calm.matches ? 0 : DOLL_SECONDS };
+  changed();
+}
+
+export function advanceDollFlight(now) {
+  const way = state.doll.flight;
+  if (!way || isWaiting()) return;
+  way.began ??= now;
+  const t = way.seconds ? clamp((now - way.began) / (1000 * way.seconds), 0, 1) : 1, part = ease(t);
+  const mix = (from, to) => from + part * (to - from);
+  camera.position = way.start.position.map((from, k) => mix(from, way.target.position[k]));
+  for (const name of ["yaw", "pitch", "fov"]) camera[name] = mix(way.start[name], way.target[name]);
+  changed();
+  if (t < 1) return;
+  state.doll.flight = null;
+  way.then();
+}
+
+// ---- flights and jumps ----
+
 // A smooth flight to a panorama along the edges; the direction of view stays the user's. To another part, the camera
 // turns to the link, goes a step along it, and the image fades; without a link it fades at once.
-export let flight = null, touring = false;
 export function flyTo(spot) {
-  if (doll.isOn) {
-    doll.visit(spot);
+  if (state.doll.isOn) {
+    visit(spot);
     return;
   }
   if (calm.matches) {
-    flight = { spot, legs: [{ from: edges.length ? nearestNode(camera.position) : spot, to: spot }], began: null };
-    if (touring) flight.legs.push({ path: [GRAPH.positions[spot]], rest: REST_SECONDS });
+    state.flight = { spot, legs: [{ from: edges.length ? nearestNode(camera.position) : spot, to: spot }], began: null };
+    if (state.isTouring) state.flight.legs.push({ path: [GRAPH.positions[spot]], rest: REST_SECONDS });
     changed();
     return;
   }
-  const way = edges.length ? findWay(GRAPH, camera.position, spot, partOfEdge(GRAPH, followEdge(GRAPH, camera.position, edge))) : [spot];
+  const way = edges.length ? findWay(GRAPH, camera.position, spot, partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge))) : [spot];
   const legs = [];
   let path = [[...camera.position]];
   way.forEach((node, i) => {
@@ -86,36 +158,36 @@ export function flyTo(spot) {
     path.push(GRAPH.positions[node]);
   });
   legs.push({ path, end: spot });
-  flight = { spot, legs, began: null };
+  state.flight = { spot, legs, began: null };
   changed();
 }
 
 export const ease = (t) => t * t * t * (t * (6 * t - 15) + 10);
 
 export function advanceFlight(now) {
-  if (!flight || isWaiting()) return;
-  const leg = flight.legs[0];
+  if (!state.flight || isWaiting()) return;
+  const leg = state.flight.legs[0];
   if (leg.to !== undefined) {
     const isElsewhere = parts[leg.from] !== parts[leg.to], isDolly = !isElsewhere && isFade(GRAPH, leg.from, leg.to) && !calm.matches;
     const arrival = isElsewhere ? arriveAt(leg.to, leg.from) : { ...camera, yaw: lookOn(leg.to, camera.yaw) };
     jump(GRAPH.positions[leg.to], arrival, isDolly ? zoomTowards(GRAPH.positions[leg.to]) : null);
-    flight.legs.shift();
-    if (!flight.legs.length) flight = null;
+    state.flight.legs.shift();
+    if (!state.flight.legs.length) state.flight = null;
     return;
   }
-  if (flight.began === null) beginLeg(leg, now);
-  const t = leg.seconds ? clamp((now - flight.began) / (1000 * leg.seconds), 0, 1) : 1;
+  if (state.flight.began === null) beginLeg(leg, now);
+  const t = leg.seconds ? clamp((now - state.flight.began) / (1000 * leg.seconds), 0, 1) : 1;
   if (leg.length) camera.position = t < 1 ? pointAlong(leg.path, ease(t) * leg.length) : [...leg.path.at(-1)];
   turn(leg.turn[0] * (ease(t) - leg.done), leg.turn[1] * (ease(t) - leg.done));  // a drag adds to it
   leg.done = ease(t);
   changed();
   if (t < 1) return;
-  flight.began = null;
-  flight.legs.shift();
-  if (flight.legs.length) return;
-  const { spot } = flight;
-  flight = null;
-  if (touring) flyTo((spot + 1) % HEADER.spots.length);
+  state.flight.began = null;
+  state.flight.legs.shift();
+  if (state.flight.legs.length) return;
+  const { spot } = state.flight;
+  state.flight = null;
+  if (state.isTouring) flyTo((spot + 1) % HEADER.spots.length);
 }
 
 // Of an image, as of a camera that comes nearer; none if the way leads to the side or back.
@@ -125,13 +197,13 @@ function zoomTowards(position) {
 }
 
 function beginLeg(leg, now) {
-  flight.began = now;
+  state.flight.began = now;
   leg.length = lengthOf(leg.path);
   leg.done = 0;
   const yaw = leg.yaw === undefined && leg.end !== undefined ? lookOn(leg.end, camera.yaw) : leg.yaw;
-  const across = yaw === undefined || headset.session ? 0 : Math.atan2(Math.sin(yaw - camera.yaw), Math.cos(yaw - camera.yaw));
+  const across = yaw === undefined || state.headset.session ? 0 : Math.atan2(Math.sin(yaw - camera.yaw), Math.cos(yaw - camera.yaw));
   leg.turn = [across, leg.yaw === undefined ? 0 : -camera.pitch];
-  const turning = headset.session ? 0 : Math.hypot(...leg.turn) / TURN_SPEED;  // the head turns itself
+  const turning = state.headset.session ? 0 : Math.hypot(...leg.turn) / TURN_SPEED;  // the head turns itself
   leg.seconds = leg.rest || Math.max(turning, leg.length ? clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : 0);
 }
 
@@ -146,7 +218,6 @@ function pointAlong(path, distance) {
 
 // The flight through all panoramas of a tour. It begins at the point of the route that is nearest to the camera, and
 // the difference in pose disappears at first. The camera turns with the route; a drag adds to it until a fade.
-export let route = null;
 function startRoute() {
   const distances = HEADER.route.map((sample) => distanceOf(sample.slice(0, 3), camera.position));
   const least = Math.min(...distances) + 0.02 * NEAR;
@@ -154,40 +225,40 @@ function startRoute() {
   const offset = minus([...camera.position, camera.yaw, camera.pitch], sample);
   offset[3] -= 2 * Math.PI * Math.round(offset[3] / (2 * Math.PI));
   const time = first / HEADER.routeRate, seconds = Math.max(1, Math.abs(offset[3]) / TURN_SPEED);
-  route = { time, began: time, seconds, last: null, offset };
+  state.route = { time, began: time, seconds, last: null, offset };
 }
 
 export function advanceRoute(seconds) {
-  if (!route || isWaiting()) return;
-  const end = HEADER.route.length - 1, before = Math.floor(route.time * HEADER.routeRate);
-  route.time += seconds;
-  const at = Math.min(route.time * HEADER.routeRate, end), index = Math.min(Math.floor(at), end - 1);
+  if (!state.route || isWaiting()) return;
+  const end = HEADER.route.length - 1, before = Math.floor(state.route.time * HEADER.routeRate);
+  state.route.time += seconds;
+  const at = Math.min(state.route.time * HEADER.routeRate, end), index = Math.min(Math.floor(at), end - 1);
   if (HEADER.jumps.some((jumped) => before <= jumped && jumped < index)) {
     const [x, y, z, yaw, pitch] = HEADER.route[index];
     jump([x, y, z], { yaw, pitch });
-    Object.assign(route, { time: index / HEADER.routeRate, offset: [0, 0, 0, 0, 0], last: { yaw, pitch } });
+    Object.assign(state.route, { time: index / HEADER.routeRate, offset: [0, 0, 0, 0, 0], last: { yaw, pitch } });
     return;
   }
   const fraction = HEADER.jumps.includes(index) ? 0 : at - index;
   const sample = plus(HEADER.route[index], scaled(minus(HEADER.route[index + 1], HEADER.route[index]), fraction));
-  const left = 1 - ease(clamp((route.time - route.began) / route.seconds, 0, 1));
-  const [x, y, z, yaw, pitch] = plus(sample, scaled(route.offset, left));
+  const left = 1 - ease(clamp((state.route.time - state.route.began) / state.route.seconds, 0, 1));
+  const [x, y, z, yaw, pitch] = plus(sample, scaled(state.route.offset, left));
   camera.position = [x, y, z];
-  turn(yaw - (route.last ? route.last.yaw : yaw), pitch - (route.last ? route.last.pitch : pitch));
-  route.last = { yaw, pitch };
+  turn(yaw - (state.route.last ? state.route.last.yaw : yaw), pitch - (state.route.last ? state.route.last.pitch : pitch));
+  state.route.last = { yaw, pitch };
   if (at === end) setTouring(false);
 }
 
 export function setTouring(value) {
-  touring = value && HEADER.spots.length > 1;
-  if (touring && doll.isOn) jumpTo(doll.node);
-  byId("play").setAttribute("aria-pressed", touring);
-  byId("play").querySelector("path").setAttribute("d", touring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
-  if (!touring) flight = route = null;
+  state.isTouring = value && HEADER.spots.length > 1;
+  if (state.isTouring && state.doll.isOn) jumpTo(state.doll.node);
+  byId("play").setAttribute("aria-pressed", state.isTouring);
+  byId("play").querySelector("path").setAttribute("d", state.isTouring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
+  if (!state.isTouring) Object.assign(state, { flight: null, route: null });
   else if (HEADER.route.length > 1 && !calm.matches) {
-    flight = null;
+    state.flight = null;
     startRoute();
-  } else if (!flight) {
+  } else if (!state.flight) {
     flyTo((nearestNode(camera.position) + 1) % GRAPH.positions.length);
   }
   changed();
@@ -195,7 +266,7 @@ export function setTouring(value) {
 
 export function goHome() {
   setTouring(false);
-  flight = null;
+  state.flight = null;
   goToPose(makeStart());
 }
 
@@ -203,7 +274,7 @@ export function goHome() {
 function goToPose(pose) {
   const isFar = distanceOf(pose.position, camera.position) > NEAR;
   const isElsewhere = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
-  if (isFar || isElsewhere || headset.session) takeStill();
+  if (isFar || isElsewhere || state.headset.session) takeStill();
   place(pose);
 }
 
@@ -220,40 +291,40 @@ export function jumpTo(node) {
   jump(GRAPH.positions[node], isSame ? { ...camera, yaw: lookOn(node, camera.yaw) } : arriveAt(node, from));
 }
 
-export const isFlying = () => flight !== null || route !== null;
+export const isFlying = () => state.flight !== null || state.route !== null;
 
 // The still, the image of the last camera before a jump, covers the new one until that is sorted, then it fades out.
 const stillCanvas = byId("still");
-export let still = null;
 
 export function takeStill(zoom = null) {
-  if (!renderer || !sorted) return;
-  if (headset.session) {  // it fades from black
-    still = { began: null, left: 1, position: null, zoom: null };
+  if (!state.renderer || !state.sorted) return;
+  if (state.headset.session) {  // it fades from black
+    state.still = { taken: null, began: null, left: 1, position: null, zoom: null };
     return;
   }
   const size = fullSize();  // a photograph is drawn fast
   drawAt(...(photographs.isOpaque ? size : [canvas.width, canvas.height]));  // it can be copied in the task that drew it
   const context = stillCanvas.getContext("2d");
   const isSame = stillCanvas.width === size[0] && stillCanvas.height === size[1];
-  context.globalAlpha = still && isSame ? 1 - still.left : 1;
+  context.globalAlpha = state.still && isSame ? 1 - state.still.left : 1;
   if (!isSame) [stillCanvas.width, stillCanvas.height] = size;
   context.drawImage(canvas, 0, 0, ...size);
-  still = { began: null, left: 1, position: null, zoom };
+  state.still = { taken: null, began: null, left: 1, position: null, zoom };
   showStill();
   changed();
 }
 
 export function updateStill(now) {
-  if (!still) return;
-  still.position = still.position || [...camera.position];
-  const isSorted = isSortedAs() && distanceOf(sorted.position, still.position) < NEAR;
-  const isThere = still.zoom === null || !HEADER.photographs.length || photographs.isOpaque;
-  if (still.began === null && isSorted && isThere && isSeen()) still.began = now;
-  if (still.began !== null) {
-    const t = clamp((now - still.began) / (still.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);
-    still.left = 1 - t * t * (3 - 2 * t);
-    if (t === 1) still = null;
+  if (!state.still) return;
+  state.still.taken ??= now;
+  state.still.position = state.still.position || [...camera.position];
+  const isSorted = isSortedAs() && distanceOf(state.sorted.position, state.still.position) < NEAR;
+  const isThere = state.still.zoom === null || !photographs.isExpected || now - state.still.taken > PHOTO_WAIT_MS;
+  if (state.still.began === null && isSorted && isThere && isSeen()) state.still.began = now;
+  if (state.still.began !== null) {
+    const t = clamp((now - state.still.began) / (state.still.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);
+    state.still.left = 1 - t * t * (3 - 2 * t);
+    if (t === 1) state.still = null;
   }
   showStill();
   changed();
@@ -261,17 +332,17 @@ export function updateStill(now) {
 
 function showStill() {
   const left = coverage();
-  stillCanvas.hidden = !still || headset.session !== null;
+  stillCanvas.hidden = !state.still || state.headset.session !== null;
   stillCanvas.style.opacity = left;
-  stillCanvas.style.transform = still && still.zoom ? `scale(${1 + still.zoom * (1 - left)})` : "";
+  stillCanvas.style.transform = state.still && state.still.zoom ? `scale(${1 + state.still.zoom * (1 - left)})` : "";
   byId("spots").style.opacity = 1 - left;
 }
 
 // Whether a view of the group at the camera is sorted, or all are empty.
-const isSeen = () => doll.isOn || HEADER.groups[group].some((view) => sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
+const isSeen = () => state.doll.isOn || HEADER.groups[state.group].some((view) => state.sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
 
 // Whether nothing moves yet: the Gaussians have not arrived, or an image covers them.
-export const isWaiting = () => !sorted || still !== null && still.began === null;
+export const isWaiting = () => !state.sorted || state.still !== null && state.still.began === null;
 
 // How much of the picture the image covers, or the black in a headset.
-export const coverage = () => still ? still.left : 0;
+export const coverage = () => state.still ? state.still.left : 0;

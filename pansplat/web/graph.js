@@ -5,6 +5,8 @@
 // on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; and the `reach` around a part,
 // within which a camera that has jumped is in it. Edges are numbers in `edges`.
 
+export const DEGREE = Math.PI / 180;
+
 export const minus = (a, b) => a.map((value, i) => value - b[i]);
 export const plus = (a, b) => a.map((value, i) => value + b[i]);
 export const scaled = (a, factor) => a.map((value) => value * factor);

@@ -1,34 +1,37 @@
 // Keys, pointers, the wheel, the device's motion, and buttons.
 
-import { camera, MAX_FOV, MAX_PITCH, MIN_FOV, tangentOf, turn, walk } from "./camera.js";
-import { doll } from "./doll.js";
+import { MAX_FOV, MAX_PITCH, MIN_FOV, tangentOf, turn, walk } from "./camera.js";
+import { orbit, zoomDoll } from "./doll.js";
 import { byId, canvas, say, showMore } from "./dom.js";
 import { embed } from "./embed.js";
-import { flyTo, goHome, setPose, setTouring, touring } from "./flight.js";
-import { clamp, distanceOf, dot, multiply, scaled } from "./graph.js";
-import { changed } from "./loop.js";
+import { enterAt, flyTo, goHome, setPose, setTouring, toggleDoll } from "./flight.js";
+import { clamp, distanceOf, dot, multiply } from "./graph.js";
 import { measure } from "./measure.js";
 import { plan } from "./plan.js";
 import { openList } from "./rings.js";
 import { copyLink, parsePose, savePicture } from "./share.js";
+import { camera, changed, state } from "./state.js";
 
 const held = new Set(), fingers = new Map();
-let fast = false;
 const MOVES = {
   KeyW: [0, 0, 1], ArrowUp: [0, 0, 1], KeyS: [0, 0, -1], ArrowDown: [0, 0, -1], KeyA: [-1, 0, 0], ArrowLeft: [-1, 0, 0],
   KeyD: [1, 0, 0], ArrowRight: [1, 0, 0], KeyE: [0, 1, 0], KeyQ: [0, -1, 0],
 };
 const PRESSES = {
-  Space: () => setTouring(!touring),
+  Space: () => setTouring(!state.isTouring),
   KeyF: () => toggleFull(),
   KeyR: () => goHome(),
   KeyH: () => byId("keys").showModal(),
   KeyL: () => openList(),
   KeyM: () => { if (HEADER.spots.length > 1) plan.toggle(); },
-  KeyO: () => doll.toggle(),
+  KeyO: () => toggleDoll(),
   KeyP: () => savePicture(),
 };
 const CLOSES = { KeyH: "keys", KeyL: "list" };  // the dialogs that a key opens and closes
+
+function onHeld() {
+  state.step = [0, 1, 2].map((k) => [...held].reduce((sum, code) => sum + MOVES[code][k], 0));
+}
 
 function onKey(event) {
   const open = document.querySelector("dialog[open]");
@@ -47,7 +50,10 @@ function onKey(event) {
   const onButton = event.target.tagName === "BUTTON" && (event.code === "Space" || event.code === "Enter");
   if (onButton) return;
   const digit = /^(Digit|Numpad)([1-9])$/.exec(event.code);
-  if (MOVES[event.code]) held.add(event.code);
+  if (MOVES[event.code]) {
+    held.add(event.code);
+    onHeld();
+  }
   else if (PRESSES[event.code] && !event.repeat) PRESSES[event.code]();
   else if (digit && HEADER.spots[digit[2] - 1]) {
     setTouring(false);
@@ -56,13 +62,6 @@ function onKey(event) {
   else return;
   event.preventDefault();
   if (MOVES[event.code]) setTouring(false);
-}
-
-export function walkByKeys(seconds) {
-  const step = [0, 0, 0];
-  for (const code of held) MOVES[code].forEach((value, i) => { step[i] += value; });
-  if (doll.isOn) doll.move(step, seconds);
-  else if (step.some((value) => value)) walk(...scaled(step, seconds * HEADER.speed * (fast ? 3 : 1)));
 }
 
 // One finger or the mouse turns: the scene follows the pointer. Two fingers pull the scene: sideways, and forward by
@@ -76,12 +75,12 @@ function onMove(event) {
   if (before.length === 1) {
     const { clientWidth, clientHeight } = canvas;
     const radians = 2 * tangentOf(clientWidth, clientHeight) / clientHeight;
-    if (doll.isOn) doll.orbit(2 * Math.PI * moved[0] / clientWidth, -Math.PI * moved[1] / clientHeight);
+    if (state.doll.isOn) orbit(2 * Math.PI * moved[0] / clientWidth, -Math.PI * moved[1] / clientHeight);
     else turn(-moved[0] * radians, moved[1] * radians);
   } else if (before.length === 2) {
     const metres = 2 * HEADER.speed / Math.min(canvas.clientWidth, canvas.clientHeight);
     const gap = distanceOf(...before), apart = distanceOf(...fingers.values());
-    if (doll.isOn) doll.zoom(gap / Math.max(apart, 1));
+    if (state.doll.isOn) zoomDoll(gap / Math.max(apart, 1));
     setTouring(false);
     walk(-0.5 * moved[0] * metres, 0, (0.5 * moved[1] + apart - gap) * metres);
   }
@@ -90,7 +89,7 @@ function onMove(event) {
 // Look around by the device's motion: its axes in the earth's (east, north, up), turned by the screen's angle.
 let motion = null;
 function onOrientation({ alpha, beta, gamma }) {
-  if (alpha === null || beta === null || gamma === null || doll.isOn) return;
+  if (alpha === null || beta === null || gamma === null || state.doll.isOn) return;
   const [ca, sa, cb, sb, cg, sg] = [alpha, beta, gamma].map((degrees) => degrees * Math.PI / 180)
     .flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
   const toEarth = multiply([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]],
@@ -135,9 +134,16 @@ function toggleFull() {
 
 export function listen() {
   addEventListener("keydown", onKey);
-  addEventListener("keydown", (event) => { fast = event.shiftKey; });
-  addEventListener("keyup", (event) => { fast = event.shiftKey; held.delete(event.code); });
-  addEventListener("blur", () => held.clear());
+  addEventListener("keydown", (event) => { state.isFast = event.shiftKey; });
+  addEventListener("keyup", (event) => {
+    state.isFast = event.shiftKey;
+    held.delete(event.code);
+    onHeld();
+  });
+  addEventListener("blur", () => {
+    held.clear();
+    onHeld();
+  });
   addEventListener("resize", changed);
   addEventListener("hashchange", () => {
     const pose = parsePose(location.hash);
@@ -155,7 +161,7 @@ export function listen() {
   canvas.addEventListener("click", ({ clientX, clientY }) => {
     if (!pressed || distanceOf(pressed, [clientX, clientY]) >= 5) return;
     if (measure.isOn) measure.take(clientX, clientY);
-    else if (doll.isOn) doll.take(clientX, clientY);
+    else if (state.doll.isOn) enterAt(clientX, clientY);
   });
   for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
@@ -167,18 +173,18 @@ export function listen() {
     event.preventDefault();
     const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
     const factor = Math.exp(0.001 * clamp(pixels, -200, 200));
-    if (doll.isOn) doll.zoom(factor);
+    if (state.doll.isOn) zoomDoll(factor);
     else camera.fov = clamp(camera.fov * factor, MIN_FOV, MAX_FOV);
     changed();
   }, { passive: false });
-  byId("play").onclick = () => setTouring(!touring);
+  byId("play").onclick = () => setTouring(!state.isTouring);
   byId("home").onclick = goHome;
   byId("place").onclick = openList;
   byId("list").onclick = (event) => { if (event.target === byId("list")) byId("list").close(); };  // beside it
   byId("map").onclick = () => plan.toggle();
-  byId("doll").onclick = () => doll.toggle();
-  byId("doll").hidden = !doll.isPossible;
-  byId("no-doll").hidden = doll.isPossible;
+  byId("doll").onclick = toggleDoll;
+  byId("doll").hidden = HEADER.doll === null;
+  byId("no-doll").hidden = HEADER.doll !== null;
   byId("more").onclick = () => showMore(byId("menu").hidden);
   for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", savePicture], ["link", copyLink]]) {
     byId(id).onclick = () => {

@@ -1,16 +1,14 @@
 // The data, which arrives in chunks while the scene is shown, and failures. docs/web.md describes the data. A page in one file
 // has all views; one with a folder loads those that the camera needs.
 
-import { camera, currentPart, edges, group, nodeHere, parts } from "./camera.js";
-import { doll } from "./doll.js";
+import { nodeHere } from "./camera.js";
+import { listRanges } from "./doll.js";
 import { byId, canvas } from "./dom.js";
-import { flight } from "./flight.js";
-import { onSorted, sorted } from "./loop.js";
+import { camera, currentPart, edges, isSortedFor, parts, refresh, state } from "./state.js";
 
-export let worker = null, failure = null, chunksArrived = 0, arrived = 0;  // chunks of the data, views
-const asked = new Set(), got = new Set();  // views
+export let failure = null;
+let worker = null, chunksArrived = 0;
 let onMissing = fail;                      // reports a chunk that does not arrive
-export const isComplete = () => [...asked].every((view) => got.has(view));
 
 export function fail(error) {
   if (failure) return;
@@ -36,33 +34,46 @@ window.addPart = (view, isLast, text) => {
   if (worker) worker.postMessage({ view, text, isLast });
 };
 
-const countChunks = () => [...asked].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
+const countChunks = () => [...state.asked].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
 
 // Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all of the part for the
 // doll's house, and all without edges.
 export function loadAround() {
-  if (asked.size === HEADER.loading.length) return;
-  const nodes = [nodeHere(), ...(flight ? [flight.spot] : [])];
+  if (state.asked.size === HEADER.loading.length) return;
+  const nodes = [nodeHere(), ...(state.flight ? [state.flight.spot] : [])];
   const groups = edges.filter(([a, b]) => nodes.includes(a) || nodes.includes(b)).map(([, , each]) => each);
-  const near = new Set([...groups, group].flatMap((each) => HEADER.groups[each]));
+  const near = new Set([...groups, state.group].flatMap((each) => HEADER.groups[each]));
   const isAll = HEADER.folder === null || !edges.length;
   for (const view of HEADER.loading) {
-    if (asked.has(view) || !(isAll || near.has(view) || doll.isOn && parts[view] === currentPart())) continue;
-    asked.add(view);
+    if (state.asked.has(view) || !(isAll || near.has(view) || state.doll.isOn && parts[view] === currentPart())) continue;
+    state.asked.add(view);
     canvas.ariaBusy = true;
     for (const file of HEADER.folder === null ? [] : HEADER.views[view].files) {
       const script = document.createElement("script");
-      Object.assign(script, { src: `${HEADER.folder}/${file}`, async: false });  // in this order
-      script.onerror = () => onMissing(new Error("A part of the scene is missing. Copy the whole folder."));
+      const end = () => { if (script.isConnected) onMissing(new Error("A part of the scene is missing. Copy the whole folder.")); };
+      Object.assign(script, { src: `${HEADER.folder}/${file}`, async: false, onload: end, onerror: end });  // in this order
       document.head.append(script);
     }
   }
 }
 
+// `tolerance`: distance in metres for which the order of before is kept.
+export function requestSort(tolerance) {
+  if (state.isSorting || isSortedFor(camera.position, currentPart(), tolerance)) return;
+  state.isSorting = true;
+  worker.postMessage({ position: [...camera.position], part: currentPart(), ranges: listRanges() });
+}
+
+function onSorted(data) {
+  Object.assign(state, { isSorting: false, sorted: data });
+  if (state.renderer) state.renderer.setSorted(data);
+  refresh();
+}
+
 // Starts the worker; `onView` gets the Gaussians of each view. Returns a promise of the first order.
 export function load(onView) {
   return new Promise((resolve, reject) => {
-    const fails = (error) => sorted ? fail(error) : reject(error);
+    const fails = (error) => state.sorted ? fail(error) : reject(error);
     onMissing = fails;
     worker = new Worker(URL.createObjectURL(new Blob([WORKER])));
     worker.onmessage = ({ data }) => {
@@ -71,8 +82,7 @@ export function load(onView) {
         onSorted(data);
         resolve();
       } else {
-        arrived += 1;
-        got.add(data.view);
+        state.got.add(data.view);
         onView(data);
       }
     };

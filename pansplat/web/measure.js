@@ -1,10 +1,9 @@
 // Distances in the picture: the depth at one point, and the distance of two.
 
-import { camera } from "./camera.js";
 import { byId, say } from "./dom.js";
 import { distanceOf, minus, plus, scaled } from "./graph.js";
-import { changed, measureAt, rayOf } from "./loop.js";
-import { here } from "./rings.js";
+import { measureAt, rayOf } from "./picture.js";
+import { camera, changed, state } from "./state.js";
 
 const SVG = byId("marks").namespaceURI;
 const SINGLE_ERROR = 0.35;  // of a distance in a panorama alone: heights of cameras over the floor differ by as much
@@ -23,7 +22,7 @@ class Measure {
   }
 
   toggle(value = !this.isOn) {
-    if (value && HEADER.rough.includes(here)) {
+    if (value && HEADER.rough.includes(state.here)) {
       say("There are no distances here, because the surfaces that were found are too rough");
       return;
     }
@@ -52,7 +51,7 @@ class Measure {
 
   // The scale of a panorama without others in its world is that of a camera of usual height.
   format(distance) {
-    const { worlds } = HEADER.plan, isAlone = worlds.filter((world) => world === worlds[here]).length === 1;
+    const { worlds } = HEADER.plan, isAlone = worlds.filter((world) => world === worlds[state.here]).length === 1;
     const [length, error] = [1, SINGLE_ERROR].map((factor) => (factor * distance / HEADER.unit).toFixed(2));
     return isAlone ? `${length} m ± ${error} m` : `${length} m`;
   }

@@ -1,10 +1,10 @@
 // What a tour says about a place in a panorama: a marker in its direction, at the panorama, opens a text box. Texts and
 // addresses are those of the tour's author; text is never HTML.
 
-import { camera, GRAPH, nodeHere } from "./camera.js";
-import { doll } from "./doll.js";
+import { nodeHere } from "./camera.js";
 import { byId, explain, make } from "./dom.js";
 import { column, distanceOf, dot } from "./graph.js";
+import { camera, GRAPH, state } from "./state.js";
 
 let markers = [];
 
@@ -24,7 +24,7 @@ export function makeNotes() {
 
 // `toWindow`: from camera axes.
 export function placeNotes(rotation, toWindow) {
-  const here = nodeHere(), isThere = !doll.isOn && distanceOf(GRAPH.positions[here], camera.position) < HEADER.spots[here].radius;
+  const here = nodeHere(), isThere = !state.doll.isOn && distanceOf(GRAPH.positions[here], camera.position) < HEADER.spots[here].radius;
   for (const { node, direction, button } of markers) {
     const place = [0, 1, 2].map((k) => dot(column(rotation, k), direction)), [left, top] = toWindow(place);
     button.hidden = !isThere || node !== here || place[2] < 0.1;

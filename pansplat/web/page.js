@@ -1,18 +1,20 @@
 // The page: starts when the first views are there, and answers scripts. docs/web.md describes it. HEADER, SHADERS and
 // WORKER of all modules are constants that export/page.py writes before them.
 
-import { camera, cameraFor, currentPart, settleAt, shown, showViews, tallOf } from "./camera.js";
+import { cameraFor, settleAt, showViews, tallOf } from "./camera.js";
 import { byId, canvas } from "./dom.js";
 import { embed } from "./embed.js";
 import { flyTo, jumpTo, setPose, setTouring } from "./flight.js";
 import { listen } from "./input.js";
-import { fail, failure, isComplete, load, loadAround } from "./loading.js";
-import { drawAt, isSettled, isSortedFor, onFrame, redraw, renderer, setRenderer, sorted } from "./loop.js";
+import { fail, failure, load, loadAround } from "./loading.js";
+import { isSettled, onFrame } from "./loop.js";
 import { makeNotes } from "./notes.js";
 import { photographs } from "./photographs.js";
+import { drawAt } from "./picture.js";
 import { Renderer } from "./renderer.js";
 import { makeList, makeRings } from "./rings.js";
 import { parsePose, poseOf } from "./share.js";
+import { camera, changed, currentPart, isComplete, isSortedFor, redraw, shown, state } from "./state.js";
 import { headset } from "./xr.js";
 
 const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later";  // that have all that the page uses
@@ -26,6 +28,13 @@ function placePoster() {
 
 const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
+// `value`: a renderer that has the data, or null while the graphics are lost.
+function setRenderer(value) {
+  state.renderer = value;
+  if (value && state.sorted) value.setSorted(state.sorted);
+  changed();
+}
+
 async function main() {
   placePoster();
   addEventListener("resize", placePoster);
@@ -37,7 +46,7 @@ async function main() {
   const received = [];  // kept for a context that is lost
   const loading = load((data) => {
     received.push(data);
-    if (renderer) renderer.add(data);
+    if (state.renderer) state.renderer.add(data);
     if (isComplete()) canvas.ariaBusy = false;
   });
   loading.catch(() => {});  // of an error that comes before it is awaited
@@ -55,7 +64,7 @@ async function main() {
     try { makeRenderer(); } catch (error) { fail(error); }
   });
   makeRenderer();
-  while (!renderer) {  // the context is lost
+  while (!state.renderer) {  // the context is lost
     if (failure) throw failure;
     await wait(50);
   }
@@ -104,13 +113,13 @@ window.pansplat = Object.assign(new EventTarget(), {
     const place = [...camera.position];
     settleAt(place);
     loadAround();
-    while (!sorted || !renderer || !isComplete() || !isSortedFor(place, currentPart()) || !photographs.isFinal([width, height])) {
+    while (!state.sorted || !state.renderer || !isComplete() || !isSortedFor(place, currentPart()) || !photographs.isFinal([width, height])) {
       if (failure) throw failure;
       await wait(5);
       photographs.update(1, [width, height]);
     }
     settleAt(place);
-    sorted.views.forEach((view) => { shown[view] = 1; });
+    state.sorted.views.forEach((view) => { shown[view] = 1; });
     drawAt(width, height);
     const image = canvas.toDataURL("image/png");
     redraw();

@@ -2,12 +2,10 @@
 // docs/web.md describes it. Tiles of cube faces arrive as text in scripts: a page from disk may not read the pixels of
 // image files. A large level is drawn over the smallest one, as far as it has arrived.
 
-import { camera, GRAPH, nodeHere, rotationOf, tangentOf } from "./camera.js";
-import { doll } from "./doll.js";
-import { flight } from "./flight.js";
+import { nodeHere, rotationOf, tangentOf } from "./camera.js";
+import { fullSize, say } from "./dom.js";
 import { clamp, column, distanceOf, dot, multiply, scaled } from "./graph.js";
-import { changed, fullSize, refresh, renderer } from "./loop.js";
-import { headset } from "./xr.js";
+import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
 const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
 const GONE = 0.3;                   // metres from a panorama, where its photograph has faded at any rate
@@ -15,6 +13,7 @@ const PHOTO_FADE = 0.2;             // seconds
 const DENSITY = 0.8;                // texels of a pixel in the middle of a face, at least
 const KEPT = 3;                     // photographs whose textures are kept
 const AT_ONCE = 6;                  // tiles that are read at the same time
+const TRIES = 3, PAUSE_AFTER_ERROR = 2000;  // of a tile that does not arrive, ms between them
 const SMALL_FACE = 2048;            // largest face on a phone, texels
 // Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number among those of OpenGL.
 const FACES = [
@@ -22,7 +21,7 @@ const FACES = [
   [[0, 0, 1], [0, 1, 0], [-1, 0, 0], 1], [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2], [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
 ];
 const texts = new Map();            // of a page in one file: base64 of the tiles that have arrived
-const requests = new Map();         // of other pages: what takes the text of a tile
+const requests = new Map();         // of other pages: what takes the text of a tile that has not arrived
 
 // A script for each tile calls this; in a page of one file, one for the smallest tiles of a photograph and one for the others,
 // which are in the element before.
@@ -41,10 +40,13 @@ function readText(key) {
   if (HEADER.folder === null) return Promise.resolve(texts.get(key));
   return new Promise((resolve, reject) => {
     const script = document.createElement("script");
+    const end = () => {
+      script.remove();
+      requests.delete(key);  // it holds the text
+      reject(new Error(`${script.src} is missing, or is no tile`));  // unless it has arrived
+    };
     requests.set(key, resolve);
-    script.src = `${HEADER.folder}/${key}.js`;
-    script.onload = () => script.remove();
-    script.onerror = () => reject(new Error(`${script.src} is missing`));
+    Object.assign(script, { src: `${HEADER.folder}/${key}.js`, onload: end, onerror: end });
     document.head.append(script);
   });
 }
@@ -56,7 +58,8 @@ async function readTile(key) {
   return image;
 }
 
-// One size of a photograph. `state` of a tile: null, or "reading", "ready" or "failed".
+// One size of a photograph. `status` of a tile: null, or "reading", "ready" or "failed", which is after the last one of its `tries`; `due`:
+// the time of the next one.
 class Level {
   constructor(name, rotation, first, [size, step]) {
     Object.assign(this, { size, texture: null, isFresh: true, tiles: [] });
@@ -68,25 +71,25 @@ class Level {
           const ray = [0, 1, 2].map((k) => x * right[k] + y * down[k] + forward[k]);
           const direction = scaled(rotation.map((axis) => dot(axis, ray)), 1 / Math.hypot(...ray));
           const reach = Math.atan(Math.SQRT2 * step / size);
-          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, state: null });
+          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, status: null, tries: 0, due: 0 });
         }
       }
     });
   }
 
   get isReady() {
-    return this.tiles.every(({ state }) => state === "ready");
+    return this.tiles.every(({ status }) => status === "ready");
   }
 
   take(tile, image) {
-    const { gl } = renderer;
+    const { gl } = state.renderer;
     gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture || this.makeTexture());
     gl.texSubImage2D(gl.TEXTURE_CUBE_MAP_POSITIVE_X + tile.face, 0, tile.x, tile.y, gl.RGBA, gl.UNSIGNED_BYTE, image);
     this.isFresh = false;
   }
 
   makeTexture() {
-    const { gl } = renderer;
+    const { gl } = state.renderer;
     this.texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture);
     gl.texStorage2D(gl.TEXTURE_CUBE_MAP, Math.floor(Math.log2(this.size)) + 1, gl.RGBA8, this.size, this.size);
@@ -95,7 +98,7 @@ class Level {
   }
 
   bind(unit) {
-    const { gl } = renderer;
+    const { gl } = state.renderer;
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_CUBE_MAP, this.texture);
     if (!this.isFresh) gl.generateMipmap(gl.TEXTURE_CUBE_MAP);
@@ -103,9 +106,9 @@ class Level {
   }
 
   release() {
-    if (this.texture && !renderer.gl.isContextLost()) renderer.gl.deleteTexture(this.texture);
+    if (this.texture && !state.renderer.gl.isContextLost()) state.renderer.gl.deleteTexture(this.texture);
     this.texture = null;
-    this.tiles.forEach((tile) => { tile.state = null; });
+    this.tiles.forEach((tile) => Object.assign(tile, { status: null, tries: 0, due: 0 }));
   }
 }
 
@@ -121,29 +124,29 @@ class Photographs {
 
   // Whether the picture has all of the photograph that it needs.
   isFinal(size = fullSize()) {
-    if (!HEADER.photographs.length || headset.session) return true;
-    if (this.last === null || this.renderer !== renderer || distanceOf(camera.position, this.last) > 0) return false;
+    if (!HEADER.photographs.length || state.headset.session) return true;
+    if (this.last === null || this.renderer !== state.renderer || distanceOf(camera.position, this.last) > 0) return false;
     const node = this.findNode(), isDue = node !== null && this.levelsOf(node)[0].isReady;
     if (this.target !== Number(isDue) || this.opacity !== this.target) return false;
-    return node === null || this.listMissing(node, size, true).every(({ state }) => state === "failed");
+    return node === null || this.listMissing(node, size, true).every(({ status }) => status === "failed");
   }
 
   // The panorama at which the camera stands.
   findNode() {
     const node = nodeHere();
-    return !doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
+    return !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
   }
 
-  // Whether the photograph at the camera, which is not shown yet, may arrive.
+  // Whether the photograph at the camera, which is not shown yet, may arrive soon.
   get isExpected() {
     const node = HEADER.photographs.length ? this.findNode() : null;
-    return node !== null && renderer !== null && !this.isOpaque && this.levelsOf(node)[0].tiles.every(({ state }) => state !== "failed");
+    return node !== null && state.renderer !== null && !this.isOpaque && this.levelsOf(node)[0].tiles.every(({ tries }) => !tries);
   }
 
   // The levels of a photograph that the device can hold, the smallest first.
   levelsOf(node) {
     if (!this.made.has(node)) {
-      const { name, levels, rotation } = HEADER.photographs[node], { gl } = renderer;
+      const { name, levels, rotation } = HEADER.photographs[node], { gl } = state.renderer;
       const most = Math.min(gl.getParameter(gl.MAX_CUBE_MAP_TEXTURE_SIZE), matchMedia("(pointer: coarse)").matches ? SMALL_FACE : Infinity);
       let first = 0;
       const made = levels.map((level) => {
@@ -168,7 +171,7 @@ class Photographs {
     const corner = Math.atan(Math.hypot(tangent, tangent * size[0] / size[1]));
     const away = ({ direction, reach }) => Math.acos(clamp(dot(direction, forward), -1, 1)) - reach - corner;
     const [preview] = this.levelsOf(node), level = this.chooseLevel(node, size);
-    const tiles = [...preview.tiles, ...(level === preview ? [] : level.tiles)].filter(({ state }) => state !== "ready");
+    const tiles = [...preview.tiles, ...(level === preview ? [] : level.tiles)].filter(({ status }) => status !== "ready");
     const found = tiles.map((tile) => ({ tile, isPreview: preview.tiles.includes(tile), angle: away(tile) }));
     found.sort((a, b) => b.isPreview - a.isPreview || a.angle - b.angle);
     return found.filter(({ isPreview, angle }) => !isOnlySeen || isPreview || angle < 0).map(({ tile }) => tile);
@@ -176,18 +179,18 @@ class Photographs {
 
   // Reads what the photograph at the camera needs, or that where a flight ends, and fades; `seconds` after the last time.
   update(seconds, size = fullSize()) {
-    if (!HEADER.photographs.length || !renderer) return;
-    if (this.renderer !== renderer) {  // the graphics were lost
+    if (!HEADER.photographs.length || !state.renderer) return;
+    if (this.renderer !== state.renderer) {  // the graphics were lost
       this.made.clear();
-      Object.assign(this, { renderer, program: renderer.link(SHADERS.photograph), opacity: 0 });
+      Object.assign(this, { renderer: state.renderer, program: state.renderer.link(SHADERS.photograph), opacity: 0 });
     }
     const node = this.findNode(), isStill = this.last !== null && distanceOf(camera.position, this.last) === 0;
     this.last = [...camera.position];
-    this.wanted = node !== null || !flight ? nodeHere() : flight.spot;
+    this.wanted = node !== null || !state.flight ? nodeHere() : state.flight.spot;
     this.read(this.wanted, size);
-    const isShown = isStill && node !== null && !headset.session && this.levelsOf(node)[0].isReady;
+    const isShown = isStill && node !== null && !state.headset.session && this.levelsOf(node)[0].isReady;
     if (this.node !== null && node !== this.node) {
-      const most = headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / (GONE * HEADER.unit);
+      const most = state.headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / (GONE * HEADER.unit);
       this.opacity = clamp(this.opacity, 0, Math.max(most, 0));
     }
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
@@ -204,31 +207,34 @@ class Photographs {
       this.made.delete(old);
     }
     const levels = this.levelsOf(node);
-    const tiles = this.listMissing(node, size).filter(({ key, state }) => !state && (HEADER.folder !== null || texts.has(key)));
+    const isThere = ({ key }) => HEADER.folder !== null || texts.has(key), now = performance.now();
+    const tiles = this.listMissing(node, size).filter((tile) => !tile.status && tile.due <= now && isThere(tile));
     tiles.slice(0, Math.max(AT_ONCE - this.reading, 0)).forEach(async (tile) => {
       const level = levels.find(({ tiles: each }) => each.includes(tile));
-      tile.state = "reading";
+      tile.status = "reading";
       this.reading += 1;
       try {
         const image = await readTile(tile.key);
-        if (this.made.get(node) === levels && this.renderer === renderer) {
+        if (this.made.get(node) === levels && this.renderer === state.renderer) {
           level.take(tile, image);
-          tile.state = "ready";
+          tile.status = "ready";
           refresh();
         }
       } catch (error) {
-        tile.state = "failed";
+        tile.tries += 1;
+        Object.assign(tile, { status: tile.tries < TRIES ? null : "failed", due: performance.now() + PAUSE_AFTER_ERROR });
         console.warn(error);
+        if (tile.status === "failed") say(`A part of the photograph of ${HEADER.spots[node].name} cannot be loaded`);
       }
       this.reading -= 1;
-      if (this.wanted === node && this.renderer === renderer) this.read(node, size);
+      if (this.wanted === node && this.renderer === state.renderer) this.read(node, size);
     });
   }
 
   // Draws over the viewport of the canvas; `seen` is a camera of Renderer.draw.
   draw({ rotation, center, half }, width, height) {
     if (!this.opacity) return;
-    const { gl, screen } = renderer, { program, places } = this.program, levels = this.levelsOf(this.node);
+    const { gl, screen } = state.renderer, { program, places } = this.program, levels = this.levelsOf(this.node);
     const chosen = this.chooseLevel(this.node, [width, height]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);

@@ -1,14 +1,11 @@
 // The floor plan: outlines of rooms, doors, panoramas and the camera from above, the longest wall horizontal. It shows the
 // world of the panorama at the camera; rooms of other worlds, whose places are unknown, are a list.
 
-import { camera } from "./camera.js";
 import { byId, make } from "./dom.js";
 import { goTo } from "./flight.js";
-import { clamp, column, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
-import { changed } from "./loop.js";
+import { clamp, column, DEGREE, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
 import { drawSvg } from "./measure.js";
-import { here } from "./rings.js";
-import { DEGREE } from "./share.js";
+import { camera, changed, state } from "./state.js";
 
 const PLAN_MARGIN = 32;        // pixels
 const LARGEST_PLAN_SCALE = 60; // pixels for a metre
@@ -104,8 +101,8 @@ class Plan {
   chooseWorld() {
     const { worlds } = HEADER.plan, sizeOf = (world) => worlds.filter((each) => each === world).length;
     const largest = worlds.reduce((best, world) => sizeOf(world) > sizeOf(best) ? world : best);
-    const isAlone = sizeOf(worlds[here]) === 1 && sizeOf(largest) > 1;
-    return isAlone ? this.world === null ? largest : this.world : worlds[here];
+    const isAlone = sizeOf(worlds[state.here]) === 1 && sizeOf(largest) > 1;
+    return isAlone ? this.world === null ? largest : this.world : worlds[state.here];
   }
 
   show() {
@@ -113,13 +110,13 @@ class Plan {
     const world = this.chooseWorld(), heightOf = (position) => dot(column(HEADER.level, 1), position) / HEADER.unit;
     if (world !== this.world) this.make(world);
     const place = this.turned([0, 2].map((k) => dot(column(HEADER.level, k), camera.position))), [x, y] = this.toPlan(place);
-    this.camera.setAttribute("visibility", HEADER.plan.worlds[here] === world ? "visible" : "hidden");
+    this.camera.setAttribute("visibility", HEADER.plan.worlds[state.here] === world ? "visible" : "hidden");
     this.camera.setAttribute("transform", `translate(${x} ${y}) rotate(${(camera.yaw - this.turn) / DEGREE})`);
-    const [floor, ...others] = [here, ...this.marks.map(([node]) => node)].map((node) => heightOf(HEADER.spots[node].position));
+    const [floor, ...others] = [state.here, ...this.marks.map(([node]) => node)].map((node) => heightOf(HEADER.spots[node].position));
     this.marks.forEach(([node, element], k) => {
       const isElsewhere = HEADER.plan.worlds[node] !== world;
-      element.classList.toggle("faint", !isElsewhere && HEADER.plan.worlds[here] === world && Math.abs(others[k] - floor) > STOREY);
-      if (node === here && element.tagName === "BUTTON") element.setAttribute("aria-current", "location");
+      element.classList.toggle("faint", !isElsewhere && HEADER.plan.worlds[state.here] === world && Math.abs(others[k] - floor) > STOREY);
+      if (node === state.here && element.tagName === "BUTTON") element.setAttribute("aria-current", "location");
       else element.removeAttribute("aria-current");
     });
   }

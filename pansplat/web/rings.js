@@ -1,10 +1,11 @@
 // The panoramas that can be visited: rings on the floor, the list, and the name of the one at the camera.
 
-import { camera, currentPart, edge, edges, endsOfEdge, GRAPH, nodeHere, parts, tangentOf } from "./camera.js";
-import { doll } from "./doll.js";
+import { nodeHere, tangentOf } from "./camera.js";
+import { isInDoll } from "./doll.js";
 import { byId, canvas, make } from "./dom.js";
 import { goTo } from "./flight.js";
 import { clamp, column, distanceOf, dot, isReachable, minus } from "./graph.js";
+import { camera, currentPart, edges, endsOfEdge, GRAPH, parts, state } from "./state.js";
 
 let rings = [], chosenFor = null;  // the edge for which they are chosen
 
@@ -24,13 +25,13 @@ export function makeRings() {
 
 // The rings of panoramas next to the edge, and of links from its ends. A link's text is a part of the label.
 function chooseRings() {
-  if (chosenFor === edge) return;
-  chosenFor = edge;
+  if (chosenFor === state.edge) return;
+  chosenFor = state.edge;
   const ends = endsOfEdge();
   for (const ring of rings) {
     const { name } = HEADER.spots[ring.node];
     const link = ring.link || HEADER.links.find(({ from, to }) => to === ring.node && ends.includes(from));
-    const isHere = parts[ring.node] === currentPart() && (link || !edges.length || isReachable(GRAPH, edge, ring.node));
+    const isHere = parts[ring.node] === currentPart() && (link || !edges.length || isReachable(GRAPH, state.edge, ring.node));
     ring.isNext = ring.link ? ends.includes(link.from) : isHere;
     ring.text.textContent = link && link.text !== name ? link.text : "";
     ring.button.title = ["Go to", name, ring.text.textContent].join(" ").trim();
@@ -42,7 +43,7 @@ function chooseRings() {
 // Those of chooseRings without that at the camera, and those behind furniture, unless all are.
 export function findRings() {
   chooseRings();
-  if (doll.isOn) return rings.filter(({ link, node }) => !link && doll.shows(node));
+  if (state.doll.isOn) return rings.filter(({ link, node }) => !link && isInDoll(node));
   const isAtCamera = (ring) => ring.camera !== null && distanceOf(ring.camera, camera.position) < 2 * ring.radius;
   const next = rings.filter((ring) => ring.isNext && !isAtCamera(ring)), { hidden } = HEADER.spots[nodeHere()];
   const seen = next.filter(({ link, node }) => link || !hidden.includes(node));
@@ -76,7 +77,6 @@ export function placeRings(rotation) {
 }
 
 const listed = [];  // a button for each panorama
-export let here = null;    // the panorama at the camera
 
 // The panoramas in the order of the tour.
 export function makeList() {
@@ -94,15 +94,15 @@ export function makeList() {
 export function openList() {
   if (HEADER.spots.length < 2) return;
   byId("list").showModal();
-  listed[here].focus();
+  listed[state.here].focus();
 }
 
 // Names the panorama at the camera.
 export function showPlace() {
   const node = nodeHere();
-  if (node === here) return;
-  if (listed[here]) listed[here].removeAttribute("aria-current");
-  here = node;
-  listed[here].setAttribute("aria-current", "location");
-  byId("name").textContent = HEADER.spots[here].name;
+  if (node === state.here) return;
+  if (listed[state.here]) listed[state.here].removeAttribute("aria-current");
+  state.here = node;
+  listed[state.here].setAttribute("aria-current", "location");
+  byId("name").textContent = HEADER.spots[state.here].name;
 }

@@ -1,11 +1,10 @@
 // Links to a pose, and pictures. A pose has `position` (three numbers in the page's unit), `yaw`, `pitch` and `fov` (degrees); it
 // stands in the hash of the address as #at=x,y,z,yaw,pitch,fov.
 
-import { camera } from "./camera.js";
 import { explain, say } from "./dom.js";
-import { takePicture } from "./loop.js";
-
-export const DEGREE = Math.PI / 180;
+import { DEGREE } from "./graph.js";
+import { takePicture } from "./picture.js";
+import { camera } from "./state.js";
 
 const turnsOf = (radians) => Math.atan2(Math.sin(radians), Math.cos(radians)) / DEGREE;
 

@@ -4,17 +4,17 @@
 // heading turns it into the scene, and the point between the eyes is the page's camera. So the page's functions work as
 // without a headset: they move the camera, and the movement of the head is added to it.
 
-import { blendWeights, camera, findSpot, floorPoint, walk } from "./camera.js";
-import { doll } from "./doll.js";
+import { blendWeights, findSpot, floorPoint, walk } from "./camera.js";
 import { byId, calm, explain } from "./dom.js";
 import { coverage, goHome, goTo, isFlying, jumpTo, setTouring } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
-import { advance, changed, renderer, requestSort, sorted } from "./loop.js";
+import { requestSort } from "./loading.js";
+import { advance, SORT_DISTANCE } from "./loop.js";
 import { findRings } from "./rings.js";
+import { camera, changed, state } from "./state.js";
 
 const XR_FEATURES = ["local-floor", "hand-tracking"];
 const XR_AXES = [[1, 0, 0], [0, -1, 0], [0, 0, -1]];  // of WebXR to OpenCV, and back
-export const SORT_DISTANCE = 0.01;         // metres from the point for which the Gaussians are sorted
 const SNAP_TURN = Math.PI / 6;      // radians
 const DEAD_ZONE = 0.2;              // of a stick
 const MIN_POINTING = 0.06;          // radians between a ray and the centre of a ring that it selects
@@ -73,7 +73,7 @@ class Headset {
   }
 
   start(session) {
-    if (doll.isOn) jumpTo(doll.node);
+    if (state.doll.isOn) jumpTo(state.doll.node);
     this.heading = this.headYaw = 0;
     this.head = this.origin = this.left = this.floor = this.hovered = null;
     this.last = performance.now();
@@ -125,7 +125,7 @@ class Headset {
     const elapsed = now - this.last, seconds = clamp(elapsed, 0, 100) / 1000;
     this.last = now;
     const pose = frame.getViewerPose(this.space);
-    if (!pose || !renderer || !sorted) return;  // not tracked; the graphics are lost
+    if (!pose || !state.renderer || !state.sorted) return;  // not tracked; the graphics are lost
     advance(now, seconds);
     this.followHead(pose.transform, seconds);
     const isWalking = this.readControllers(seconds);
@@ -140,7 +140,7 @@ class Headset {
       const { x, y, width, height } = layer.getViewport(view);
       if (!width || !height) continue;
       const eye = this.makeEye(view);
-      renderer.draw(eye, blendWeights(eye.position), layer.framebuffer, [x, y, width, height]);
+      state.renderer.draw(eye, blendWeights(eye.position), layer.framebuffer, [x, y, width, height]);
       this.drawMarks(eye, [...marks, ...this.findVeils(eye)]);
     }
   }
@@ -336,9 +336,9 @@ class Headset {
   // Over what has been drawn in the viewport.
   drawMarks(eye, marks) {
     const { gl } = this;
-    if (this.renderer !== renderer) {
-      this.renderer = renderer;
-      this.program = renderer.link(SHADERS.mark);
+    if (this.renderer !== state.renderer) {
+      this.renderer = state.renderer;
+      this.program = state.renderer.link(SHADERS.mark);
       this.picture = gl.createTexture();
       this.hovered = null;
     }
@@ -352,7 +352,7 @@ class Headset {
     gl.uniform1i(places.picture, 0);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.bindVertexArray(renderer.screen);
+    gl.bindVertexArray(state.renderer.screen);
     for (const { center, axes, shape, color, radius = 0, ring } of marks) {
       if (ring && ring !== this.hovered) this.writeLabel(ring);
       gl.uniform3fv(places.center, center);
@@ -382,4 +382,4 @@ class Headset {
   }
 }
 
-export const headset = new Headset();
+export const headset = state.headset = new Headset();

@@ -1,0 +1,42 @@
+// Pictures of the camera, and what a point of the window shows.
+
+import { blendWeights, rotationOf, tangentOf } from "./camera.js";
+import { canvas, fullSize } from "./dom.js";
+import { dot, scaled } from "./graph.js";
+import { photographs } from "./photographs.js";
+import { camera, changed, state } from "./state.js";
+
+export function drawAt(width, height) {
+  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  const rotation = rotationOf(camera), tangent = tangentOf(width, height), half = [tangent * width / height, tangent];
+  const seen = { position: camera.position, rotation, center: [0, 0], half };
+  if (!photographs.isOpaque) state.renderer.draw(seen, blendWeights(camera.position), null, [0, 0, width, height]);
+  photographs.draw(seen, width, height);
+  return rotation;
+}
+
+// The place of a point of the window on the image plane, and its direction in the scene.
+function planeOf(left, top) {
+  const { clientWidth: width, clientHeight: height } = canvas, step = 2 * tangentOf(width, height) / height;
+  return [(left - 0.5 * width) * step, (top - 0.5 * height) * step];
+}
+
+export function rayOf(left, top) {
+  const ray = [...planeOf(left, top), 1];
+  return scaled(rotationOf(camera).map((row) => dot(row, ray)), 1 / Math.hypot(...ray));
+}
+
+// The distance from the camera to what a point of the window shows, or null.
+export function measureAt(left, top) {
+  if (!state.renderer || !state.sorted) return null;
+  const [width, height] = fullSize(), tangent = tangentOf(width, height), half = [tangent / height, tangent / height];
+  const seen = { position: camera.position, rotation: rotationOf(camera), center: planeOf(left, top), half };
+  return state.renderer.measure(seen, blendWeights(camera.position));
+}
+
+export function takePicture() {
+  if (!state.renderer || !state.sorted) return null;
+  drawAt(...fullSize());
+  changed();
+  return new Promise((resolve) => { canvas.toBlob(resolve, "image/png"); });
+}

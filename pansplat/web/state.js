@@ -1,0 +1,54 @@
+// All that changes while the page is shown. Every module but the renderers is functions of it and of HEADER, which is
+// PageHeader of pansplat/export/page_data.py. This module, graph.js, camera.js and doll.js need no browser.
+
+import { distanceOf, partOfEdge } from "./graph.js";
+
+export const { edges, parts } = HEADER;
+export const GRAPH = { ...HEADER, positions: HEADER.spots.map((spot) => spot.position) };
+
+export const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
+export const camera = makeStart();
+
+// How far each view has faded in. The first ones are there at once.
+export const shown = HEADER.views.map(() => 0);
+
+export const state = {
+  edge: 0, group: edges.length ? edges[0][2] : 0, fade: null,  // at the camera; `fade`: from the views of another group
+  asked: new Set(), got: new Set(),                            // views whose data is loaded, and is there
+  sorted: null, isSorting: false,                              // the last order of the worker (sorter.js)
+  renderer: null,                                              // null while the graphics are lost
+  isDirty: true, drawnScale: 0, lastChange: 0,                 // of the picture
+  flight: null, route: null, isTouring: false, still: null,    // flight.js
+  doll: { isOn: false, node: 0, heading: null, flight: null, center: null, distance: 0, first: 0, fov: 0 },
+  headset: { session: null, turnTo() {} },                     // xr.js
+  here: null,                                                  // the panorama at the camera of the last frame
+  step: [0, 0, 0], isFast: false,                              // of the keys that are held: right, up, forward
+};
+
+export function changed() {
+  state.isDirty = true;
+  state.lastChange = performance.now();
+}
+
+// Draws the same camera again, when something of its picture has arrived.
+export function refresh() {
+  state.isDirty = true;
+}
+
+// Draws the next frame, which another one has replaced.
+export function redraw() {
+  state.drawnScale = 0;
+  changed();
+}
+
+export const currentPart = () => edges.length ? partOfEdge(GRAPH, state.edge) : 0;
+export const endsOfEdge = () => edges.length ? edges[state.edge].slice(0, 2) : [];
+export const isComplete = () => [...state.asked].every((view) => state.got.has(view));
+
+// Whether the order is that of the part, and of the doll's house view or of panoramas, as the page shows it.
+export const isSortedAs = (part = currentPart()) => state.sorted.part === part && (state.sorted.ranges !== null) === state.doll.isOn;
+
+export const isSortedFor = (position, part, tolerance = 0) => {
+  const { sorted, got } = state;
+  return sorted !== null && isSortedAs(part) && sorted.arrived === got.size && distanceOf(sorted.position, position) <= tolerance;
+};

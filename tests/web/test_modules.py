@@ -1,0 +1,267 @@
+"""The modules of the page in node: their imports, and those that need no browser as functions of HEADER and state."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from pansplat.export.page_data import PageHeader
+from pansplat.inputs.pairs import Link, Panorama
+from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
+from pansplat.tours.layout import REACH
+
+FOLDER = Path(str(resources.files("pansplat.web")))
+MODULES = {file.name: file.read_text("utf-8") for file in FOLDER.glob("*.js")}
+WITHOUT_BROWSER = ("graph.js", "state.js", "camera.js", "doll.js")
+IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+\.js)";$', re.MULTILINE)
+
+
+def find_circle(modules: dict[str, str]) -> list[str]:
+    """The modules of a circle of imports, or none."""
+    done: set[str] = set()
+
+    def visit(name: str, path: list[str]) -> list[str]:
+        if name in path:
+            return path[path.index(name) :]
+        found = [] if name in done else [visit(other, [*path, name]) for _, other in IMPORT.findall(modules[name])]
+        done.add(name)
+        return max(found, key=len, default=[])
+
+    return max((visit(name, []) for name in modules), key=len)
+
+
+def test_imports_of_the_modules_have_no_circle() -> None:
+    assert sum(len(IMPORT.findall(text)) for text in MODULES.values()) > 60
+    assert find_circle(MODULES) == []
+    planted = MODULES | {"camera.js": 'import { advance } from "./loop.js";\n' + MODULES["camera.js"]}
+    assert {"camera.js", "loop.js"} <= set(find_circle(planted))
+
+
+def test_modules_that_need_no_browser_import_no_others() -> None:
+    for name in WITHOUT_BROWSER:
+        assert {other for _, other in IMPORT.findall(MODULES[name])} <= set(WITHOUT_BROWSER)
+
+
+def test_the_modules_read_the_fields_of_the_header_and_all_of_them() -> None:
+    fields = {field.encode_name for field in msgspec.structs.fields(PageHeader)}
+    read = {name for text in MODULES.values() for name in re.findall(r"\bHEADER\.(\w+)", text)}
+    for text in MODULES.values():
+        for names in re.findall(r"\{((?:[^{}]|\{[^{}]*\})*)\} = HEADER\b(?!\.)", text):
+            read |= set(re.findall(r"\w+", re.sub(r": \{[^{}]*\}", "", names)))
+    graph = {"next", "poor", "hysteresis", "reach", "positions"}  # of GRAPH, which is HEADER with `positions`
+    assert read <= fields and fields - read <= graph
+
+
+@pytest.fixture(scope="module")
+def node() -> str:
+    """The node of playwright; without it the tests fail in CI and are skipped elsewhere."""
+    try:
+        import playwright
+
+        program: str | None = str(Path(playwright.__file__).parent / "driver" / "node")
+    except ImportError:
+        program = None
+    program = program if program and Path(program).is_file() else shutil.which("node")
+    if program is None:
+        if os.environ.get("CI"):
+            pytest.fail("CI needs playwright (pip install -e '.[dev]')")
+        pytest.skip("needs playwright (pip install -e '.[dev]') or node")
+    return program
+
+
+def test_every_name_that_a_module_imports_is_exported(node: str, tmp_path: Path) -> None:
+    """Node links all modules before it runs the first one, which needs HEADER."""
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    for wrong, error in (("", "ReferenceError"), ('import { nothing } from "./graph.js";\n', "SyntaxError")):
+        for name, text in (MODULES | {"page.js": wrong + MODULES["page.js"]}).items():
+            (tmp_path / name).write_text(text)
+        done = subprocess.run([node, tmp_path / "page.js"], capture_output=True, text=True, timeout=120)
+        assert re.findall(r"^(?:\w*Error)\b", done.stderr, re.MULTILINE) == [error], done.stderr
+
+
+def run(node: str, folder: Path, header: dict[str, Any], program: str, *values: Any) -> Any:
+    """The JSON value that a program returns; it has all names of the modules that need no browser, and `values`."""
+    (folder / "package.json").write_text('{"type": "module"}')
+    for name in WITHOUT_BROWSER:
+        shutil.copy(FOLDER / name, folder)
+    imports = "".join(f'Object.assign(globalThis, await import("./{name}"));\n' for name in WITHOUT_BROWSER)
+    (folder / "program.js").write_text(
+        f"globalThis.HEADER = {json.dumps(header)};\nconst values = {json.dumps(values)};\n{imports}"
+        f"const act = {program};\nconsole.log(JSON.stringify(act(...values)));\n"
+    )
+    done = subprocess.run([node, folder / "program.js"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]], parts: list[int]) -> dict[str, Any]:
+    """What the modules read of a header of level panoramas; each edge blends its two views."""
+    spots = [{"position": place, "mark": [place[0], place[1] + 1.5, place[2]], "name": ""} for place in positions]
+    boxes = [[[place[k] - 1 for k in range(3)], [place[k] + 1 for k in range(3)]] for place in positions]
+    return {
+        "spots": spots,
+        "views": [{"position": place, "count": 1, "start": view} for view, place in enumerate(positions)],
+        "level": np.eye(3).tolist(),
+        "start": {"position": positions[0], "yaw": 0.0, "pitch": 0.0, "fov": 75.0},
+        "edges": [(*edge, group) for group, edge in enumerate(edges)],
+        "groups": [sorted({*edge}) for edge in edges] or [list(range(len(positions)))],
+        "parts": parts,
+        "limits": [2.0] * (max(parts) + 1),
+        "hysteresis": 0.25,
+        "reach": 2.0,
+        "poor": [],
+        "next": [],
+        "tallest": 1.5,
+        "doll": {"boxes": boxes, "storeys": [0] * len(positions), "ranges": [(k, k, 1) for k in range(len(positions))]},
+    }
+
+
+ROW = [(0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, 4.0), (30.0, 0.0, 0.0)]
+SORTED = "state.sorted = { position: [0, 0, 0], part: 0, ranges: null, views: [0, 1], arrived: 0 };"
+
+
+def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) -> None:
+    row = [(0, 0, 0), (0, 0.1, 1), (0, 0, 2), (0.2, 0, 3), (1, 0, 1), (1, 0, 2.2), (2, 0, 2), (0.5, 0, 2.9)]
+    others = [(9, 0, 0), (9, 0, 9), (10, 0, 9.5)]  # parts of one and of two panoramas
+    places = np.array([*row, *others])
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
+    poses[:, :3, 3] = torch.from_numpy(places)
+    edges = [(0, 1), (1, 2), (2, 3), (1, 4), (2, 5), (4, 5), (5, 6), (3, 7), (8, 8), (9, 10)]
+    links = {6: (Link("8", 0.0),), 8: (Link("10", 0.0),)}
+    panoramas = tuple(Panorama(str(node), Path(), pose, links=links.get(node, ())) for node, pose in enumerate(poses))
+    overlaps = {edge: 0.1 + 0.02 * edge[1] for edge in edges}
+    tour = TourGraph("", Path(), panoramas, 0.5, 10.0, (), overlaps, poor=((1, 2), (4, 5)))
+    graph = {
+        "positions": places.tolist(),
+        "parts": tour.parts,
+        "edges": edges,
+        "next": tour.find_next_nodes(),
+        "poor": tour.poor,
+        "hysteresis": EDGE_HYSTERESIS,
+        "reach": REACH,
+    }
+    random = np.random.default_rng(0)
+    positions = random.uniform((-1, -0.5, -1), (3, 0.5, 4), (60, 3))
+    positions[40:] = random.uniform((3, -0.5, -1), (11, 0.5, 11), (20, 3))
+    nodes, current = range(len(places)), random.integers(len(edges), size=60)
+    found = run(
+        node,
+        tmp_path,
+        make_header(ROW, [(0, 1)], [0, 0, 0, 1]),
+        """(graph, positions, current) => positions.map((position, i) => ({
+            nearest: graph.edges[nearestEdge(graph, position)],
+            ofPart: graph.edges[nearestEdge(graph, position, partOfEdge(graph, current[i]))],
+            followed: graph.edges[followEdge(graph, position, current[i])],
+            reachable: graph.positions.map((_, node) => isReachable(graph, current[i], node)),
+            ways: graph.positions.map((_, node) => findWay(graph, position, node)),
+            waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
+            fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
+        }))""",
+        graph,
+        positions.tolist(),
+        current.tolist(),
+    )
+    for position, number, case in zip(positions, current, found, strict=True):
+        edge = edges[number]
+        assert tuple(case["nearest"]) == tour.find_nearest_edge(position)[0]
+        assert tuple(case["ofPart"]) == tour.find_nearest_edge(position, tour.parts[edge[0]])[0]
+        assert tuple(case["followed"]) == tour.follow_edge(position, edge)
+        assert set(np.flatnonzero(case["reachable"])) == tour.list_reachable(edge)
+        assert case["ways"] == [tour.find_way(position, node) for node in nodes]
+        assert case["waysOfPart"] == [tour.find_way(position, node, 0) for node in nodes]
+        assert case["fades"] == [tour.is_fade(node, edge[0]) for node in nodes]
+    followed = [tuple(case["followed"]) for case in found]
+    assert len({edge == tuple(case["nearest"]) for edge, case in zip(followed, found, strict=True)}) == 2, "hysteresis"
+    parts = [
+        (tour.parts[edge[0]], tour.parts[edges[number][0]]) for edge, number in zip(followed, current, strict=True)
+    ]
+    assert len({a == b for a, b in parts}) == 2, "a position near another part is in it"
+
+
+def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp_path: Path) -> None:
+    program = f"""() => {{
+        {SORTED}
+        const places = [];
+        for (let k = 0; k < 400; k++) {{ walk(0.05, 0, 0); places.push([...camera.position]); }}
+        return places;
+    }}"""
+    places = np.array(run(node, tmp_path, make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1]), program))
+    steps = np.diff(places[:, 0])
+    assert (places[:, 1:] == 0).all() and 1.9 < places[-1, 0] <= 2 and (steps >= 0).all()
+    assert steps[0] == pytest.approx(0.05) and steps[-1] < 0.005
+
+
+def test_nothing_walks_before_the_gaussians_are_sorted_or_in_the_dolls_house(node: str, tmp_path: Path) -> None:
+    program = f"""() => {{
+        walk(1, 0, 0);
+        const before = [...camera.position];
+        {SORTED}
+        state.doll.isOn = true;
+        walk(1, 0, 0);
+        return [before, camera.position];
+    }}"""
+    assert run(node, tmp_path, make_header(ROW, [(0, 1)], [0, 0, 0, 1]), program) == [[0, 0, 0], [0, 0, 0]]
+
+
+def test_the_views_of_the_edge_are_blended_and_those_of_the_edge_before_fade_out(node: str, tmp_path: Path) -> None:
+    program = """() => {
+        shown.fill(1);
+        const weights = [];
+        camera.position = [0, 0, 1.5];
+        weights.push(blendWeights(camera.position));
+        camera.position = [0, 0, 3];
+        for (const now of [0, 250, 500, 1000]) {
+            updateEdge(now);
+            weights.push(blendWeights(camera.position));
+        }
+        return [weights, state.edge, state.fade];
+    }"""
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+    weights, edge, fade = run(node, tmp_path, header, program)
+    assert weights[0] == pytest.approx([0.25, 0.75, 0, 0]) and weights[-1] == pytest.approx([0, 0.5, 0.5, 0])
+    assert [row[0] > 0 for row in weights] == [True, True, True, True, False] and (edge, fade) == (1, None)
+    assert all(sum(row) == pytest.approx(1) for row in weights)
+
+
+def test_all_rooms_of_the_dolls_house_are_in_the_picture_from_every_side(node: str, tmp_path: Path) -> None:
+    """The rooms of the part and storey only; a zoom has limits."""
+    program = """(size) => {
+        const look = () => listBoxes().flatMap((box) => [0, 1, 2, 3, 4, 5, 6, 7].map((corner) => {
+            const point = minus([0, 1, 2].map((k) => box[corner >> k & 1][k]), camera.position);
+            const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), point));
+            const tangent = tangentOf(...size);
+            return [Math.abs(x) / z / tangent * size[1] / size[0], Math.abs(y) / z / tangent, z];
+        }));
+        Object.assign(camera, frameDoll(size));
+        const first = [look(), listBoxes().length];
+        zoomDoll(100);
+        const far = state.doll.distance / state.doll.first;
+        orbit(1, 9);
+        state.doll.isOn = true;
+        return [...first, far, camera.pitch, listRanges()];
+    }"""
+    for size in ((1280, 720), (390, 844)):
+        header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+        corners, count, far, pitch, ranges = run(node, tmp_path, header, program, size)
+        x, y, z = np.array(corners).T
+        assert count == 3 and max(x.max(), y.max()) <= 1 and max(x.max(), y.max()) > 0.8 and z.min() > 0
+        assert far == 2 and pitch == pytest.approx(-np.pi * 8 / 180) and [row[0] for row in ranges] == [0, 1, 2]
+
+
+def test_a_pose_is_moved_to_within_the_limits_and_must_be_finite(node: str, tmp_path: Path) -> None:
+    program = """() => {
+        const far = cameraFor({ position: [9, 0, 1], pitch: 500, fov: 400 });
+        try { cameraFor({ yaw: "x" }); } catch (error) { return [far, error.message]; }
+    }"""
+    far, message = run(node, tmp_path, make_header(ROW, [(0, 1)], [0, 0, 0, 1]), program)
+    assert far["position"] == pytest.approx([2, 0, 1]) and far["fov"] == 110 and "finite" in message
+    assert far["pitch"] == pytest.approx(np.radians(89.9)) and far["yaw"] == 0
