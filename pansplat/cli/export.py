@@ -303,8 +303,8 @@ class _Photographs:
     files: ClassVar = "a folder of photographs"
 
     photos: bool = False
-    """Write the panoramas of a tour as 2:1 photographs to a new folder, with titles, links and start views. Blur masks
-    are applied; no poses are estimated or written."""
+    """Write the panoramas of a tour as 2:1 photographs to a new folder, with titles, links, notes and start views. Blur
+    masks are applied; no poses are estimated or written."""
 
     def write(self, export: Export) -> None:
         """Write the photographs and print their size."""
@@ -321,9 +321,6 @@ class _Photographs:
         with replacing_folder(export.out) as folder, progress_bar() as progress:
             size = write_panoramas(folder, panoramas, progress)
         print(f"{export.out}: {describe_count(len(panoramas), 'photograph')}, {size / 1e6:.1f} MB")
-        notes = sum(len(panorama.notes) for panorama in panoramas)
-        if notes:
-            print(f"note: {export.out}: {notes} notes of hot spots are left out", file=sys.stderr)
 
 
 @dataclass(frozen=True)
