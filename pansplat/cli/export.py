@@ -105,7 +105,7 @@ class _Mesh:
     def write(self, export: Export) -> None:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
-        from pansplat.export.mesh_files import name_mesh_files, save_mesh
+        from pansplat.export.mesh_files import name_mesh_files, remove_old_meshes, save_mesh
         from pansplat.tours.doll_house import find_rooms
         from pansplat.tours.graph import make_graph, select_views
 
@@ -126,7 +126,9 @@ class _Mesh:
             mesh = make_mesh(part, triangles=limit, textures=textures, inside=inside)
             name = export.out.name if number == 1 else f"{export.out.stem}_{number}{export.out.suffix}"
             if mesh.parts:
-                meshes[export.out.with_name(name)] = mesh
+                meshes[export.out.with_name(name)] = dataclasses.replace(
+                    mesh, part_of=export.out.name if number > 1 else ""
+                )
         if not meshes:
             raise InputError(f"{export.path}: needed surfaces in rooms, got none; --whole keeps all of them")
         for file, mesh in meshes.items():
@@ -138,6 +140,7 @@ class _Mesh:
             count, names = len(mesh.parts), ", ".join(part.name for part in mesh.parts)
             whose = names if file != export.out else f"{count} panorama{'s' if count > 1 else ''}"
             print(f"{file}{beside}: {mesh.num_triangles:,} triangles of {whose}, {size / 1e6:.1f} MB")
+        remove_old_meshes(export.out, meshes)
         if len(meshes) > 1:
             print(
                 f"note: {export.out}: what is not placed relative to each other is in {len(meshes)} files",
@@ -303,8 +306,8 @@ class _Photographs:
     files: ClassVar = "a folder of photographs"
 
     photos: bool = False
-    """Write the panoramas of a tour as 2:1 photographs to a new folder, with titles, links and start views. Blur masks
-    are applied; no poses are estimated or written."""
+    """Write the panoramas of a tour as 2:1 photographs to a new folder, with titles, links, notes and start views. Blur
+    masks are applied; no poses are estimated or written."""
 
     def write(self, export: Export) -> None:
         """Write the photographs and print their size."""
@@ -321,9 +324,6 @@ class _Photographs:
         with replacing_folder(export.out) as folder, progress_bar() as progress:
             size = write_panoramas(folder, panoramas, progress)
         print(f"{export.out}: {describe_count(len(panoramas), 'photograph')}, {size / 1e6:.1f} MB")
-        notes = sum(len(panorama.notes) for panorama in panoramas)
-        if notes:
-            print(f"note: {export.out}: {notes} notes of hot spots are left out", file=sys.stderr)
 
 
 @dataclass(frozen=True)

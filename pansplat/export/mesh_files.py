@@ -10,8 +10,10 @@ KHR_materials_unlit, because the light is in the photographs; Wavefront Technolo
 from __future__ import annotations
 
 import io
+import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,11 +29,12 @@ from pansplat.gaussians.gltf import write_glb
 from pansplat.gaussians.scene_files import Y_UP
 from pansplat.geometry.world import USER_FRAME, WorldFrame
 from pansplat.system.atomic import replacing
-from pansplat.system.files import SOFTWARE, require_replaceable
+from pansplat.system.files import SOFTWARE, is_written, require_replaceable
 
 MESH_SUFFIXES = (".obj", ".glb")
 
 _QUALITY = 92  # of textures
+_HEAD = 1 << 16  # bytes in which a further file states the first one
 _UNLIT = "KHR_materials_unlit"
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 _FLOAT, _UINT = 5126, 5125
@@ -64,10 +67,12 @@ class Mesh:
     Attributes:
         parts: one of each panorama.
         frame: where their world is in the user's world, that of files.
+        part_of: name of the file of which this is a further one; empty if it is the first.
     """
 
     parts: tuple[MeshPart, ...]
     frame: WorldFrame = USER_FRAME
+    part_of: str = ""
 
     @property
     def num_triangles(self) -> int:
@@ -86,8 +91,8 @@ def name_mesh_files(path: Path, parts: int) -> list[Path]:
 def save_mesh(mesh: Mesh, path: Path, *, overwrite: bool | None = True) -> tuple[Path, ...]:
     """Write a mesh in the format of the suffix, each file atomically, and return the files, the named one first.
 
-    Textures show only what triangles need of them: the rest has the colours around it. `overwrite` is that of
-    `pansplat.system.files.require_replaceable`.
+    Textures show only what triangles need of them: the rest has the colours around it. Further textures of the file
+    before are removed. `overwrite` is that of `pansplat.system.files.require_replaceable`.
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -96,8 +101,43 @@ def save_mesh(mesh: Mesh, path: Path, *, overwrite: bool | None = True) -> tuple
         raise InputError(f"cannot write {path}: needed one or more triangles, got none; give a scene with surfaces")
     files = name_mesh_files(path, len(mesh.parts))
     require_replaceable(f"cannot write {path}", files, overwrite)
+    old = _list_written_files(path)
     (_save_obj if suffix == ".obj" else _save_glb)(mesh, *files)
+    _remove(set(old) - set(files))
     return tuple(files)
+
+
+def remove_old_meshes(path: Path, kept: Collection[Path]) -> None:
+    """Remove what an earlier mesh of this name has in further files, which state that name, other than those kept."""
+    name = re.compile(rf"{re.escape(path.stem)}_\d+{re.escape(path.suffix)}")
+    for file in path.parent.iterdir():
+        if name.fullmatch(file.name) and file not in kept and is_written(file):
+            with open(file, "rb") as stream:
+                is_part = _state_part(path.name).encode() in stream.read(_HEAD)
+            if is_part:
+                _remove(_list_written_files(file))
+
+
+def _state_part(name: str) -> str:
+    """What a further file states about the first one, in JSON or a comment."""
+    return json.dumps({"part_of": name}, separators=(",", ":"))[1:-1]
+
+
+def _list_written_files(path: Path) -> list[Path]:
+    """The files of a mesh that pansplat wrote earlier: the named one, the materials, and the textures they name."""
+    files = [path]
+    if path.suffix.lower() == ".obj":
+        materials = name_mesh_files(path, 0)[1]
+        text = materials.read_text("utf-8", "replace") if is_written(materials) else ""
+        textures = re.findall(rf"^map_Kd ({re.escape(materials.stem)}_\d+\.jpg)$", text, re.MULTILINE)
+        files += [materials, *map(path.with_name, textures)]
+    return [file for file in files if is_written(file)]
+
+
+def _remove(files: Iterable[Path]) -> None:
+    for file in files:
+        with suppress(OSError):
+            file.unlink()
 
 
 def _encode_texture(part: MeshPart) -> bytes:
@@ -147,7 +187,8 @@ def _save_obj(mesh: Mesh, path: Path, materials: Path, *images: Path) -> None:
     with replacing(materials) as partial:
         partial.write_text("\n".join(described), encoding="utf-8")
     with replacing(path) as partial, open(partial, "w", encoding="utf-8", newline="\n") as file:
-        file.write(f"# {SOFTWARE}; metres, y up\nmtllib {materials.name}\n")
+        part = f"; {_state_part(mesh.part_of)}" if mesh.part_of else ""
+        file.write(f"# {SOFTWARE}; metres, y up{part}\nmtllib {materials.name}\n")
         for number, part in enumerate(mesh.parts):
             file.write(f"o view_{number}\nusemtl view_{number}\n")
             places = mesh.frame.globalize_places(torch.from_numpy(part.positions)) @ Y_UP
@@ -161,7 +202,9 @@ def _save_obj(mesh: Mesh, path: Path, materials: Path, *images: Path) -> None:
 def _save_glb(mesh: Mesh, path: Path) -> None:
     blocks: list[bytes] = []
     # float32 does not hold large positions: they are relative to the origin.
-    extras = {"extras": {"pansplat": {"origin": mesh.frame.origin}}} if any(mesh.frame.origin) else {}
+    stated = {"origin": mesh.frame.origin} if any(mesh.frame.origin) else {}
+    stated |= {"part_of": mesh.part_of} if mesh.part_of else {}
+    extras = {"extras": {"pansplat": stated}} if stated else {}
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "pansplat", **extras},
         "extensionsUsed": [_UNLIT],

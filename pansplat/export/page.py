@@ -663,8 +663,7 @@ def _write_files(
             temporary.write_text(text, "utf-8")
     with replacing(path) as temporary:
         temporary.write_bytes(page)
-    if split:
-        _remove_old_parts(folder, set(scripts))
+    _remove_old_parts(folder, set(scripts) if split else set())
     files.insert(0, path)
     total = len(page) + sum(map(len, scripts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
@@ -704,11 +703,13 @@ def _make_folder(folder: Path) -> None:
 
 
 def _remove_old_parts(folder: Path, kept: set[str]) -> None:
-    """Remove the parts of the page that was replaced."""
+    """Remove the parts of the page that was replaced, by their names and content, and an empty folder."""
     for file in folder.glob("*.js"):
         if file.name not in kept and re.fullmatch(r"[0-9a-f]{16}(_\d+)?\.js", file.name) and is_written(file):
             with suppress(OSError):
                 file.unlink()
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def _bundle_programs() -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,40 +12,55 @@ from pansplat.images.image_files import read_height, read_mask, read_panorama, w
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.photographs import LINKS, describe_notes
 from pansplat.predictor import Progress
+from pansplat.system.files import make_unique_name
 
 
 def write_panoramas(folder: Path, panoramas: Sequence[Panorama], progress: Progress | None = None) -> int:
     """Write NAME.jpg for each panorama in its full resolution, NAME_mask.png for a mask, and links.json.
 
-    What blur masks hide is hidden in the files. Poses are not written.
+    If a name is taken, the next panorama of that name gets the name of its folder before its own, and a number if that
+    is taken, too. What blur masks hide is hidden in the files. Poses are not written.
 
     Args:
         folder: exists.
-        panoramas: of unique names.
+        panoramas: of any folders.
         progress: called with a description and the completed fraction.
 
     Returns:
         The bytes of all files.
     """
-    for number, view in enumerate(panoramas):
+    names = _name_files(panoramas)
+    for number, (view, name) in enumerate(zip(panoramas, names, strict=True)):
         if progress is not None:
-            progress(f"writing {view.name}.jpg", number / len(panoramas))
+            progress(f"writing {name}.jpg", number / len(panoramas))
         height = read_height(view.image)
-        write_image(folder / f"{view.name}.jpg", read_panorama(view.image, height)[0], panorama="photograph")
+        write_image(folder / f"{name}.jpg", read_panorama(view.image, height)[0], panorama="photograph")
         if view.mask is not None:
             mask = np.repeat(read_mask(view.mask, height).numpy()[..., None], 3, axis=2)
-            write_image(folder / f"{view.name}_mask.png", mask.astype(np.uint8) * 255, panorama=False)
-    entries = {f"{view.name}.jpg": _describe(view) for view in panoramas}
+            write_image(folder / f"{name}_mask.png", mask.astype(np.uint8) * 255, panorama=False)
+    named = {(view.image.parent, view.name): name for view, name in zip(panoramas, names, strict=True)}
+    entries = {f"{name}.jpg": _describe(view, named) for view, name in zip(panoramas, names, strict=True)}
     entries = {name: entry for name, entry in entries.items() if entry}
     if entries:
         (folder / LINKS).write_text(json.dumps(entries, indent=1, ensure_ascii=False), "utf-8")
     return sum(file.stat().st_size for file in folder.iterdir())
 
 
-def _describe(view: Panorama) -> dict[str, object]:
-    """The entry of links.json."""
+def _name_files(panoramas: Sequence[Panorama]) -> list[str]:
+    """Distinct names for the files of panoramas."""
+    names: list[str] = []
+    for view in panoramas:
+        is_taken = view.name.lower() in map(str.lower, names)
+        name = f"{view.image.parent.resolve().name}_{view.name}" if is_taken else view.name
+        names.append(make_unique_name(name, names))
+    return names
+
+
+def _describe(view: Panorama, named: Mapping[tuple[Path, str], str]) -> dict[str, object]:
+    """The entry of links.json; `named` are the files of panoramas by folder and name."""
     links = [
-        {"to": f"{link.target}.jpg", "yaw": link.yaw, "pitch": link.pitch} | ({"text": link.text} if link.text else {})
+        {"to": f"{named.get((view.image.parent, link.target), link.target)}.jpg", "yaw": link.yaw, "pitch": link.pitch}
+        | ({"text": link.text} if link.text else {})
         for link in view.links
     ]
     notes = describe_notes(view.notes)

@@ -16,7 +16,7 @@ from pathlib import Path
 import ezdxf
 import numpy as np
 import shapely
-from ezdxf import units
+from ezdxf import transform, units
 from ezdxf.enums import TextEntityAlignment
 from jaxtyping import Float
 from shapely.geometry import Polygon
@@ -120,8 +120,8 @@ def describe_plan(plan: Plan) -> list[str]:
     spread = "" if plan.scale_error is None else f", which differ by {100 * plan.scale_error:.1f} %"
     count = describe_count(plan.num_heights, "panorama")
     lines = [
-        f"{describe_count(len(plan.rooms), 'room')}, {area:.1f} m² between the walls",
-        f"scale: cameras {plan.camera_height:.2f} m over the floor (median of {count}{spread})",
+        f"{describe_count(len(plan.rooms), 'room')}, {_format_number(plan, area, 1, power=2)} m² between the walls",
+        f"scale: cameras {_format_number(plan, plan.camera_height, 2)} m over the floor (median of {count}{spread})",
     ]
     inside = {node for room in plan.rooms for node in room.panoramas}
     if outside := [panorama.name for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
@@ -131,7 +131,20 @@ def describe_plan(plan: Plan) -> list[str]:
     if plan.wall_error is None:
         return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
     walls = describe_count(plan.num_walls, "wall")
-    return [*lines, f"walls: ± {100 * plan.wall_error:.1f} cm, by the panoramas that show the same {walls}"]
+    error = _format_number(plan, 100 * plan.wall_error, 1)
+    return [*lines, f"walls: ± {error} cm, by the panoramas that show the same {walls}"]
+
+
+def _format_number(plan: Plan, value: float, decimals: int, power: int = 1) -> str:
+    """A length, or with a power of 2 an area, in the unit of the poses.
+
+    Args:
+        plan: of the value.
+        value: in metres of the plan.
+        decimals: of metres; in other units as many digits are written.
+    """
+    factor = plan.frame.unit**power
+    return f"{factor * value:.{max(decimals - round(math.log10(factor)), 0)}f}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,8 +225,8 @@ class _Drawing:
             free -= shapely.MultiPoint(self.panoramas[list(room.panoramas)]).buffer(_SMALL_TEXT)
             circle = shapely.maximum_inscribed_circle(Polygon(corners) if free.is_empty else free)
             (x, y), width = circle.coords[0], 2 * circle.length
-            area = f"{room.area:.1f} m² ± {self.plan.area_error(room):.1f}"
-            for row, text in ((0.7, room.name), (-0.7, area)):
+            area, error = (_format_number(self.plan, v, 1, power=2) for v in (room.area, self.plan.area_error(room)))
+            for row, text in ((0.7, room.name), (-0.7, f"{area} m² ± {error}")):
                 size = min(_TEXT, 0.9 * width / (_LETTER * max(len(text), 1)))
                 yield _Text("ROOMS", (x, y + row * size), text, size)
             for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -223,7 +236,8 @@ class _Drawing:
                     angle = math.degrees(
                         math.remainder(math.atan2(*(end - start)[::-1]) - _UPWARDS, math.pi) + _UPWARDS
                     )
-                    yield _Text("LENGTHS", (x, y), f"{length:.2f}", _SMALL_TEXT, angle=angle)
+                    text = _format_number(self.plan, length, 2)
+                    yield _Text("LENGTHS", (x, y), text, _SMALL_TEXT, angle=angle)
         inside = {node for room in self.plan.rooms for node in room.panoramas}
         for node, (x, y) in enumerate(self.panoramas.tolist()):
             if node not in inside:
@@ -241,7 +255,8 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    notes = [*drawing.notes, "1:50 on paper; the bar is 1 m"]
+    unit = drawing.plan.frame.unit
+    notes = [*drawing.notes, f"1:{unit / _PAPER:g} on paper; the bar is {unit:g} m"]
     width, height = drawing.size
     width = max(width, 0.15 * _LETTER * max(map(len, notes)) + _MARGIN)
     below = _LINE * len(notes) + _MARGIN
@@ -282,7 +297,7 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
 
 
 def _draw_dxf(drawing: _Drawing) -> bytes:
-    """The plan as a DXF of AutoCAD 2010, in metres."""
+    """The plan as a DXF of AutoCAD 2010, in metres, or the unit of the poses."""
     document = ezdxf.new("R2010", setup=True)
     document.units = units.M
     for name, color in _LAYERS.items():
@@ -300,6 +315,8 @@ def _draw_dxf(drawing: _Drawing) -> bytes:
         align = TextEntityAlignment.MIDDLE_CENTER if text.is_centred else TextEntityAlignment.MIDDLE_LEFT
         entity = space.add_text(content, height=text.size, rotation=text.angle, dxfattribs={"layer": text.layer})
         entity.set_placement(text.place, align=align)
+    document.header["$LTSCALE"] = drawing.plan.frame.unit  # of dashes
+    transform.scale_uniform(space, drawing.plan.frame.unit)
     stream = io.StringIO()
     stream.write(f"999\n{SOFTWARE}\n")
     document.write(stream)

@@ -179,16 +179,19 @@ class FloorPlan:
 def find_other_storeys(tour: TourGraph, position: Float[np.ndarray, "3"]) -> frozenset[int]:
     """The panoramas of the world around a position that are in another storey, each in the one of the nearest level."""
     nearest = int(np.linalg.norm(tour.positions - position, axis=1).argmin())
-    members, levels = _find_levels(tour, tour.panoramas[nearest].world)
+    members, levels = _find_levels(tour, tour.worlds[nearest])
     places = np.concatenate((tour.positions[members], position[None])) @ -tour.level_axes[:, 1]
     storeys = np.abs(places[:, None] - levels).argmin(axis=1)
     return frozenset(np.array(members)[storeys[:-1] != storeys[-1]].tolist())
 
 
 def assign_storeys(tour: TourGraph) -> list[int]:
-    """The storey of each panorama in its world, that of the nearest level; 0 is the lowest."""
+    """The storey of each panorama in its world, that of the nearest level; 0 is the lowest.
+
+    Heights of two worlds cannot be compared: a panorama that is not placed is in storey 0 of its own.
+    """
     storeys = [0] * len(tour)
-    for world in {panorama.world for panorama in tour.panoramas}:
+    for world in set(tour.worlds):
         members, levels = _find_levels(tour, world)
         heights = tour.positions[members] @ -tour.level_axes[:, 1]
         for node, storey in zip(members, np.abs(heights[:, None] - levels).argmin(axis=1).tolist(), strict=True):
@@ -198,7 +201,7 @@ def assign_storeys(tour: TourGraph) -> list[int]:
 
 def _find_levels(tour: TourGraph, world: int) -> tuple[list[int], Float[np.ndarray, "storey"]]:
     """The panoramas of a world, and the levels of its storeys, the lowest first."""
-    members = [node for node, panorama in enumerate(tour.panoramas) if panorama.world == world]
+    members = [node for node, own in enumerate(tour.worlds) if own == world]
     heights = tour.positions[members] @ -tour.level_axes[:, 1]
     return members, np.sort([float(np.median(heights[storey])) for storey in find_storeys(heights)])
 

@@ -108,8 +108,9 @@ class TourGraph:
     @cached_property
     def worlds(self) -> tuple[int, ...]:
         """The world of each node: parts with walls between them have known relative places. A pair has no edges."""
-        edges = [*self.overlaps, *self.walls]
-        return tuple(label_components(len(self), edges)) if self.overlaps else (0,) * len(self)
+        if not self.overlaps:
+            return tuple(panorama.world for panorama in self.panoramas)
+        return tuple(label_components(len(self), [*self.overlaps, *self.walls]))
 
     def is_placed(self, node: int) -> bool:
         """Whether the place of a node relative to another one is known."""

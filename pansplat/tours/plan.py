@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from shapely.geometry import MultiPolygon, Polygon
 
 from pansplat.gaussians.scene import Scene
+from pansplat.geometry.world import WorldFrame
 from pansplat.system.components import label_components
 from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, trace_floor
 from pansplat.tours.graph import TourGraph
@@ -111,6 +112,11 @@ class Plan:
     wall_error: float | None
     num_heights: int
     num_walls: int
+
+    @property
+    def frame(self) -> WorldFrame:
+        """Where the world of the plan is in that of files."""
+        return self.tour.panoramas[0].frame
 
     @property
     def turns(self) -> list[float]:

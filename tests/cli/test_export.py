@@ -247,6 +247,8 @@ def test_the_mesh_of_a_panorama_without_a_pose_is_a_file_of_its_own(
     assert len(placed) == 2 and sum(len(part.faces) for part in placed) <= 4000 and len(single.faces) <= 2000
     texture = np.asarray(single.visual.material.baseColorTexture, float)
     assert np.abs(texture - photograph).mean() < 60, "random pixels, as JPEG; another photograph differs by 85"
+    pairs.remove(pairs[0])
+    assert run(command) == 0 and not (tmp_path / "home_2.glb").exists(), "a mesh of before"
 
 
 def test_a_floor_plan_needs_a_floor(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:

@@ -14,11 +14,13 @@ from synthetic_scenes import make_balls, place_cameras
 
 from pansplat.errors import InputError
 from pansplat.export.mesh import make_mesh
-from pansplat.export.mesh_files import Mesh, MeshPart, save_mesh
+from pansplat.export.mesh_files import Mesh, MeshPart, remove_old_meshes, save_mesh
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
+from pansplat.images.image_files import write_image
+from pansplat.system.files import is_written
 from pansplat.tours.doll_house import find_rooms
 
 LOW, HIGH = torch.tensor((-2.0, -1.1, -3.0)), torch.tensor((2.0, 1.5, 3.0))  # y is down
@@ -191,6 +193,31 @@ def test_files_are_read_by_another_program(mesh: Mesh, tmp_path: Path, name: str
     for file in files[2:]:
         with Image.open(file) as image:
             assert not image.getexif()
+
+
+def test_what_a_mesh_no_longer_needs_is_removed_and_files_of_others_stay(mesh: Mesh, tmp_path: Path) -> None:
+    parts = (*mesh.parts, *mesh.parts)
+    first = save_mesh(Mesh(parts), tmp_path / "our house.obj")
+    edited, rendered = tmp_path / "our_house_3.jpg", tmp_path / "our_house_9.jpg"
+    assert edited in first
+    Image.new("RGB", (8, 4)).save(edited)
+    write_image(rendered, np.zeros((4, 8, 3), np.float32))
+    assert is_written(rendered), "it has the name of a texture, but no mesh names it"
+    second = save_mesh(mesh, tmp_path / "our house.obj")
+    assert len(second) == len(first) - 2 and set(tmp_path.iterdir()) == {*second, edited, rendered}
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb"])
+def test_further_meshes_of_an_earlier_export_are_removed_and_other_exports_stay(
+    mesh: Mesh, tmp_path: Path, suffix: str
+) -> None:
+    path = tmp_path / f"k\xfcche{suffix}"
+    further = [dataclasses.replace(mesh, part_of=name) for name in (path.name, path.name, f"other{suffix}")]
+    files = [save_mesh(part, path.with_stem(f"{path.stem}_{k}")) for k, part in enumerate((mesh, *further), 2)]
+    users = path.with_stem(f"{path.stem}_7")
+    users.write_text(f'"part_of":"{path.name}"')
+    remove_old_meshes(path, [files[1][0]])
+    assert set(tmp_path.iterdir()) == {*files[0], *files[1], *files[3], users}, "without the third one"
 
 
 @pytest.mark.parametrize("frame", [WorldFrame(1e3), WorldFrame(1.0, (5e6, -4e5, 64.0))])

@@ -16,7 +16,7 @@ from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import Placement
 from pansplat.tours import floor
 from pansplat.tours.floor import draw_floor_plan, find_floor_outline
-from pansplat.tours.graph import TourGraph
+from pansplat.tours.graph import TourGraph, make_graph
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +117,17 @@ def test_other_storeys_are_those_of_the_same_world_at_another_level(room_scene):
     assert floor.find_other_storeys(tour, tour.positions[4]) == {0, 1}, "the stairs are nearer to the upper storey"
     assert floor.find_other_storeys(tour, tour.positions[2]) == {0, 1}
     assert floor.find_other_storeys(tour, tour.positions[5]) == frozenset(), "levels of two worlds cannot be compared"
+
+
+def test_panoramas_that_are_not_placed_neither_add_nor_merge_storeys(room_scene):
+    heights = torch.tensor([0.0, 0.0, 0.0, 2.3, 2.3, 2.3, *[1.15] * 5], dtype=torch.float64)
+    poses = room_scene.cam2world[:1].repeat(len(heights), 1, 1)
+    poses[:, 2, 3] += heights  # z is up
+    edges = (*((k, k + 1, 0.5) for k in range(5)), *((k, k, 1.0) for k in range(6, 11)))
+    tour = make_graph(dataclasses.replace(room_scene, cam2world=poses, names=(), overlaps=edges))
+    assert floor.assign_storeys(tour) == [0, 0, 0, 1, 1, 1, 0, 0, 0, 0, 0]
+    assert floor.find_other_storeys(tour, tour.positions[0]) == {3, 4, 5}
+    assert floor.find_other_storeys(tour, tour.positions[8]) == frozenset(), "it has no storey"
 
 
 def test_storeys_of_a_plan_are_next_to_each_other(room_scene):

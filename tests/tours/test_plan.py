@@ -19,6 +19,7 @@ from pansplat.export.cleanup import crop_to_rooms
 from pansplat.export.plan_files import _Drawing, describe_plan, write_picture, write_plan
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
 from pansplat.tours import doll_house
 from pansplat.tours.graph import make_graph
@@ -253,6 +254,27 @@ def test_the_picture_is_the_drawing_and_without_walls_the_floors(tmp_path: Path)
     assert (image[:3] == 255).all() and np.abs(image[..., ::-1].astype(int) - (242, 240, 234)).sum(axis=2).min() == 0
     assert write_picture(dataclasses.replace(scene, joint=True), tmp_path / "floors.png") is None
     assert not (cv2.imread(str(tmp_path / "floors.png"))[:3] == 255).all()
+
+
+@pytest.mark.parametrize(("unit", "wall", "area"), [(1e3, "4000", "15"), (1e-3, "0.00400", "0.00001")])
+def test_lengths_are_in_the_unit_of_the_poses(tmp_path: Path, unit: float, wall: str, area: str) -> None:
+    metres = _make_house(_walls_around(HALL), CAMERAS[2:])
+    scene = dataclasses.replace(metres, frame=WorldFrame(unit))
+    svg, dxf = tmp_path / "plan.svg", tmp_path / "plan.dxf"
+    plan = write_plan(scene, svg)
+    (room,), text = _read_svg(svg)
+    assert _area(room) == pytest.approx(15.6, rel=0.02), "on paper it has the size of a room in metres"
+    lines = text.split("\n")
+    assert wall in lines and f"1:{50 * unit:g} on paper; the bar is {unit:g} m" in lines
+    assert any(line.startswith(area) and "m² ±" in line for line in lines)
+    height = float(re.search(r"cameras ([\d.]+) m over", text)[1])
+    assert height == pytest.approx(CAMERA_HEIGHT * unit, rel=0.01)
+    assert describe_plan(plan) != describe_plan(write_plan(metres, tmp_path / "metres.svg"))
+    write_plan(scene, dxf)
+    (outline,) = ezdxf.readfile(dxf).modelspace().query("LWPOLYLINE[layer=='WALLS']")
+    assert _area([point[:2] for point in outline]) == pytest.approx(15.6 * unit**2, rel=0.02)
+    texts = ezdxf.readfile(dxf).modelspace().query("TEXT[layer=='LENGTHS']")
+    assert {entity.dxf.height for entity in texts} == {0.13 * unit} and wall in {entity.dxf.text for entity in texts}
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 200])

@@ -382,6 +382,21 @@ def test_the_parts_of_a_split_page_replace_the_old_ones(
     assert [name for view in header["views"] for name in view["files"]] == [file.name for file in second.files[1:]]
 
 
+@pytest.mark.parametrize("is_shared", [False, True])
+def test_a_page_in_one_file_removes_the_parts_of_the_split_one_before(
+    scene: Scene, tmp_path: Path, is_shared: bool
+) -> None:
+    """`is_shared`: a user's file is beside the parts."""
+    write_page(scene, tmp_path / "tour.html", split=True)
+    other = tmp_path / "tour_files" / "0123456789abcdef.js"
+    if is_shared:
+        other.write_text("mine")
+    write_page(scene, tmp_path / "tour.html")
+    files = {file for file in tmp_path.rglob("*") if file.is_file()}
+    assert files == {tmp_path / "tour.html", *([other] if is_shared else [])}
+    assert (tmp_path / "tour_files").exists() == is_shared
+
+
 @pytest.mark.parametrize("stem", ["room #2", "50%25 done?", "a:b & 'c'", "k\xfcche", os.fsdecode(b"caf\xe9")])
 def test_a_split_page_finds_its_parts_under_any_name(scene: Scene, tmp_path: Path, stem: str) -> None:
     written = write_page(scene, tmp_path / f"{stem}.html", split=True)
