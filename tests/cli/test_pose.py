@@ -42,7 +42,7 @@ def _place_two(images, **options) -> PoseEstimate:
 @pytest.fixture
 def estimator(monkeypatch):
     """Sets the function that estimates poses."""
-    return lambda function: monkeypatch.setattr("pansplat.poses.estimate.estimate_poses", function)
+    return lambda function: monkeypatch.setattr("pansplat.poses.files.estimate_poses", function)
 
 
 def test_measured_poses_of_all_panoramas_are_an_error_before_the_estimate(folder: Path, estimator, capsys) -> None:
