@@ -57,12 +57,14 @@ class Pose(Writer):
             raise InputError(f"{self.paths[0]}: needed two or more panoramas, got {len(panoramas)}; add the others.")
         if out is not None:
             require_mergeable(out, [view.image for view in panoramas], overwrite=self.overwrite)
+        folder = self.paths[0] if self.paths[0].is_dir() else self.paths[0].parent
         with progress_bar() as progress:
             if is_video and out is not None:
+                folder = out.parent
                 frames = extract_key_frames(self.paths[0], out.parent, self.frames, progress, overwrite=self.overwrite)
                 panoramas = list_unposed(frames)
             estimate = estimate_panoramas(
-                self.paths[0] if self.paths[0].is_dir() else panoramas[0].image.parent,
+                folder,
                 panoramas,
                 camera_height=self.camera_height,
                 baseline=self.baseline,

@@ -77,7 +77,10 @@ _MIRROR_RATIO = 1.5  # of that number to the one with the picture itself; symmet
 _MAX_BASELINE = 1e9  # metres
 _LEAST_NEAR, _LARGEST_NEAR = 0.1, 0.6  # metres; the depth range is not narrower than that of rooms
 _MIN_FAR = 6.0
-
+_ADVICE = (
+    "take one more photograph between those that share too little, or in the open door, or place them by hand in "
+    "pansplat-view"
+)
 
 Suggestions = dict[tuple[Path, Path], tuple[Suggestion, ...]]
 """For pairs of files, places of the second panorama relative to the first one, best first."""
@@ -388,7 +391,8 @@ class NoPosesError(InputError):
         names: Mapping[Path, str] | None = None,
     ) -> None:
         listed = "; ".join(f"{(names or {}).get(path, path.name)}: {reason}" for path, reason in reasons.items())
-        super().__init__(f"no poses were found: {listed}.")
+        advice = "" if suggestions is None else f"; {_ADVICE}"
+        super().__init__(f"no poses were found: {listed}{advice}.")
         self.reasons, self.suggestions = dict(reasons), suggestions or {}
 
 
@@ -687,12 +691,10 @@ def _find_scale(
         first, second = (names[files[end]] for end in ends)
         return baseline[2] / distance, f"{first} and {second} are {baseline[2]:g} m apart"
     found = find_common_height(find_floors(images, poses, camera_height))
-    if found is None:
-        return camera_height, f"by estimated depth and an assumed height of {camera_height:g} m: no floor was found"
-    height, doubt = found
+    height, doubt = (1.0, "no floor was found, so by estimated depth") if found is None else found
     source = f"cameras {camera_height:g} m over the floor"
     if doubt is not None:
-        source += f" (uncertain: {doubt}, see --baseline)"
+        source += f" (uncertain: {doubt}; set --camera-height or --baseline of `pansplat pose`)"
     return camera_height / height, source
 
 
