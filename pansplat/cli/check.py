@@ -43,4 +43,6 @@ class Check:
             return 1
         if check.can_judge:
             print("no other interpretation of the poses fits far better")
+        else:
+            print("undecided: the check says nothing for or against these poses")
         return 0

@@ -24,7 +24,7 @@ class Pose(Writer):
     """Estimate the camera poses of equirectangular panoramas of one place."""
 
     paths: Positional[tuple[Path, ...]]
-    """A folder of panoramas, or two or more files; or a 360-degree video."""
+    """A folder of panoramas, a web tour, or two or more files; or a 360-degree video."""
     out: OptionalOut = None
     """File to write: poses.json, or a trajectory .tum or .kitti. Without it, only the table is shown. For a video, a
     folder for the key frames and their poses.json."""
@@ -37,13 +37,12 @@ class Pose(Writer):
 
     def run(self) -> int:
         """Estimate, print the table and write the file."""
-        from pansplat.inputs.folders import VIDEO_FILES
-        from pansplat.poses.estimate import estimate_poses
-        from pansplat.poses.files import SUFFIXES, require_mergeable, write_poses
+        from pansplat.inputs.folders import VIDEO_FILES, list_unposed
+        from pansplat.poses.files import SUFFIXES, estimate_panoramas, require_mergeable, write_poses
         from pansplat.poses.key_frames import extract_key_frames
 
         if not self.paths:
-            raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
+            raise InputError("`pansplat pose` needs a folder of panoramas, a web tour, two or more files, or a video")
         is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in VIDEO_FILES
         out = self.out
         if is_video:
@@ -53,17 +52,22 @@ class Pose(Writer):
             out = out / "poses.json"
         elif out is not None:
             require_output_file("--out", out, SUFFIXES)
-        images = [] if is_video else _list_images(self.paths)
+        panoramas = [] if is_video else list_unposed(self.paths)
+        if not is_video and len(panoramas) < 2:
+            raise InputError(f"{self.paths[0]}: needed two or more panoramas, got {len(panoramas)}; add the others.")
         if out is not None:
-            require_mergeable(out, images, overwrite=self.overwrite)
+            require_mergeable(out, [view.image for view in panoramas], overwrite=self.overwrite)
+        folder = self.paths[0] if self.paths[0].is_dir() else self.paths[0].parent
         with progress_bar() as progress:
             if is_video and out is not None:
-                images = extract_key_frames(self.paths[0], out.parent, self.frames, progress, overwrite=self.overwrite)
-            estimate = estimate_poses(
-                images,
+                folder = out.parent
+                frames = extract_key_frames(self.paths[0], out.parent, self.frames, progress, overwrite=self.overwrite)
+                panoramas = list_unposed(frames)
+            estimate = estimate_panoramas(
+                folder,
+                panoramas,
                 camera_height=self.camera_height,
                 baseline=self.baseline,
-                cache_folder=images[0].parent,
                 progress=progress,
             )
         _print_estimate(estimate)
@@ -71,24 +75,6 @@ class Pose(Writer):
             write_poses(estimate, out, overwrite=self.overwrite)
             print(out)
         return 0
-
-
-def _list_images(paths: tuple[Path, ...]) -> list[Path]:
-    """The files, and the photographs in the folders, as other commands find them."""
-    from pansplat.images.image_files import is_assembled
-    from pansplat.inputs.folders import require_known_masks
-    from pansplat.inputs.photographs import list_photographs
-
-    images: list[Path] = []
-    for path in paths:
-        if not path.exists():
-            raise InputError(f"{path}: needed a folder of panoramas or a file, got no such path; check it.")
-        found = [view.image for view in list_photographs(path)] if path.is_dir() else [path]
-        images += [image for image in found if not is_assembled(image)]
-        require_known_masks(path)
-    if len(images) < 2:
-        raise InputError(f"{paths[0]}: needed two or more panoramas, got {len(images)}; add the others.")
-    return images
 
 
 def _print_estimate(estimate: PoseEstimate) -> None:
@@ -104,7 +90,7 @@ def _print_estimate(estimate: PoseEstimate) -> None:
         if relation.is_reliable or len(estimate.relations) <= 3:
             degrees = [math.degrees(angle) for angle in (relation.parallax, *relation.uncertainty)]
             table.add_row(
-                f"{estimate.images[i].stem} - {estimate.images[j].stem}",
+                " - ".join(estimate.name_of(estimate.images[n]) for n in (i, j)),
                 *(f"{value:.0f}" for value in (relation.score, relation.places)),
                 "matches suffice" if math.isinf(relation.log_odds) else f"{math.exp(relation.log_odds):.1f}",
                 f"{degrees[0]:.1f}",
@@ -114,9 +100,9 @@ def _print_estimate(estimate: PoseEstimate) -> None:
     make_table_console().print(table)
     print(estimate.summary)
     for image, reason in estimate.probable.items():
-        print_message("note", f"{image.name} is only probably placed, {reason}")
+        print_message("note", f"{estimate.name_of(image)} is only probably placed, {reason}")
     for image, reason in estimate.apart.items():
-        print_message("note", f"{image.name} is in a smaller group: {reason}")
+        print_message("note", f"{estimate.name_of(image)} is in a smaller group: {reason}")
     for image, reason in estimate.unplaced.items():
-        print_message("note", f"{image.name} has no pose: {reason}")
+        print_message("note", f"{estimate.name_of(image)} has no pose: {reason}")
     sys.stdout.flush()

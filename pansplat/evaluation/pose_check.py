@@ -124,8 +124,8 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
     if not can_judge:
         warnings += (
             "the check cannot judge these poses, because no interpretation fits clearly (lowest error "
-            f"{next(iter(errors.values())):.3f}): the views overlap too little, or the poses or the order of the "
-            "images are wrong in another way.",
+            f"{next(iter(errors.values())):.3f}): the views have too little in common for it, as cameras some metres "
+            "apart have. If they are near each other in one room, the poses or the order of the images are wrong.",
         )
     mistake = _describe_mistake(errors)
     return PoseCheck(name, baseline, errors[AS_GIVEN], errors, tuple(indistinguishable), mistake, can_judge, warnings)

@@ -44,6 +44,7 @@ from pansplat.inputs.photographs import LINKS, add_links, list_photographs, list
 from pansplat.inputs.poses import parse_convention
 from pansplat.inputs.reconstructions import find_reconstruction, read_reconstruction
 from pansplat.inputs.web_tours import find_web_tour, is_web_tour_file, read_web_tour
+from pansplat.inputs.web_tours.entries import make_panorama
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import expand_home, is_scene_file, is_written
 
@@ -92,6 +93,37 @@ def load_panoramas(path: Path | str) -> list[Panorama]:
     except UnposedPanoramasError as error:
         return error.panoramas
     return list({view.image: view for pair in pairs for view in pair.context + pair.targets}.values())
+
+
+@list_folders_once()
+def list_unposed(paths: Sequence[Path]) -> list[Panorama]:
+    """The panoramas of folders, files of web tours, and pictures, with links and titles; no poses are read.
+
+    Those of a folder are the scenes of its web tour, or else its pictures.
+    """
+    panoramas: list[Panorama] = []
+    siblings: dict[Path, dict[Path, Panorama]] = {}
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: needed a folder of panoramas or a file, got no such path; check it.")
+        if path.is_dir() or is_web_tour_file(path):
+            found = _list_unposed(path) if path.is_dir() else _read_tour_file(path)
+            require_known_masks(path, found if path.is_dir() else ())
+        else:
+            if path.parent not in siblings:
+                siblings[path.parent] = _list_silently(path.parent)
+            found = [siblings[path.parent].get(path) or make_panorama(path.stem, path, path.parent)]
+            require_known_masks(path)
+        panoramas += found
+    return panoramas
+
+
+def _list_silently(folder: Path) -> dict[Path, Panorama]:
+    """The panoramas of a folder by their files, without notes about other files."""
+    with warnings.catch_warnings(), contextlib.suppress(InputError):
+        warnings.simplefilter("ignore", InputWarning)
+        return {panorama.image: panorama for panorama in _list_unposed(folder)}
+    return {}
 
 
 def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,14 +19,14 @@ from jaxtyping import Float
 from msgspec import Meta
 from numpy import ndarray as Array
 
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.images.image_files import list_pictures
 from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
 from pansplat.inputs.web_tours import is_scene_of_tour
-from pansplat.poses.estimate import PoseEstimate
+from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.placing import PlanPose, Suggestion
 from pansplat.poses.pose_file import (
     format_pose_file,
@@ -37,6 +38,7 @@ from pansplat.poses.pose_file import (
     world_of,
 )
 from pansplat.system.atomic import replacing
+from pansplat.system.descriptions import list_first
 from pansplat.system.files import read_file
 from pansplat.system.store import read_entry
 from pansplat.system.strict_json import MAX_BYTES, convert, read_field, read_json
@@ -256,13 +258,14 @@ def merge_estimate(
             worlds, made = _list_worlds(content, world), make_range(group)
             worlds[world] = worlds[world] | made if world in own else made | worlds[world] | {"unit": made["unit"]}
             own.add(world)
+        scales = _find_scales(content, file, group, anchors) if new else {}
         for image, name in new.items():
             pose = group.poses[image]
             if anchors:
                 nearest = min(anchors, key=lambda a: float(np.linalg.norm(group.poses[a][:3, 3] - pose[:3, 3])))
                 world = world_of(poses[anchors[nearest]])
                 motion = np.linalg.inv(group.poses[nearest]) @ pose
-                motion[:3, 3] *= (_find_unit(content, world) or group.unit) / group.unit
+                motion[:3, 3] *= scales[world]
                 pose = _read_pose(content, anchors[nearest], file) @ motion
             assert world is not None
             poses[name] = former.pop(name, {})
@@ -288,6 +291,34 @@ def merge_estimate(
         "written": " ".join(mark for world, mark in mark_worlds(content).items() if world in own),
     }
     return content, [name for name in poses if name in kept & placed]
+
+
+def _find_scales(content: Content, file: Path, group: PoseGroup, anchors: Mapping[Path, str]) -> dict[int, float]:
+    """The scale of the worlds of panoramas that stay, relative to that of an estimated group.
+
+    It is that of the units, or else the median ratio of the distances between these panoramas; 1, with a warning, for a
+    single one.
+    """
+    scales = {}
+    for world in {world_of(content["poses"][name]) for name in anchors.values()}:
+        own = {image: name for image, name in anchors.items() if world_of(content["poses"][name]) == world}
+        ratios = []
+        for pair in itertools.combinations(own, 2):
+            first, second = (_read_pose(content, own[image], file)[:3, 3] for image in pair)
+            distance = np.linalg.norm(group.poses[pair[0]][:3, 3] - group.poses[pair[1]][:3, 3])
+            if distance > 0:
+                ratios.append(float(np.linalg.norm(first - second) / distance))
+        unit, median = _find_unit(content, world), float(np.median(ratios)) if ratios else 0.0
+        if unit is None and not median:
+            warnings.warn(
+                f"{file} has only one measured pose, of {list_first(list(own.values()))}, beside new ones, which does "
+                "not state a scale: the distances of the new ones are those of the estimate in metres; set "
+                "--baseline or --camera-height in the unit of the file, or measure a second pose.",
+                InputWarning,
+                stacklevel=4,
+            )
+        scales[world] = unit / group.unit if unit is not None else median or 1.0
+    return scales
 
 
 def _name_in(folder: Path, panorama: Panorama) -> str:

@@ -79,7 +79,10 @@ _MIRROR_RATIO = 1.5  # of that number to the one with the picture itself; symmet
 _MAX_BASELINE = 1e9  # metres
 _LEAST_NEAR, _LARGEST_NEAR = 0.1, 0.6  # metres; the depth range is not narrower than that of rooms
 _MIN_FAR = 6.0
-
+_ADVICE = (
+    "take one more photograph between those that share too little, or in the open door, or place them by hand in "
+    "pansplat-view"
+)
 
 Suggestions = dict[tuple[Path, Path], tuple[Suggestion, ...]]
 """For pairs of files, places of the second panorama relative to the first one, best first."""
@@ -122,6 +125,7 @@ class PoseEstimate:
         relations: of the pairs that were compared, by indices into `images`.
         rejected: pairs of them that contradict the others and are not used.
         suggestions: for placing by hand.
+        names: of the files, for messages; by default their own.
     """
 
     images: tuple[Path, ...]
@@ -130,6 +134,7 @@ class PoseEstimate:
     relations: dict[IndexPair, RelativePose]
     rejected: tuple[IndexPair, ...] = ()
     suggestions: Suggestions = field(default_factory=dict)
+    names: Mapping[Path, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<PoseEstimate: {self.summary}>"
@@ -139,14 +144,19 @@ class PoseEstimate:
         """The poses, cam2world, of the panoramas of the largest group."""
         return self.groups[0].poses
 
+    def name_of(self, image: Path) -> str:
+        """The name of a file, for messages."""
+        return self.names.get(image, image.name)
+
     @property
     def apart(self) -> dict[Path, str]:
         """For each file of a smaller group, a sentence that names the others of its group."""
-        return {
-            image: f"it has a pose with {', '.join(other.name for other in group.poses if other != image)} only"
-            for group in self.groups[1:]
-            for image in group.poses
-        }
+        found = {}
+        for group in self.groups[1:]:
+            for image in group.poses:
+                others = ", ".join(self.name_of(other) for other in group.poses if other != image)
+                found[image] = f"it has a pose with {others} only"
+        return found
 
     def list_ties(self, names: Mapping[Path, str]) -> list[Tie]:
         """The pairs that hold the groups together, by the names of their files."""
@@ -161,11 +171,11 @@ class PoseEstimate:
     @property
     def probable(self) -> dict[Path, str]:
         """For each file that only probable pairs connect with the core of its group, these pairs."""
-        ties = self.list_ties({image: image.name for image in self.images})
-        found = {}
+        names = {image: self.name_of(image) for image in self.images}
+        ties, found = self.list_ties(names), {}
         for group in self.groups:
-            holds = find_holds([image.name for image in group.poses], ties)
-            found |= {image: holds[image.name].reason for image in group.poses if image.name in holds}
+            holds = find_holds([names[image] for image in group.poses], ties)
+            found |= {image: holds[names[image]].reason for image in group.poses if names[image] in holds}
         return found
 
     @property
@@ -238,6 +248,7 @@ def estimate_poses(
     *,
     masks: Mapping[Path, Path | None] | None = None,
     links: Mapping[Path, Mapping[Path, float]] | None = None,
+    names: Mapping[Path, str] | None = None,
     camera_height: float = CAMERA_HEIGHT,
     baseline: tuple[Path | str, Path | str, float] | None = None,
     seed: int = 0,
@@ -250,6 +261,7 @@ def estimate_poses(
         images: files, 2:1; one that is repeated is used once.
         masks: the mask file of each image, if it has one; by default those beside the images (docs/input.md).
         links: for an image, the yaw at which a tour links to other images, radians to the right of the centre.
+        names: of the images, for messages; by default those of the files.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images of the largest group and their distance in metres, instead of the camera's height.
         seed: of the random samples.
@@ -264,6 +276,7 @@ def estimate_poses(
         NoPosesError: no two panoramas could be placed.
     """
     paths = tuple(dict.fromkeys(Path(image) for image in images))
+    names = {path: path.name for path in paths} | dict(names or {})
     report = part_of(progress)
     if len(paths) < 2:
         raise InputError(f"needed two or more different panoramas to estimate poses, got {len(paths)}; add one.")
@@ -274,17 +287,17 @@ def estimate_poses(
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     if baseline is not None:
-        ends = {_find_file(name, paths, "the images") for name in baseline[:2]}
+        ends = {_find_file(name, paths, names, "the images") for name in baseline[:2]}
         if len(ends) < 2 or not 0 < baseline[2] < _MAX_BASELINE:
             raise InputError(
                 f"`baseline` must be two different images and a distance above 0 to {_MAX_BASELINE:g} metres, got "
                 f"{' '.join(map(str, baseline))}"
             )
     hints = [read_hints(path) for path in paths]
-    pixels, unplaced = _read_images(paths, hints)
+    pixels, unplaced = _read_images(paths, names, hints)
     kept = [n for n in range(len(paths)) if n not in unplaced]
     if len(kept) < 2:
-        raise _no_poses(paths, unplaced | {n: "no other panorama is left" for n in kept})
+        raise _no_poses(paths, names, unplaced | {n: "no other panorama is left" for n in kept})
     with one_thread():  # panoramas and pairs are divided among threads
         files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
         cache = Store(cache_folder, _CACHED)
@@ -301,13 +314,13 @@ def estimate_poses(
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
     tour = build_tour([v.joined for v in views], relations, downs, noise)
-    placed = [position for group in tour.groups for position in group.placed]
+    placed, listed = [position for group in tour.groups for position in group.placed], [names[paths[n]] for n in kept]
     for position, (reason, other) in tour.unplaced.items():
-        partner = "" if other is None else f" (best with {paths[kept[other]].name})"
-        unplaced[kept[position]] = _describe_mirrored(position, views, placed, paths, kept) or reason + partner
+        partner = "" if other is None else f" (its best pair is with {listed[other]})"
+        unplaced[kept[position]] = _describe_mirrored(position, views, placed, listed) or reason + partner
     suggestions = _suggest(views, relations, [paths[n] for n in kept])
     if not tour.groups:
-        raise _no_poses(paths, unplaced, suggestions)
+        raise _no_poses(paths, names, unplaced, suggestions)
     report("finding the floor", 0.95)
     groups = [
         _finish_group(
@@ -315,6 +328,7 @@ def estimate_poses(
             level_poses(group.poses, downs[list(group.placed)]),
             [paths[kept[position]] for position in group.placed],
             [views[position].small for position in group.placed],
+            names,
             camera_height,
             baseline if number == 0 else None,
         )
@@ -327,6 +341,7 @@ def estimate_poses(
         {(kept[i], kept[j]): relation for (i, j), relation in (relations | tour.confirmed).items()},
         tuple((kept[i], kept[j]) for i, j in tour.rejected),
         suggestions,
+        names,
     )
 
 
@@ -344,11 +359,12 @@ def _finish_group(
     poses: Float[Array, "view 4 4"],
     files: Sequence[Path],
     images: Sequence[Array],
+    names: Mapping[Path, str],
     camera_height: float,
     baseline: tuple[Path | str, Path | str, float] | None,
 ) -> PoseGroup:
     """The group in metres."""
-    scale, source = _find_scale(files, poses, images, camera_height, baseline)
+    scale, source = _find_scale(files, poses, images, names, camera_height, baseline)
     poses[:, :3, 3] *= scale
     near, far = depth_range(group.depths * scale) or (NEAR, FAR)
     return PoseGroup(
@@ -369,20 +385,29 @@ class NoPosesError(InputError):
         suggestions: for placing by hand.
     """
 
-    def __init__(self, reasons: Mapping[Path, str], suggestions: Suggestions | None = None) -> None:
-        listed = "; ".join(f"{path.name}: {reason}" for path, reason in reasons.items())
-        super().__init__(f"no poses were found: {listed}.")
+    def __init__(
+        self,
+        reasons: Mapping[Path, str],
+        suggestions: Suggestions | None = None,
+        names: Mapping[Path, str] | None = None,
+    ) -> None:
+        listed = "; ".join(f"{(names or {}).get(path, path.name)}: {reason}" for path, reason in reasons.items())
+        advice = "" if suggestions is None else f"; {_ADVICE}"
+        super().__init__(f"no poses were found: {listed}{advice}.")
         self.reasons, self.suggestions = dict(reasons), suggestions or {}
 
 
 def _no_poses(
-    paths: Sequence[Path], reasons: Mapping[int, str], suggestions: Suggestions | None = None
+    paths: Sequence[Path],
+    names: Mapping[Path, str],
+    reasons: Mapping[int, str],
+    suggestions: Suggestions | None = None,
 ) -> NoPosesError:
-    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)}, suggestions)
+    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)}, suggestions, names)
 
 
 def _read_images(
-    paths: Sequence[Path], hints: Sequence[Hints]
+    paths: Sequence[Path], names: Mapping[Path, str], hints: Sequence[Hints]
 ) -> tuple[dict[int, UInt8[Array, "height width"]], dict[int, str]]:
     """Grey panoramas by index, and the reasons against those that cannot be used."""
     pixels: dict[int, Array] = {}
@@ -408,7 +433,7 @@ def _read_images(
         elif not _is_closed(grey):
             reasons[n] = "it is not a panorama of 360 degrees: its left and right edges do not join"
         elif copy is not None:
-            reasons[n] = f"it is a copy of {paths[copy].name}, or was taken at the same place"
+            reasons[n] = f"it is a copy of {names[paths[copy]]}, or was taken at the same place"
         else:
             pixels[n], thumbnails[n] = grey, small
     return pixels, reasons
@@ -619,16 +644,14 @@ def _estimate_pair(
     return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, links, seed=seed)
 
 
-def _describe_mirrored(
-    view: int, views: Sequence[_View], placed: Sequence[int], paths: Sequence[Path], kept: Sequence[int]
-) -> str | None:
+def _describe_mirrored(view: int, views: Sequence[_View], placed: Sequence[int], names: Sequence[str]) -> str | None:
     """The problem of a panorama whose mirror image fits another one; None if it does not."""
     others = placed or [other for other in range(len(views)) if other != view]
     for other in sorted(others, key=lambda v: abs(v - view))[:3]:
         if _is_mirrored(views[view], views[other]):
             if placed:
                 return "it looks mirrored left to right; flip it"
-            return f"this one or {paths[kept[other]].name} looks mirrored left to right; flip one"
+            return f"this one or {names[other]} looks mirrored left to right; flip one"
     return None
 
 
@@ -662,30 +685,30 @@ def _find_scale(
     files: Sequence[Path],
     poses: Float[Array, "view 4 4"],
     images: Sequence[Array],
+    names: Mapping[Path, str],
     camera_height: float,
     baseline: tuple[Path | str, Path | str, float] | None,
 ) -> tuple[float, str]:
     """Metres per unit of the poses, and how it was found."""
     centres = poses[:, :3, 3]
     if baseline is not None:
-        ends = [_find_file(name, files, "the largest group of images with poses") for name in baseline[:2]]
+        ends = [_find_file(name, files, names, "the largest group of images with poses") for name in baseline[:2]]
         distance = float(np.linalg.norm(centres[ends[0]] - centres[ends[1]]))
         if distance == 0:
             raise InputError(f"`baseline` must be two images with a distance, got two from the same place: {baseline}")
-        return baseline[2] / distance, f"{files[ends[0]].name} and {files[ends[1]].name} are {baseline[2]:g} m apart"
+        first, second = (names[files[end]] for end in ends)
+        return baseline[2] / distance, f"{first} and {second} are {baseline[2]:g} m apart"
     found = find_common_height(find_floors(images, poses, camera_height))
-    if found is None:
-        return camera_height, f"by estimated depth and an assumed height of {camera_height:g} m: no floor was found"
-    height, doubt = found
+    height, doubt = (1.0, "no floor was found, so by estimated depth") if found is None else found
     source = f"cameras {camera_height:g} m over the floor"
     if doubt is not None:
-        source += f" (uncertain: {doubt}, see --baseline)"
+        source += f" (uncertain: {doubt}; set --camera-height or --baseline of `pansplat pose`)"
     return camera_height / height, source
 
 
-def _find_file(name: Path | str, files: Sequence[Path], which: str) -> int:
+def _find_file(name: Path | str, files: Sequence[Path], names: Mapping[Path, str], which: str) -> int:
     for n, file in enumerate(files):
-        if str(name) in (str(file), file.name, file.stem):
+        if str(name) in (str(file), file.name, file.stem, names[file]):
             return n
-    listed = ", ".join(file.name for file in files)
+    listed = ", ".join(names[file] for file in files)
     raise InputError(f"`baseline` must name two of {which} ({listed}), got {name}")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,7 @@ import torch
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.images.cube_images import CUBE_SUFFIX
-from pansplat.images.image_files import read_thumbnail
+from pansplat.images.image_files import is_assembled, list_masks, read_thumbnail
 from pansplat.inputs.content import hash_pixels
 from pansplat.inputs.folders import make_names_unique
 from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
@@ -24,7 +26,7 @@ from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.inputs.web_tours import is_scene_of_tour
-from pansplat.poses.edit import find_kept, merge_estimate, read_pose_content, write_pose_file
+from pansplat.poses.edit import POSES, find_kept, merge_estimate, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses, fingerprint_estimates
 from pansplat.poses.pose_file import (
     CONVENTION,
@@ -97,10 +99,63 @@ def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
     for image in images:
         if is_scene_of_tour(path.parent, image):
             names[image] = image.name.removesuffix(CUBE_SUFFIX)
+        elif is_assembled(image):
+            raise InputError(
+                f"{path}: needed 2:1 photographs or a web tour, got the cube faces of "
+                f"{image.name.removesuffix(CUBE_SUFFIX)}, of which it holds no poses; `pansplat export --photos` makes "
+                "photographs of them."
+            )
         else:
             file = locate_inside(path.parent, os.path.abspath(image), path)
             names[image] = file.relative_to(path.parent).as_posix()
     return names
+
+
+def estimate_panoramas(
+    folder: Path,
+    panoramas: Sequence[Panorama],
+    *,
+    camera_height: float = CAMERA_HEIGHT,
+    baseline: tuple[Path | str, Path | str, float] | None = None,
+    progress: Progress | None = None,
+) -> PoseEstimate:
+    """Poses of panoramas, by all that their folder or tour states of them; every command estimates poses by this.
+
+    Args:
+        folder: whose cache keeps features and relative poses.
+        panoramas: two or more; masks and links count, and titles are used in messages. A link to a name that several
+            have is not used.
+        camera_height, baseline, progress: see `estimate_poses`.
+
+    Raises:
+        NoPosesError: no two panoramas could be placed.
+    """
+    counts = Counter(panorama.name for panorama in panoramas)
+    images = {panorama.name: panorama.image for panorama in panoramas if counts[panorama.name] == 1}
+    return estimate_poses(
+        [panorama.image for panorama in panoramas],
+        masks={panorama.image: panorama.mask for panorama in panoramas},
+        links={
+            panorama.image: {images[link.target]: link.yaw for link in panorama.links if link.target in images}
+            for panorama in panoramas
+        },
+        names=_name_for_people(panoramas),
+        camera_height=camera_height,
+        baseline=baseline,
+        cache_folder=folder,
+        progress=progress,
+    )
+
+
+def _name_for_people(panoramas: Sequence[Panorama]) -> dict[Path, str]:
+    """The title of each panorama that no other one has, or else the name of its file or scene."""
+    counts = Counter(panorama.title for panorama in panoramas)
+    return {
+        panorama.image: panorama.title
+        if panorama.title and counts[panorama.title] == 1
+        else panorama.image.name.removesuffix(CUBE_SUFFIX)
+        for panorama in panoramas
+    }
 
 
 def estimate_pairs(
@@ -148,20 +203,7 @@ def _estimate(
     """What is cached: worlds of placed panoramas, and the reasons for the others, by name."""
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
-        masks = {panorama.image: panorama.mask for panorama in panoramas}
-        images = {panorama.name: panorama.image for panorama in panoramas}
-        links = {
-            panorama.image: {images[link.target]: link.yaw for link in panorama.links if link.target in images}
-            for panorama in panoramas
-        }
-        estimate = estimate_poses(
-            list(names),
-            masks=masks,
-            links=links,
-            camera_height=camera_height,
-            cache_folder=folder,
-            progress=progress,
-        )
+        estimate = estimate_panoramas(folder, panoramas, camera_height=camera_height, progress=progress)
     except NoPosesError as error:
         worlds, summary, unplaced, pairs, suggestions = [], "", error.reasons, [], error.suggestions
     else:
@@ -201,8 +243,10 @@ def _make_pairs(
     by_name = {panorama.name: panorama for panorama in panoramas}
     unplaced, unreadable = content["unplaced"], content["unreadable"]
     if content["worlds"]:
-        is_flat = all(panorama.image.parent == folder for panorama in panoramas)
-        advice = " `pansplat pose` writes them to a file." if is_flat else ""
+        advice = ""
+        with contextlib.suppress(InputError):
+            name_pictures(folder / POSES, [panorama.image for panorama in panoramas])
+            advice = f" `pansplat pose {folder} -o {folder / POSES}` writes them to a file."
         warnings.warn(f"{folder} has no poses; they were estimated: {content['summary']}.{advice}", stacklevel=4)
     for name, reason in unplaced.items():
         panorama = by_name[name]

@@ -98,6 +98,7 @@ _PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pos
 _PROPOSAL_NOISE = math.radians(0.5), 0.1  # of the pose of a comparison: rotation; position, camera heights
 _LARGEST_SLOPE = 0.3
 _CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0
+_SHOWN_ODDS = 0.0  # above which messages state the probability; a pose that is rather wrong than right has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -709,10 +710,14 @@ def _find_problem(support: _Support, log_odds: float) -> str | None:
     """Why a pose must not be used; None if its matches suffice, or with the comparison of both panoramas."""
     if support.suffices or log_odds >= _PROBABLE_ODDS:
         return None
-    share = (
-        f"right with a probability of {100 / (1 + math.exp(-log_odds)):.0f} %" if log_odds > -math.inf else "unclear"
+    outcome = "too uncertain to use"
+    if log_odds > _SHOWN_ODDS:
+        probability, needed = (100 / (1 + math.exp(-odds)) for odds in (log_odds, _PROBABLE_ODDS))
+        outcome = f"right with a probability of {probability:.0f} %, and {needed:.0f} % are needed"
+    return (
+        f"too little in common: {support.places:.0f} places match where {_NEEDED_PLACES:g} suffice, and the best pose "
+        f"is {outcome}"
     )
-    return f"too little in common: {support.places:.0f} places match, and the best pose is {share}"
 
 
 def polish_relative_pose(

@@ -39,3 +39,4 @@ def test_check_draws_no_conclusion_from_unrelated_panoramas(tmp_path: Path, caps
     assert run(["check", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "the check cannot judge these poses" in out and "no other interpretation" not in out
+    assert out.rstrip().endswith("undecided: the check says nothing for or against these poses")

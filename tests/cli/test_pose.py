@@ -1,18 +1,23 @@
 """`pansplat pose` replaces nothing that it did not write, and key frames without a pose are not lost."""
 
+import contextlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import pansplat
 from pansplat.cli import run
+from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
 from pansplat.images.video import write_video
 from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.photographs import list_photographs
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
+from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
@@ -42,7 +47,7 @@ def _place_two(images, **options) -> PoseEstimate:
 @pytest.fixture
 def estimator(monkeypatch):
     """Sets the function that estimates poses."""
-    return lambda function: monkeypatch.setattr("pansplat.poses.estimate.estimate_poses", function)
+    return lambda function: monkeypatch.setattr("pansplat.poses.files.estimate_poses", function)
 
 
 def test_measured_poses_of_all_panoramas_are_an_error_before_the_estimate(folder: Path, estimator, capsys) -> None:
@@ -143,3 +148,106 @@ def test_key_frames_of_two_films_are_different_files(video: Path, tmp_path: Path
         assert run(["pose", str(film), "-o", str(tmp_path / "walk"), "--frames", "3"]) == 0
     assert len(list((tmp_path / "walk").glob("*.png"))) == 6
     assert sorted(len(pair.context) for pair in load_pairs(tmp_path / "walk")) == [1, 1, 2, 2]
+
+
+@pytest.fixture(params=["a folder with links", "a web tour of pictures", "a web tour of cube faces"])
+def linked(request: pytest.FixtureRequest, folder: Path, write_tiles) -> Path:
+    """Three panoramas, of which the first one links to the second."""
+    Image.fromarray(_photograph(2)).save(folder / "c.png")
+    if request.param == "a folder with links":
+        entry = {"title": "Hall", "links": [{"to": "b.png", "yaw": 1.5}]}
+        (folder / "links.json").write_text(json.dumps({"a.png": entry}))
+        return folder
+    tour = folder / "tour"
+    tour.mkdir()
+    if request.param == "a web tour of pictures":
+        (tour / "img").mkdir()
+        for name in "abc":
+            (folder / f"{name}.png").rename(tour / "img" / f"{name}.png")
+        spots = [{"type": "scene", "yaw": 90, "sceneId": "b"}]
+        scenes = {name: {"panorama": f"img/{name}.png", "hotSpots": spots if name == "a" else []} for name in "abc"}
+        (tour / "tour.json").write_text(json.dumps({"scenes": scenes}))
+        return tour
+    scenes = []
+    for name in "abc":
+        base = tour / "tiles" / name
+        write_tiles(32, 32, lambda face, row, column, base=base: base / "1" / face / str(row) / f"{column}.jpg")
+        links = [{"yaw": 1.5, "pitch": 0, "target": "b"}] if name == "a" else []
+        levels = [{"tileSize": 32, "size": 32}]
+        scenes.append({"id": name, "name": f"Room {name}", "levels": levels, "faceSize": 32, "linkHotspots": links})
+    (tour / "data.js").write_text(f"var APP_DATA = {json.dumps({'scenes': scenes, 'name': 'Flat'})};")
+    (tour / "index.html").write_text("<script src='data.js'></script>")
+    for name in "abc":  # tiles of one scene look like those of another one
+        Image.fromarray(_photograph(ord(name))[:32, :32]).save(tour / "tiles" / name / "1" / "f" / "0" / "0.jpg")
+    return tour
+
+
+def _export(folder: Path, out: Path) -> object:
+    return run(["export", str(folder), "-o", str(out / "tour.html"), "--model", "sphere"])
+
+
+CALLERS = {
+    "pose": lambda folder, out: run(["pose", str(folder), "-o", str(folder / "poses.json")]),
+    "pose of files": lambda folder, out: run(["pose", *map(str, sorted(folder.glob("*.png")))]),
+    "pose of a tour's file": lambda folder, out: run(["pose", *map(str, folder.glob("*.html"))]),
+    "export": _export,
+    "predict_tour": lambda folder, out: pansplat.predict_tour(folder),
+    "the window": lambda folder, out: find_entries(folder, LoadOptions()),
+}
+
+
+def test_all_commands_estimate_poses_from_the_same_arguments(linked: Path, tmp_path: Path, estimator) -> None:
+    calls: list[tuple[list[Path], dict]] = []
+
+    def record(images, *, progress, **options) -> PoseEstimate:
+        calls.append((list(images), options))
+        raise NoPosesError(dict.fromkeys(images, "no door"))
+
+    estimator(record)
+    callers = dict(CALLERS)
+    callers.pop("pose of a tour's file" if not list(linked.glob("*.html")) else "pose of files")
+    if not list(linked.glob("*.png")):
+        callers.pop("pose of files", None)
+    for number, (name, call) in enumerate(callers.items(), start=1):
+        for cache in linked.glob(".pansplat/poses-*.json"):
+            cache.unlink()
+        with contextlib.suppress(InputError):
+            call(linked, tmp_path)
+        assert len(calls) == number and calls[-1] == calls[0], name
+    images, options = calls[0]
+    assert len(images) == 3 and options["links"][images[0]] == {images[1]: pytest.approx(1.5, abs=0.1)}
+
+
+def test_the_written_poses_are_those_that_other_commands_use(linked: Path, estimator) -> None:
+    estimator(_place_two)
+    before = {view.name: view for pair in pansplat.load_pairs(linked) for view in pair.context}
+    assert run(["pose", str(linked), "-o", str(linked / "poses.json")]) == 0
+    estimator(_refuse)
+    after = {view.name: view for pair in pansplat.load_pairs(linked) for view in pair.context}
+    assert list(after) == list(before) == ["a", "b", "c"]
+    for name, view in after.items():
+        assert np.array_equal(view.cam2world, before[name].cam2world)
+        assert (view.image, view.world, view.links, view.placement.state, view.placement.reason) == (
+            *(before[name].image, before[name].world, before[name].links),
+            *(before[name].placement.state, before[name].placement.reason),
+        )
+
+
+def test_messages_name_rooms_by_their_titles(linked: Path, estimator, capsys) -> None:
+    estimator(lambda images, *, names, **options: replace(_place_two(images), names=names))
+    assert run(["pose", str(linked)]) == 0
+    error = capsys.readouterr().err
+    third = {"links.json": "c.png", "tour.json": "c.png", "data.js": "Room c"}
+    name = next(name for file, name in third.items() if (linked / file).exists())
+    assert f"{name} has no pose: no door" in error and "cube" not in error
+
+
+def test_poses_of_cube_faces_beside_each_other_are_refused_before_the_estimate(
+    tmp_path: Path, write_tiles, estimator, capsys
+) -> None:
+    for name in "ab":
+        write_tiles(32, 32, lambda face, row, column, name=name: tmp_path / f"{name}_{face}.png")
+    estimator(_refuse)
+    assert run(["pose", str(tmp_path), "-o", str(tmp_path / "poses.json")]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "got the cube faces of a, of which it holds no poses" in error and "--photos" in error

@@ -383,6 +383,30 @@ def test_poses_of_a_file_of_another_program_are_kept_in_its_convention(folder: P
     assert len({views[name].world for name in "abcde"}) == 1
 
 
+def _measure_some(folder: Path, places: dict[str, float]) -> None:
+    """A file of another program, without the unit of an estimate, with cameras at these places along x."""
+    poses = {f"{name}.png": np.eye(4) for name in places}
+    for name, x in places.items():
+        poses[f"{name}.png"][0, 3] = x
+    stated = {"convention": "cam2world opencv", "poses": {name: pose.tolist() for name, pose in poses.items()}}
+    (folder / "poses.json").write_text(json.dumps(stated))
+
+
+def test_new_panoramas_have_the_scale_of_the_distances_between_measured_ones(folder: Path, recwarn):
+    """The estimate has 1 m between neighbours; the file has 2.7 units by the median of 3.1, 2.7 and 2.5."""
+    _measure_some(folder, {"a": 6.9, "b": 10.0, "d": 15.0})
+    write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    assert _load(folder)["e"].cam2world[0, 3].item() == pytest.approx(17.7)
+    assert not [warning for warning in recwarn if "does not state a scale" in str(warning.message)]
+
+
+def test_a_single_measured_pose_states_no_scale_and_a_warning_says_what_to_do(folder: Path):
+    _measure_some(folder, {"a": 7.0})
+    with pytest.warns(UserWarning, match=r"only one measured pose, of a\.png, .*--baseline or --camera-height"):
+        write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
+    assert _load(folder)["b"].cam2world[0, 3].item() == pytest.approx(8.0)
+
+
 def test_what_cannot_be_placed_beside_replaced_poses_keeps_its_own_in_another_world(folder: Path):
     """a was measured with b, and is not placed now: with --overwrite it stays as it is, where nothing else is."""
     _write_edited(folder, lambda content: (_measure(content), content["poses"]["a.png"][2].__setitem__(3, 0.5)))

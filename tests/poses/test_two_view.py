@@ -13,6 +13,8 @@ from pansplat.poses.two_view import (
     NO_LINKS,
     LinkDirections,
     RelativePose,
+    _find_problem,
+    _Support,
     estimate_relative_pose,
     polish_pose,
     polish_relative_pose,
@@ -147,7 +149,16 @@ def test_surroundings_confirm_a_pose_of_few_matches(scene, see_room, look_around
     assert max(errors_degrees(found, bearings)) < 0.5
     assert found.distance == pytest.approx(np.linalg.norm(bearings.translation), rel=0.03)
     other = estimate(mixed, axes=PARALLEL, surroundings=look(look_around, TURN, CENTRES[1], room=1))
-    assert not other.is_reliable and "right with a probability of" in str(other.problem)
+    assert not other.is_reliable and str(other.problem).endswith("and the best pose is too uncertain to use")
+
+
+def test_a_probability_is_stated_only_if_a_pose_is_rather_right_than_wrong() -> None:
+    support = _Support(7.6, 30.0, 1.0)
+    assert str(_find_problem(support, 0.4)).endswith("is right with a probability of 60 %, and 73 % are needed")
+    for odds in (-math.inf, -2.6, 0.0):
+        assert _find_problem(support, odds) == (
+            "too little in common: 8 places match where 32 suffice, and the best pose is too uncertain to use"
+        )
 
 
 def test_many_places_suffice_without_a_comparison(scene, quick) -> None:
