@@ -36,7 +36,7 @@ from pansplat.inputs.pairs import (
     list_panorama_files,
     too_many_panoramas,
 )
-from pansplat.inputs.photographs import add_links, list_further_photographs
+from pansplat.inputs.photographs import list_further_photographs
 from pansplat.inputs.placements import Placement, is_by_hand, judge, read_rejected, read_ties
 from pansplat.inputs.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import find_inside, locate_inside
@@ -84,7 +84,6 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     rest = [view for view in dict.fromkeys(tour.values()) if view.image not in known]
     further = rest if tour else _list_further(source, folders, panoramas, reasons)
     unposed = [_explain_unposed(view, reasons, source) for view in further]
-    linked = add_links([*panoramas, *unposed], folder)
     ranges = _read_ranges(content, source)
     near, far = (
         read_field(content, key, float, source, default)
@@ -98,13 +97,13 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     is_single = count == 1 and (len(panoramas) > 1 or not unposed)
     return Collection(
         source,
-        tuple(linked[: len(panoramas)]),
+        panoramas,
         groups,
         near=near,
         far=far,
         ranges=ranges,
         name=folder.resolve().name if is_single else None,
-        unposed=tuple(linked[len(panoramas) :]),
+        unposed=tuple(unposed),
         folders=folders,
     )
 

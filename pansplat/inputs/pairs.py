@@ -85,6 +85,7 @@ class Panorama:
         camera_height: over the floor, metres; the scale of a scene of this panorama alone.
         placement: how the pose was found, or why there is none.
         frame: where the world of the pose is in the user's world, that of files.
+        links_at: the links.json that links and notes are read from, and the key there; None if none is read.
     """
 
     name: str
@@ -102,6 +103,7 @@ class Panorama:
     camera_height: float = CAMERA_HEIGHT
     placement: Placement = PLACED
     frame: WorldFrame = USER_FRAME
+    links_at: tuple[Path, str] | None = None
 
     def __repr__(self) -> str:
         position = ", ".join(f"{x:.3g}" for x in self.cam2world[:3, 3].tolist())

@@ -32,6 +32,11 @@ class FileWatch:
         self._next, self._found = 0, False
         self._stamps = [_read_stamp(file) for file in self._files]
 
+    def skip(self, file: Path) -> None:
+        """Take a file that the window itself has written as it is now; changes of other files stay to be noticed."""
+        if file in self._files:
+            self._stamps[self._files.index(file)] = _read_stamp(file)
+
     def look(self, now: float) -> None:
         """Look at some files at time `now` (seconds), and update `changed` after the last one; then pause."""
         if self._next == 0 and now - self._last < _SECONDS:
