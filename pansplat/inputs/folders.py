@@ -46,7 +46,7 @@ from pansplat.inputs.poses import parse_convention
 from pansplat.inputs.reconstructions import find_reconstruction, read_reconstruction
 from pansplat.inputs.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.system.descriptions import list_first
-from pansplat.system.files import expand_home, is_scene_file, is_written
+from pansplat.system.files import expand_home, is_scene_file, is_written, require_text
 
 VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
 _RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
@@ -76,6 +76,7 @@ def load_pairs(
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
     """
     root = expand_home(path)
+    require_text(root)
     convention = None if convention is None else parse_convention(convention, "`convention`")
     try:
         pairs = _load_pairs(root, convention, near, far)
@@ -414,7 +415,7 @@ class UnposedPanoramasError(InputError):
     """A folder or web tour holds two or more panoramas, and no poses in a known format."""
 
     def __init__(self, folder: Path, panoramas: list[Panorama]) -> None:
-        names = list_first([panorama.image.name for panorama in panoramas])
+        names = list_first([panorama.file_label for panorama in panoramas])
         super().__init__(
             f"{folder}: needed poses for the panoramas, got images only ({names}); run `pansplat pose {folder} -o "
             f"{folder / POSES}`, or add a pose file (docs/input.md)."

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pansplat.errors import InputError
 from pansplat.inputs.pairs import list_panorama_files
 
 _SECONDS = 2.0  # between looks at the files
@@ -54,6 +55,6 @@ def _read_stamp(file: Path) -> tuple[object, ...] | None:
         if file.is_dir():
             return tuple(path.name for path in list_panorama_files(file))
         status = file.stat()
-    except OSError:
+    except (OSError, InputError):
         return None
     return status.st_mtime_ns, status.st_size
