@@ -16,6 +16,7 @@ import torch
 
 import pansplat
 from pansplat.cli import run
+from pansplat.errors import InputError
 from pansplat.inputs.poses import read_trajectory
 from pansplat.poses.axes import SceneAxes
 from pansplat.poses.dense import Surroundings
@@ -24,6 +25,7 @@ from pansplat.poses.estimate import (
     NoPosesError,
     PoseEstimate,
     PoseGroup,
+    _find_file,
     _is_mirrored,
     _match,
     _relate_views,
@@ -282,3 +284,10 @@ def test_poses_of_pictures_outside_of_their_folder_are_refused_before_the_estima
     (tmp_path / "other").mkdir()
     message = _message(capsys, "pose", str(tmp_path / "room"), "-o", str(tmp_path / "other" / "poses.json"))
     assert "poses.json: needed a file inside" in message and "copy the picture into the folder" in message
+
+
+def test_a_baseline_by_a_name_of_two_files_is_refused(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("left.jpg", "left.png", "right.png")]
+    assert [_find_file(name, files, "the images") for name in ("left.png", files[0], "right")] == [1, 0, 2]
+    with pytest.raises(InputError, match=r"got left, which may be .*left\.jpg, .*left\.png; give the path"):
+        _find_file("left", files, "the images")
