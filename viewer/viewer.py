@@ -23,7 +23,7 @@ from imgui_bundle import imgui
 
 from pansplat.errors import InputError
 from pansplat.geometry.path import find_direction
-from pansplat.inputs.photographs import LINKS, write_notes
+from pansplat.inputs.photographs import write_notes
 from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable
 from pansplat.tours.route import find_angles
@@ -301,9 +301,9 @@ class Viewer:
 
     def put_note(self, text: str) -> None:
         """State a note at the middle of the image, in place of one that is there; without a text remove that one."""
-        photographs, camera, folder = self.stage.comparer.photographs, self.state.camera, self.library.folder
+        photographs, camera = self.stage.comparer.photographs, self.state.camera
         index = photographs.find_stop(np.asarray(camera.position))
-        if index is None or folder is None:
+        if index is None or photographs.panoramas[index].links_at is None:
             self.state.show_message("a note is put at a panorama of a folder; open the folder of this one")
             return
         away = photographs.pose(index)[:3, :3].T @ camera.rotation[:, 2]
@@ -313,10 +313,10 @@ class Viewer:
         yaw, pitch = find_angles(away)
         notes = (*kept, make_note((yaw, -pitch), text)) if text.strip() else kept
         with self._showing_errors():
-            write_notes(photographs.panoramas[index], notes, folder)
+            file = write_notes(photographs.panoramas[index], notes)
             photographs.change_notes(index, notes)
-            self.library.watch_again()
-            self.state.show_message(f"wrote {folder / LINKS}")
+            self.library.watch.skip(file)
+            self.state.show_message(f"wrote {file}")
 
     def save_path(self, text: str) -> None:
         """Write the key frames of the camera path."""

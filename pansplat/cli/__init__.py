@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from typing import Annotated, Any, Protocol, Union
 
+from pansplat.errors import InputError
 from pansplat.system.console import own_warnings, parse_arguments, run_command
 
 _COMMANDS = (
@@ -48,6 +50,10 @@ def parse(argv: Sequence[str] | None = None) -> Command:
     """The command of the arguments; prints help or an error and exits if there is none."""
     import tyro
 
+    first = next(iter(sys.argv[1:] if argv is None else argv), "-")
+    if not first.startswith("-") and first not in _COMMANDS:
+        near = "".join(f" (did you mean {name}?)" for name in get_close_matches(first, _COMMANDS, n=1))
+        raise InputError(f"needed a command, got {first!r}{near}; the commands are {', '.join(_COMMANDS)}")
     kind: Any = _list_commands()
     return parse_arguments(
         lambda: tyro.cli(

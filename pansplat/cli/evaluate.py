@@ -13,6 +13,7 @@ from pansplat.cli.inputs import Out, Writer, parse_blend
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import make_table_console, progress_bar
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
 from pansplat.system.options import Count, CountOrNone
 
@@ -109,7 +110,8 @@ class Evaluate(Writer):
             else:
                 with_targets = [pair for pair in found if pair.targets]
                 if not with_targets:
-                    print(f"note: {path}: none of its {len(found)} pairs has a target view; skipped", file=sys.stderr)
+                    count = describe_count(len(found), "pair")
+                    print(f"note: {path}: no target view in {count}; skipped", file=sys.stderr)
             pairs += with_targets
         predictor = pipeline.load_predictor(self.prediction)
         with progress_bar() as progress:

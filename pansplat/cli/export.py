@@ -18,7 +18,7 @@ from tyro.conf import Positional
 from pansplat.cli.inputs import Out, ScenePrediction, Writer
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
-from pansplat.system.descriptions import describe_count
+from pansplat.system.descriptions import describe_count, list_first
 from pansplat.system.files import (
     SCENE_SUFFIXES,
     find_scene_suffix,
@@ -83,7 +83,7 @@ class _FloorPlan:
 
         scene, changes, _ = export.open()
         plan = (write_picture if export.out.suffix.lower() == ".png" else write_plan)(scene, export.out)
-        floors = [f"the floors of {len(scene.cam2world)} panoramas"]
+        floors = [f"the floors of {describe_count(len(scene.cam2world), 'panorama')}"]
         print(f"{export.out}: {'; '.join(floors if plan is None else describe_plan(plan))}")
         _print_changes(changes)
 
@@ -138,7 +138,7 @@ class _Mesh:
             size = sum(written.stat().st_size for written in files)
             beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
             count, names = len(mesh.parts), ", ".join(part.name for part in mesh.parts)
-            whose = names if file != export.out else f"{count} panorama{'s' if count > 1 else ''}"
+            whose = names if file != export.out else describe_count(count, "panorama")
             print(f"{file}{beside}: {mesh.num_triangles:,} triangles of {whose}, {size / 1e6:.1f} MB")
         remove_old_meshes(export.out, meshes)
         if len(meshes) > 1:
@@ -210,9 +210,14 @@ class Page:
             f"{out}{beside}: {page.num_gaussians:,} Gaussians,{pictures} {page.num_bytes / 1e6:.1f} MB; open it in a "
             "browser"
         )
-        if page.num_fades:
-            counts = f"{page.num_flights} ways between panoramas are flights, {page.num_fades} are fades"
-            print(f"note: {out}: {counts}, because the surfaces of their panoramas disagree", file=sys.stderr)
+        if page.fades:
+            flights, fades = describe_count(page.num_flights, "flight"), describe_count(len(page.fades), "fade")
+            names = list_first([" and ".join(ends) for ends in page.fades])
+            print(
+                f"note: {out}: {flights} between panoramas, and {fades} ({names}), because their surfaces disagree; "
+                "one more photograph between two such panoramas would help",
+                file=sys.stderr,
+            )
         if page.num_rough:
             views = describe_count(page.num_rough, "panorama")
             print(
@@ -226,7 +231,7 @@ class Page:
             more = min(_GOOD_GAUSSIANS * panoramas, _MOST_GAUSSIANS)
             size = (page.num_bytes + _BYTES * (more - page.num_gaussians)) / 1e6
             print(
-                f"note: {out}: {count // panoramas:,} Gaussians for each of {panoramas} panoramas; "
+                f"note: {out}: {count // panoramas:,} Gaussians for each of {describe_count(panoramas, 'panorama')}; "
                 f"--gaussians {more} shows more detail in about {size:.0f} MB",
                 file=sys.stderr,
             )
@@ -268,8 +273,8 @@ class _TrainingSet:
         from pansplat.system.atomic import replacing_folder
 
         require_new_folder("--out", export.out)
-        if export.crop or export.rooms or not export.floaters:
-            names = "--crop, --rooms and --no-floaters"
+        if export.crop or export.rooms or export.remove_floaters:
+            names = "--crop, --rooms and --remove-floaters"
             raise InputError(f"{names} are not for {self.files}, got {export.out}; leave them out")
         if is_scene_file(export.path):
             raise InputError(
@@ -293,7 +298,8 @@ class _TrainingSet:
             count = write_dataset(folder, views, source.siblings, means, colors, progress)
             save_points(dataclasses.replace(scene, gaussians=gaussians).rotated(Z_UP[:3, :3]), folder / POINTS)
         print(
-            f"{export.out}: {count} cube faces of {len(views)} panoramas, {len(gaussians):,} points; sparse/0 is a "
+            f"{export.out}: {count} cube faces of {describe_count(len(views), 'panorama')}, "
+            f"{len(gaussians):,} points; sparse/0 is a "
             "model of COLMAP, transforms.json is for nerfstudio"
         )
 
@@ -349,8 +355,8 @@ class Export(Writer):
     left out."""
     rooms: tuple[str, ...] = ()
     """Keep these rooms of the floor plan, by their names or by those of panoramas in them."""
-    floaters: bool = True
-    """Keep isolated Gaussians in free space; --no-floaters leaves them out."""
+    remove_floaters: bool = False
+    """Leave out isolated Gaussians in free space."""
     up: Literal["y", "z"] | None = None
     """Axis of a given file that points up, if its program did not keep to the axes of the format."""
     layers: bool = False
@@ -432,7 +438,7 @@ class Export(Writer):
         if box is not None:
             corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
             box = tuple(scene.frame.localize_places(corners).flatten().tolist())
-        cleaning = Cleaning(self.rooms, box, self.floaters, self.min_opacity)
+        cleaning = Cleaning(self.rooms, box, not self.remove_floaters, self.min_opacity)
         try:
             with progress_bar() as progress:
                 scene, changes = clean_up(scene, cleaning, layers, progress)

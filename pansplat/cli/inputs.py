@@ -15,6 +15,7 @@ from tyro.conf import arg
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import progress_bar
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import is_scene_file
 from pansplat.system.options import Height
 
@@ -56,8 +57,8 @@ class SceneOptions(PredictOptions):
 class ScenePrediction:
     """How the scene of a path is predicted."""
 
-    options: SceneOptions = field(default_factory=SceneOptions)
-    choice: PairChoice = field(default_factory=PairChoice)
+    options: Annotated[SceneOptions, arg(name="prediction", prefix_name=False)] = field(default_factory=SceneOptions)
+    choice: Annotated[PairChoice, arg(prefix_name=False)] = field(default_factory=PairChoice)
 
     def open(self, path: Path) -> tuple[Scene, Pair | None]:
         """The scene of a scene file, or the prediction of a pair's folder, and the pair."""
@@ -89,10 +90,9 @@ class ScenePrediction:
             return predict_scene(pair, options), pair
         alone = sum(a == b for a, b in tours[0].overlaps)
         kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
-        more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
-        print(
-            f"note: {path}: a tour of {len(tours[0])} panoramas ({kinds}--pair chooses one pair){more}", file=sys.stderr
-        )
+        more = f"; left out: {describe_count(len(tours) - 1, 'other tour')}" if len(tours) > 1 else ""
+        count = describe_count(len(tours[0]), "panorama")
+        print(f"note: {path}: a tour of {count} ({kinds}--pair chooses one pair){more}", file=sys.stderr)
         with progress_bar() as progress:
             tour = connect(tours[0], progress)
         return predict_scene(tour, options), tour

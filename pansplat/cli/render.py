@@ -14,6 +14,7 @@ from tyro.conf import Positional
 from pansplat.cli.inputs import Out, ScenePrediction, Writer, parse_blend
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import read_file, require_output_file
 from pansplat.system.options import EYE_DISTANCE, EyeDistance, ImageHeight
 
@@ -102,7 +103,7 @@ class Render(Writer):
             with progress_bar() as progress:
                 frames = self._render_frames(scene, path, options, stops, progress)
                 count = write_video(self.out, frames, self.fps, panorama=layout != "perspective", stereo=stereo)
-            print(f"{self.out}: {count} frames of {size}, {layout}")
+            print(f"{self.out}: {describe_count(count, 'frame')} of {size}, {layout}")
             return 0
         pose = self._pose_between_cameras(scene) if poses is None else poses[0]
         with torch.no_grad():

@@ -101,7 +101,8 @@ class PageFiles:
         degree: of its harmonics.
         embed: origins of the pages that may frame it and exchange messages with it.
         photo_height: of its photographs, pixels; 0 without photographs.
-        num_flights, num_fades: edges along which it flies, and those along which it fades.
+        num_flights: number of edges along which it flies.
+        fades: labels of the two panoramas of each edge along which it fades.
         num_rough: panoramas without doll's house and distances, because their surfaces are too rough.
     """
 
@@ -112,7 +113,7 @@ class PageFiles:
     embed: tuple[str, ...] = ()
     photo_height: int = 0
     num_flights: int = 0
-    num_fades: int = 0
+    fades: tuple[tuple[str, str], ...] = ()
     num_rough: int = 0
 
 
@@ -667,8 +668,10 @@ def _write_files(
     files.insert(0, path)
     total = len(page) + sum(map(len, scripts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
-    fades, edges = len(header["poor"]), sum(a != b for a, b, _ in header["edges"])
-    return PageFiles(tuple(files), total, count, header["degree"], header["embed"], photo_height, edges - fades, fades)
+    names = [spot["name"] for spot in header["spots"]]
+    fades = tuple((names[a], names[b]) for a, b in header["poor"])
+    num_flights = sum(a != b for a, b, _ in header["edges"]) - len(fades)
+    return PageFiles(tuple(files), total, count, header["degree"], header["embed"], photo_height, num_flights, fades)
 
 
 def parse_origins(texts: Sequence[str]) -> tuple[str, ...]:

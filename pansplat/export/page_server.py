@@ -74,7 +74,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         content = b""
-        file = self.server.files.get(unquote_to_bytes(urlsplit(self.path).path))
+        try:
+            file = self.server.files.get(unquote_to_bytes(urlsplit(self.path).path))
+        except ValueError:  # no address
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return
         if file is not None:
             with suppress(OSError):
                 content = file.read_bytes()

@@ -73,8 +73,9 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
     plan = _find_rooms(scene)
     if plan is None:
         raise InputError(
-            f"cannot write {path}: needed a floor, and walls around at least one of the {len(scene.cam2world)} input "
-            "cameras, got none; export a folder of upright panoramas of rooms"
+            f"cannot write {path}: needed a floor, and walls around at least one of "
+            f"{describe_count(len(scene.cam2world), 'input camera')}, got none; "
+            "export a folder of upright panoramas of rooms"
         )
     _write(plan, Path(path))
     return plan
@@ -124,7 +125,7 @@ def describe_plan(plan: Plan) -> list[str]:
         f"scale: cameras {_format_number(plan, plan.camera_height, 2)} m over the floor (median of {count}{spread})",
     ]
     inside = {node for room in plan.rooms for node in room.panoramas}
-    if outside := [panorama.name for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
+    if outside := [panorama.label for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
         lines.append(f"no closed walls around {', '.join(outside)}")
     if not all(room.is_placed for room in plan.rooms):
         lines.append("dashed: rooms whose places are not known")
@@ -241,7 +242,7 @@ class _Drawing:
         inside = {node for room in self.plan.rooms for node in room.panoramas}
         for node, (x, y) in enumerate(self.panoramas.tolist()):
             if node not in inside:
-                name = self.plan.tour.panoramas[node].name
+                name = self.plan.tour.panoramas[node].label
                 yield _Text("PANORAMAS", (x + 0.12, y), name, _SMALL_TEXT, is_centred=False)
 
 

@@ -27,6 +27,7 @@ from pansplat.inputs.pairs import (
     FAR,
     FAR_SEQUENCE,
     MAX_CONTEXT,
+    MAX_NAMES,
     NEAR,
     Collection,
     Panorama,
@@ -36,12 +37,13 @@ from pansplat.inputs.pairs import (
     list_panorama_files,
     too_many_panoramas,
 )
-from pansplat.inputs.photographs import add_links, list_further_photographs
+from pansplat.inputs.photographs import list_further_photographs
 from pansplat.inputs.placements import Placement, is_by_hand, judge, read_rejected, read_ties
 from pansplat.inputs.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import find_inside, locate_inside
 from pansplat.inputs.web_tours import find_web_tour, read_web_tour
 from pansplat.inputs.web_tours.entries import plain_text
+from pansplat.system.descriptions import describe_count, list_first
 from pansplat.system.files import read_file
 from pansplat.system.strict_json import read_field, read_json
 
@@ -84,7 +86,6 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     rest = [view for view in dict.fromkeys(tour.values()) if view.image not in known]
     further = rest if tour else _list_further(source, folders, panoramas, reasons)
     unposed = [_explain_unposed(view, reasons, source) for view in further]
-    linked = add_links([*panoramas, *unposed], folder)
     ranges = _read_ranges(content, source)
     near, far = (
         read_field(content, key, float, source, default)
@@ -98,13 +99,13 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     is_single = count == 1 and (len(panoramas) > 1 or not unposed)
     return Collection(
         source,
-        tuple(linked[: len(panoramas)]),
+        panoramas,
         groups,
         near=near,
         far=far,
         ranges=ranges,
         name=folder.resolve().name if is_single else None,
-        unposed=tuple(linked[len(panoramas) :]),
+        unposed=tuple(unposed),
         folders=folders,
     )
 
@@ -163,8 +164,8 @@ def _drop_groups_of_several_worlds(
     kept = tuple(group for group in groups if len({panoramas[n].world for part in group for n in part}) == 1)
     if len(kept) < len(groups):
         warnings.warn(
-            f"left out of {source}: {len(groups) - len(kept)} of {len(groups)} pairs, whose poses are in different "
-            f"worlds of {POSES}.",
+            f"left out of {source}: {len(groups) - len(kept)} of {describe_count(len(groups), 'pair')}, "
+            f"whose poses are in different worlds of {POSES}.",
             category=InputWarning,
             stacklevel=4,
         )
@@ -196,7 +197,8 @@ def _list_further(
     unposed = list_further_photographs(folders, files, [view.name for view in panoramas], set(stated))
     if unposed:
         warnings.warn(
-            f"{source} has no pose of {list_names([view.image for view in unposed])}; each is a scene of its own.",
+            f"{source} has no pose of {list_first([view.file_label for view in unposed], MAX_NAMES)}; "
+            "each is a scene of its own.",
             category=InputWarning,
             stacklevel=5,
         )
@@ -298,7 +300,7 @@ def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
     if unposed and not groups:
         _find_name(*next((name, numbers, where) for name, where in unposed.items()))
     if unposed:
-        pairs = f"; {dropped} of {dropped + len(groups)} pairs need them" if dropped else ""
+        pairs = f"; pairs that need them: {dropped} of {dropped + len(groups)}" if dropped else ""
         warnings.warn(
             f"left out of {source}, without a pose in {POSES}: {list_names([Path(name) for name in unposed])}{pairs}.",
             category=InputWarning,

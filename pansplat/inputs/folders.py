@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import itertools
 import os
 import warnings
 from collections import Counter
@@ -46,7 +47,7 @@ from pansplat.inputs.reconstructions import find_reconstruction, read_reconstruc
 from pansplat.inputs.web_tours import find_web_tour, is_web_tour_file, read_web_tour
 from pansplat.inputs.web_tours.entries import make_panorama
 from pansplat.system.descriptions import list_first
-from pansplat.system.files import expand_home, is_scene_file, is_written
+from pansplat.system.files import expand_home, is_scene_file, is_written, require_text
 
 VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
 _RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
@@ -76,6 +77,7 @@ def load_pairs(
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
     """
     root = expand_home(path)
+    require_text(root)
     convention = None if convention is None else parse_convention(convention, "`convention`")
     try:
         pairs = _load_pairs(root, convention, near, far)
@@ -189,7 +191,7 @@ def _load_pairs(root: Path, convention: str | None, near: float | None, far: flo
         if root.suffix.lower() in READABLE_SUFFIXES and root.is_file():
             return single_view_pairs([read_photograph(root)], root.parent, near, far)
         if root.is_file() and root in triplet_files(root.parent):
-            collections = [(root.parent, read_triplet(root, convention))]
+            collections = _link_collections([read_triplet(root, convention)], root.parent)
         elif root.is_file() and not _is_pose_file(root) and not _is_posed_tour(root):
             return _make_unposed_pairs(root.parent, _read_tour_file(root), near, far)
         else:
@@ -231,7 +233,8 @@ def list_stated_files(folder: Path) -> list[Path]:
         )  # fmt: skip
     except (OSError, InputError):
         return files
-    return files + [file for file in others if file is not None]
+    stated = [file for file in others if file is not None]
+    return list(dict.fromkeys([*files, *stated, *(place / LINKS for place in _list_link_folders(folder))]))
 
 
 def _read_tour_file(file: Path) -> list[Panorama]:
@@ -240,7 +243,36 @@ def _read_tour_file(file: Path) -> list[Panorama]:
             f"{file}: needed a panorama, a folder of panoramas, its file of poses, or a web tour, got another file; "
             "give the folder."
         )
-    return add_links(read_web_tour(file), file.parent)
+    return _add_links(read_web_tour(file), file.parent)
+
+
+def _list_link_folders(folder: Path) -> list[Path]:
+    """The folders whose links.json is read: a folder, and that of the data of its web tour."""
+    tour = find_web_tour(folder)
+    return list(dict.fromkeys((folder, *([] if tour is None else [tour.parent]))))
+
+
+def _add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
+    """The panoramas of a folder with what each links.json of it states; the notes go to the last one."""
+    for place in _list_link_folders(folder):
+        panoramas = add_links(panoramas, place)
+    return list(panoramas)
+
+
+def _link_collections(collections: Sequence[Collection], folder: Path) -> list[tuple[Path, Collection]]:
+    """The collections of a folder with what its links.json states."""
+    linked = iter(_add_links([view for found in collections for view in (*found.panoramas, *found.unposed)], folder))
+    return [
+        (
+            folder,
+            dataclasses.replace(
+                found,
+                panoramas=tuple(itertools.islice(linked, len(found.panoramas))),
+                unposed=tuple(itertools.islice(linked, len(found.unposed))),
+            ),
+        )
+        for found in collections
+    ]
 
 
 def _list_unposed(root: Path) -> list[Panorama]:
@@ -248,7 +280,7 @@ def _list_unposed(root: Path) -> list[Panorama]:
     source, problem = find_web_tour(root), None
     if source is not None:
         try:
-            panoramas = add_links(read_web_tour(source), source.parent)
+            panoramas = _add_links(read_web_tour(source), root)
         except InputError as error:
             problem = error
         else:
@@ -322,24 +354,31 @@ def _search(root: Path, find: Callable[[Path, int, bool], list[Any]]) -> list[An
 
 def _find_collections(folder: Path, depth: int, exports: bool, convention: str | None) -> list[tuple[Path, Collection]]:
     """The collections in a folder itself, or else those in its subfolders."""
-    if (folder / POSES).exists():  # the reader refuses what is no file
-        return [(folder, read_pose_file_folder(folder, convention))]
-    if is_loc360_sequence(folder):
-        return [(folder, with_further(read_loc360_sequence(folder, convention)))]
-    if is_matterport3d_scene(folder):
-        return [(folder, read_matterport3d_scene(folder, convention))]
-    if triplets := triplet_files(folder):
-        return [(folder, read_triplet(path, convention)) for path in triplets]
-    if find_trajectory(folder) is not None:
-        return [(folder, read_trajectory_folder(folder, convention))]
-    if (source := find_reconstruction(folder)) is not None:
-        found = read_reconstruction(source, folder, convention)
-        is_joined = any(len(list_pictures(view.image)) > 1 for view in found.panoramas)
-        return [(folder, found if is_joined else with_further(found))]
+    if collections := _read_collections(folder, convention):
+        return _link_collections(collections, folder)
     if find_web_tour(folder) is not None:
         return []
     find = partial(_find_collections, depth=depth - 1, exports=exports, convention=convention)
     return [found for sub in _list_subfolders(folder, depth, exports) for found in find(sub)]
+
+
+def _read_collections(folder: Path, convention: str | None) -> list[Collection]:
+    """The collections in a folder, without its links.json."""
+    if (folder / POSES).exists():  # the reader refuses what is no file
+        return [read_pose_file_folder(folder, convention)]
+    if is_loc360_sequence(folder):
+        return [with_further(read_loc360_sequence(folder, convention))]
+    if is_matterport3d_scene(folder):
+        return [read_matterport3d_scene(folder, convention)]
+    if triplets := triplet_files(folder):
+        return [read_triplet(path, convention) for path in triplets]
+    if find_trajectory(folder) is not None:
+        return [read_trajectory_folder(folder, convention)]
+    if (source := find_reconstruction(folder)) is not None:
+        found = read_reconstruction(source, folder, convention)
+        is_joined = any(len(list_pictures(view.image)) > 1 for view in found.panoramas)
+        return [found if is_joined else with_further(found)]
+    return []
 
 
 def _leave_out_damaged(collection: Collection) -> Collection:
@@ -408,7 +447,7 @@ class UnposedPanoramasError(InputError):
     """A folder or web tour holds two or more panoramas, and no poses in a known format."""
 
     def __init__(self, folder: Path, panoramas: list[Panorama]) -> None:
-        names = list_first([panorama.image.name for panorama in panoramas])
+        names = list_first([panorama.file_label for panorama in panoramas])
         super().__init__(
             f"{folder}: needed poses for the panoramas, got images only ({names}); run `pansplat pose {folder} -o "
             f"{folder / POSES}`, or add a pose file (docs/input.md)."

@@ -16,18 +16,27 @@ from torch import Tensor
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import USER_FRAME, WorldFrame, choose_frame, require_depth_range
 from pansplat.images.blur_masks import MASK_SUFFIX, list_mask_files, locate_panorama, split_mask_name
-from pansplat.images.image_files import READABLE_SUFFIXES, find_masks, read_depth, read_height, read_mask, read_panorama
+from pansplat.images.image_files import (
+    READABLE_SUFFIXES,
+    find_masks,
+    is_assembled,
+    read_depth,
+    read_height,
+    read_mask,
+    read_panorama,
+)
 from pansplat.images.masks import lift_black_surfaces, scene_mask_of_files
 from pansplat.inputs.placements import PLACED, Placement
 from pansplat.inputs.views import CAMERA_HEIGHT, Views
 from pansplat.system.descriptions import describe_range, list_first
+from pansplat.system.files import require_text
 
 NEAR, FAR = 0.45, 10.0  # metres; depth range of the official indoor data (docs/official.md, section 2.1)
 FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, sections 2.2 and 2.3)
 
 MAX_CONTEXT = 64  # context panoramas of a pair
 
-_MAX_NAMES = 20  # in a note
+MAX_NAMES = 20  # in a note
 _MATCHING_SECONDS = 2.0  # for two panoramas of 512 rows on two cores
 
 
@@ -85,6 +94,7 @@ class Panorama:
         camera_height: over the floor, metres; the scale of a scene of this panorama alone.
         placement: how the pose was found, or why there is none.
         frame: where the world of the pose is in the user's world, that of files.
+        links_at: the links.json that links and notes are read from, and the key there; None if none is read.
     """
 
     name: str
@@ -102,6 +112,7 @@ class Panorama:
     camera_height: float = CAMERA_HEIGHT
     placement: Placement = PLACED
     frame: WorldFrame = USER_FRAME
+    links_at: tuple[Path, str] | None = None
 
     def __repr__(self) -> str:
         position = ", ".join(f"{x:.3g}" for x in self.cam2world[:3, 3].tolist())
@@ -112,6 +123,11 @@ class Panorama:
     def label(self) -> str:
         """The title, or the name if there is none."""
         return self.title or self.name
+
+    @property
+    def file_label(self) -> str:
+        """The name of the file, or the label of a panorama that is made from cube faces or perspective pictures."""
+        return self.label if is_assembled(self.image) else self.image.name
 
     def in_frame(self, frame: WorldFrame) -> Panorama:
         """The panorama in the world of another frame."""
@@ -260,7 +276,7 @@ class Collection:
         if alone:
             warnings.warn(
                 f"{self.source}: in no pair of pairs.json, and each a scene of its own: "
-                f"{list_names([view.image for view in alone])}.",
+                f"{list_first([view.file_label for view in alone], MAX_NAMES)}.",
                 category=InputWarning,
                 stacklevel=4,
             )
@@ -371,7 +387,7 @@ def single_view_pairs(
 
 def list_names(files: Sequence[Path]) -> str:
     """The names of files, for notes; of many the first ones."""
-    return list_first([file.name for file in files], _MAX_NAMES)
+    return list_first([file.name for file in files], MAX_NAMES)
 
 
 def find_mask(image: Path, folder: Path) -> Path | None:
@@ -383,8 +399,12 @@ def find_mask(image: Path, folder: Path) -> Path | None:
 
 
 def list_panorama_files(folder: Path) -> list[Path]:
-    """Panorama files of a folder, sorted by name; without masks and depth files."""
-    return [
+    """Panorama files of a folder, sorted by name; without masks and depth files.
+
+    Raises:
+        InputError: a name is not UTF-8.
+    """
+    files = [
         path
         for path in sorted(folder.iterdir())
         if path.suffix.lower() in READABLE_SUFFIXES
@@ -393,3 +413,6 @@ def list_panorama_files(folder: Path) -> list[Path]:
         and not path.name.startswith(".")
         and path.is_file()
     ]
+    for file in files:
+        require_text(file)
+    return files

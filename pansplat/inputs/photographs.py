@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import warnings
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -13,8 +14,9 @@ from typing import Any
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
 from pansplat.images.cube_faces import group_faces, read_picture
-from pansplat.images.cube_images import CubeImage
+from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
 from pansplat.images.image_files import is_two_to_one
+from pansplat.images.rig_images import RIG_SUFFIX
 from pansplat.inputs.pairs import Link, Note, Panorama, list_panorama_files
 from pansplat.inputs.web_tours.entries import (
     Number,
@@ -126,31 +128,38 @@ def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
     What an entry does not state stays. Warns about entries and links that cannot be used, or about a file that cannot
     be read.
     """
-    source = folder / LINKS
-    if not source.is_file():
-        return list(panoramas)
+    source, content = folder / LINKS, {}
     try:
-        content = read_json(source, dict[str, Any])
+        content = read_json(source, dict[str, Any]) if source.is_file() else {}
     except InputError as error:
         warnings.warn(f"links are left out: {error}", category=InputWarning, stacklevel=3)
-        return list(panoramas)
-    names = {key: panorama.name for panorama in panoramas for key in (panorama.name, panorama.image.name)}
-    entries: dict[str, Any] = {}
-    for key, entry in content.items():
-        if key in names:
-            entries[names[key]] = entry
-        else:
-            warnings.warn(
-                f"{source}: {key[:60]!r} is left out: it is no panorama of the folder.", InputWarning, stacklevel=3
-            )
+    counts = Counter(
+        key for view in {view.image: view for view in panoramas}.values() for key in _list_keys(view, folder)
+    )
+    names = {key: view.name for view in panoramas for key in _list_keys(view, folder) if counts[key] == 1}
+    for key in content:
+        if key not in names:
+            what = "the name of several panoramas; give the path" if counts[key] else "no panorama of the folder"
+            warnings.warn(f"{source}: {key[:60]!r} is left out: it is {what}.", InputWarning, stacklevel=3)
     result = []
     for panorama in panoramas:
+        own = [key for key in _list_keys(panorama, folder) if key in names] or [panorama.name]
+        key = next((key for key in own if key in content), own[0])
+        result.append(dataclasses.replace(panorama, links_at=(source, key)))
         try:
-            result.append(_add_entry(panorama, entries.get(panorama.name, []), names, source))
+            result[-1] = _add_entry(result[-1], content.get(key, {}), names, source)
         except InputError as error:
             warnings.warn(f"links of {panorama.name} are left out: {error}", category=InputWarning, stacklevel=3)
-            result.append(panorama)
     return result
+
+
+def _list_keys(panorama: Panorama, folder: Path) -> list[str]:
+    """The keys of links.json that stand for a panorama; the first is that of a new entry, and of no other panorama."""
+    image = panorama.image
+    if image.name.endswith((CUBE_SUFFIX, RIG_SUFFIX)):
+        return list(dict.fromkeys((panorama.name, image.name)))
+    path = os.path.relpath(image, folder).replace(os.sep, "/")
+    return list(dict.fromkeys((path, image.name, panorama.name)))
 
 
 def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Path) -> Panorama:
@@ -187,17 +196,19 @@ def describe_notes(notes: Sequence[Note]) -> list[dict[str, Any]]:
     ]
 
 
-def write_notes(panorama: Panorama, notes: Sequence[Note], folder: Path) -> None:
-    """Replace the notes of a panorama in the links.json of its folder, which keeps all else that it states.
+def write_notes(panorama: Panorama, notes: Sequence[Note]) -> Path:
+    """Replace the notes of a panorama in its links.json, which keeps all else that it states; returns that file.
 
     Raises:
-        InputError: links.json cannot be read.
+        InputError: links.json cannot be read, or the panorama has none.
     """
-    source = folder / LINKS
+    if panorama.links_at is None:
+        raise InputError(f"{panorama.image}: needed a panorama of a folder for a note, got a file; open its folder.")
+    source, key = panorama.links_at
     content = read_json(source, dict[str, Any]) if source.exists() else {}
-    key = panorama.image.name if panorama.image.name in content else panorama.name
     entry = content.get(key, {})
     entry = {"links": entry} if isinstance(entry, list) else convert(entry, dict[str, Any], source)
     content[key] = entry | {"notes": describe_notes(notes)}
     with replacing(source) as temporary:
         temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), "utf-8")
+    return source

@@ -9,6 +9,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 
 import cv2
@@ -707,8 +708,14 @@ def _find_scale(
 
 
 def _find_file(name: Path | str, files: Sequence[Path], names: Mapping[Path, str], which: str) -> int:
-    for n, file in enumerate(files):
-        if str(name) in (str(file), file.name, file.stem, names[file]):
-            return n
+    for key in (str, attrgetter("name"), attrgetter("stem"), names.__getitem__):
+        found = [n for n, file in enumerate(files) if key(file) == str(name)]
+        if len(found) > 1:
+            candidates = list_first([str(files[n]) for n in found])
+            raise InputError(
+                f"`baseline` must name one image each, got {name}, which may be {candidates}; give the path"
+            )
+        if found:
+            return found[0]
     listed = ", ".join(names[file] for file in files)
     raise InputError(f"`baseline` must name two of {which} ({listed}), got {name}")

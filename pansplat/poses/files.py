@@ -17,7 +17,7 @@ import torch
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.images.cube_images import CUBE_SUFFIX
-from pansplat.images.image_files import is_assembled, list_masks, read_thumbnail
+from pansplat.images.image_files import is_assembled, read_thumbnail
 from pansplat.inputs.content import hash_pixels
 from pansplat.inputs.folders import make_names_unique
 from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
@@ -251,7 +251,7 @@ def _make_pairs(
     for name, reason in unplaced.items():
         panorama = by_name[name]
         outcome = "cannot be read and is left out" if name in unreadable else "has no pose and is a scene of its own"
-        warnings.warn(f"{panorama.image}{_in_brackets(panorama.title)} {outcome}: {reason}", InputWarning, stacklevel=4)
+        warnings.warn(f"{_describe(panorama, folder)} {outcome}: {reason}", InputWarning, stacklevel=4)
     pairs, ties = [], read_ties(content)
     for number, world in enumerate(content["worlds"]):
         placements = judge(list(world["poses"]), ties, (), source)
@@ -259,7 +259,7 @@ def _make_pairs(
             if placement.state == "probable":
                 view = by_name[name]
                 outcome = "is only probably placed, and can be rejected in pansplat-view"
-                message = f"{view.image}{_in_brackets(view.title)} {outcome}: {placement.reason}"
+                message = f"{_describe(view, folder)} {outcome}: {placement.reason}"
                 warnings.warn(message, InputWarning, stacklevel=4)
         placed = tuple(
             replace(
@@ -283,8 +283,11 @@ def _make_pairs(
     return localize_pairs(make_names_unique(pairs))
 
 
-def _in_brackets(title: str) -> str:
-    return f" ({title})" if title else ""
+def _describe(panorama: Panorama, folder: Path) -> str:
+    """The file with the title, or the folder of the tour with the label of a panorama that has no file of its own."""
+    if is_assembled(panorama.image):
+        return f"{folder}: {panorama.label}"
+    return f"{panorama.image}{f' ({panorama.title})' if panorama.title else ''}"
 
 
 def _hash_inputs(panoramas: Sequence[Panorama], camera_height: float) -> str:

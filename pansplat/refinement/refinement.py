@@ -52,6 +52,7 @@ _BETAS, _POSE_BETAS = (0.5, 0.95), (0.9, 0.99)
 # Adam's epsilon relative to the root mean square of the first gradients, for photographs that are compared at their own
 # size; it grows with the number of their pixels. Gaussians of little effect move less.
 _DAMPING = 0.2
+_STEPS_SHARE = 0.65  # of the time, that the steps take; the rest is the fit of colours (the sample on two cores)
 _COLORS = ColorFitConfig()
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
@@ -373,7 +374,7 @@ class Refinement:
             if should_stop():
                 stopped = "interrupted"
                 break
-            report("refining", fraction)
+            report("refining", _STEPS_SHARE * fraction)
             if after is None and fraction >= self.config.release and not self._start.joint:
                 after = measure()
             if after is not None and after > before:
@@ -392,7 +393,7 @@ class Refinement:
                 stopped, after = "converged", error
                 clock.shorten()
         after = measure() if after is None else after
-        report("refined", 1.0)
+        report("fitting colours", _STEPS_SHARE)
         self._result = self.scene() if after <= before else self._start
         self._release_parameters()
         if after <= before:
@@ -402,6 +403,7 @@ class Refinement:
             stopped = "worse"
         if after <= before or self._start.joint:  # a fused scene has the colours of single photographs
             self._result = self._finish(self._result)
+        report("refined", 1.0)
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
 
     def _release_parameters(self) -> None:

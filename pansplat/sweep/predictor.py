@@ -108,15 +108,15 @@ class Sweep:
             far=high,
         )
         report, config = part_of(progress), self.config
-        searching = part_of(progress, 0, 0.7)
+        searching = part_of(progress, 0, 0.57)  # of the time, as are all fractions here (the sample on two cores)
         # Axes of the scene, planes, and of each view its neighbours and the depth that the prior model expects.
         scene = observe(posed, config.search, self.prior, searching)
         # Inverse depth (h, 2h) of each view, at most `SearchConfig.finest_height` high.
         surfaces = search(scene, searching)
-        report("placing Gaussians", 0.7)
+        report("placing Gaussians", 0.57)
         # A Gaussian for each point of the lattices (n); the photograph's height gives their spacing.
         gaussians = lift(posed, surfaces, config.lift, scene.neighbours)
-        report("fitting colours", 0.8)
+        report("fitting colours", 0.76)
         # Colours (n, 1, 3) with which the Gaussians of each view draw its photograph.
         poses = torch.from_numpy(posed.cam2world)
         gaussians = fit_colors(gaussians, images.detach().cpu(), poses, fitted, config.colors)

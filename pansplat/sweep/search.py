@@ -155,7 +155,7 @@ def observe(
             return [()] * len(posed.images)
         return estimator.estimate_by_matching(views, neighbours, (low, high), config.matching)
 
-    report("finding planes", 0.05)
+    report("finding planes", 0.15)
     if thread_count() > 1:  # half of each is work of one thread
         with ThreadPoolExecutor(1) as pool:
             estimated = pool.submit(estimate_priors)
@@ -179,7 +179,7 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     surfaces: list[Surface] = []
     priors = scene.priors
     for n in range(config.coarse_passes):
-        report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
+        report("searching the whole depth range", 0.25 + 0.3 * n / config.coarse_passes)
         if estimator is not None and surfaces:
             priors = estimator.estimate_from_surfaces(surfaces)
         rows = heights[0] if n == config.coarse_passes - 1 else min(heights[0], config.first_height)
@@ -190,7 +190,7 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
         sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen((depths.low, depths.high))]
         finest_posed = posed.resize(finest)
     for n, height in enumerate(heights[1:]):
-        report("refining the surfaces", 0.5 + 0.25 * n)
+        report("refining the surfaces", 0.55 + 0.1 * n)
         surfaces = _upsample(surfaces, posed.images, height)
         if sharp is not None and height == finest:
             surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)

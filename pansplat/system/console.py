@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import errno
 import functools
@@ -9,6 +10,7 @@ import io
 import math
 import os
 import re
+import shutil
 import signal
 import sys
 import tempfile
@@ -35,7 +37,9 @@ _P = ParamSpec("_P")
 
 _COLORS = {"error": 31, "interrupted": 31, "note": 33, "progress": 36}  # ANSI codes of red, yellow and cyan
 _COMPLETION = "--tyro-print-completion"
-_LINE_INTERVAL, _MAX_LEFT = 30.0, 86_400.0  # seconds: between two lines of progress; left that are printed
+_LINE_INTERVAL, _MAX_LEFT = 30.0, 86_400.0  # seconds: between two lines of progress; whole time that is stated
+_AGREE = 1.5  # between two estimates of the whole time of some work
+_MIN_WIDTH = 40  # columns of help; tyro's layout of narrow ones does not end
 _REDRAW_INTERVAL = 0.25  # seconds between two states of a progress bar in a notebook
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -231,11 +235,16 @@ def parse_arguments(parse: Callable[[], _T], program: str, arguments: Sequence[s
         raise SystemExit(0)
     from pansplat.system.options import NUMBERS
 
-    script = io.StringIO()
+    script, width = io.StringIO(), os.environ.get("COLUMNS")
+    if shutil.get_terminal_size().columns < _MIN_WIDTH:
+        os.environ["COLUMNS"] = str(_MIN_WIDTH)
     try:
         with NUMBERS, contextlib.redirect_stdout(script if given[:1] == [_COMPLETION] else sys.stdout):
             return parse()
-    finally:  # the shell would read the second line of a description as another word
+    finally:
+        os.environ.pop("COLUMNS", None)
+        os.environ |= {} if width is None else {"COLUMNS": width}
+        # The shell would read the second line of a description as another word.
         print(re.sub(r"\\n(?=.*'type':)", " ", script.getvalue()), end="")
 
 
@@ -254,14 +263,21 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
     a line is printed each half minute.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+    from rich.text import Text
 
     in_notebook, console = is_notebook(), Console(stderr=True)
     if not console.is_terminal and not in_notebook:
         yield _print_progress()
         return
     columns = TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
-    times = TimeElapsedColumn(), TimeRemainingColumn()
+    time_left = _TimeLeft()
+
+    class TimeLeftColumn(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text(time_left.describe(), "progress.remaining")
+
+    times = TimeElapsedColumn(), TimeLeftColumn()
     # Standard output goes through the bar if it is on the same terminal, and stays what it is if it is a file.
     is_shared = sys.stdout.isatty() and not in_notebook
     bar = Progress(*columns, *times, console=console, transient=True, redirect_stdout=is_shared)
@@ -269,6 +285,7 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
         task = bar.add_task("", total=1.0)
 
         def report(stage: str, fraction: float) -> None:
+            time_left.report(fraction)
             bar.update(task, description=stage, completed=fraction)
             if callable(redraw):  # in a notebook
                 redraw()
@@ -276,19 +293,51 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
         yield report
 
 
+class _TimeLeft:
+    """The time that work will still take, from the fractions done.
+
+    The rate so far and that of the last half of the time must agree on the whole time within a factor of `_AGREE`;
+    the longer time is stated. It never exceeds `_AGREE` times a whole time that was stated before: nothing is then.
+    """
+
+    def __init__(self) -> None:
+        """The work begins."""
+        self._times, self._fractions = [time.monotonic()], [0.0]
+        self._least = math.inf  # whole time that was stated, seconds
+
+    def report(self, fraction: float) -> None:
+        """Note the fraction that is done now."""
+        self._times.append(time.monotonic())
+        self._fractions.append(fraction)
+
+    def describe(self) -> str:
+        """Such as "about 30 s left"; empty while it is not certain enough."""
+        now, began, done = time.monotonic(), self._times[0], self._fractions[-1]
+        half = bisect.bisect_right(self._times, (began + now) / 2) - 1
+        rates = [(done - self._fractions[start]) / max(now - self._times[start], 1e-9) for start in (0, half)]
+        if not 0 < done < 1 or min(rates) <= 0:
+            return ""
+        wholes = [now - began + (1 - done) / rate for rate in rates]
+        whole = max(wholes)
+        if whole > _AGREE * min(*wholes, self._least) or whole > _MAX_LEFT:
+            return ""
+        self._least = min(self._least, whole)
+        return f"about {whole - (now - began):.0f} s left"
+
+
 def _print_progress() -> Callable[[str, float], None]:
     """A function that prints the progress on standard error, a line each half minute."""
-    began = printed = time.monotonic()
+    printed, time_left = time.monotonic(), _TimeLeft()
 
     def report(stage: str, fraction: float) -> None:
         nonlocal printed
         now = time.monotonic()
+        time_left.report(fraction)
         if now - printed < _LINE_INTERVAL:
             return
         printed = now
-        left = (now - began) * (1 - fraction) / fraction if fraction > 0 else math.inf
-        rest = f", about {left:.0f} s left" if left < _MAX_LEFT else ""
-        print_message("progress", f"{stage or 'working'}, {100 * fraction:.0f} %{rest}")
+        rest = time_left.describe()
+        print_message("progress", f"{stage or 'working'}, {100 * fraction:.0f} %{rest and f', {rest}'}")
 
     return report
 

@@ -39,6 +39,16 @@ _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d) *(\..*)?", re.IGNORECASE)
 _REFUSED = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[. ]$')
 
 
+def require_text(path: Path | str) -> None:
+    """Check that a path is text: JSON, comments of scenes and pages cannot hold bytes that are not UTF-8."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{str(path)!a}: needed a name in UTF-8, got other bytes; rename the file or folder."
+        ) from error
+
+
 def is_portable_name(name: str) -> bool:
     """Whether a file or folder may have a name on every system."""
     return bool(name) and not _REFUSED.search(name) and not _DEVICE.fullmatch(name)
@@ -76,6 +86,8 @@ def require_file(path: Path | str, needed: str = "a readable file") -> None:
     """
     try:
         kind = describe_kind(path)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: needed {needed}, got no such file; check the path.") from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: needed {needed}, got '{reason}'; check the path.") from error

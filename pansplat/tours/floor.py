@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
+from pansplat.system.descriptions import describe_count
 from pansplat.tours.graph import TourGraph, ViewNumbers, make_graph
 from pansplat.tours.route import Route
 from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
@@ -251,7 +252,8 @@ def write_floor_plan(scene: Scene, path: str | Path) -> None:
     outlines = find_floor_outlines(tour, scene, tuple(range(len(tour)))) if len(tour) else {}
     if not outlines:
         raise InputError(
-            f"cannot write {path}: needed a floor below at least one of the {len(tour)} input cameras, got none; "
+            f"cannot write {path}: needed a floor below at least one of {describe_count(len(tour), 'input camera')}, "
+            "got none; "
             "export a folder of upright panoramas"
         )
     write_image(path, paint_floor_plan(tour, outlines).astype(np.float32) / 255)
@@ -302,5 +304,5 @@ def _paint_storey(
         else:
             is_probable = panorama.placement.state == "probable"
             cv2.circle(image, (x, y), 6, (90, 204, 255), 2 if is_probable else -1, cv2.LINE_AA)
-        cv2.putText(image, panorama.name, (x + 9, y + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+        cv2.putText(image, panorama.label, (x + 9, y + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return image

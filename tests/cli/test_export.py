@@ -312,7 +312,7 @@ def test_a_crop_keeps_the_cameras_in_the_box_and_states_what_it_leaves_out(
     assert f"{scene}: needed a box with Gaussians, got (50.00" in message
     assert "--crop" in refusal("export", scene, "-o", out, "--crop", "a", 0, 0, 1, 1, 1)
     message = refusal("export", room, "-o", tmp_path / "set", "--training-set", "--crop", 0, 0, 0, 1, 1, 1)
-    assert "--crop, --rooms and --no-floaters are not for a folder to train from" in message
+    assert "--crop, --rooms and --remove-floaters are not for a folder to train from" in message
 
 
 def test_the_mesh_of_a_crop_has_the_photograph_of_the_camera_that_is_left(
@@ -348,7 +348,7 @@ def test_floaters_are_left_out_and_counted(scene: Path, tmp_path: Path, capsys: 
     dirty = dataclasses.replace(clean, gaussians=Gaussians.cat([clean.gaussians, added]))
     pipeline.save(dirty, tmp_path / "dirty.ply")
     out = tmp_path / "out.ply"
-    assert run(["export", str(tmp_path / "dirty.ply"), "-o", str(out), "--layers", "--no-floaters"]) == 0
+    assert run(["export", str(tmp_path / "dirty.ply"), "-o", str(out), "--layers", "--remove-floaters"]) == 0
     assert "floaters: 1 of 1,025 Gaussians left out; the pictures at the 2 cameras" in capsys.readouterr().out
     assert torch.equal(pipeline.load(out).gaussians.means, clean.gaussians.means)
 

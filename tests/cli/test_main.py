@@ -33,13 +33,13 @@ def test_help_does_not_import_torch() -> None:
         assert f"usage: pansplat {command} " in done.stdout
 
 
-@pytest.mark.parametrize("arguments", [["predict"], ["predikt", "x"], ["render", "x", "-o", "y.png", "--heigth", "3"]])
+@pytest.mark.parametrize("arguments", [["predict"], ["render", "x", "-o", "y.png", "--heigth", "3"]])
 def test_missing_or_misspelt_arguments_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         run(arguments)
     err = capsys.readouterr().err
     assert stop.value.code == 2 and "Traceback" not in err
-    assert {"predict": "--out", "predikt": "Available subcommands: predict", "render": "--height"}[arguments[0]] in err
+    assert {"predict": "--out", "render": "--height"}[arguments[0]] in err
 
 
 @pytest.mark.parametrize("module", ["pansplat.cli", "pansplat_viewer", "pansplat.training.__main__"])
@@ -169,3 +169,45 @@ def test_equal_notes_are_printed_once(capsys: pytest.CaptureFixture[str]) -> Non
         for text in ("first", "second", "first"):
             warnings.warn(text, InputWarning, stacklevel=2)
     assert capsys.readouterr().err.splitlines() == ["note: first", "note: second"]
+
+
+@pytest.mark.parametrize(
+    ("word", "near"), [("exprot", " (did you mean export?)"), ("predikt", " (did you mean predict?)"), ("zzz", "")]
+)
+def test_an_unknown_command_is_named_with_the_nearest_one(word: str, near: str, capsys) -> None:
+    assert run([word, "x"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"error: needed a command, got '{word}'{near}; the commands are predict, ")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["render", "export", "predict", "check", "evaluate"])
+def test_help_ends_in_a_narrow_terminal_and_has_plain_headings(command: str, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "2")
+    with pytest.raises(SystemExit):
+        run([command, "--help"])
+    text = capsys.readouterr().out
+    headings = [line for line in text.splitlines() if line.rstrip().endswith(" options")]
+    assert os.environ["COLUMNS"] == "2" and len(headings) > 1
+    assert not any("." in line or "options options" in line for line in headings)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["info", "gone.ply"], ["render", "gone.ply", "-o", "x.png"], ["info", "gone.spz"]]
+)
+def test_a_missing_file_is_said_to_be_missing(arguments: list[str], tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(arguments) == 2
+    assert "got no such file; check the path" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs file names of any bytes")
+def test_a_name_that_is_no_text_is_refused_with_its_bytes(tmp_path: Path, write_pair, capsys) -> None:
+    folder = write_pair(tmp_path / "pair")
+    odd = os.fsdecode(b"caf\xe9.png")
+    shutil.copy(folder / "left.png", folder / odd)
+    (tmp_path / os.fsdecode(b"caf\xe9")).mkdir()
+    for path in (folder, tmp_path / os.fsdecode(b"caf\xe9"), folder / odd):
+        assert run(["check", str(path)]) == 2
+        err = capsys.readouterr().err
+        assert "caf\\udce9" in err and "needed a name in UTF-8, got other bytes; rename" in err and err.count("\n") == 1

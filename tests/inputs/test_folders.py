@@ -375,7 +375,7 @@ def test_pairs_of_panoramas_without_a_pose_are_left_out_with_a_note(tmp_path: Pa
     pairs = [{"context": context, "target": ["d.jpg"]} for context in contexts[:2]]
     (folder / "pairs.json").write_text(json.dumps({"pairs": [*pairs, {"context": contexts[2]}]}))
     with (
-        pytest.warns(UserWarning, match=r"pairs\.json, .* pose in poses\.json: d\.jpg; 1 of 3 pairs need them"),
+        pytest.warns(UserWarning, match=r"pairs\.json, .* pose in poses\.json: d\.jpg; pairs that need them: 1 of 3"),
         pytest.warns(UserWarning, match=r"poses\.json has no pose of d\.jpg; each is a scene of its own"),
     ):
         first, second, single = load_pairs(folder)

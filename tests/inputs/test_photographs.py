@@ -96,12 +96,12 @@ def test_notes_are_read_and_written_and_all_else_stays(rooms: Path) -> None:
         rooms, {"p01.jpg": links, "p02": {"title": "Bad", "notes": [stated, {"yaw": 1}], "colour": "blue"}}
     )
     assert one.notes == () and two.notes == (note,)
-    write_notes(one, [note], rooms)
-    write_notes(two, [*two.notes, Note(3, 0, "window")], rooms)
+    write_notes(one, [note])
+    write_notes(two, [*two.notes, Note(3, 0, "window")])
     one, two = list_photographs(rooms)
     assert one.notes == (note,) and one.links == (Link("p02", 0.5),)
     assert two.notes == (note, Note(3, 0, "window")) and two.title == "Bad"
-    write_notes(two, [], rooms)
+    write_notes(two, [])
     content = json.loads((rooms / "links.json").read_text("utf-8"))
     assert content["p02"] == {"title": "Bad", "notes": [], "colour": "blue"} and content["p01.jpg"]["links"] == links
     assert list_photographs(rooms)[1].notes == ()

@@ -16,6 +16,7 @@ import torch
 
 import pansplat
 from pansplat.cli import run
+from pansplat.errors import InputError
 from pansplat.inputs.poses import read_trajectory
 from pansplat.poses import estimate as estimate_module
 from pansplat.poses.axes import SceneAxes
@@ -25,6 +26,7 @@ from pansplat.poses.estimate import (
     NoPosesError,
     PoseEstimate,
     PoseGroup,
+    _find_file,
     _is_mirrored,
     _match,
     _relate_views,
@@ -307,3 +309,11 @@ def test_a_further_panorama_costs_its_own_features_and_pairs(tmp_path: Path, mon
     again = estimate_poses(files, cache_folder=tmp_path)
     assert calls == [] and all(np.array_equal(again.poses[file], every.poses[file]) for file in files)
     assert set(first.poses) < set(again.poses)
+
+
+def test_a_baseline_by_a_name_of_two_files_is_refused(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("left.jpg", "left.png", "right.png")]
+    names = dict.fromkeys(files, "")
+    assert [_find_file(name, files, names, "the images") for name in ("left.png", files[0], "right")] == [1, 0, 2]
+    with pytest.raises(InputError, match=r"got left, which may be .*left\.jpg, .*left\.png; give the path"):
+        _find_file("left", files, names, "the images")

@@ -22,9 +22,10 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.pairs import Note, Panorama
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
@@ -39,6 +40,7 @@ from pansplat_viewer.scene.loader import (
     SceneEntry,
     SceneLoader,
 )
+from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.settings import Display, DrawSettings, Preset
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
@@ -264,6 +266,21 @@ def changed_fraction(before: np.ndarray, after: np.ndarray) -> float:
 def test_every_widget_has_a_test_and_fits_without_scrolling(user):
     assert set(user.panels.widgets.items) == set(IMAGE_WIDGETS) | OTHER_WIDGETS
     assert max(rectangle[3] for rectangle in user.panels.widgets.items.values()) < SIZE[1]
+
+
+def test_a_percent_sign_of_a_note_is_shown_once(user):
+    photographs, camera, io = user.viewer.stage.comparer.photographs, user.state.camera, imgui.get_io()
+    position = np.asarray(camera.position)
+    index = photographs.find_stop(position)
+    note = Note(0.32, -0.3, "50 % wool")
+    photographs.change_notes(index, (note,))
+    away = find_direction(photographs.panoramas[index].cam2world, note.yaw, note.pitch).numpy()
+    io.add_mouse_pos_event(*project_point(camera, tuple(position + away), SIZE))
+    user.draw_frames(3)
+    tooltip = imgui.internal.find_window_by_name("##Tooltip_00")
+    width = tooltip.size.x - 2 * imgui.get_style().window_padding.x
+    assert tooltip.was_active and width == pytest.approx(imgui.calc_text_size(note.text).x, abs=1)
+    photographs.change_notes(index, ())
 
 
 @pytest.mark.slow

@@ -148,14 +148,15 @@ def test_a_rough_storey_has_no_dolls_house(flat: Scene, tmp_path: Path, monkeypa
 
 def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good = write_page(house, tmp_path / "good.html")
-    assert (good.num_flights, good.num_fades) == (2, 0) and read_header(tmp_path / "good.html")["jumps"] == []
+    assert (good.num_flights, good.fades) == (2, ()) and read_header(tmp_path / "good.html")["jumps"] == []
     monkeypatch.setattr(edges, "POOR", -9)
     poor = write_page(house, tmp_path / "poor.html")
     header = read_header(tmp_path / "poor.html")
-    assert (poor.num_flights, poor.num_fades) == (0, 2) and header["poor"] == [[0, 1], [1, 2]]
+    assert (poor.num_flights, len(poor.fades)) == (0, 2) and header["poor"] == [[0, 1], [1, 2]]
+    assert poor.fades == tuple(zip(house.names[:2], house.names[1:], strict=True)), "the labels"
     assert len(header["jumps"]) >= 3 and set(header["parts"]) == {0}, "the route fades from panorama to panorama"
     joint = dataclasses.replace(house, joint=True, overlaps=())
-    assert write_page(joint, tmp_path / "joint.html").num_fades == 0
+    assert write_page(joint, tmp_path / "joint.html").fades == ()
 
 
 def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: Path) -> None:

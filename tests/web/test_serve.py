@@ -89,6 +89,17 @@ def test_every_answer_forbids_frames_of_other_origins_and_guesses_of_types(
         server.shutdown()
 
 
+@pytest.mark.parametrize("address", [b"http://[", b"http://[::1"])
+def test_what_is_no_address_is_a_bad_request(server: PageServer, capfd: pytest.CaptureFixture[str], address) -> None:
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    plain = socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=30)
+    with context.wrap_socket(plain) as connection:
+        connection.sendall(b"GET " + address + b" HTTP/1.1\r\nConnection: close\r\n\r\n")
+        assert connection.recv(1000).startswith(b"HTTP/1.1 400 ")
+    assert get(server, "/")[0] == 200 and capfd.readouterr() == ("", "")
+
+
 def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(
     server: PageServer, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pansplat.errors import InputError
 from pansplat.inputs.pairs import list_panorama_files
 
 _SECONDS = 2.0  # between looks at the files
@@ -32,6 +33,11 @@ class FileWatch:
         self._next, self._found = 0, False
         self._stamps = [_read_stamp(file) for file in self._files]
 
+    def skip(self, file: Path) -> None:
+        """Take a file that the window itself has written as it is now; changes of other files stay to be noticed."""
+        if file in self._files:
+            self._stamps[self._files.index(file)] = _read_stamp(file)
+
     def look(self, now: float) -> None:
         """Look at some files at time `now` (seconds), and update `changed` after the last one; then pause."""
         if self._next == 0 and now - self._last < _SECONDS:
@@ -49,6 +55,6 @@ def _read_stamp(file: Path) -> tuple[object, ...] | None:
         if file.is_dir():
             return tuple(path.name for path in list_panorama_files(file))
         status = file.stat()
-    except OSError:
+    except (OSError, InputError):
         return None
     return status.st_mtime_ns, status.st_size

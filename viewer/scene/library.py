@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from pansplat.errors import InputError
-from pansplat.images.image_files import READABLE_SUFFIXES
 from pansplat_viewer.scene.file_watch import FileWatch
 from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader, choose_entry
 
@@ -41,14 +40,6 @@ class Library:
         """What was not used or not placed at the path, and why."""
         return self.entries[self.current].notes if 0 <= self.current < len(self.entries) else ()
 
-    @property
-    def folder(self) -> Path | None:
-        """The folder of the photographs of the current entry; None of scene files and of a single photograph."""
-        entry = self.entries[self.current] if 0 <= self.current < len(self.entries) else None
-        source = entry and (entry.tour or entry.pair)
-        is_photograph = self.path is None or self.path.suffix.lower() in READABLE_SUFFIXES
-        return None if source is None or is_photograph else source.folder
-
     def search(self, path: Path, name: str | None = None) -> None:
         """Look for the entries at a path, to show that of a name or number, else the first one."""
         self.expect(path, name)
@@ -70,10 +61,6 @@ class Library:
         """Offer these entries, of which one is loaded."""
         self.entries, self.current, self.path = entries, index, path
         self.watch.start(entries[index].files)
-
-    def watch_again(self) -> None:
-        """Watch the files of the current entry from now on, after one of them was written."""
-        self.watch.start(self.entries[self.current].files)
 
     def keep(self) -> None:
         """Remember the list and its current entry, which is shown, for `restore`."""

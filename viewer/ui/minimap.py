@@ -12,6 +12,7 @@ import moderngl
 import numpy as np
 from imgui_bundle import imgui
 
+from pansplat.system.descriptions import describe_count
 from pansplat.tours.floor import FloorPlan, draw_floor_plan, find_other_storeys
 from pansplat.tours.graph import TourGraph
 from pansplat_viewer.scene.camera import Camera
@@ -46,11 +47,11 @@ def describe_panorama(tour: TourGraph, node: int) -> str:
 def describe_panoramas(tour: TourGraph) -> str:
     """The number of panoramas with a known, a probable and no known place, and of fades because of poor flights."""
     flights = sum(a != b for a, b in tour.overlaps) - len(tour.poor)
-    ways = f"; {flights} flights, {len(tour.poor)} fades" if tour.poor else ""
+    ways = f"; {describe_count(flights, 'flight')}, {describe_count(len(tour.poor), 'fade')}" if tour.poor else ""
     alone = sum(not tour.is_placed(node) for node in range(len(tour)))
     probable = sum(is_probable(tour, node) for node in range(len(tour)))
     if not alone and not probable:
-        return f"{len(tour)} panoramas{ways}"
+        return f"{describe_count(len(tour), 'panorama')}{ways}"
     counts = ((len(tour) - alone - probable, "placed"), (probable, "probably"), (alone, "not placed"))
     return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed") + ways
 

@@ -40,7 +40,7 @@ def draw_notes(viewer: Viewer) -> None:
             np.hypot(pointer.x - pixel[0], pointer.y - pixel[1]) < 1.5 * radius
             and not imgui.get_io().want_capture_mouse
         ):
-            imgui.set_tooltip("\n".join((note.text, *note.addresses)).strip().replace("%", "%%"))
+            imgui.set_tooltip("\n".join((note.text, *note.addresses)).strip())  # no format: a % is shown as it is
 
 
 class NotesSection:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, get_args
 import moderngl
 from imgui_bundle import imgui
 
+from pansplat.system.descriptions import describe_count
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.key_frames import KeyFrame
 from pansplat_viewer.scene.settings import Display, Preset
@@ -143,7 +144,7 @@ class Panels:
             imgui.end_combo()
         else:
             self.widgets.record("visit")
-        imgui.text_unformatted(f"{len(tour.loaded)} of {tour.num_scenes} scenes in memory")
+        imgui.text_unformatted(f"{len(tour.loaded)} of {describe_count(tour.num_scenes, 'scene')} in memory")
         if viewer.scenes.background is not None:
             task, fraction = viewer.scenes.background
             draw_wrapped(task)

@@ -21,6 +21,7 @@ import torch
 from pansplat.errors import InputError
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.reconstructions.shots import Reconstruction, Shot, find_picture, note_smaller
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import read_file
 
 _MAX_BYTES = 1 << 28  # of a file
@@ -89,9 +90,9 @@ def read_metashape(source: Path, convention: str | None = None) -> Reconstructio
         ) from error
     if not spherical:
         raise InputError(
-            f"{source}: needed aligned cameras of a spherical sensor, got {len(cameras)} aligned cameras and "
-            f"{len(sensors)} spherical sensors; set the camera type to Spherical and align, or move the file away to "
-            "estimate poses."
+            f"{source}: needed aligned cameras of a spherical sensor, got "
+            f"{describe_count(len(cameras), 'aligned camera')} and {describe_count(len(sensors), 'spherical sensor')}; "
+            "set the camera type to Spherical and align, or move the file away to estimate poses."
         )
     note_smaller(source, len(sizes) - 1)
     return Reconstruction(source, source.parent, shots, is_metric=is_metric, missing=missing)

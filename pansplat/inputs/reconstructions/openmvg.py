@@ -19,6 +19,7 @@ from pansplat.errors import InputError
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.reconstructions.shots import Reconstruction, Shot, find_picture
 from pansplat.inputs.stated_files import find_inside
+from pansplat.system.descriptions import describe_count
 from pansplat.system.strict_json import read_field, read_json
 
 FILE = "sfm_data.json"
@@ -64,9 +65,9 @@ def read_openmvg(source: Path, convention: str | None = None) -> Reconstruction:
         ) from error
     if not posed:
         raise InputError(
-            f"{source}: needed spherical views with poses, got {len(views)} views, {len(poses)} poses and "
-            f"{len(spherical)} spherical cameras; reconstruct with --camera_model 7, or move the file away to estimate "
-            "poses."
+            f"{source}: needed spherical views with poses, got {describe_count(len(views), 'view')}, "
+            f"{describe_count(len(poses), 'pose')} and {describe_count(len(spherical), 'spherical camera')}; "
+            "reconstruct with --camera_model 7, or move the file away to estimate poses."
         )
     return Reconstruction(source, source.parent, shots, table, missing=missing)
 

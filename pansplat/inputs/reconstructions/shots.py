@@ -27,6 +27,7 @@ from pansplat.inputs.pairs import FAR, NEAR, Collection, Panorama, find_mask, li
 from pansplat.inputs.poses import read_number
 from pansplat.inputs.stated_files import find_inside
 from pansplat.system.components import label_components
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import make_unique_name
 
 _SCALE = "scale.txt"
@@ -84,7 +85,7 @@ def note_smaller(source: Path, count: int) -> None:
     """Warn that a file holds smaller reconstructions, if there are any."""
     if count:
         warnings.warn(
-            f"{source}: {count} smaller reconstructions, whose poses have no relation to the largest, are left out.",
+            f"{source}: {describe_count(count, 'smaller reconstruction')} without relation to the largest: left out.",
             InputWarning,
             stacklevel=5,
         )
@@ -131,9 +132,10 @@ def make_collection(found: Reconstruction) -> Collection:
     panoramas, partial = _join_shots(replace(found, shots=_add_masks(found)))
     if not panoramas:
         raise InputError(
-            f"{found.source}: needed 360-degree panoramas, got {len(partial)} perspective pictures that show at most "
-            f"{100 * max(partial.values(), default=0):.0f}% of what is around a camera; give equirectangular pictures "
-            f"or all cube faces with their poses, or move {found.source.name} away to estimate poses."
+            f"{found.source}: needed 360-degree panoramas, got {describe_count(len(partial), 'perspective picture')}, "
+            f"with at most {100 * max(partial.values(), default=0):.0f}% of what is around a camera in view; give "
+            f"equirectangular pictures or all cube faces with their poses, or move {found.source.name} away to "
+            "estimate poses."
         )
     if partial:
         warnings.warn(

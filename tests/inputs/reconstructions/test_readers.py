@@ -293,7 +293,7 @@ def test_opensfm_spherical_shots(
         "reference_lla": {"latitude": 47.1, "longitude": 8.5, "altitude": 0.0},
     }  # fmt: skip
     (tmp_path / "reconstruction.json").write_text(json.dumps([{"cameras": {}, "shots": {}}, part]))
-    with pytest.warns(InputWarning, match="1 smaller reconstructions.*are left out"):
+    with pytest.warns(InputWarning, match="1 smaller reconstruction without.* left out"):
         _, panoramas = load(tmp_path, arbitrary=False)
     for panorama in panoramas:
         shot = shots[panorama.image.name]
@@ -359,7 +359,7 @@ def test_only_the_largest_component_of_metashape_is_one_world(
     )
     with pytest.warns(InputWarning) as notes:
         pairs = load_pairs(tmp_path)
-    assert any("cameras.xml: 1 smaller reconstructions" in str(note.message) for note in notes)
+    assert any("cameras.xml: 1 smaller reconstruction without" in str(note.message) for note in notes)
     worlds = {view.name: view.world for pair in pairs for view in pair.context}
     alone, *others = (worlds[name[:-4]] for name in NAMES)
     assert len(worlds) == 3 and len(set(others)) == 1 and alone not in others, "a scene of its own"
@@ -401,7 +401,7 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
     frame = {"file_path": "v.png", "transform_matrix": cameras[0].tolist(), "fl_x": 24}
     for content, message in (
         ({}, 'needed posed pictures as "frames"'),
-        ({"frames": [frame]}, "needed 360-degree panoramas, got 1 perspective pictures that show at most 17%"),
+        ({"frames": [frame]}, "needed 360-degree panoramas, got 1 perspective picture, with at most 17%"),
         ({"frames": [frame | {"k1": 0.1}]}, "frame 0: needed pictures without distortion, got k1; undistort"),
         ({"frames": [frame | {"camera_model": "OPENCV_FISHEYE"}]}, "needed the camera model EQUIRECTANGULAR or"),
         ({"frames": [frame | {"file_path": "gone.png"}]}, r"needed its pictures, got none of them \(gone\.png"),

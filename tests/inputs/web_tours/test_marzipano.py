@@ -12,11 +12,11 @@ from PIL import Image
 
 from pansplat.cli import run
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.folders import load_pairs, load_panoramas
+from pansplat.inputs.folders import UnposedPanoramasError, load_pairs, load_panoramas
 from pansplat.inputs.pairs import Link, Note, Panorama
 from pansplat.inputs.web_tours import find_web_tour, read_web_tour
 from pansplat.poses.edit import PoseEditor
-from pansplat.poses.files import name_pictures
+from pansplat.poses.files import _describe, name_pictures
 
 LEVELS = [
     {"tileSize": 16, "size": 16, "fallbackOnly": True},
@@ -80,6 +80,13 @@ def test_an_export_has_its_pictures_names_links_and_start_views(export: Export, 
     assert hall.start == (0.5, 0.1)
     _check_picture(hall, check_colors)
     _check_picture(kitchen, check_colors)
+
+
+def test_messages_name_rooms_by_their_titles(export: Export) -> None:
+    folder = export(_scene("0-hall", name="Entrance"), _scene("1-kitchen"))
+    with pytest.raises(UnposedPanoramasError, match=r"got images only \(Entrance, Kitchen\)") as caught:
+        load_pairs(folder)
+    assert [_describe(view, folder) for view in caught.value.panoramas] == [f"{folder}: Entrance", f"{folder}: Kitchen"]
 
 
 def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Export) -> None:

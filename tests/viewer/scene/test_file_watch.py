@@ -53,6 +53,20 @@ def test_a_changed_web_tour_and_a_new_panorama_are_noticed(tmp_path: Path) -> No
         assert watch.changed
 
 
+def test_a_file_that_the_window_writes_hides_no_change_of_another(tmp_path: Path) -> None:
+    own, other = tmp_path / "links.json", tmp_path / "poses.json"
+    for changed in ((own,), (own, other)):
+        for file in (own, other):
+            file.write_text("{}")
+        watch = FileWatch()
+        watch.start([own, other])
+        for file in changed:
+            file.write_text('{"a": []}')
+        watch.skip(own)
+        watch.look(0.0)
+        assert watch.changed == (other in changed)
+
+
 def test_many_files_are_looked_at_one_part_a_frame(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("pansplat_viewer.scene.file_watch._FILES", 2)
     files = [tmp_path / str(number) for number in range(5)]
