@@ -16,6 +16,7 @@ from torch.nn.functional import grid_sample, interpolate
 
 from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equirect, uv_from_directions
 from pansplat.networks.depth_network import DepthEstimate
+from pansplat.system.threads import one_thread
 
 _TANGENT = math.tan(math.radians(95) / 2)  # of half of the field of view along a crop's shorter side
 # Yaw and pitch of the crops, degrees; the last two look straight up and down.
@@ -52,7 +53,8 @@ def join_crops(
         height: of the result, pixels.
     """
     crops = [(crop - crop.min()) / (crop.mean() - crop.min()).clamp_min(1e-12) for crop in relative]
-    parameters = solve_crops(crops, estimate)
+    with one_thread():
+        parameters = solve_crops(crops, estimate)
     total, weight = torch.zeros(2, height, 2 * height, dtype=torch.float64)
     for crop, axes, solved in zip(crops, crop_axes(), parameters, strict=True):
         position, forward, window = _project(axes, crop.shape, height)
