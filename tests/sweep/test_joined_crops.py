@@ -10,6 +10,14 @@ from pansplat.networks.depth_network import DepthEstimate
 from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
 from pansplat.sweep import joined_crops
 from pansplat.sweep.joined_crops import crop_axes, crop_panorama, join_crops, solve_crops
+from pansplat.system.threads import one_thread
+
+
+@pytest.fixture(autouse=True)
+def on_one_thread():
+    with one_thread():
+        yield
+
 
 _LOW, _HIGH = np.array((-2.4, -1.3, -1.9)), np.array((2.1, 1.2, 2.6))  # of a room around the camera
 _COLUMN = 0.8, 0.2, 1.1  # direction of a thin column, half of its width in radians, and its depth
@@ -20,7 +28,8 @@ def _inverse_depth(rays):
     """Inverse radial depth of unit rays (..., 3) in a room with a column in it."""
     walls = np.maximum(rays / _LOW, rays / _HIGH).max(axis=-1)
     longitude = np.arctan2(rays[..., 0], rays[..., 2])
-    return np.where(np.abs(longitude - _COLUMN[0]) < _COLUMN[1], np.maximum(walls, 1 / _COLUMN[2]), walls)
+    is_column = (np.abs(longitude - _COLUMN[0]) < _COLUMN[1]) & (np.abs(rays[..., 1]) < 0.8)
+    return np.where(is_column, np.maximum(walls, 1 / _COLUMN[2]), walls)
 
 
 def _colors(height):
@@ -111,7 +120,7 @@ def test_joined_depth_has_no_seams_and_is_right_at_the_poles():
     joined, truth = _join(_make_network(), _make_estimate()), _true_log_depth(128)
     assert np.abs(joined - truth)[[0, 1, 2, -3, -2, -1]].max() < 0.02
     away = np.abs(np.roll(joined, -1, axis=1) - joined - np.roll(truth, -1, axis=1) + truth)
-    assert np.quantile(away, 0.98) < 0.01
+    assert np.quantile(away, 0.95) < 0.003  # the rest are pixels at the edges of the column
 
 
 def test_solution_is_a_minimum_of_the_cost_by_float64_torch():
