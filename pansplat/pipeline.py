@@ -132,6 +132,7 @@ def load_model(
     *,
     compat: CompatChoice = "trained",
     precision: Precision = "float32",
+    depth_network: str | Path | None = None,
     **options: Any,
 ) -> Predictor:
     """Load a predictor.
@@ -142,6 +143,8 @@ def load_model(
         compat: for networks: "official" reproduces the official code with its defects; "fixed" corrects them;
             "trained" is the mode of the training, which is "official" for official weights.
         precision: for networks: number type of the convolutions; docs/bench_model.md shows time against error.
+        depth_network: for "default" and files of depth networks: an ONNX file of relative depth, whose edges the
+            surfaces have (docs/depth_network.md).
         **options: of "sweep", the arguments of `pansplat.sweep.Sweep`; of the weights of a network, those of
             `pansplat.model.network.load_predictor`; others have none.
     """
@@ -150,6 +153,8 @@ def load_model(
     of_networks = [*(["compat"] if compat != "trained" else []), *(["precision"] if precision != "float32" else [])]
     if str(name) in _MODELS:
         _refuse_options(name, of_networks if str(name) == "sweep" else [*of_networks, *options])
+        if depth_network is not None:
+            return _load_guided(name, None, depth_network)
         return _MODELS[str(name)](**options)
     if Path(name).suffix.lower() not in WEIGHTS_SUFFIXES:
         raise InputError(
@@ -157,14 +162,23 @@ def load_model(
             f"({', '.join(WEIGHTS_SUFFIXES)}), got {str(name)!r}"
         )
     path = expand_home(name)
-    if read_model_name(path) == "depth":
-        from pansplat.sweep.guided_sweep import load_guided_sweep
-
+    if read_model_name(path) == "depth" or depth_network is not None:
         _refuse_options(name, [*of_networks, *options])
-        return load_guided_sweep(path, path.stem)
+        return _load_guided(name, path, depth_network)
     from pansplat.model.network import load_predictor
 
     return load_predictor(path, compat, precision=precision, **options)
+
+
+def _load_guided(name: str | Path, path: Path | None, depth_network: str | Path | None) -> Predictor:
+    """The guided sweep of the weights of a depth network, by default the shipped one; others have no surfaces of it."""
+    from pansplat.sweep.guided_sweep import default_weights, load_guided_sweep
+
+    if str(name) == "sweep" or (path is not None and read_model_name(path) != "depth"):
+        raise InputError(f"`depth_network` is for the model default, got the model {name}; leave one of them out")
+    if path is None:
+        return load_guided_sweep(default_weights(), depth_network=depth_network)
+    return load_guided_sweep(path, path.stem, depth_network)
 
 
 def _refuse_options(name: str | Path, options: Sequence[str]) -> None:
@@ -174,7 +188,9 @@ def _refuse_options(name: str | Path, options: Sequence[str]) -> None:
 
 def load_predictor(options: PredictOptions) -> Predictor:
     """The predictor of options; an InputError if there is none of that name or file, or it lacks the options."""
-    return load_model(options.model, compat=options.compat, precision=options.precision)
+    return load_model(
+        options.model, compat=options.compat, precision=options.precision, depth_network=options.depth_network
+    )
 
 
 def _load_default() -> Predictor:
@@ -285,6 +301,7 @@ class PredictKeywords(TypedDict, total=False):
 
     compat: CompatChoice
     precision: Precision
+    depth_network: str | Path | None
     height: int | None
     refine_seconds: float | None
     gaussians: int | None
@@ -339,7 +356,7 @@ def predict(
         model: the name of a predictor, a file of weights, or a predictor.
         progress: called with a description of the current work and the completed fraction.
         on_predicted: called with the prediction before it is refined.
-        compat, precision: see `load_model`; without effect on a predictor object.
+        compat, precision, depth_network: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
         refine_seconds: time limit of the refinement. By default 0, for none; commands have None, which is
@@ -522,8 +539,8 @@ def predict_tour(
 
     Args:
         tour: of `pansplat.tours.overlap.connect`, or the path of a folder that holds the panoramas of one tour.
-        model, progress, compat, precision, refine_seconds, cache: see `predict`; the time limit is that of three
-            panoramas.
+        model, progress, compat, precision, depth_network, refine_seconds, cache: see `predict`; the time limit is that
+            of three panoramas.
         height: panoramas are resized to (height, 2 height); by default that of the photographs, at most 512.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.

@@ -6,6 +6,7 @@ Imports no torch, so that `--help` is fast.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Fixed, Suppress, arg
@@ -45,6 +46,9 @@ class PredictOptions:
     that the weights were trained with, which is official for official weights."""
     precision: Precision = "float32"
     """Number type of a network's convolutions; bfloat16 is less exact, and faster if the processor supports it."""
+    depth_network: Path | None = None
+    """For the model default: an ONNX file of a network of relative depth, whose edges the surfaces then have
+    (docs/depth_network.md); it needs onnxruntime, the extra `onnx`."""
     height: Height | None = None
     """Panoramas are resized to this height before the prediction, pixels; by default that of the photographs, at
     most 1024 (for networks and tours 512)."""

@@ -28,7 +28,9 @@ from pansplat.model.weights import (
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.networks.depth_refinement import DepthRefinement, Observations, RefinementConfig
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
 from pansplat.sweep import Sweep
+from pansplat.sweep.joined_crops import crop_panorama, join_crops
 from pansplat.sweep.predictor import SweepConfig
 from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.search import SearchConfig
@@ -43,12 +45,18 @@ _KINDS: dict[type, tuple[str, type]] = {
 _SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
 
 
-def load_guided_sweep(path: Path, name: str = "default") -> Sweep:
-    """The sweep guided by the network of a weights file, with the package's sharpening network."""
+def load_guided_sweep(path: Path, name: str = "default", depth_network: Path | str | None = None) -> Sweep:
+    """The sweep guided by the network of a weights file, with the package's sharpening network.
+
+    Args:
+        depth_network: an ONNX file whose network replaces the sharpening network (`networks.relative_depth`).
+    """
     files_of_weights = path, _shipped("sharpening.safetensors")
     networks = load_network(files_of_weights[0], DepthRefinement), load_network(files_of_weights[1], DepthSharpening)
+    relative = None if depth_network is None else load_relative_depth(depth_network)
     digest = hashlib.blake2b(b"".join(file.read_bytes() for file in files_of_weights), digest_size=8)
-    prior = NetworkPrior(*networks, digest.hexdigest() + hash_sources(__name__))
+    fingerprint = digest.hexdigest() + hash_sources(__name__) + ("" if relative is None else relative.fingerprint)
+    prior = NetworkPrior(*networks, fingerprint, relative=relative)
     return Sweep(SweepConfig(search=SearchConfig(finest_height=_SEARCH_HEIGHT)), prior, name)
 
 
@@ -107,12 +115,19 @@ class NetworkPrior:
         sharpening: in eval mode.
         fingerprint: changes with the weights.
         height: height of the panoramas that the depth network sees, pixels.
+        relative: replaces the sharpening network.
     """
 
     def __init__(
-        self, network: DepthRefinement, sharpening: DepthSharpening, fingerprint: str, height: int = 128
+        self,
+        network: DepthRefinement,
+        sharpening: DepthSharpening,
+        fingerprint: str,
+        height: int = 128,
+        relative: RelativeDepthNetwork | None = None,
     ) -> None:
         self.network, self.sharpening, self.fingerprint, self.height = network, sharpening, fingerprint, height
+        self.relative = relative
 
     @torch.no_grad()
     def observe(self, images: Sequence[np.ndarray]) -> NetworkObservation:
@@ -126,11 +141,15 @@ class NetworkPrior:
     def _sharpen(self, maps: Float[Tensor, "view 3 h w"], estimate: DepthEstimate) -> list[np.ndarray]:
         """Sharpened log-depth of the panoramas, in camera heights; one after another, in bounded memory."""
         height = self.sharpening.config.height
+        each = [DepthEstimate(*(map[n : n + 1] for map in estimate)) for n in range(len(maps))]
+        if self.relative is not None:
+            rows = min(height, maps.shape[-2])
+            return [
+                join_crops(self.relative.estimate(crop_panorama(image, self.relative.size)), own, rows).float().numpy()
+                for image, own in zip(maps, each, strict=True)
+            ]
         large = [torch.from_numpy(resize_sphere(_as_image(m), height)).permute(2, 0, 1)[None] for m in maps]
-        sharp = [
-            self.sharpening(to_channels_last(image), DepthEstimate(*(map[n : n + 1] for map in estimate)))[0]
-            for n, image in enumerate(large)
-        ]
+        sharp = [self.sharpening(to_channels_last(image), own)[0] for image, own in zip(large, each, strict=True)]
         return [log_depth[0].float().numpy() for log_depth in sharp]
 
 

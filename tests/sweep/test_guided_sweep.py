@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from onnx_files import Node, write_onnx
 
 from pansplat.errors import InputError
 from pansplat.evaluation.metrics import ws_psnr
@@ -12,7 +13,8 @@ from pansplat.model.weights import pack_weights, save_weights
 from pansplat.networks.depth_network import DepthNetworkConfig
 from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
-from pansplat.pipeline import load_model, load_pairs, predict, render
+from pansplat.pipeline import load_model, load_pairs, load_predictor, predict, render
+from pansplat.prediction_options import PredictOptions
 from pansplat.sweep import Sweep
 from pansplat.sweep.guided_sweep import (
     NetworkPrior,
@@ -185,3 +187,42 @@ def test_coincident_cameras_give_a_scene_that_is_better_than_a_sphere(sample, sp
     sphere = predict(dataclasses.replace(views, **same), sphere_predictor())
     drawn = render(sphere, targets.cam2world[0], size=(64, 128)).color.clamp(0, 1)
     assert _error_between(sample, **same) > ws_psnr(drawn, targets.images[0]) + 2
+
+
+def _write_depth_network(path, channel=0):
+    """A network whose inverse depth is a channel of the image."""
+    constants = {"channel": np.array(channel, np.int64)}
+    write_onnx(path, (1, 3, 28, 28), [Node("Gather", ["image", "channel"], ["depth"], {"axis": 1})], constants)
+    return path
+
+
+def test_depth_network_replaces_the_sharpening_network(weights, tmp_path):
+    """The surface has the edges of the red channel, which is the network's inverse depth."""
+    pytest.importorskip("onnxruntime")
+    prior = load_guided_sweep(weights, "depth", _write_depth_network(tmp_path / "red.onnx")).prior
+    images = np.full((2, 64, 128, 3), 0.2, np.float32)
+    images[0, 20:44, :30, 0], images[1, 20:44, 60:90, 0] = 0.8, 0.8
+    for image, log_depth in zip(images, prior.observe(images).sharpen(), strict=True):
+        assert log_depth.shape == (64, 128)
+        assert np.corrcoef(log_depth[4:-4].ravel(), image[4:-4, :, 0].ravel())[0, 1] < -0.5
+
+
+def test_fingerprint_depends_on_the_content_of_the_depth_network(weights, tmp_path):
+    pytest.importorskip("onnxruntime")
+    path = _write_depth_network(tmp_path / "net.onnx")
+    first = load_model(weights, depth_network=path)
+    same = load_model(weights, depth_network=str(_write_depth_network(tmp_path / "copy.onnx")))
+    other = load_model(weights, depth_network=_write_depth_network(path, 1))
+    fingerprints = [model.fingerprint for model in (first, other, load_model(weights))]
+    assert first.fingerprint == same.fingerprint and len(set(fingerprints)) == 3
+    shipped = load_model(depth_network=path)
+    assert shipped.name == "default" and shipped.fingerprint != load_model().fingerprint
+    assert load_predictor(PredictOptions(depth_network=path)).fingerprint == shipped.fingerprint
+
+
+def test_depth_network_is_refused_by_models_without_a_depth_network(tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_weights(path, pack_weights("pansplat", _CONFIG, {"a": torch.zeros(1)}, compat="fixed"))
+    for name in ("sweep", path):
+        with pytest.raises(InputError, match=r"`depth_network` is for the model default, got the model "):
+            load_model(name, depth_network=tmp_path / "net.onnx")

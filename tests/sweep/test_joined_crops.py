@@ -1,0 +1,192 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from onnx_files import FakeSession, Node, write_onnx
+
+from pansplat.geometry.equirect import pixel_directions, row_weights
+from pansplat.networks.depth_network import DepthEstimate
+from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
+from pansplat.sweep import joined_crops
+from pansplat.sweep.joined_crops import crop_axes, crop_panorama, join_crops, solve_crops
+from pansplat.system.threads import one_thread
+
+
+@pytest.fixture(autouse=True)
+def on_one_thread():
+    with one_thread():
+        yield
+
+
+_LOW, _HIGH = np.array((-2.4, -1.3, -1.9)), np.array((2.1, 1.2, 2.6))  # of a room around the camera
+_COLUMN = 0.8, 0.2, 1.1  # direction of a thin column, half of its width in radians, and its depth
+_MEAN, _DEVIATION = np.array((0.485, 0.456, 0.406)), np.array((0.229, 0.224, 0.225))
+
+
+def _inverse_depth(rays):
+    """Inverse radial depth of unit rays (..., 3) in a room with a column in it."""
+    walls = np.maximum(rays / _LOW, rays / _HIGH).max(axis=-1)
+    longitude = np.arctan2(rays[..., 0], rays[..., 2])
+    is_column = (np.abs(longitude - _COLUMN[0]) < _COLUMN[1]) & (np.abs(rays[..., 1]) < 0.8)
+    return np.where(is_column, np.maximum(walls, 1 / _COLUMN[2]), walls)
+
+
+def _colors(height):
+    """A panorama (3, h, 2h) whose colours are the directions of its pixels."""
+    return (pixel_directions(height, 2 * height).permute(2, 0, 1) + 1) / 2
+
+
+def _see(normalised):
+    """Directions (h, w, 3) that a normalised crop of `_colors` shows, of unit length, and its optical axis."""
+    rays = (normalised[0].transpose(1, 2, 0) * _DEVIATION + _MEAN) * 2 - 1
+    axis = rays.mean(axis=(0, 1))
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True), axis / np.linalg.norm(axis)
+
+
+class IdealNetwork:
+    """A session with the true inverse depth, of another scale and shift in each image, and relative noise."""
+
+    def __init__(self, noise=0.0):
+        self.noise, self.generator = noise, np.random.default_rng(0)
+
+    def __call__(self, image):
+        rays, axis = _see(image)
+        inverse = _inverse_depth(rays) / (rays @ axis)
+        inverse *= np.exp(self.noise * self.generator.normal(size=inverse.shape))
+        scale, shift = 10 ** self.generator.uniform(-2, 2), self.generator.uniform(-0.5, 2)
+        return [(scale * (inverse + shift)).astype(np.float32)[None]]
+
+
+def _make_network(noise=0.0, size=140):
+    session = FakeSession(IdealNetwork(noise), [("image", "tensor(float)", (1, 3, size, size))])
+    return RelativeDepthNetwork(session, "ideal", "")
+
+
+def _true_log_depth(height):
+    return -np.log(_inverse_depth(pixel_directions(height, 2 * height, dtype=torch.float64).numpy()))
+
+
+def _make_estimate(error=0.0, height=32):
+    """The room without the column, with a smooth error; the scale is its deviation."""
+    rays = pixel_directions(height, 2 * height, dtype=torch.float64)
+    log_depth = -torch.from_numpy(np.maximum(rays.numpy() / _LOW, rays.numpy() / _HIGH).max(axis=-1)).log()
+    wave = error * torch.sin(3 * torch.atan2(rays[..., 0], rays[..., 2]) + 4 * rays[..., 1])
+    return DepthEstimate((log_depth + wave).float()[None], torch.full_like(log_depth, math.log(0.1)).float()[None])
+
+
+def _join(network, estimate, height=128):
+    return join_crops(network.estimate(crop_panorama(_colors(256), network.size)), estimate, height).numpy()
+
+
+def _mean(values):
+    weights = row_weights(len(values)).numpy()[:, None] * np.ones(values.shape)
+    return float((values * weights).sum() / weights.sum())
+
+
+def test_every_direction_is_well_inside_a_crop_and_most_are_in_several():
+    windows = torch.stack([joined_crops._project(axes, (100, 100), 64)[2] for axes in crop_axes()])
+    assert windows.max(dim=0).values.min() > 0.2
+    assert ((windows > 0).sum(dim=0) >= 2).double().mean() > 0.95
+    np.testing.assert_allclose(crop_axes() @ crop_axes().mT, np.broadcast_to(np.eye(3), (16, 3, 3)), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(60, 60), (56, 84)])
+def test_crops_show_the_panorama_in_their_directions(size):
+    for image, axes in zip(crop_panorama(_colors(256), size), crop_axes(), strict=True):
+        rays, axis = _see((image.numpy() - _MEAN[:, None, None])[None] / _DEVIATION[:, None, None])
+        np.testing.assert_allclose(axis, axes[:, 2], atol=2e-3)
+        position, forward, _ = joined_crops._project(axes, size, 64)
+        inside = (position.abs() < 0.95).all(dim=-1) & (forward > 0.1)
+        back = torch.stack([joined_crops._sample(torch.from_numpy(rays[..., n]), position)[inside] for n in range(3)])
+        np.testing.assert_allclose(back.T, pixel_directions(64, 128)[inside], atol=5e-3)
+
+
+def test_crops_of_unknown_scale_and_shift_join_to_the_true_depth():
+    """The estimate lacks the column, and is wrong by up to 15 %; its error in the mean remains."""
+    joined, truth = _join(_make_network(), _make_estimate(0.15)), _true_log_depth(128)
+    error = np.abs(joined - truth - np.median(joined - truth))
+    assert abs(np.median(joined - truth)) < 0.05
+    assert np.median(error) < 0.01 and np.quantile(error, 0.95) < 0.03
+
+
+def test_noise_of_the_network_is_all_the_error_of_the_joined_depth():
+    joined, truth = _join(_make_network(noise=0.05), _make_estimate(0.15)), _true_log_depth(128)
+    difference = joined - truth - np.median(joined - truth)
+    assert np.median(np.abs(difference)) < 0.04
+
+
+def test_joined_depth_has_no_seams_and_is_right_at_the_poles():
+    joined, truth = _join(_make_network(), _make_estimate()), _true_log_depth(128)
+    assert np.abs(joined - truth)[[0, 1, 2, -3, -2, -1]].max() < 0.02
+    away = np.abs(np.roll(joined, -1, axis=1) - joined - np.roll(truth, -1, axis=1) + truth)
+    assert np.quantile(away, 0.95) < 0.003  # the rest are pixels at the edges of the column
+
+
+def test_solution_is_a_minimum_of_the_cost_by_float64_torch():
+    network, estimate = _make_network(noise=0.05), _make_estimate(0.15)
+    crops = network.estimate(crop_panorama(_colors(256), network.size))
+    crops = [(crop - crop.min()) / (crop.mean() - crop.min()) for crop in crops]
+    values, forward, window = joined_crops._sample_crops(crops, 32)
+    area = row_weights(32)[:, None].expand(32, 64).flatten()
+    known, scale = (each[0].double().flatten() for each in (estimate.log_depth, estimate.log_scale.exp()))
+
+    def cost(solved, mean):
+        depth = -solved[:, :1] - (values + solved[:, 1:].exp()).log() - forward.log()
+        of_crops = (window * area * (1 + ((depth - mean) / joined_crops._AGREEMENT) ** 2).log()).sum()
+        return of_crops + (joined_crops._TRUST * area * (1 + ((known - mean) / scale) ** 2).log()).sum()
+
+    solved = solve_crops(crops, estimate)
+    depth = -solved[:, :1] - (values + solved[:, 1:].exp()).log() - forward.log()
+    mean = torch.where(window > 0, depth, math.nan).nanmedian(dim=0).values
+    for _ in range(300):  # the unknown depth of each pixel, for these scales and shifts
+        weights = window / joined_crops._AGREEMENT**2 / (1 + ((depth - mean) / joined_crops._AGREEMENT) ** 2)
+        own = joined_crops._TRUST / scale**2 / (1 + ((known - mean) / scale) ** 2)
+        mean = ((weights * depth).sum(dim=0) + own * known) / (weights.sum(dim=0) + own)
+    at = solved.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(cost(at, mean), at)
+    shifted = (solved + 0.1).requires_grad_()
+    (elsewhere,) = torch.autograd.grad(cost(shifted, mean), shifted)
+    assert gradient.abs().max() < 0.01 * elsewhere.abs().max()
+
+
+def test_crop_of_one_distance_keeps_a_finite_depth():
+    network, estimate = _make_network(), _make_estimate()
+    crops = network.estimate(crop_panorama(_colors(256), network.size))
+    crops[-2] = torch.full_like(crops[-2], 3.0)
+    joined, truth = join_crops(crops, estimate, 64).numpy(), _true_log_depth(64)
+    assert np.isfinite(joined).all() and np.median(np.abs(joined - truth)) < 0.02
+
+
+def _write_room_network(path):
+    """The room without the column as a network: the largest of six planes, over the cosine to the optical axis."""
+    planes = np.stack([axis / bound for bounds in (_LOW, _HIGH) for axis, bound in zip(np.eye(3), bounds, strict=True)])
+    rows = np.concatenate((planes, np.eye(3)))  # of rays, which are 2 * color - 1
+    kernel, bias = 2 * rows * _DEVIATION, rows @ (2 * _MEAN - 1)
+    constants = {
+        "kernel": kernel.astype(np.float32)[:, :, None, None],
+        "bias": bias.astype(np.float32),
+        "parts": np.array((6, 3), np.int64),
+        "channel": np.array((1,), np.int64),
+    }
+    nodes = [
+        Node("Conv", ["image", "kernel", "bias"], ["all"]),
+        Node("Split", ["all", "parts"], ["planes", "rays"], {"axis": 1}),
+        Node("ReduceMax", ["planes"], ["inverse"], {"axes": [1], "keepdims": 0}),
+        Node("ReduceMean", ["rays"], ["axis"], {"axes": [2, 3]}),
+        Node("Mul", ["rays", "axis"], ["product"]),
+        Node("ReduceSum", ["product", "channel"], ["cosine"], {"keepdims": 0}),
+        Node("Div", ["inverse", "cosine"], ["depth"]),
+    ]
+    write_onnx(path, (1, 3, "height", "width"), nodes, constants)
+
+
+def test_file_with_the_depth_of_a_room_gives_its_depth(tmp_path):
+    pytest.importorskip("onnxruntime")
+    _write_room_network(tmp_path / "room.onnx")
+    network = load_relative_depth(tmp_path / "room.onnx")
+    network.size = 70, 70
+    joined = _join(network, _make_estimate(0.15), 64)
+    truth = -np.log(np.maximum(*(pixel_directions(64, 128).numpy() / bound for bound in (_LOW, _HIGH))).max(axis=-1))
+    error = np.abs(joined - truth - np.median(joined - truth))
+    assert np.median(error) < 0.01 and error.max() < 0.1
