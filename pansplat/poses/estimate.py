@@ -711,7 +711,7 @@ def _find_file(name: Path | str, files: Sequence[Path], names: Mapping[Path, str
     for key in (str, attrgetter("name"), attrgetter("stem"), names.__getitem__):
         found = [n for n, file in enumerate(files) if key(file) == str(name)]
         if len(found) > 1:
-            candidates = list_first([str(files[n]) for n in found])
+            several = list_first([str(files[n]) for n in found])
             raise InputError(
                 f"`baseline` must name one image each, got {name}, which may be {candidates}; give the path"
             )
