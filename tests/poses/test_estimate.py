@@ -24,6 +24,7 @@ from pansplat.poses.estimate import (
     NoPosesError,
     PoseEstimate,
     PoseGroup,
+    _find_scale,
     _is_mirrored,
     _match,
     _relate_views,
@@ -282,3 +283,11 @@ def test_poses_of_pictures_outside_of_their_folder_are_refused_before_the_estima
     (tmp_path / "other").mkdir()
     message = _message(capsys, "pose", str(tmp_path / "room"), "-o", str(tmp_path / "other" / "poses.json"))
     assert "poses.json: needed a file inside" in message and "copy the picture into the folder" in message
+
+
+def test_a_scale_without_a_floor_names_the_options_that_set_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pansplat.poses.estimate.find_floors", lambda *arguments: [])
+    monkeypatch.setattr("pansplat.poses.estimate.find_common_height", lambda floors: None)
+    scale, source = _find_scale([], np.eye(4)[None], [], {}, 1.6, None)
+    assert scale == 1.6 and "no floor was found" in source
+    assert "--camera-height" in source and "--baseline" in source
