@@ -27,6 +27,7 @@ from pansplat.poses.estimate import (
     PoseEstimate,
     PoseGroup,
     _find_file,
+    _find_scale,
     _is_mirrored,
     _match,
     _relate_views,
@@ -317,3 +318,11 @@ def test_a_baseline_by_a_name_of_two_files_is_refused(tmp_path: Path) -> None:
     assert [_find_file(name, files, names, "the images") for name in ("left.png", files[0], "right")] == [1, 0, 2]
     with pytest.raises(InputError, match=r"got left, which may be .*left\.jpg, .*left\.png; give the path"):
         _find_file("left", files, names, "the images")
+
+
+def test_a_scale_without_a_floor_names_the_options_that_set_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pansplat.poses.estimate.find_floors", lambda *arguments: [])
+    monkeypatch.setattr("pansplat.poses.estimate.find_common_height", lambda floors: None)
+    scale, source = _find_scale([], np.eye(4)[None], [], {}, 1.6, None)
+    assert scale == 1.6 and "no floor was found" in source
+    assert "--camera-height" in source and "--baseline" in source
