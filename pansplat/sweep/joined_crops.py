@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
+from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equirect, uv_from_directions
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.system.threads import one_thread
@@ -69,11 +70,20 @@ def solve_crops(crops: Sequence[Float[Tensor, "h w"]], estimate: DepthEstimate) 
 
     Each pixel of the estimate has an unknown depth. The crops and the estimate deviate from it, with the logarithm of
     a Cauchy distribution as cost, which iterated least squares minimise.
+
+    Raises:
+        InputError: the values grow with the depth of the estimate.
     """
     height = estimate.log_depth.shape[-2]
     values, forward, window = _sample_crops(crops, height)
     area = row_weights(height)[:, None].expand(height, 2 * height).flatten()
     known, scale = estimate.log_depth[0].double().flatten(), estimate.log_scale[0].double().exp().flatten()
+    nearness = values - (window * values).sum(dim=1, keepdim=True) / window.sum(dim=1, keepdim=True)
+    if (window * area * nearness * known).sum() > 0:
+        raise InputError(
+            "the depth network: needed relative inverse depth, which is large near the camera, got values that grow "
+            "with the distance; choose a network of inverse depth (docs/depth_network.md)."
+        )
     window = window * area / _AGREEMENT**2
     certainty = _TRUST * area / scale**2
     solved = torch.zeros(len(crops), 2, dtype=torch.float64)
