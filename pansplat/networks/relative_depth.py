@@ -7,9 +7,8 @@ inverse depth along the optical axis up to a scale and a shift of each image. Th
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,24 +25,11 @@ _NEEDED = (
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
 
 
-@runtime_checkable
-class Session(Protocol):
-    """What is used of `onnxruntime.InferenceSession`."""
-
-    def get_inputs(self) -> Sequence[Any]:
-        """Its inputs, with `name`, `type` and `shape`; a size that is no number is any."""
-        ...
-
-    def run(self, output_names: None, input_feed: dict[str, np.ndarray]) -> Sequence[Any]:
-        """All outputs."""
-        ...
-
-
 class RelativeDepthNetwork:
     """A network of relative inverse depth.
 
     Args:
-        session: of onnxruntime.
+        session: an `onnxruntime.InferenceSession`, or an object with its `get_inputs` and `run`.
         name: of the file, for messages.
         fingerprint: changes with the file.
 
@@ -51,15 +37,14 @@ class RelativeDepthNetwork:
         InputError: the network has other inputs.
     """
 
-    def __init__(self, session: Session, name: str, fingerprint: str) -> None:
+    def __init__(self, session: Any, name: str, fingerprint: str) -> None:
         self._session, self._name, self.fingerprint = session, name, fingerprint
         inputs = session.get_inputs()
-        described = ", ".join(f"{each.name} {each.type} {list(each.shape)}" for each in inputs)
-        if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 4:
-            raise self._refuse(f"inputs {described}")
-        sizes = [size if isinstance(size, int) and size > 0 else None for size in inputs[0].shape]
-        if sizes[0] not in (1, None) or sizes[1] not in (3, None):
-            raise self._refuse(f"inputs {described}")
+        sizes = [size if isinstance(size, int) and size > 0 else None for each in inputs for size in each.shape]
+        is_image = len(sizes) == 4 and sizes[0] in (1, None) and sizes[1] in (3, None)
+        if len(inputs) != 1 or inputs[0].type != "tensor(float)" or not is_image:
+            described = (f"{each.name} {each.type} {list(each.shape)}" for each in inputs)
+            raise self._refuse(f"inputs {', '.join(described)}")
         self.size = sizes[2] or sizes[3] or _DEFAULT_SIZE, sizes[3] or sizes[2] or _DEFAULT_SIZE
         """Height and width of its images, pixels."""
         self._input = inputs[0].name

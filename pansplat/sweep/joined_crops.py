@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
+from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equirect, uv_from_directions
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.system.threads import one_thread
@@ -28,6 +29,8 @@ _DOMINANCE = 3  # exponent of the weights with which crops are blended
 _ITERATIONS = 30
 _MAX_STEP = 1.0  # of the logarithms of scale and shift in one iteration
 _DAMPING = 1e-4  # for crops that show one distance only, relative to their weight
+_LEAST_CONTRAST = 1e-4  # mean difference of a crop's values from its smallest, relative to the largest
+_MAX_CORRELATION = 0.3  # of the crops' values with the estimated distance
 _FARTHEST = 2.0  # joined depth, relative to the largest of the estimate
 
 
@@ -52,7 +55,7 @@ def join_crops(
         estimate: of the whole panorama, a batch of one.
         height: of the result, pixels.
     """
-    crops = [(crop - crop.min()) / (crop.mean() - crop.min()).clamp_min(1e-12) for crop in relative]
+    crops = [_normalise(crop.double()) for crop in relative]
     with one_thread():
         parameters = solve_crops(crops, estimate)
     total, weight = torch.zeros(2, height, 2 * height, dtype=torch.float64)
@@ -69,11 +72,22 @@ def solve_crops(crops: Sequence[Float[Tensor, "h w"]], estimate: DepthEstimate) 
 
     Each pixel of the estimate has an unknown depth. The crops and the estimate deviate from it, with the logarithm of
     a Cauchy distribution as cost, which iterated least squares minimise.
+
+    Raises:
+        InputError: the values grow with the depth of the estimate.
     """
     height = estimate.log_depth.shape[-2]
     values, forward, window = _sample_crops(crops, height)
     area = row_weights(height)[:, None].expand(height, 2 * height).flatten()
     known, scale = estimate.log_depth[0].double().flatten(), estimate.log_scale[0].double().exp().flatten()
+    nearness = values - (window * values).sum(dim=1, keepdim=True) / window.sum(dim=1, keepdim=True)
+    distance = (known - known.mean()).expand_as(values)
+    products = [(window * area * a * b).sum() for a, b in ((nearness, distance), (nearness, nearness), (distance,) * 2)]
+    if products[0] > _MAX_CORRELATION * (products[1] * products[2]).sqrt():
+        raise InputError(
+            "the depth network: needed relative inverse depth, which is large near the camera, got values that grow "
+            "with the distance; choose a network of inverse depth (docs/depth_network.md)."
+        )
     window = window * area / _AGREEMENT**2
     certainty = _TRUST * area / scale**2
     solved = torch.zeros(len(crops), 2, dtype=torch.float64)
@@ -106,6 +120,12 @@ def crop_axes() -> Float[Tensor, "crop 3 3"]:
     turn = torch.stack((yaw.cos(), zero, yaw.sin(), zero, one, zero, -yaw.sin(), zero, yaw.cos()), dim=-1)
     rise = torch.stack((one, zero, zero, zero, pitch.cos(), -pitch.sin(), zero, pitch.sin(), pitch.cos()), dim=-1)
     return turn.unflatten(-1, (3, 3)) @ rise.unflatten(-1, (3, 3))
+
+
+def _normalise(crop: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Values from 0, with a mean of 1; differences that are small beside the values are rounding errors."""
+    above = crop - crop.min()
+    return above / torch.maximum(above.mean(), _LEAST_CONTRAST * crop.abs().max()).clamp_min(1e-12)
 
 
 def _extent(size: Sequence[int]) -> tuple[float, float]:

@@ -5,6 +5,7 @@ import pytest
 import torch
 from onnx_files import FakeSession, Node, write_onnx
 
+from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
@@ -156,6 +157,13 @@ def test_crop_of_one_distance_keeps_a_finite_depth():
     crops[-2] = torch.full_like(crops[-2], 3.0)
     joined, truth = join_crops(crops, estimate, 64).numpy(), _true_log_depth(64)
     assert np.isfinite(joined).all() and np.median(np.abs(joined - truth)) < 0.02
+
+
+def test_network_of_depth_in_place_of_inverse_depth_is_refused():
+    network = _make_network()
+    crops = [-crop for crop in network.estimate(crop_panorama(_colors(256), network.size))]
+    with pytest.raises(InputError, match=r"needed relative inverse depth, .* got values that grow with the distance"):
+        join_crops(crops, _make_estimate(0.15), 64)
 
 
 def _write_room_network(path):
