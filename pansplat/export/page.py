@@ -706,13 +706,16 @@ def _make_folder(folder: Path) -> None:
 
 
 def _remove_old_parts(folder: Path, kept: set[str]) -> None:
-    """Remove the parts of the page that was replaced, by their names and content, and an empty folder."""
-    for file in folder.glob("*.js"):
-        if file.name not in kept and re.fullmatch(r"[0-9a-f]{16}(_\d+)?\.js", file.name) and is_written(file):
-            with suppress(OSError):
-                file.unlink()
-    with suppress(OSError):
-        folder.rmdir()
+    """Remove the parts of the page that was replaced, by their names and content, and the folder if that empties it."""
+    name = re.compile(r"[0-9a-f]{16}(_\d+)?\.js")
+    old = [file for file in folder.glob("*.js") if file.name not in kept and name.fullmatch(file.name)]
+    old = [file for file in old if is_written(file)]
+    for file in old:
+        with suppress(OSError):
+            file.unlink()
+    if old:
+        with suppress(OSError):
+            folder.rmdir()
 
 
 def _bundle_programs() -> str:
