@@ -62,17 +62,17 @@ def test_pictures_that_two_threads_read_leave_the_filters_of_warnings(tmp_path, 
     def open_in_turn(*arguments, **options):
         if not first_is_inside.is_set():
             first_is_inside.set()
-            assert second_is_inside.wait(60)
+            assert second_is_inside.wait(300)
         else:
             second_is_inside.set()
-            assert first_is_done.wait(60)
+            assert first_is_done.wait(300)
         return open_image(*arguments, **options)
 
     monkeypatch.setattr(Image, "open", open_in_turn)
     before = list(warnings.filters)
     with ThreadPoolExecutor(2) as pool:
         first = pool.submit(read_size, tmp_path / "a.png")
-        assert first_is_inside.wait(60)
+        assert first_is_inside.wait(300)
         second = pool.submit(read_size, tmp_path / "a.png")
         assert first.result() == (8, 4)
         first_is_done.set()

@@ -143,7 +143,7 @@ def test_export_serves_until_a_signal(plain_scene: Scene, tmp_path: Path, number
     )
     assert process.stdout is not None
     lines: list[str] = []
-    killer = threading.Timer(120, process.kill)
+    killer = threading.Timer(600, process.kill)
     killer.start()
     while not lines or "https://" not in lines[-1]:
         lines.append(process.stdout.readline().decode())

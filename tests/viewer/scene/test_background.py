@@ -11,7 +11,7 @@ def test_cancelled_work_ends_before_the_next_begins_and_work_that_waits_is_never
 
     def first(report):
         begun.set()
-        assert released.wait(60)
+        assert released.wait(300)
         try:
             report()
         finally:
@@ -19,12 +19,12 @@ def test_cancelled_work_ends_before_the_next_begins_and_work_that_waits_is_never
 
     last_begun = threading.Event()
     worker.start(first)
-    assert begun.wait(60)
+    assert begun.wait(300)
     worker.start(lambda report: order.append("second"))
     worker.start(lambda report: (last_begun.set(), order.append("third"))[1])
     assert not last_begun.wait(0.2)
     released.set()
-    worker.future.result(60)
+    worker.future.result(300)
     assert order == ["first has ended", "third"]
     worker.close()
 
@@ -41,7 +41,7 @@ def test_joining_waits_for_all_cancelled_work():
 
     worker_is_joining = threading.Event()
     worker.start(first)
-    assert begun.wait(60)
+    assert begun.wait(300)
     worker.start(lambda report: order.append("second"))
     threading.Timer(0.5, worker_is_joining.set).start()
     assert worker.cancel(join=True)
