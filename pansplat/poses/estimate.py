@@ -712,9 +712,7 @@ def _find_file(name: Path | str, files: Sequence[Path], names: Mapping[Path, str
         found = [n for n, file in enumerate(files) if key(file) == str(name)]
         if len(found) > 1:
             several = list_first([str(files[n]) for n in found])
-            raise InputError(
-                f"`baseline` must name one image each, got {name}, which may be {candidates}; give the path"
-            )
+            raise InputError(f"`baseline` must name one image each, got {name}, which may be {several}; give the path")
         if found:
             return found[0]
     listed = ", ".join(names[file] for file in files)
