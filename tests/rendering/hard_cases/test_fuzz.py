@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import os
 
 import pytest
 import torch
@@ -15,10 +14,7 @@ from pansplat.gaussians.scene import Gaussians
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "covariances")
 _EXTREMES = (math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0)
 _EXTREMES += (1e-45, 1e-38, 1e-20, 1e-6, 1e6, 1e12, 1e18, 1e29, -1e29, 1e38)
-_QUIET = settings(
-    derandomize=bool(os.environ.get("CI")),
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
+_QUIET = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
 @st.composite
