@@ -38,9 +38,10 @@ if not torch.cuda.is_available():
 with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
-# Generated examples may take any time, because machines differ, and are the same in each run. `--hypothesis-profile default`
-# generates others.
+# Generated examples may take any time, because machines differ. They are the same in each run;
+# `--hypothesis-profile random` generates others.
 settings.register_profile("repeatable", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("random", settings.get_profile("repeatable"), derandomize=False)
 settings.load_profile("repeatable")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
