@@ -22,8 +22,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.batch import list_items
 from pansplat.cli import _COMMANDS
+from pansplat.cli.batch import list_items
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene
 from pansplat.gaussians.gltf import save_glb
@@ -142,7 +142,7 @@ _CASES: dict[str, Callable[[Path], Case]] = {
         [{"cameras": {"c": {"projection_type": "spherical"}}, "shots": {"a.png": _SHOT, "b.png": dict(_SHOT)}}],
     ),
     "manifest": lambda f: json_case(
-        f / "all.json", {"items": ["b", {"path": "a", "name": "x", "near": 0.1, "far": 9, "pair": "p"}]}, list_items
+        f / "all.json", {"items": ["b", "a"]}, list_items
     ),
     "key frames": lambda f: json_case(f / "path.json", {"key_frames": [_KEY_FRAME], "software": "x"}, read_path),
     "glTF": glb_case,

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputError, InputWarning, collect_notes
 from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
 from pansplat.images.image_files import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
 from pansplat.inputs.folder_formats import (
@@ -77,7 +77,8 @@ def load_pairs(
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
     """
     root = expand_home(path)
-    require_text(root)
+    if not root.is_dir():
+        require_text(root)
     convention = None if convention is None else parse_convention(convention, "`convention`")
     try:
         pairs = _load_pairs(root, convention, near, far)
@@ -122,8 +123,7 @@ def list_unposed(paths: Sequence[Path]) -> list[Panorama]:
 
 def _list_silently(folder: Path) -> dict[Path, Panorama]:
     """The panoramas of a folder by their files, without notes about other files."""
-    with warnings.catch_warnings(), contextlib.suppress(InputError):
-        warnings.simplefilter("ignore", InputWarning)
+    with collect_notes(), contextlib.suppress(InputError):
         return {panorama.image: panorama for panorama in _list_unposed(folder)}
     return {}
 

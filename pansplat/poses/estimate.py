@@ -54,7 +54,7 @@ from pansplat.predictor import Progress, part_of
 from pansplat.sweep.guided_sweep import list_default_weights
 from pansplat.system.console import with_progress_bar
 from pansplat.system.descriptions import describe_count, describe_range, list_first
-from pansplat.system.files import require_file
+from pansplat.system.files import require_file, require_text
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_file, hash_parts
 from pansplat.system.threads import one_thread, worker_threads
@@ -283,8 +283,7 @@ def estimate_poses(
         raise InputError(f"needed two or more different panoramas to estimate poses, got {len(paths)}; add one.")
     for path in paths:
         require_file(path, "a panorama")
-        if any("\ud800" <= letter <= "\udfff" for letter in path.name):  # surrogates: pose files are UTF-8
-            raise InputError(f"{path}: needed a name in UTF-8, got {path.name!a}; rename it.")
+        require_text(path)
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     if baseline is not None:

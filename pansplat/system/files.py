@@ -34,24 +34,16 @@ _KINDS = (
 )
 
 
-# Names of devices on Windows, with any suffix, and characters that it refuses in names.
+# Names of devices on Windows, with any suffix.
 _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d) *(\..*)?", re.IGNORECASE)
-_REFUSED = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[. ]$')
 
 
-def require_text(path: Path | str) -> None:
-    """Check that a path is text: JSON, comments of scenes and pages cannot hold bytes that are not UTF-8."""
+def require_text(path: Path) -> None:
+    """Check that a file's name is text: JSON, comments of scenes and pages cannot hold bytes that are not UTF-8."""
     try:
-        str(path).encode()
+        path.name.encode()
     except UnicodeEncodeError as error:
-        raise InputError(
-            f"{str(path)!a}: needed a name in UTF-8, got other bytes; rename the file or folder."
-        ) from error
-
-
-def is_portable_name(name: str) -> bool:
-    """Whether a file or folder may have a name on every system."""
-    return bool(name) and not _REFUSED.search(name) and not _DEVICE.fullmatch(name)
+        raise InputError(f"{str(path)!a}: needed a name in UTF-8, got other bytes; rename the file.") from error
 
 
 def make_portable_name(name: str) -> str:

@@ -25,7 +25,7 @@ def test_evaluate_writes_results_and_prints_the_table(room: Path, tmp_path: Path
     assert run([*start, "--height", "64"]) == 0
     out, err = capsys.readouterr()
     assert "WS-PSNR" in out and "cross-fade" in out and "room" in out
-    assert "alone: none of its 2 pairs has a target view; skipped" in err
+    assert "alone: no target view in 2 pairs; skipped" in err
     (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
     assert f"{result['ws_psnr']:.2f}" in out
     assert Path(result["prediction"]).is_file() and Path(result["target"]).is_file()

@@ -209,7 +209,7 @@ def test_all_commands_estimate_poses_from_the_same_arguments(linked: Path, tmp_p
     if not list(linked.glob("*.png")):
         callers.pop("pose of files", None)
     for number, (name, call) in enumerate(callers.items(), start=1):
-        for cache in linked.glob(".pansplat/poses-*.json"):
+        for cache in linked.glob(".pansplat/poses-*.entry"):
             cache.unlink()
         with contextlib.suppress(InputError):
             call(linked, tmp_path)

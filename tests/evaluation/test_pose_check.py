@@ -156,7 +156,7 @@ def test_unrelated_images_give_a_warning() -> None:
     noise = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(0))
     check = check_views(dataclasses.replace(views, images=noise))
     assert check.likely_mistake is None and not check.can_judge
-    assert any("overlap too little" in warning for warning in check.warnings)
+    assert any("too little in common" in warning for warning in check.warnings)
 
 
 @pytest.mark.slow

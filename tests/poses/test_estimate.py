@@ -144,7 +144,7 @@ def test_a_name_that_is_not_utf8_is_refused_before_the_estimate(tmp_path: Path, 
         cv2.imwrite(str(tmp_path / "image.png"), np.full((64, 128, 3), 90, np.uint8))
         (tmp_path / "image.png").rename(tmp_path / os.fsdecode(name))
     for command in ("pose", "check"):
-        assert "needed a name in UTF-8, got '\\udcff.png'; rename it" in _message(capsys, command, str(tmp_path))
+        assert "needed a name in UTF-8, got other bytes; rename the file" in _message(capsys, command, str(tmp_path))
 
 
 def _relation(log_odds: float, problem: str | None = None) -> RelativePose:

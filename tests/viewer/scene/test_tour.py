@@ -101,7 +101,7 @@ def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
     assert scenes.tour.poor == ((0, 1),), "each edge once, and no others"
     assert len(scenes.plan_way(camera, 1).fades) == 1
     edges = sum(a != b for a, b in scenes.tour.overlaps)
-    assert describe_panoramas(scenes.tour).endswith(f"; {edges - 1} flights, 1 fades")
+    assert describe_panoramas(scenes.tour).endswith(f"; {edges - 1} flights, 1 fade")
 
 
 def test_after_a_cut_a_photograph_fades_from_the_one_before_and_not_from_the_scene():
