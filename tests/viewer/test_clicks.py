@@ -828,12 +828,12 @@ def test_a_note_is_typed_shown_and_removed(tour_user, house, monkeypatch):
         imgui.get_io().add_input_character(ord(character))
     user.draw_frames(2)
     user.click("Put at the middle")
-    assert json.loads(file.read_text())["room0"]["notes"][0]["text"] == "oak"
+    assert json.loads(file.read_text())["room0.png"]["notes"][0]["text"] == "oak"
     changed = np.abs(look_aside() - before).max(axis=2) > 20
     assert 100 < changed.sum() < 600, "its mark"
     user.click("Remove at the middle")
     user.click("Notes in the picture")
-    assert json.loads(file.read_text())["room0"]["notes"] == []
+    assert json.loads(file.read_text())["room0.png"]["notes"] == []
     assert not (np.abs(look_aside() - before) > 20).any()
     file.unlink()
 
