@@ -51,6 +51,7 @@ def test_batches_from_a_step_equal_those_of_an_uninterrupted_run(tmp_path: Path)
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on one core
 def test_batches_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     source = _triplets(tmp_path, 5)
     options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": Augmentation(exposure=0.3)}
