@@ -21,7 +21,6 @@ from pansplat.model.network import (
     NetworkPredictor,
     build_empty_network,
     build_network,
-    choose_tiles,
     convert_checkpoint,
     load_predictor,
     remove_masked_gaussians,
@@ -112,10 +111,6 @@ def test_predictions_carry_no_gradient(predictor, prediction):
     assert not prediction.means.requires_grad
     assert not next(predictor.stream(images.requires_grad_(), poses, 0.5, 20.0)).means.requires_grad
     assert torch.is_grad_enabled()
-
-
-def test_tiles_follow_the_height():
-    assert [choose_tiles(height) for height in (256, 512, 1024, 2048)] == [1, 1, 2, 4]
 
 
 def test_the_fingerprint_depends_on_weights_settings_and_compatibility(small_config):
@@ -232,14 +227,6 @@ def test_a_checkpoint_and_its_converted_file_load_equally(
     first, second = load_model(tmp_path / "original.ckpt"), load_model(tmp_path / "converted.safetensors")
     assert _network_of(first).compat == _network_of(second).compat == "official"
     assert first.fingerprint == second.fingerprint
-
-
-def test_a_packed_config_is_restored(tmp_path: Path) -> None:
-    config = PanSplatConfig()
-    heads = dataclasses.replace(config.heads, lattice="pixel", residual=False)
-    config = dataclasses.replace(config, heads=heads)
-    network = build_empty_network(pack_weights("pansplat", config, {}, compat="fixed"), "fixed", "x")
-    assert isinstance(network, PanSplat) and network.config == config
 
 
 def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> None:
