@@ -149,22 +149,18 @@ def _run(matched: MatchedViews | None = None, **changes: object) -> tuple[Gaussi
         return heads, heads(matched or _matched())[0]
 
 
-def test_pixel_lattice_has_a_gaussian_at_each_pixel_and_no_linear_layer():
-    heads, gaussians = _run(lattice="pixel")
-    assert len(gaussians) == 2 * sum((64 >> level) * (128 >> level) for level in range(4))
-    assert not any("linear" in name for name, _ in heads.named_parameters())
-
-
-def test_a_single_level_has_the_finest_head_only():
-    heads, gaussians = _run(levels="single")
-    assert len(heads.levels) == 1 and gaussians.levels.unique().tolist() == [0]
-    assert len(gaussians) == 2 * lattice_size(128)
-
-
-def test_with_finest_only_the_finest_level_emits_gaussians():
-    heads, gaussians = _run(emitted="finest")
+def test_each_ablation_has_its_levels_and_lattice():
+    pixels = sum((64 >> level) * (128 >> level) for level in range(4))
+    for changes, levels, count in (
+        ({"lattice": "pixel"}, 4, pixels),
+        ({"levels": "single"}, 1, lattice_size(128)),
+        ({"emitted": "finest"}, 4, lattice_size(128)),
+    ):
+        heads, gaussians = _run(**changes)
+        assert len(heads.levels) == levels and len(gaussians) == 2 * count
+        has_linear = any("linear" in name for name, _ in heads.named_parameters())
+        assert has_linear == ("lattice" not in changes)
     _, every = _run()
-    assert len(heads.levels) == 4
     assert _difference(gaussians, every.select(every.levels == 0)) == 0
 
 

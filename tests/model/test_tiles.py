@@ -6,29 +6,17 @@ import pytest
 import torch
 from torch.nn import functional
 
-from pansplat.geometry.equirect import sample_equirect
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.model.tiles import (
     crop_window,
     make_lattice_uv,
     make_tiles,
     move_points,
-    sample_panorama,
 )
 
 
 def _random(*shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-
-@pytest.mark.parametrize("lattice", ["fibonacci", "pixel"])
-@pytest.mark.parametrize("grid", [1, 2, 4])
-def test_each_point_belongs_to_exactly_one_tile(lattice, grid):
-    for exact in (True, False):
-        uv = make_lattice_uv(lattice, 64, exact=exact)
-        held = torch.stack([tile.contains(uv) for tile in make_tiles(grid)])
-        assert bool((held.sum(dim=0) == 1).all())
-        assert int(held.sum(dim=1).min()) > 0
 
 
 @pytest.mark.parametrize("height", [8, 32, 128])
@@ -40,14 +28,6 @@ def test_an_official_window_wraps_columns_and_has_zero_rows(height):
         window = tile.window(height).expand(3)
         expected = whole[:, window.top + 3 :, window.left + 3 :][:, : window.height, : window.width]
         assert torch.allclose(crop_window(source, height, window, "official"), expected, atol=1e-14)
-
-
-def test_panorama_samples_wrap_if_fixed_and_repeat_the_border_if_official():
-    source, uv = _random(5, 8, 16), make_lattice_uv("fibonacci", 32)
-    assert torch.allclose(sample_panorama(source, uv, "fixed"), sample_equirect(source, uv).T, atol=1e-14)
-    grid = (2 * uv - 1)[None, None]
-    border = functional.grid_sample(source[None], grid, padding_mode="border", align_corners=False)[0, :, 0].T
-    assert torch.allclose(sample_panorama(source, uv, "official"), border, atol=1e-14)
 
 
 def test_points_move_at_most_half_a_pixel_of_their_latitude():

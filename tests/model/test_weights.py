@@ -142,24 +142,19 @@ def test_code_in_a_pickle_is_refused_and_not_executed(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-def test_a_web_page_and_a_git_lfs_pointer_are_recognised(tmp_path: Path) -> None:
-    path = tmp_path / "wrong.ckpt"
-    path.write_bytes(b"<!DOCTYPE html><html><body>OneDrive</body></html>")
-    with pytest.raises(InputError, match="it is a web page: download the file itself"):
-        read_checkpoint(path)
-    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
-    with pytest.raises(InputError, match="run `git lfs pull`"):
-        read_checkpoint(path)
-
-
-def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="got no file"):
-        read_checkpoint(tmp_path / "none.ckpt")
-    with pytest.raises(InputError, match="got a folder"):
-        read_checkpoint(tmp_path)
-    (tmp_path / "empty.ckpt").touch()
-    with pytest.raises(InputError, match="got an empty file"):
-        read_checkpoint(tmp_path / "empty.ckpt")
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"<!DOCTYPE html><html><body>OneDrive</body></html>", "it is a web page: download the file itself"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "run `git lfs pull`"),
+        (b"hello\n" * 50, r"wrong\.ckpt: needed a .*PyTorch checkpoint, got .* again"),
+        (b"", "got an empty file"),
+    ],
+)
+def test_what_is_no_checkpoint_is_recognised(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "wrong.ckpt").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_checkpoint(tmp_path / "wrong.ckpt")
 
 
 def test_a_checkpoint_without_tensors_by_name_is_refused(tmp_path: Path) -> None:
