@@ -18,7 +18,6 @@ from pansplat.poses.placing import PlanPose, Suggestion
 from pansplat.poses.two_view import RelativePose
 
 NAMES = "abcdef"
-EYE = np.eye(4).tolist()
 
 
 def _relation(log_odds: float) -> RelativePose:
@@ -323,13 +322,6 @@ def test_what_a_user_adds_to_estimated_poses_stays_and_the_poses_are_estimated_a
     assert (pair.near, pair.far) == (0.2, 5)
 
 
-def test_a_range_that_was_estimated_is_estimated_anew(folder: Path):
-    images = sorted(folder.glob("*.png"))
-    for factor in (1, 2):
-        write_poses(_scaled(factor, images), folder / "poses.json")
-        assert [(pair.near, pair.far) for pair in pansplat.load_pairs(folder)][:1] == [(0.4 * factor, 8 * factor)]
-
-
 def test_near_and_far_of_a_world_that_a_user_states_stay(folder: Path):
     images = sorted(folder.glob("*.png"))
     _write_edited(folder, lambda content: content["worlds"][0].update(near=0.2, far=5))
@@ -472,12 +464,6 @@ def test_the_first_change_by_hand_keeps_the_old_file(folder: Path):
     ("content", "message"),
     [
         ({"poses": {}}, 'needed a pose "convention"'),
-        ({"convention": "cam2world opencv"}, "poses: needed an object"),
-        (
-            {"convention": "cam2world opencv", "poses": {"a.png": {"pose": EYE, "world": "x"}}},
-            "a.png.*needed a whole number",
-        ),
-        ({"convention": "cam2world opencv", "poses": {}, "worlds": 3}, "worlds: needed a list"),
         ({"convention": "cam2world opencv", "poses": {}, "worlds": [3]}, r"worlds, \[0\]: needed an object"),
         ({"convention": "cam2world opencv", "poses": {"a.png": {"room": "x"}}}, "a.png.*needed a pose"),
     ],

@@ -16,7 +16,6 @@ from pansplat.poses.placing import (
     Piece,
     PlanFrame,
     PlanPose,
-    find_wall_yaw,
     list_suggestions,
     measure_fit,
     snap,
@@ -57,12 +56,6 @@ def test_a_pose_of_a_place_has_this_place_whatever_the_tilt(tilt):
     assert np.allclose(pose[:3, :3] @ upright[:, 1], floor.level[:, 1])  # gravity
 
 
-def test_y_is_down_if_the_cameras_are_nearly_upright():
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_exp(np.array((0.05, 0, 0.02)))
-    assert np.allclose(PlanFrame.of_world(pose[None], 1.0).level[:, 1], (0, 1, 0))
-
-
 def test_suggestions_are_where_the_second_camera_of_a_candidate_is():
     """The second camera is 2 camera heights to the right of the first one and 1 ahead, and is turned by 0.6 radians."""
     uprights = rotation_exp(np.array((0.1, 0, 0.05))), rotation_exp(np.array((-0.05, 0, 0.1)))
@@ -96,13 +89,6 @@ def test_walls_snap_to_multiples_of_a_quarter_turn(quarters):
         assert snapped.place[:2] == (1, 2)
     place = PlanPose(1, 2, exact + 1.1 * WALL_ANGLE)
     assert snap(place, [], own, target) == snap(place, []) == (place, None, False)
-
-
-def test_the_mean_of_wall_directions_ignores_quarter_turns():
-    yaws = [0.1 + QUARTER, 0.12, 0.08 - 2 * QUARTER]
-    assert math.remainder(find_wall_yaw(yaws) - 0.1, QUARTER) == pytest.approx(0, abs=1e-9)
-    assert find_wall_yaw([]) is None
-    assert find_wall_yaw([0.0, QUARTER / 2]) is None  # they contradict each other
 
 
 def test_the_outline_of_a_room_is_where_its_walls_are(look_around):
