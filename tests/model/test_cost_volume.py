@@ -116,14 +116,6 @@ def test_maps_that_the_unet_cannot_halve_are_refused(small):
         small([features[0][..., :6, :12]], *rest)
 
 
-def test_monocular_features_must_be_given_exactly_if_configured(small, randomize):
-    *rest, mono = _inputs()
-    with pytest.raises(ValueError, match="mono_channels=3"):
-        small(*rest)
-    with pytest.raises(ValueError, match="mono_channels=0"):
-        randomize(SphericalCostVolume(replace(_SMALL, mono_channels=0), "fixed"))(*rest, mono)
-
-
 # Hard cases, in fixed mode with two views and without monocular features
 
 

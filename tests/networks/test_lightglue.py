@@ -39,8 +39,3 @@ def test_dropped_keypoints_leave_the_others_numbers(network: LightGlue) -> None:
     first, second = make_keypoints(30, 1), make_keypoints(40, 2)
     indices, scores = network(first, second)
     assert (scores < 1e-3).all() and (indices < torch.tensor((30, 40))).all()
-
-
-def test_an_image_without_keypoints_has_no_matches(network: LightGlue) -> None:
-    indices, scores = network(make_keypoints(0, 1), make_keypoints(40, 2))
-    assert indices.shape == (0, 2) and scores.shape == (0,)

@@ -322,6 +322,13 @@ def test_what_a_user_adds_to_estimated_poses_stays_and_the_poses_are_estimated_a
     assert (pair.near, pair.far) == (0.2, 5)
 
 
+def test_a_range_that_was_estimated_is_estimated_anew(folder: Path):
+    images = sorted(folder.glob("*.png"))
+    for factor in (1, 2):
+        write_poses(_scaled(factor, images), folder / "poses.json")
+        assert [(pair.near, pair.far) for pair in pansplat.load_pairs(folder)][:1] == [(0.4 * factor, 8 * factor)]
+
+
 def test_near_and_far_of_a_world_that_a_user_states_stay(folder: Path):
     images = sorted(folder.glob("*.png"))
     _write_edited(folder, lambda content: content["worlds"][0].update(near=0.2, far=5))

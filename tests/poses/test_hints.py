@@ -65,6 +65,13 @@ def test_gravity_of_the_picture_comes_before_that_of_the_metadata() -> None:
         assert np.allclose(axes.axes @ axes.axes.T, np.eye(3)) and np.linalg.det(axes.axes) > 0
 
 
+def test_gravity_of_the_metadata_keeps_the_yaw_of_the_picture() -> None:
+    axes = SceneAxes(np.array(((0.0, 1, 0), (0, 0, 1), (1, 0, 0))), False, False)
+    down = np.array((0.1, 1.0, 0.1)) / math.sqrt(1.02)  # tilted by 8 degrees between both walls' normals
+    wall = with_hints(axes, down, None).axes[1]
+    assert abs(wall @ axes.axes[1]) > math.cos(math.radians(8.1))
+
+
 def test_the_compass_prefers_rotations_that_keep_north() -> None:
     unknown = SceneAxes(np.eye(3), False, False)
     prior = RotationPrior(with_hints(unknown, None, 0.0), with_hints(unknown, None, math.radians(60)))

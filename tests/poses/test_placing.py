@@ -56,6 +56,12 @@ def test_a_pose_of_a_place_has_this_place_whatever_the_tilt(tilt):
     assert np.allclose(pose[:3, :3] @ upright[:, 1], floor.level[:, 1])  # gravity
 
 
+def test_y_is_down_if_the_cameras_are_nearly_upright():
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_exp(np.array((0.05, 0, 0.02)))
+    assert np.allclose(PlanFrame.of_world(pose[None], 1.0).level[:, 1], (0, 1, 0))
+
+
 def test_suggestions_are_where_the_second_camera_of_a_candidate_is():
     """The second camera is 2 camera heights to the right of the first one and 1 ahead, and is turned by 0.6 radians."""
     uprights = rotation_exp(np.array((0.1, 0, 0.05))), rotation_exp(np.array((-0.05, 0, 0.1)))

@@ -14,19 +14,6 @@ def test_depth_along_an_axis_becomes_distance_by_the_official_factor(golden):
     assert torch.allclose(1 / ahead, golden("units")["cubemap.depth_norm"].double(), rtol=0, atol=2e-7)
 
 
-@pytest.mark.parametrize("stitching", ["seamless", "official"])
-def test_stitching_face_by_face_adds_up_to_the_whole(stitching):
-    generator = torch.Generator().manual_seed(0)
-    faces = torch.randn(6, 2, 6, 6, generator=generator, dtype=torch.float64)
-    whole = stitch_faces(faces, (12, 24), stitching=stitching)
-    parts = torch.zeros_like(whole)
-    for face in range(6):
-        alone = torch.zeros_like(faces)
-        alone[face] = faces[face]
-        parts += stitch_faces(alone, (12, 24), stitching=stitching)
-    assert torch.allclose(parts, whole, rtol=0, atol=1e-14)
-
-
 def test_stitching_reproduces_the_direction_of_every_pixel_across_edges_and_corners():
     expected = pixel_directions(64, 128, dtype=torch.float64).permute(2, 0, 1)
     # Bilinear within a face, and a neighbour's pixel is less than a pixel from its ideal position.

@@ -93,12 +93,6 @@ def test_each_entry_of_a_symmetric_pair_gets_half_the_gradient(make_scene, pose)
     assert torch.allclose(covariances.grad, covariances.grad.transpose(1, 2), rtol=0, atol=1e-12)
 
 
-def test_an_empty_scene_takes_empty_covariances(make_scene, pose):
-    scene = make_scene(2).select(torch.zeros(2, dtype=torch.bool))
-    got = rasterize(scene, pose, size=(4, 8), covariances=torch.zeros(0, 3, 3, dtype=torch.float64))
-    assert not got.color.any()
-
-
 # --- torch.compile ---
 
 

@@ -1,5 +1,6 @@
 """The scene's axes and planes."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -94,6 +95,25 @@ def test_vertical_bounds_contain_the_floor_and_the_ceiling(planes, empty_room, v
     floor, ceiling = room.high[1] - pose[1, 3], room.low[1] - pose[1, 3]
     assert floor < down < 1.15 * floor + 0.1
     assert 1.15 * ceiling - 0.1 < up < ceiling
+
+
+def test_votes_support_a_plane_without_any_surface(empty_room):
+    poses = empty_room.posed.cam2world
+    nothing = make_empty_planes(poses, _AXES, 0.45, 8.0)
+    votes = np.zeros_like(nothing.votes)
+    votes[0, nothing.offsets.searchsorted(1.2)] = 0.7
+    voted = dataclasses.replace(nothing, votes=votes)
+    distance = voted.offsets[voted.votes[0].argmax()] - poses[0][1, 3] + voted.origin[1]
+    assert voted.support(0, poses[0], np.array((1 / distance,)))[1, 0] == pytest.approx(0.7)
+    assert nothing.support(0, poses[0], np.array((1 / distance,))).max() == 0
+
+
+def test_a_detected_floor_overrides_the_floor_of_surfaces(planes, empty_room):
+    pose = empty_room.posed.cam2world[0]
+    voted = dataclasses.replace(planes, floor_ceiling=(2.0, -np.inf)).vertical_bounds(pose)
+    below = 2.0 - (pose[1, 3] - planes.origin[1])
+    assert voted[0] == pytest.approx(1.06 * below + planes.bin)
+    assert voted[1] == planes.vertical_bounds(pose)[1]
 
 
 def test_planes_between_two_cameras_are_separating():

@@ -159,9 +159,10 @@ def test_only_a_single_view_is_filled_where_it_is_masked(small, views):
 
 
 def test_moving_the_world_moves_the_gaussians(make_room):
-    """Places and shift are multiples of 1/8, so that float64 holds the cameras' relative positions without rounding."""
-    room, shift = make_room(), torch.tensor((8.0, -4.0, 2.0), dtype=torch.float64)
-    images, poses = _tensors(room.observe(64, [room.pose((-0.375, 0.0, -0.25)), room.pose((0.5, 0.125, 0.125))]))
+    """Places and shift are multiples of 2^-24, which float64 subtracts without rounding, and float32 does not."""
+    room, shift, fine = make_room(), torch.tensor((8.0, -4.0, 2.0), dtype=torch.float64), 2.0**-24
+    places = (3 * fine - 0.375, fine, -0.25), (0.5 - 5 * fine, 0.125, 0.125 + 7 * fine)
+    images, poses = _tensors(room.observe(64, [room.pose(place) for place in places]))
     shifted = poses.clone()
     shifted[:, :3, 3] += shift
     there, back = (Sweep()(images, cam2world, 0.5, 8.0) for cam2world in (poses, shifted))

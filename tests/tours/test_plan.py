@@ -16,7 +16,7 @@ from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
 from pansplat.export.cleanup import crop_to_rooms
-from pansplat.export.plan_files import describe_plan, write_picture, write_plan
+from pansplat.export.plan_files import _Drawing, describe_plan, write_picture, write_plan
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
@@ -275,6 +275,36 @@ def test_lengths_are_in_the_unit_of_the_poses(tmp_path: Path, unit: float, wall:
     assert _area([point[:2] for point in outline]) == pytest.approx(15.6 * unit**2, rel=0.02)
     texts = ezdxf.readfile(dxf).modelspace().query("TEXT[layer=='LENGTHS']")
     assert {entity.dxf.height for entity in texts} == {0.13 * unit} and wall in {entity.dxf.text for entity in texts}
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 90, 200])
+def test_the_longest_wall_is_horizontal_and_lengths_are_read_from_below_or_the_right(degrees: float) -> None:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    corners = [(c * x - s * z, s * x + c * z) for x, z in ((0, 0), (5, 0), (5, 3), (0, 3))]
+    plan = _plan(_make_house(_walls_around(corners), [(c * 2 - s * 1.5, s * 2 + c * 1.5)]))
+    drawing = _Drawing(plan)
+    sides = np.diff(drawing.outline(plan.rooms[0]), axis=0)
+    longest = sides[np.linalg.norm(sides, axis=1).argmax()]
+    assert abs(longest[1]) < 0.02 * abs(longest[0])
+    lengths = {text.text: text.angle for text in drawing.list_texts() if text.layer == "LENGTHS"}
+    assert all(min(abs(angle), abs(angle - 90)) < 2 for angle in lengths.values()), lengths
+
+
+def test_a_room_that_is_not_placed_is_upright_beside_the_others_and_no_camera_hides_a_name() -> None:
+    plan = _plan(_make_house(WALLS, CAMERAS, names=("living room", "living room", "the hall of the house")))
+    c, s = math.cos(0.3), math.sin(0.3)
+    hall = plan.rooms[1].outline @ np.array(((c, s), (-s, c)))  # it would cover a part of the other room
+    lost = dataclasses.replace(plan.rooms[1], outline=hall, is_placed=False)
+    tour = dataclasses.replace(plan.tour, overlaps={(0, 1): 0.5, (2, 2): 1.0})
+    drawing = _Drawing(dataclasses.replace(plan, tour=tour, rooms=(plan.rooms[0], lost), doors=()))
+    living, hall = (drawing.outline(room) for room in drawing.plan.rooms)
+    assert hall.min(axis=0)[0] > living.max(axis=0)[0] + 1 and (np.array(drawing.size) > hall.max(axis=0)).all()
+    sides = np.diff(hall, axis=0)
+    assert np.abs(sides).min(axis=1) == pytest.approx(0, abs=1e-9)
+    assert "dashed: rooms whose places are not known" in drawing.notes
+    for text in drawing.list_texts():
+        away = np.abs(drawing.panoramas - text.place)
+        assert text.layer != "ROOMS" or (away > (0.3 * len(text.text) * text.size, 0.5 * text.size)).any(axis=1).all()
 
 
 def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:
