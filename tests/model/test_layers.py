@@ -13,6 +13,7 @@ from pansplat.model.layers import (
     choose_border,
     convolve_and_normalize,
     require_rigid,
+    resize,
 )
 
 
@@ -41,6 +42,13 @@ def test_convolve_and_normalize_equals_both_layers(randomize, bias):
     norm.train()
     result = convolve_and_normalize(conv, norm, maps)
     assert torch.allclose(result.mean(dim=(0, 2, 3)), norm.bias, atol=1e-12)
+
+
+def test_resizing_wraps_at_the_seam_in_fixed_mode_only():
+    maps = _noise(1, 2, 8, 16)
+    for compat, wraps in (("fixed", True), ("official", False)):
+        resized, rolled = resize(maps, (16, 32), compat), resize(maps.roll(8, -1), (16, 32), compat)
+        assert torch.allclose(rolled, resized.roll(16, -1), atol=1e-12) == wraps
 
 
 def _softmax_attention(queries, keys, values, mask):
