@@ -1,10 +1,8 @@
 """Notes about the input belong to the thread that issues them; filters of warnings belong to commands."""
 
-import re
 import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +11,6 @@ from PIL import Image
 from pansplat.errors import InputWarning, collect_notes
 from pansplat.images.image_files import read_size
 from pansplat.system.threads import worker_threads
-
-ROOT = Path(__file__).resolve().parents[1]
-OWNERS = {
-    "console.py": {"own_warnings", "print_once"},
-    "batch.py": {"dask_setup"},
-    "image_files.py": {""},  # once, at import
-}
 
 
 def warn(text: str) -> None:
@@ -78,16 +69,3 @@ def test_pictures_that_two_threads_read_leave_the_filters_of_warnings(tmp_path, 
         first_is_done.set()
         assert second.result() == (8, 4)
     assert list(warnings.filters) == before
-
-
-def test_only_imports_and_the_frames_of_processes_change_filters_of_warnings() -> None:
-    changed = []
-    for source in (*(ROOT / "pansplat").rglob("*.py"), *(ROOT / "viewer").rglob("*.py")):
-        function = ""
-        for number, line in enumerate(source.read_text("utf-8").splitlines(), 1):
-            found = re.match(r" *(?:def|class) (\w+)", line)
-            function = found[1] if found else function
-            changes = re.search(r"\b(catch_warnings|simplefilter|filterwarnings|showwarning)\b", line)
-            if changes and function not in OWNERS.get(source.name, ()):
-                changed.append(f"{source.relative_to(ROOT)}:{number}: {line.strip()}")
-    assert not changed, "\n".join(changed)

@@ -63,30 +63,6 @@ def test_a_scene_is_the_page_in_a_frame_with_a_picture_and_the_size(scene: Scene
     assert bundle["text/plain"] == repr(scene)
 
 
-def test_similar_gaussians_of_a_large_scene_are_merged_without_a_fit(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("a fit takes up to a minute")
-
-    monkeypatch.setattr("pansplat.export.page._merge", refuse)
-    bundle = notebook._bundle_scene(scene, 100)
-    assert "100 of 400 Gaussians" in bundle["text/html"] and "100 Gaussians." in open_page(bundle)
-
-
-def test_of_a_scene_without_cameras_or_of_very_many_gaussians_a_choice_of_wider_ones_remains(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    foreign = dataclasses.replace(scene, cam2world=scene.cam2world[:0], names=())
-    fewer = notebook._reduce(foreign, 100).gaussians
-    assert len(fewer) == 100 and torch.allclose(fewer.scales, torch.tensor(0.2))
-    assert "100 Gaussians." in open_page(notebook._bundle_scene(foreign, 100))
-    merged: list[Scene] = []
-    monkeypatch.setattr("pansplat.refinement.budget.merge_to", lambda scene, *_: merged.append(scene) or scene)
-    notebook._reduce(scene, 10)
-    assert len(merged[0].gaussians) == 80
-
-
 def test_an_empty_scene_is_text(scene: Scene) -> None:
     bundle = display(dataclasses.replace(scene, gaussians=empty_gaussians()))
     assert set(bundle) == {"text/plain"} and "no visible Gaussians" in bundle["text/plain"]
@@ -186,15 +162,6 @@ def test_calls_show_one_bar_in_a_notebook_and_remove_it(
     assert any("placing Gaussians" in str(state) and "50 %" in str(state) for state in cell.states)
     assert cell.states[-1] == "" and len([state for state in cell.states if state == ""]) == 1
     assert not console._has_bar
-
-
-def test_a_bar_is_not_shown_with_another_progress_or_without_a_notebook(
-    cell: Output, sphere_predictor: type, pair_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pansplat.predict(pair_folder, sphere_predictor(), cache=False, height=64, progress=lambda what, done: None)
-    monkeypatch.setattr("IPython.get_ipython", lambda: None)
-    pansplat.predict(pair_folder, sphere_predictor(), cache=False, height=64)
-    assert cell.states == []
 
 
 def test_an_error_removes_the_bar(cell: Output, tmp_path: Path) -> None:

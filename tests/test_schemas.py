@@ -16,7 +16,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import torch
@@ -281,19 +280,3 @@ def test_a_number_of_a_command_is_in_its_range_or_the_message_names_the_option(k
             except InputError as error:
                 assert str(error).startswith(option)
         object.__setattr__(holder, name, default)
-
-
-def test_types_say_what_they_need() -> None:
-    class Inner(msgspec.Struct, forbid_unknown_fields=True):
-        sides: list[float] = []
-
-    from pansplat.system.strict_json import convert
-
-    for value, message in (
-        ({"sides": [1, "x"]}, "f.json, sides[1]: needed a number, got 'x'; correct it."),
-        ({"sides": 3}, "f.json, sides: needed a list, got 3; correct it."),
-        ({"angle": 3}, "f.json: needed only known fields, got 'angle'; correct it."),
-    ):
-        with pytest.raises(InputError) as refused:
-            convert(value, Inner, "f.json")
-        assert str(refused.value) == message

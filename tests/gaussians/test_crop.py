@@ -58,17 +58,6 @@ def test_a_panorama_without_neighbours_has_an_edge_to_itself() -> None:
     assert part.overlaps == ((0, 0, 1.0), (1, 1, 1.0)) and part.links == ()
 
 
-def test_a_crop_around_everything_changes_nothing(make_scene: Callable[..., Scene]) -> None:
-    scene = make_scene()
-    cropped = crop(scene, (-1e5, -1e5, -1e5, 1e5, 1e5, 1e5))
-    assert torch.equal(cropped.gaussians.means, scene.gaussians.means)
-    assert torch.equal(cropped.gaussians.views, scene.gaussians.views) and torch.equal(
-        cropped.cam2world, scene.cam2world
-    )
-    for name in ("names", "gains", "overlaps", "links", "starts"):
-        assert getattr(cropped, name) == getattr(scene, name)
-
-
 def test_a_scene_without_cameras_is_cropped(make_scene: Callable[..., Scene]) -> None:
     scene = make_scene()
     foreign = replace(scene, cam2world=scene.cam2world[:0], names=(), gains=(), overlaps=(), links=(), starts=())

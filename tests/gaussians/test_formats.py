@@ -6,6 +6,7 @@ import dataclasses
 import gzip
 import io
 import json
+import re
 import struct
 import zipfile
 from pathlib import Path
@@ -173,17 +174,37 @@ def test_unknown_suffixes_are_refused_with_the_known_ones(tmp_path: Path, make_s
             call()
 
 
-@pytest.mark.parametrize("suffix", CODED)
-def test_damaged_files_are_refused(tmp_path: Path, suffix: str, make_scene) -> None:
+@pytest.mark.parametrize("suffix", SCENE_SUFFIXES)
+def test_damaged_files_are_refused_with_their_name(tmp_path: Path, suffix: str, make_scene) -> None:
     path = tmp_path / f"a{suffix}"
     save_scene(make_scene(degree=0), path)
     content = path.read_bytes()
-    for damaged in (b"", content[: len(content) // 2 + 1], content[:3] + bytes(len(content) - 3)):
-        if suffix == ".splat" and damaged == content[:3] + bytes(len(content) - 3):
-            continue  # zeros are Gaussians
+    damages = [content[:length] for length in (0, 3, len(content) // 2 + 1, len(content) - 1)]
+    damages += [content[:3] + bytes(len(content) - 3)] * (suffix != ".splat")  # of which zeros are Gaussians
+    for damaged in damages:
         path.write_bytes(damaged)
-        with pytest.raises(InputError, match=r": needed a (complete )?\.(spz|splat|sog|compressed\.ply) scene"):
+        with pytest.raises(InputError, match=rf"a{re.escape(suffix)}.*(needed a|truncated|not a)"):
             load_scene(path)
+
+
+HEADER = "ply\nformat binary_little_endian 1.0\nelement "
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("ply\nformat ascii 1.0\nelement vertex 0", "'ascii' is not read"),
+        (HEADER + "vertex 1\nproperty quad x", "cannot understand"),
+        (HEADER + "face 0\nproperty list uchar int vertex_indices", "list property"),
+        (HEADER + "face 0", "no `vertex`"),
+        (HEADER + "vertex 0\nproperty float x\nproperty float y", "lack z, f_dc_0"),
+        (HEADER + "vertex 0\nproperty float f_rest_0", "1 f_rest properties fit no SH degree"),
+    ],
+)
+def test_ply_files_of_other_content_are_refused(tmp_path: Path, header: str, message: str) -> None:
+    (tmp_path / "a.ply").write_bytes(f"{header}\nend_header\n".encode())
+    with pytest.raises(InputError, match=rf"a\.ply.*{message}"):
+        load_scene(tmp_path / "a.ply")
 
 
 def test_an_spz_of_more_gaussians_than_its_bytes_can_hold_is_not_decoded(

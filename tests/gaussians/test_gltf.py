@@ -120,20 +120,14 @@ def test_quantised_and_interleaved_attributes_are_read(file: Path) -> None:
 
 
 REFUSED: dict[str, tuple[Edit, str]] = {
-    "no Gaussians": (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "holds no Gaussians"),
     "required extension": (lambda d: d.update(extensionsRequired=["EXT_meshopt"]), "the extension EXT_meshopt"),
     "compressed": (
         lambda d: d["meshes"][0]["primitives"][0]["extensions"][NAME].update(extensions={"spz": {}}),
         "compressed by an extension",
     ),
-    "another file": (lambda d: d["buffers"][0].update(uri="a.bin"), "inside the .glb"),
     "a cycle": (lambda d: d.update(nodes=[{"children": [0]}]), "or a cycle"),
     "squeezed": (lambda d: d["nodes"][0].update(scale=[1, 1, 2]), "scale all axes alike"),
     "mirrored": (lambda d: d["nodes"][0].update(scale=[1, 1, -1]), "scale all axes alike"),
-    "short view": (lambda d: d["bufferViews"][2].update(byteLength=8), "is truncated"),
-    "far view": (lambda d: d["bufferViews"][2].update(byteOffset=10**9), "is truncated"),
-    "no accessor": (lambda d: d["meshes"][0]["primitives"][0]["attributes"].update(POSITION=99), "accessors, got 99"),
-    "other type": (lambda d: d["accessors"][0].update(type="VEC4"), "plain VEC3"),
     "fewer scales": (lambda d: d["accessors"][3].update(count=2), "attributes of one length"),
     "no rotation": (
         lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:ROTATION"),
@@ -148,14 +142,6 @@ def test_unusable_files_are_refused(file: Path, fault: str) -> None:
     edit(file, change)
     with pytest.raises(InputError, match=message):
         load_glb(file)
-
-
-def test_truncated_files_are_refused(file: Path) -> None:
-    data = file.read_bytes()
-    for length in (0, 3, 19, 40, len(data) - 1):
-        file.write_bytes(data[:length])
-        with pytest.raises(InputError, match=r"a\.glb"):
-            load_glb(file)
 
 
 def test_a_scene_above_4_gib_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene) -> None:

@@ -38,13 +38,6 @@ def test_wrong_shapes_are_refused_with_the_name(unchecked):
         Gaussians(**{**fields, "harmonics": torch.zeros(3, 5, 3)})
 
 
-def test_selecting_applies_to_every_field():
-    gaussians = _make(10)
-    chosen = gaussians.select(gaussians.levels == 2)
-    assert len(chosen) == 2 and torch.equal(chosen.means, gaussians.means[[2, 6]])
-    assert torch.equal(chosen.views, gaussians.views[[2, 6]])
-
-
 def test_joining_appends_sets_of_one_degree():
     a, b = _make(3), _make(4, seed=1)
     joined = Gaussians.cat([a, b])
@@ -53,11 +46,6 @@ def test_joining_appends_sets_of_one_degree():
         Gaussians.cat([a, _make(2, 1)])
     with pytest.raises(ValueError, match="at least one"):
         Gaussians.cat([])
-
-
-def test_changing_the_type_keeps_integer_labels():
-    gaussians = _make(3).to(dtype=torch.float64)
-    assert gaussians.means.dtype == torch.float64 and gaussians.levels.dtype == torch.int64
 
 
 @pytest.fixture

@@ -6,9 +6,7 @@ import torch
 from pansplat.geometry.cubemap import (
     FACES,
     equirect_from_strip,
-    face_poses,
     face_rotations,
-    strip_directions,
     strip_from_equirect,
     strip_lookup,
 )
@@ -24,18 +22,6 @@ def test_faces_look_along_their_names():
     for name, rotation in zip(FACES, rotations, strict=True):
         assert rotation[:, 2].tolist() == list(forward[name])
     assert torch.equal(torch.linalg.det(rotations), torch.ones(6, dtype=torch.float64))
-
-
-def test_side_faces_stand_upright():
-    assert (face_rotations()[:4, :, 1] == torch.tensor((0.0, 1, 0))).all()
-
-
-def test_face_poses_share_the_panoramas_centre():
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = torch.tensor((1.0, 2, 3))
-    poses = face_poses(pose)
-    assert (poses[:, :3, 3] == pose[:3, 3]).all() and (poses[:, 3] == pose[3]).all()
-    assert torch.equal(poses[:, :3, :3], face_rotations())
 
 
 def test_face_rotations_equal_the_official_ones(golden):
@@ -54,15 +40,6 @@ def test_the_lookup_equals_the_one_in_checkpoints(scale, recipe_weights):
     stored = recipe_weights[f"mono_depth.c2e.{scale}.sample_grid"][0, 0].double()
     x, y, face = strip_lookup(512 >> scale).unbind(-1)
     assert (torch.stack((x, y, face / 2.5 - 1), dim=-1) - stored).abs().max() < 2e-6
-
-
-def test_adjacent_faces_share_their_edge():
-    rays = strip_directions(5)
-    for right in range(4):
-        left = (right - 1) % 4
-        assert torch.equal(rays[:, 5 * left + 4], rays[:, 5 * right])
-    assert torch.equal(rays[4, 20:25], rays[0, 0:5])  # the lower edge of up is the upper edge of front
-    assert torch.equal(rays[0, 25:30], rays[4, 0:5])  # the upper edge of down is the lower edge of front
 
 
 def test_a_panorama_is_restored_from_its_strip():

@@ -91,21 +91,10 @@ def test_wrapped_columns_have_zeros_beyond_the_poles():
     assert float(padded.sum()) == 8 and float(padded[..., 1:-1, 1:-1].sum()) == 8
 
 
-@pytest.mark.parametrize("border", ["sphere", "wrapped_columns"])
-def test_padding_keeps_channels_last(border):
-    maps = _noise(2, 4, 6, 12).contiguous(memory_format=torch.channels_last)
-    assert pad_equirect(maps, 1, border).is_contiguous(memory_format=torch.channels_last)
-
-
 @pytest.mark.parametrize(("border", "shape"), [("sphere", (4, 8)), ("wrapped_columns", (9, 4))])
 def test_a_margin_larger_than_the_map_is_refused(border, shape):
     with pytest.raises(ValueError, match=r"at least as large as the margin of 5, got \dx\d"):
         pad_equirect(torch.zeros(1, 1, *shape), 5, border)
-
-
-def test_an_odd_width_is_refused():
-    with pytest.raises(ValueError, match="even width"):
-        pad_equirect(torch.zeros(1, 1, 4, 7), 1, "sphere")
 
 
 @pytest.mark.parametrize("height", [16, 12, 8, 6, 4, 2, 5])
@@ -120,8 +109,3 @@ def test_padding_and_resizing_pass_gradcheck():
     assert torch.autograd.gradcheck(lambda x: pad_equirect(x, 2, "sphere"), maps)
     assert torch.autograd.gradcheck(lambda x: pad_equirect(x, 2, "wrapped_columns"), maps)
     assert torch.autograd.gradcheck(lambda x: resize_equirect(x, (6, 12)), maps)
-
-
-def test_another_aspect_ratio_is_refused():
-    with pytest.raises(ValueError, match="must keep the aspect ratio of 4x8, got 4x4"):
-        resize_equirect(torch.zeros(1, 1, 4, 8), (4, 4))

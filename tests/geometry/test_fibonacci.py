@@ -24,13 +24,6 @@ def test_points_are_unit_vectors_from_pole_to_pole(count):
         assert points[-1].tolist() == [0, -1, 0]
 
 
-def test_adjacent_points_differ_by_the_golden_angle():
-    points = fibonacci_directions(5340353)[-4000:-1000]
-    angle = torch.atan2(points[:, 2], points[:, 0])
-    step = (angle[1:] - angle[:-1]).remainder(2 * math.pi)
-    assert float((step - math.pi * (3 - math.sqrt(5))).abs().max()) < 1e-8
-
-
 def test_an_empty_lattice_is_refused():
     with pytest.raises(ValueError, match="at least 1"):
         fibonacci_directions(0)

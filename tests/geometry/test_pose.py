@@ -36,10 +36,6 @@ def test_rotations_are_orthonormal_and_do_not_depend_on_the_quaternions_length_a
     assert torch.allclose(rotations_from_quats(-2 * q), rotations, atol=1e-12)
 
 
-def test_the_zero_quaternion_is_the_identity():
-    assert torch.equal(rotations_from_quats(torch.zeros(4)), torch.eye(3))
-
-
 def test_rotations_are_converted_back_to_their_quaternions():
     q = torch.nn.functional.normalize(_quats(200), dim=1)
     half_turns = torch.eye(4, dtype=torch.float64)[1:]

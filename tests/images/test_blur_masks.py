@@ -250,10 +250,8 @@ NEAR_LEFT = r"did you mean (\S*/)?left_"
             "lefd_Blur.PNG",
             rf"lefd_Blur\.PNG: needed the name of a panorama before _blur.* got 'lefd_\S*' \({NEAR_LEFT}blur",
         ),
-        ("lefd_blur.jpg", rf"lefd_blur\.jpg: needed the name of a panorama .* got 'lefd_\S*' \({NEAR_LEFT}blur\.png"),
         ("left_blur.jpg", r"needed the name .* got 'left_blur\.jpg' \(did you mean left_blur\.png\?\)"),
         ("lefd_mask.png", rf"lefd_mask\.png: needed the name of a panorama .* got 'lefd_\S*' \({NEAR_LEFT}mask\.png"),
-        ("left.png_mask.png", rf"needed the name of a panorama .* got 'left\.png_mask\.png' \({NEAR_LEFT}mask\.png"),
         (
             "left_Mask.JPG",
             r"left_Mask\.JPG: needed the name .* got 'left_Mask\.JPG' \(did you mean left_mask\.png\?\); rename, conv",
@@ -262,12 +260,10 @@ NEAR_LEFT = r"did you mean (\S*/)?left_"
             "mask.jpg",
             r"mask\.jpg: needed the name of a panorama before _mask\.png, got 'mask\.jpg'; rename, convert or",
         ),
-        ("blur.png", r"/blur\.png: needed the name of a panorama before _blur"),
         (
             "masks/left_blur.png",
             rf"masks/left_blur\.png: needed the name .* got 'left_blur\.png' \({NEAR_LEFT}blur\.png",
         ),
-        ("deep/er/lefd_mask.png", r"deep/er/lefd_mask\.png: needed the name of a panorama"),
         ("left_Blur.png", r"left\.png: needed one mask _blur, got left_Blur\.png, left_blur\.png; keep the right one"),
     ],
 )
@@ -447,23 +443,10 @@ def test_a_mask_of_a_picture_hides_it_in_its_panorama(
         assert (image - before)[:, inside].abs().mean() > 0.1
     for first, second in zip(*reads, strict=True):
         assert torch.equal(first, second), "what is hidden has no influence"
-
-
-@pytest.mark.filterwarnings("ignore:.*in no picture")
-@pytest.mark.parametrize("kind", ASSEMBLED)
-def test_a_scene_mask_of_a_picture_masks_its_panorama(
-    tmp_path: Path, kind: str, color_face: Callable[[str, int], np.ndarray]
-) -> None:
-    write, name = ASSEMBLED[kind]
-    folder = write(tmp_path / "a", color_face, 1)
-    before = load_pairs(folder)[0].load_context(64).masks[0]
+    before = load_pairs(folder)[0].load_context(height).masks[0]
     _draw_mask(folder / re.sub("blur", "mask", name, flags=re.IGNORECASE), _cover(kind), kind="mask")
-    after = load_pairs(folder)[0].load_context(64).masks[0]
-    rays = pixel_directions(64, 128)
-    x, y = ((rays[..., axis] / rays[..., 2] + 1) * SIDE / 2 for axis in (0, 1))
-    covered = (rays[..., 2] > 0) & (x > 15) & (x < 33) & (y > 17) & (y < 35)
-    far = (rays[..., 2] < 0) | (x < 12) | (x > 36) | (y < 14) | (y > 38)
-    assert not after[covered].any() and torch.equal(after[far], before[far]) and before[covered].all()
+    after = load_pairs(folder)[0].load_context(height).masks[0]
+    assert before[inside].all() and not after[inside].any() and torch.equal(after[far], before[far])
 
 
 def test_a_mask_of_a_tile_hides_it_at_all_levels(tmp_path: Path, write_tiles: Callable) -> None:
@@ -488,14 +471,6 @@ def test_a_mask_of_a_tile_hides_it_at_all_levels(tmp_path: Path, write_tiles: Ca
             "hall_f_blur.png",
             (64, 32),
             r"hall_f_blur\.png: needed a mask of the proportions .* 48x48, got 64x32",
-        ),
-        ("strip", "hall_blur.png", (64, 64), r"hall_blur\.png: needed a mask of the proportions .* 288x48, got 64x64"),
-        ("faces", "hall_blur.png", (64, 64), r"hall_blur\.png: needed a mask of the proportions .* 192x96, got 64x64"),
-        (
-            "faces",
-            "hall_g_blur.png",
-            (48, 48),
-            r"hall_g_blur\.png: needed the name .* \(did you mean hall_[frblud]_blur",
         ),
         ("colmap", "images/0000_a_blur.png", (64, 32), r"0000_a_blur.png: needed .*did you mean \S*/set/0000_a_blur"),
         ("nerfstudio", "images/0000_a_frond_blur.png", (48, 48), r"frond_blur.* \(did you mean 0000_a_front_blur"),

@@ -106,47 +106,11 @@ def test_depth_is_in_metres_and_not_interpolated(tmp_path: Path) -> None:
         read_depth(tmp_path / "depth.png", 16)
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".exr"])
-def test_truncated_data_is_refused(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    write_image(path, torch.rand(3, 64, 128, generator=torch.Generator().manual_seed(0)))
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) * 6 // 10])
-    with pytest.raises(InputError, match="damaged or truncated"):
-        read_panorama(path, 64)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "needed an image, got a file of 0 bytes"),
-        (b"GIF89a" + bytes(100), "unknown format"),
-        (b"plain text", "unknown format"),
-        (bytes(50), "unknown format"),
-    ],
-)
-def test_files_that_are_no_images_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
-    (tmp_path / "a.png").write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        read_panorama(tmp_path / "a.png", 16)
-    with pytest.raises(InputError, match=r"gone\.png: needed a readable image file"):
-        read_panorama(tmp_path / "gone.png", 8)
-
-
-def test_images_of_another_shape_or_content_are_refused(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.png", torch.zeros(3, 16, 24))
-    with pytest.raises(InputError, match=r"a\.png: needed a 2:1 equirectangular panorama, got 24x16"):
-        read_panorama(tmp_path / "a.png", 16)
-    pixels = np.zeros((8, 16, 3), np.float32)
-    pixels[2, 3:5, 1] = np.nan, np.inf
-    for channels, message in (
-        ({"RGB": pixels}, r"a\.exr: .*got 2 NaN or infinite"),
-        ({"beauty.R": pixels[..., 0]}, "needed the channels R, G and B"),
-    ):
-        with OpenEXR.File({"type": OpenEXR.scanlineimage}, channels) as file:
-            file.write(str(tmp_path / "a.exr"))
-        with pytest.raises(InputError, match=message):
-            read_panorama(tmp_path / "a.exr", 8)
+def test_an_exr_without_colours_is_refused(tmp_path: Path) -> None:
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"beauty.R": np.zeros((8, 16), np.float32)}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match=r"a\.exr: needed the channels R, G and B"):
+        read_panorama(tmp_path / "a.exr", 8)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.exr"])
@@ -185,20 +149,6 @@ def test_the_size_of_an_image_is_read_without_its_pixels(tmp_path: Path, monkeyp
     monkeypatch.setattr("pansplat.images.image_files._exr_channels", None)
     assert [read_size(tmp_path / f"a{suffix}") for suffix in (".png", ".jpg", ".webp", ".exr")] == [(30, 20)] * 4
     assert read_size(tmp_path / "turned.jpg") == (20, 30)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "got a file of 0 bytes"),
-        (b"hello" * 9, "got an unknown format"),
-        (b"\x76\x2f\x31\x01", "a damaged header"),
-    ],
-)
-def test_the_size_of_a_damaged_image_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
-    (tmp_path / "a.png").write_bytes(content)
-    with pytest.raises(InputError, match=rf"a\.png: needed .* {message}"):
-        read_size(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize(("rows", "is_refused"), [(9459, False), (9460, True)])

@@ -21,7 +21,6 @@ from pansplat.model.network import (
     NetworkPredictor,
     build_empty_network,
     build_network,
-    choose_tiles,
     convert_checkpoint,
     load_predictor,
     remove_masked_gaussians,
@@ -114,10 +113,6 @@ def test_predictions_carry_no_gradient(predictor, prediction):
     assert torch.is_grad_enabled()
 
 
-def test_tiles_follow_the_height():
-    assert [choose_tiles(height) for height in (256, 512, 1024, 2048)] == [1, 1, 2, 4]
-
-
 def test_the_fingerprint_depends_on_weights_settings_and_compatibility(small_config):
     other = dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, residual=False))
     predictors = (
@@ -144,15 +139,17 @@ def refuse(small_config, unchecked):
     return check
 
 
-def test_wrong_shapes_are_refused(refuse):
+def test_wrong_shapes_and_values_are_refused(refuse):
     images, poses = _inputs()
     refuse(r"must be \(view, 3, height, 2 \* height\), got \(2, 3, 64, 64\)", images[..., :64], poses)
     refuse(r"`cam2world` must be \(2, 4, 4\) to fit the images, got \(1, 4, 4\)", images, poses[:1])
     refuse(r"`masks` must be \(2, 64, 128\)", images, poses, masks=torch.ones(2, 32, 64, dtype=torch.bool))
-
-
-def test_low_panoramas_are_refused(refuse):
     refuse("at least 64 pixels high", *_inputs(32))
+    refuse("must be finite, got NaN", images.index_fill(-1, torch.tensor(3), float("nan")), poses)
+    for near, far in ((3.0, 2.0), (0.0, 20.0)):
+        refuse("0 < near < far", images, poses, near=near, far=far)
+    refuse("bring them to a world of metres", images, poses, near=500.0, far=9000.0)
+    refuse("one number, or one number per view", images, poses, near=torch.ones(3))
 
 
 @pytest.mark.parametrize(("height", "compat"), [(67, "fixed"), (70, "official")])
@@ -162,15 +159,6 @@ def test_any_height_is_predicted_from(small_config, height: int, compat: Literal
     gaussians = _predictor(small_config, compat)(images, poses, 0.5, 20.0, masks=masks)
     assert isinstance(gaussians, Gaussians) and len(gaussians) > 0
     assert gaussians.means.isfinite().all()
-
-
-def test_wrong_values_are_refused(refuse):
-    images, poses = _inputs()
-    refuse("must be finite, got NaN", images.index_fill(-1, torch.tensor(3), float("nan")), poses)
-    refuse("0 < near < far", images, poses, near=3.0, far=2.0)
-    refuse("0 < near < far", images, poses, near=0.0)
-    refuse("bring them to a world of metres", images, poses, near=500.0, far=9000.0)
-    refuse("one number, or one number per view", images, poses, near=torch.ones(3))
 
 
 # Loading
@@ -232,14 +220,6 @@ def test_a_checkpoint_and_its_converted_file_load_equally(
     first, second = load_model(tmp_path / "original.ckpt"), load_model(tmp_path / "converted.safetensors")
     assert _network_of(first).compat == _network_of(second).compat == "official"
     assert first.fingerprint == second.fingerprint
-
-
-def test_a_packed_config_is_restored(tmp_path: Path) -> None:
-    config = PanSplatConfig()
-    heads = dataclasses.replace(config.heads, lattice="pixel", residual=False)
-    config = dataclasses.replace(config, heads=heads)
-    network = build_empty_network(pack_weights("pansplat", config, {}, compat="fixed"), "fixed", "x")
-    assert isinstance(network, PanSplat) and network.config == config
 
 
 def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> None:

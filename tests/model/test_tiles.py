@@ -6,43 +6,17 @@ import pytest
 import torch
 from torch.nn import functional
 
-from pansplat.geometry.equirect import pad_equirect, sample_equirect
 from pansplat.geometry.fibonacci import lattice_size
-from pansplat.model.layers import resize
 from pansplat.model.tiles import (
-    Margins,
-    Tile,
-    Window,
     crop_window,
     make_lattice_uv,
     make_tiles,
     move_points,
-    sample_panorama,
 )
 
 
 def _random(*shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-
-@pytest.mark.parametrize("lattice", ["fibonacci", "pixel"])
-@pytest.mark.parametrize("grid", [1, 2, 4])
-def test_each_point_belongs_to_exactly_one_tile(lattice, grid):
-    for exact in (True, False):
-        uv = make_lattice_uv(lattice, 64, exact=exact)
-        held = torch.stack([tile.contains(uv) for tile in make_tiles(grid)])
-        assert bool((held.sum(dim=0) == 1).all())
-        assert int(held.sum(dim=1).min()) > 0
-
-
-@pytest.mark.parametrize("height", [8, 32, 128])
-def test_a_fixed_window_is_a_crop_of_the_resized_and_padded_map(height):
-    source = _random(3, 32, 64)
-    whole = pad_equirect(resize(source[None], (height, 2 * height), "fixed")[0], 7)
-    for tile in make_tiles(2):
-        window = tile.window(height).expand(7)
-        expected = whole[:, window.top + 7 :, window.left + 7 :][:, : window.height, : window.width]
-        assert torch.allclose(crop_window(source, height, window, "fixed"), expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("height", [8, 32, 128])
@@ -54,42 +28,6 @@ def test_an_official_window_wraps_columns_and_has_zero_rows(height):
         window = tile.window(height).expand(3)
         expected = whole[:, window.top + 3 :, window.left + 3 :][:, : window.height, : window.width]
         assert torch.allclose(crop_window(source, height, window, "official"), expected, atol=1e-14)
-
-
-def test_panorama_samples_wrap_if_fixed_and_repeat_the_border_if_official():
-    source, uv = _random(5, 8, 16), make_lattice_uv("fibonacci", 32)
-    assert torch.allclose(sample_panorama(source, uv, "fixed"), sample_equirect(source, uv).T, atol=1e-14)
-    grid = (2 * uv - 1)[None, None]
-    border = functional.grid_sample(source[None], grid, padding_mode="border", align_corners=False)[0, :, 0].T
-    assert torch.allclose(sample_panorama(source, uv, "official"), border, atol=1e-14)
-
-
-def test_margins_let_the_next_level_be_read_with_the_same_margin():
-    margins = Margins.of(3, "fixed", chained=True)
-    assert margins.input - margins.output == 3  # one pixel for each convolution
-    # The outermost pixel that the next level reads lies between two pixels of this one; both must be in the output.
-    farthest = (-margins.input + 0.5) / 2 - 0.5
-    assert -margins.output <= farthest - 0.25
-    assert (-(margins.input - 1) + 0.5) / 2 - 0.5 - 0.25 <= -margins.output + 1  # a smaller margin does not suffice
-    assert Margins.of(3, "official", chained=True) == Margins(3, 3)
-
-
-def test_a_tile_grid_is_in_row_major_order():
-    assert make_tiles(2) == [Tile(0, 0, 2), Tile(0, 1, 2), Tile(1, 0, 2), Tile(1, 1, 2)]
-    assert Tile(1, 0, 2).window(8) == Window(4, 0, 4, 8)
-    assert Window(4, 0, 4, 8).expand(2) == Window(2, -2, 8, 12)
-
-
-def test_pixel_lattice_has_the_pixel_centres_in_row_major_order():
-    uv = make_lattice_uv("pixel", 4)
-    assert uv.shape == (32, 2)
-    assert uv[0].tolist() == [0.5 / 8, 0.5 / 4] and uv[9].tolist() == [1.5 / 8, 1.5 / 4]
-
-
-@pytest.mark.parametrize("lattice", ["fibonacci", "pixel"])
-def test_zero_offset_does_not_move_points(lattice):
-    uv = make_lattice_uv(lattice, 16)
-    assert torch.equal(move_points(uv, torch.zeros_like(uv), lattice, 16), uv)
 
 
 def test_points_move_at_most_half_a_pixel_of_their_latitude():

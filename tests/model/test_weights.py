@@ -13,17 +13,13 @@ import torch
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.model.mvsplat import MVSplat
-from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import (
-    ModelName,
     UnsafeCheckpointError,
     WeightsFile,
     config_from_dict,
     convert_tensors,
     get_state_dict,
     load_weights,
-    map_official_names,
     match_tensors,
     read_checkpoint,
     require_shapes,
@@ -79,16 +75,6 @@ def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must end in \.safetensors, got '\.ckpt'"):
         save_weights(tmp_path / "w.ckpt", make_weights())
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("kept", [0, 5, 40, 0.5, 0.99])
-def test_a_truncated_weights_file_is_refused(tmp_path: Path, kept: float) -> None:
-    path = tmp_path / "w.safetensors"
-    save_weights(path, make_weights())
-    content = path.read_bytes()
-    path.write_bytes(content[: kept if isinstance(kept, int) else int(kept * len(content))])
-    with pytest.raises(InputError, match=r"w\.safetensors: needed .* again"):
-        load_weights(path)
 
 
 def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
@@ -156,43 +142,19 @@ def test_code_in_a_pickle_is_refused_and_not_executed(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("zipped", [True, False])
-@pytest.mark.parametrize("kept", [0.1, 0.95])
-def test_a_truncated_checkpoint_is_refused(tmp_path: Path, kept: float, zipped: bool) -> None:
-    path = tmp_path / "short.ckpt"
-    torch.save({"state_dict": {"a": torch.rand(5000)}}, path, _use_new_zipfile_serialization=zipped)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(kept * len(content))])
-    with pytest.raises(InputError, match=r"short\.ckpt: needed a whole PyTorch checkpoint, got a damaged one"):
-        read_checkpoint(path)
-
-
-@pytest.mark.parametrize("content", [b"hello\n" * 50, bytes(3000), bytes(range(256)) * 9])
-def test_a_file_of_other_content_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "wrong.ckpt"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=r"wrong\.ckpt: needed a .*PyTorch checkpoint, got .* again"):
-        read_checkpoint(path)
-
-
-def test_a_web_page_and_a_git_lfs_pointer_are_recognised(tmp_path: Path) -> None:
-    path = tmp_path / "wrong.ckpt"
-    path.write_bytes(b"<!DOCTYPE html><html><body>OneDrive</body></html>")
-    with pytest.raises(InputError, match="it is a web page: download the file itself"):
-        read_checkpoint(path)
-    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
-    with pytest.raises(InputError, match="run `git lfs pull`"):
-        read_checkpoint(path)
-
-
-def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="got no file"):
-        read_checkpoint(tmp_path / "none.ckpt")
-    with pytest.raises(InputError, match="got a folder"):
-        read_checkpoint(tmp_path)
-    (tmp_path / "empty.ckpt").touch()
-    with pytest.raises(InputError, match="got an empty file"):
-        read_checkpoint(tmp_path / "empty.ckpt")
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"<!DOCTYPE html><html><body>OneDrive</body></html>", "it is a web page: download the file itself"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "run `git lfs pull`"),
+        (b"hello\n" * 50, r"wrong\.ckpt: needed a .*PyTorch checkpoint, got .* again"),
+        (b"", "got an empty file"),
+    ],
+)
+def test_what_is_no_checkpoint_is_recognised(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "wrong.ckpt").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_checkpoint(tmp_path / "wrong.ckpt")
 
 
 def test_a_checkpoint_without_tensors_by_name_is_refused(tmp_path: Path) -> None:
@@ -216,37 +178,6 @@ def list_names(shared: Path, keys: str) -> list[str]:
 
 def make_tensors(shared: Path, keys: str) -> dict[str, Tensor]:
     return {name.removeprefix("encoder."): torch.zeros(1) for name in list_names(shared, keys)}
-
-
-@pytest.mark.parametrize(("model", "count", "grids"), [("pansplat", 993, 5), ("mvsplat", 471, 0)])
-def test_every_official_tensor_is_used_or_computed(model: ModelName, count: int, grids: int, shared: Path) -> None:
-    theirs = {name.removeprefix("encoder.") for name in list_names(shared, f"{model}-512")}
-    table = map_official_names(model)
-    assert len(theirs) == count and table.keys() <= theirs
-    assert len(theirs - table.keys()) == grids
-    assert all(name.endswith("sample_grid") for name in theirs - table.keys())
-
-
-@pytest.mark.parametrize("model", ["pansplat", "mvsplat"])
-def test_every_tensor_of_ours_has_one_official_name(model: ModelName) -> None:
-    with torch.device("meta"):
-        network = PanSplat() if model == "pansplat" else MVSplat()
-    names = list(map_official_names(model).values())
-    assert len(set(names)) == len(names)
-    assert set(names) == network.state_dict().keys()
-
-
-def test_converted_tensors_are_the_official_ones(
-    official_weights: WeightsFile, recipe_weights: dict[str, Tensor]
-) -> None:
-    assert torch.equal(
-        official_weights.tensors["heads.levels.3.linear.weight"],
-        recipe_weights["gaussian_head.gaussians_mlp_list.3.0.weight"],
-    )
-    assert torch.equal(
-        official_weights.tensors["cost_volume.levels.1.refine.unet.encoder.2.attention.project_in.weight"],
-        recipe_weights["depth_predictor.corr_refine_nets.2.3.input_blocks.5.1.qkv.weight"][..., 0],
-    )
 
 
 def test_the_report_counts_tensors_that_are_left_out(shared: Path, as_lightning: Wrap) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from pansplat.networks.aliked import Aliked, DeformedConv, _pixel_features, find_keypoints
+from pansplat.networks.aliked import Aliked, _pixel_features, find_keypoints
 
 
 @pytest.fixture(scope="module")
@@ -15,23 +15,6 @@ def network() -> Aliked:
     return network
 
 
-def test_a_deformed_convolution_without_offsets_is_a_convolution() -> None:
-    layer = DeformedConv(3, 4).requires_grad_(False)
-    layer.offset.weight.zero_()
-    layer.offset.bias.zero_()
-    maps = torch.randn(2, 3, 9, 7)
-    torch.testing.assert_close(layer(maps), layer.conv(maps), rtol=0, atol=1e-5)
-
-
-def test_offsets_of_a_whole_pixel_shift_a_deformed_convolution() -> None:
-    layer = DeformedConv(3, 4).requires_grad_(False)
-    layer.offset.weight.zero_()
-    layer.offset.bias.copy_(torch.tensor((1.0, -2.0)).repeat(9))  # y, x of each sample
-    maps = torch.randn(1, 3, 16, 16)
-    expected = layer.conv(torch.roll(maps, (-1, 2), (2, 3)))[..., 3:-3, 3:-3]
-    torch.testing.assert_close(layer(maps)[..., 3:-3, 3:-3], expected, rtol=0, atol=1e-5)
-
-
 def test_features_of_pixels_are_those_of_the_full_map(network: Aliked) -> None:
     levels = network.extract(torch.rand(3, 64, 96))
     maps = [functional.interpolate(level, (64, 96), mode="bilinear", align_corners=True) for level in levels]
@@ -40,15 +23,6 @@ def test_features_of_pixels_are_those_of_the_full_map(network: Aliked) -> None:
     found = _pixel_features(levels, torch.stack((x, y), dim=-1).flatten(0, 1))
     torch.testing.assert_close(found.T.unflatten(1, (64, 96)), full, rtol=0, atol=1e-5)
     assert not _pixel_features(levels, torch.tensor(((-1, 0), (0, 64), (96, 3)))).any()
-
-
-def test_scores_are_those_of_the_full_map(network: Aliked) -> None:
-    levels = network.extract(torch.rand(3, 64, 96))
-    maps = [functional.interpolate(level, (64, 96), mode="bilinear", align_corners=True) for level in levels]
-    full = network.score[0](torch.cat(maps, dim=1))
-    for layer in list(network.score)[1:]:
-        full = layer(functional.selu(full))
-    torch.testing.assert_close(network.score_pixels(levels), torch.sigmoid(full[0, 0]), rtol=0, atol=1e-5)
 
 
 def test_keypoints_are_the_allowed_peaks_below_a_pixel() -> None:
@@ -63,10 +37,3 @@ def test_keypoints_are_the_allowed_peaks_below_a_pixel() -> None:
     points = find_keypoints(scores, allowed, 2)
     torch.testing.assert_close(points, torch.tensor(((10.0, 8.0), (30.25, 20.0))), rtol=0, atol=0.15)
     assert len(find_keypoints(torch.zeros(30, 40), allowed, 5)) == 0
-
-
-def test_descriptors_are_unit_vectors(network: Aliked) -> None:
-    image = torch.rand(3, 64, 96)
-    points, descriptors = network(image, torch.ones(64, 96, dtype=torch.bool), 20)
-    assert points.shape == (20, 2) and descriptors.shape == (20, 128)
-    torch.testing.assert_close(descriptors.norm(dim=1), torch.ones(20))

@@ -19,12 +19,6 @@ def network():
 
 
 @torch.no_grad()
-def test_estimate_has_half_the_size(network):
-    estimate = network(torch.rand(2, 3, 64, 128))
-    assert estimate.log_depth.shape == estimate.log_scale.shape == (2, 32, 64)
-
-
-@torch.no_grad()
 def test_rolling_the_panorama_rolls_the_depth(network):
     image = torch.rand(1, 3, 64, 128)
     depth, rolled = network(image).log_depth, network(image.roll(32, dims=-1)).log_depth

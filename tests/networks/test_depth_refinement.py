@@ -41,21 +41,6 @@ def _room_depth(position, height=32):
 
 
 @torch.no_grad()
-def test_true_depth_lies_on_the_other_views_surface(network):
-    poses = _poses(2)
-    log_depth = torch.stack([_room_depth(pose[:3, 3]).log() for pose in poses]).float()
-    estimate = DepthEstimate(log_depth, torch.zeros_like(log_depth))
-    _, observed = network.observe(torch.rand(2, 3, 64, 128))
-    candidates = log_depth[:, None] + network.candidates[:, None, None]
-    relative = relative_pose(poses[[0, 1]], poses[[1, 0]])
-    views, others = [0, 1], [1, 0]
-    _, agreement = network._compare(observed, estimate, candidates, (-candidates).exp(), relative, views, others)
-    assert agreement[:, _MIDDLE].abs().median() < 0.05
-    assert (agreement[:, 0] < -0.9).float().mean() > 0.9  # in front of the other view's surface
-    assert (agreement[:, -1] > 0.9).float().mean() > 0.9  # behind it
-
-
-@torch.no_grad()
 def test_patches_match_at_the_true_depth(network):
     generator = torch.Generator().manual_seed(3)
     waves = 4 * torch.randn(24, 3, generator=generator, dtype=torch.float64)

@@ -30,22 +30,6 @@ def test_exchanging_the_images_exchanges_the_matches(network: LightGlue) -> None
     assert all(back[b, a] == pytest.approx(score, rel=1e-3) for (a, b), score in there.items())
 
 
-def test_the_order_of_the_keypoints_does_not_matter(network: LightGlue) -> None:
-    first, second = make_keypoints(30, 1), make_keypoints(40, 2)
-    order = torch.randperm(30, generator=torch.Generator().manual_seed(3))
-    there = as_pairs(network(first, second, adaptive=False))
-    shuffled = as_pairs(network((first[0][order], first[1][order]), second, adaptive=False))
-    assert {(int(order[a]), b) for a, b in shuffled} == there.keys()
-
-
-def test_matches_depend_on_relative_positions_only(network: LightGlue) -> None:
-    first, second = make_keypoints(30, 1), make_keypoints(40, 2)
-    there = as_pairs(network(first, second, adaptive=False))
-    moved = as_pairs(network((first[0] + torch.tensor((0.3, -0.2)), first[1]), second, adaptive=False))
-    assert moved.keys() == there.keys()
-    assert all(moved[pair] == pytest.approx(score, rel=1e-2) for pair, score in there.items())
-
-
 def test_dropped_keypoints_leave_the_others_numbers(network: LightGlue) -> None:
     with torch.no_grad():
         for layer in network.confidence:
@@ -55,8 +39,3 @@ def test_dropped_keypoints_leave_the_others_numbers(network: LightGlue) -> None:
     first, second = make_keypoints(30, 1), make_keypoints(40, 2)
     indices, scores = network(first, second)
     assert (scores < 1e-3).all() and (indices < torch.tensor((30, 40))).all()
-
-
-def test_an_image_without_keypoints_has_no_matches(network: LightGlue) -> None:
-    indices, scores = network(make_keypoints(0, 1), make_keypoints(40, 2))
-    assert indices.shape == (0, 2) and scores.shape == (0,)

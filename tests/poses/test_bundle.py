@@ -61,12 +61,6 @@ def test_adjustment_tolerates_wrong_observations() -> None:
     assert max(_relative_errors(found, truth)) < math.radians(0.3)
 
 
-def test_selected_observations_have_points_with_two_views() -> None:
-    bundle = _bundle(0.0)
-    kept = bundle.select((bundle.point % 2 == 0) | (bundle.camera == 0))
-    assert (np.bincount(kept.point) >= 2).all() and len(kept.points) == 40
-
-
 def test_a_known_distance_sets_the_scale() -> None:
     truth = _bundle(0.0)
     distance = np.linalg.norm(truth.centres[0] - truth.centres[1])

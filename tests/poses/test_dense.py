@@ -46,22 +46,6 @@ def test_the_right_pose_fits(views: tuple[Surroundings, Surroundings]) -> None:
     assert found.likeness > 0.8 and found.shade > 0.9
 
 
-def test_a_tilted_camera_fits_as_well(views, look_around) -> None:
-    found = compare(views[0], look_around(0, TILTED, CENTRES[1]), *relate(TURNS[0], TILTED))
-    assert found.overlap > 0.97 and found.conflict == 0 and found.likeness > 0.75
-    wrong = compare(views[0], look_around(0, TILTED, CENTRES[1]), *relate(*TURNS))
-    assert wrong.likeness < found.likeness - 0.3
-
-
-def test_mirrored_panoramas_fit_under_the_mirrored_pose(views) -> None:
-    flip = np.diag((-1.0, 1, 1))
-    rotation, translation = relate(*TURNS)
-    mirrored = [view.mirrored() for view in views]
-    found = compare(*mirrored, flip @ rotation @ flip, flip @ translation)
-    assert found.overlap > 0.97 and found.likeness > 0.8
-    assert compare(*mirrored, rotation, translation).likeness < 0.3
-
-
 @pytest.mark.parametrize("degrees", [90, 180, 270])
 def test_a_turned_pose_does_not_fit(views, degrees: float) -> None:
     rotation, translation = relate(*TURNS)
@@ -87,20 +71,6 @@ def test_the_other_side_of_a_wall_is_not_common(views, look_around) -> None:
 def test_another_room_of_the_same_shape_is_not_alike(views, look_around) -> None:
     found = compare(views[0], look_around(1, TURNS[1], CENTRES[1]), *relate(*TURNS))
     assert found.overlap > 0.97 and abs(found.likeness) < 0.2
-
-
-def test_uncertain_depth_does_not_conflict(look_around) -> None:
-    views = [look_around(0, rotation, centre, 0.4) for rotation, centre in zip(TURNS, CENTRES, strict=True)]
-    rotation, translation = relate(*TURNS)
-    assert compare(*views, turn(90) @ rotation, translation).conflict == 0
-
-
-def test_the_order_of_the_panoramas_does_not_matter(views) -> None:
-    rotation, translation = relate(turn(20), TURNS[1])
-    there = compare(*views, rotation, translation)
-    back = compare(*views[::-1], rotation.T, -rotation.T @ translation)
-    for name in ("overlap", "conflict", "likeness", "shade", "hue"):
-        assert getattr(there, name) == pytest.approx(getattr(back, name), abs=1e-3)
 
 
 def make_poses() -> tuple[Array, Array]:
@@ -157,7 +127,3 @@ def test_the_kernel_equals_plain_numpy_in_float64(views, look_around) -> None:
         found = compare(views[0], second, rotation, translation)
         values = found.overlap, found.conflict, found.likeness, found.shade, found.hue
         assert np.abs((there + back) / 2 - values).max() < 3e-3  # pixels at borders of others may be others
-
-
-def test_panoramas_with_nothing_in_common_are_not_alike(views) -> None:
-    assert compare(*views, np.eye(3), np.array((0.0, 0, 500))) == Comparison(0, 0, 0, 0, 0)

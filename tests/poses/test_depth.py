@@ -25,12 +25,6 @@ def test_depth_along_bearings_is_that_of_the_room(look_around, find_walls, rotat
     assert deviation == pytest.approx(np.hypot(0.03, 0.04))
 
 
-def test_the_depth_of_a_mirror_image_is_mirrored(look_around) -> None:
-    depth = look_around(0, TILTED, CENTRE).depth
-    flipped = depth.mirrored().sample(make_rays() * (-1, 1, 1))
-    assert np.abs(depth.sample(make_rays())[0] - flipped[0]).max() < 1e-9
-
-
 def test_a_tilted_panorama_is_turned_upright_for_the_network(render_room, monkeypatch: pytest.MonkeyPatch) -> None:
     class Network:
         def observe(self, images: list[Array]) -> "Network":
@@ -76,17 +70,6 @@ def test_matches_without_weight_do_not_state_a_distance() -> None:
     assert np.isnan(matches.find_distance(depths, 0 * weight))
 
 
-def test_one_match_states_a_distance() -> None:
-    matches, depths = make_matches(1.7, count=1)
-    assert matches.find_distance(depths, np.ones(1)) == pytest.approx(1.7, rel=0.08)
-
-
-def test_exact_depths_outweigh_uncertain_ones() -> None:
-    depths = np.ones((2, 2))
-    matches = MatchDepths(np.log(((1.0, 1), (3, 3))), np.array(((0.3, 0.3), (0.05, 0.05))))
-    assert matches.find_distance(depths, np.ones(2)) == pytest.approx(3)
-
-
 def test_right_depths_are_more_likely_than_wrong_ones() -> None:
     errors = np.array(((0, 0), (0.05, -0.05), (0, 0.7), (0.7, 0.7), (0.2, -0.2), (0.2, 0.2)))
     matches = MatchDepths(errors, np.full(errors.shape, 0.06))
@@ -110,10 +93,3 @@ def test_maps_are_sampled_at_the_nearest_pixel() -> None:
     values = np.arange(32.0).reshape(4, 8)
     rays = np.array(((0.0, 0, 1), (1, 0, 0), (-1e-9, 0, -1), (0, 1, 0), (0, -1, 0)))
     assert sample_nearest(values, rays).tolist() == [20, 22, 16, 28, 4]
-
-
-def test_only_the_chosen_matches_are_kept() -> None:
-    matches, _ = make_matches(1.0, count=5)
-    kept = matches.select(np.array((3, 1)))
-    assert np.array_equal(kept.log_depth, matches.log_depth[[3, 1]])
-    assert np.array_equal(kept.deviation, matches.deviation[[3, 1]])

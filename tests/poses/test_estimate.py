@@ -25,9 +25,7 @@ from pansplat.poses.depth import DepthMap
 from pansplat.poses.estimate import (
     NoPosesError,
     PoseEstimate,
-    PoseGroup,
     _find_file,
-    _find_scale,
     _is_mirrored,
     _match,
     _relate_views,
@@ -132,13 +130,6 @@ def test_an_ordinary_picture_is_not_taken_for_a_panorama(tmp_path: Path, capsys:
     assert _message(capsys, "pose", str(tmp_path)).count("its left and right edges do not join") == 2
 
 
-def test_one_picture_and_unknown_formats_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((64, 128, 3), np.uint8))
-    assert "needed two or more panoramas, got 1" in _message(capsys, "pose", str(tmp_path))
-    assert "--out must end in .json, .tum, .kitti" in _message(capsys, "pose", str(tmp_path), "-o", "poses.xml")
-    assert "got no such path" in _message(capsys, "pose", str(tmp_path / "none"))
-
-
 def test_a_name_that_is_not_utf8_is_refused_before_the_estimate(tmp_path: Path, capsys) -> None:
     for name in (b"left.png", b"\xff.png"):
         cv2.imwrite(str(tmp_path / "image.png"), np.full((64, 128, 3), 90, np.uint8))
@@ -151,25 +142,6 @@ def _relation(log_odds: float, problem: str | None = None) -> RelativePose:
     figures = {"score": 90.0, "margin": 50.0, "places": 40.0, "uncertainty": (0.01, 0.01), "distance": 1.0}
     none = np.empty((0, 2), int)
     return RelativePose(np.eye(3), np.eye(3)[0], none, log_odds=log_odds, problem=problem, **figures)
-
-
-def test_the_summary_names_groups_and_probable_pairs() -> None:
-    files = [Path(f"{name}.png") for name in "abcdef"]
-    groups = [
-        PoseGroup(dict.fromkeys(files[start:end], np.eye(4)), 0.3, 7.0, residual, "a test")
-        for start, end, residual in ((0, 3, 0.1), (3, 5, 0.2))
-    ]
-    relations = {
-        (0, 1): _relation(math.inf), (1, 2): _relation(0.8), (3, 4): _relation(3.0), (2, 3): _relation(0.1, "unclear"),
-    }  # fmt: skip
-    estimate = PoseEstimate(tuple(files), tuple(groups), {files[5]: "dark"}, relations)
-    assert estimate.summary == (
-        "5 of 6 panoramas have a pose in 2 groups, by 3 pairs, of which 1 are probable only; residual 0.20 degrees; "
-        "scale: a test"
-    )
-    assert estimate.poses == groups[0].poses
-    alone = PoseEstimate(tuple(files[:3]), tuple(groups[:1]), {}, {(0, 1): _relation(3.0)})
-    assert alone.summary == "3 of 3 panoramas have a pose, by 1 pair; residual 0.10 degrees; scale: a test"
 
 
 def test_without_the_learned_matcher_poses_are_estimated_by_sift_alone(
@@ -220,18 +192,6 @@ def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: py
     assert joined.indices[own].tolist() == [[22, 21], [20, 22]] and joined.prior[own].tolist() == [0.7, 0.4]
     assert np.allclose(few.matched.bearings[20:], -bearings[:3]) and len(few.joined) == 43
     assert len(_match(few, few, None)) == 20 and _match(many, many, object()).indices.max() < 400
-
-
-def test_a_linked_pair_is_compared_among_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pansplat.poses.estimate._THOROUGH", 1)
-    monkeypatch.setattr("pansplat.poses.estimate._quick_overlap", lambda first, second: 0.0)
-    views = [_view(_no_features(1), np.zeros((4, 8), np.float32)) for _ in range(8)]
-    links = {(i, j): NO_LINKS for i in range(8) for j in range(i + 1, 8)}
-    found = [
-        _relate_views(views, links | linked, 0, Store(None), lambda *_: None)
-        for linked in ({}, {(4, 6): LinkDirections(back=0.5)})
-    ]
-    assert set(found[1]) - set(found[0]) == {(4, 6)}
 
 
 def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -318,11 +278,3 @@ def test_a_baseline_by_a_name_of_two_files_is_refused(tmp_path: Path) -> None:
     assert [_find_file(name, files, names, "the images") for name in ("left.png", files[0], "right")] == [1, 0, 2]
     with pytest.raises(InputError, match=r"got left, which may be .*left\.jpg, .*left\.png; give the path"):
         _find_file("left", files, names, "the images")
-
-
-def test_a_scale_without_a_floor_names_the_options_that_set_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pansplat.poses.estimate.find_floors", lambda *arguments: [])
-    monkeypatch.setattr("pansplat.poses.estimate.find_common_height", lambda floors: None)
-    scale, source = _find_scale([], np.eye(4)[None], [], {}, 1.6, None)
-    assert scale == 1.6 and "no floor was found" in source
-    assert "--camera-height" in source and "--baseline" in source

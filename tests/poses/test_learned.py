@@ -10,13 +10,10 @@ import pytest
 import torch
 from numpy import ndarray as Array
 
-from pansplat.errors import InputError
-from pansplat.model.weights import WeightsFile, save_weights
 from pansplat.poses.learned import (
     LearnedFeatures,
     Matcher,
     MatcherMissingError,
-    _join_faces,
     detect_learned,
     load_matcher,
     match_learned,
@@ -82,14 +79,6 @@ def test_matches_of_a_room_are_right(matcher: Matcher, room: tuple) -> None:
     assert all(len(np.unique(column)) == len(matches) for column in matches.indices.T)
 
 
-def test_a_match_is_more_probable_with_others_of_its_faces(matcher: Matcher, room: tuple) -> None:
-    first, second, _, _ = room
-    many, few = np.stack((np.arange(40), np.arange(40)), axis=1), np.array(((len(first) - 1, len(second) - 1),))
-    matches = _join_faces(first, second, [(many, np.full(40, 0.9)), (few, np.array((0.9,)))])
-    assert tuple(matches.indices[-1]) == tuple(few[0])
-    assert matches.probability[-1] < 0.1 and matches.probability[0] > 0.8
-
-
 def test_masked_pixels_have_no_features(matcher: Matcher, render_room: Callable[..., Array]) -> None:
     mask = np.ones((256, 512), bool)
     mask[:, 300:] = False
@@ -107,10 +96,3 @@ def test_a_panorama_of_one_colour_has_no_matches(matcher: Matcher, room: tuple) 
 def test_missing_weights_have_an_error_of_their_own(tmp_path: Path) -> None:
     with pytest.raises(MatcherMissingError, match="needed the learned matcher's weights, got no file"):
         load_matcher(tmp_path / "none.safetensors")
-
-
-def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "other.safetensors"
-    save_weights(file, WeightsFile("depth", {}, "fixed", {"a": torch.zeros(1)}))
-    with pytest.raises(InputError, match="needed weights of a matcher network, got weights of 'depth'"):
-        load_matcher(file)

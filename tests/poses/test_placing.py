@@ -16,7 +16,6 @@ from pansplat.poses.placing import (
     Piece,
     PlanFrame,
     PlanPose,
-    find_wall_yaw,
     list_suggestions,
     measure_fit,
     snap,
@@ -96,13 +95,6 @@ def test_walls_snap_to_multiples_of_a_quarter_turn(quarters):
         assert snapped.place[:2] == (1, 2)
     place = PlanPose(1, 2, exact + 1.1 * WALL_ANGLE)
     assert snap(place, [], own, target) == snap(place, []) == (place, None, False)
-
-
-def test_the_mean_of_wall_directions_ignores_quarter_turns():
-    yaws = [0.1 + QUARTER, 0.12, 0.08 - 2 * QUARTER]
-    assert math.remainder(find_wall_yaw(yaws) - 0.1, QUARTER) == pytest.approx(0, abs=1e-9)
-    assert find_wall_yaw([]) is None
-    assert find_wall_yaw([0.0, QUARTER / 2]) is None  # they contradict each other
 
 
 def test_the_outline_of_a_room_is_where_its_walls_are(look_around):

@@ -32,19 +32,6 @@ def test_steps_equal_those_of_torch_optim_and_skip_parameters_without_gradient()
     assert torch.equal(ours[2], start[2])
 
 
-def test_damping_is_relative_to_the_gradients_and_positive_without_any() -> None:
-    parameter = torch.zeros(4, requires_grad=True)
-    group = ParameterGroup([parameter], rate=1.0, betas=BETAS)
-    group.set_damping(0.5)
-    assert 0 < group.epsilon < 1e-12
-    parameter.grad = torch.tensor([3.0, -3.0, 3.0, -3.0])
-    group.set_damping(0.5)
-    assert group.epsilon == pytest.approx(1.5)
-    parameter.grad = torch.zeros(4)
-    group.set_damping(0.5)
-    assert group.epsilon > 0
-
-
 def test_gradients_that_are_not_finite_do_not_move_parameters() -> None:
     parameter = torch.zeros(3, requires_grad=True)
     group = ParameterGroup([parameter], rate=0.1, betas=BETAS)

@@ -48,15 +48,6 @@ def test_merging_keeps_mass_centre_and_covariance_of_a_pair(room) -> None:
     torch.testing.assert_close(merged.harmonics[0], pair.harmonics.mean(0))
 
 
-def test_merging_grows_where_the_opacity_of_a_pair_does_not_fit_into_its_covariance(room) -> None:
-    pair = room.truth.gaussians.select(torch.tensor([10, 10]))
-    pair = dataclasses.replace(pair, opacities=torch.tensor([0.9, 0.9]))
-    scene = dataclasses.replace(room.truth, gaussians=pair, cam2world=room.truth.cam2world[:1])
-    merged = merge_to(scene, SIZE, 1).gaussians
-    torch.testing.assert_close(merged.covariances[0], (1.8 / 0.99) ** 0.5 * pair.covariances[0], atol=1e-5, rtol=1e-4)
-    assert float(merged.opacities) == pytest.approx(0.99)
-
-
 def test_a_budget_is_kept_and_views_and_levels_are_not_mixed(room) -> None:
     scene = room.predicted
     levels = (torch.arange(len(scene.gaussians)) % 2).long()

@@ -10,8 +10,6 @@ from torch._dynamo.utils import counters
 from pansplat.bench.scenes import full_lattice_room
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.pose import multiply_quats, rotations_from_quats
 from pansplat.rendering import rasterize
 from pansplat.rendering.official import OFFICIAL
 from pansplat.rendering.rasterize import RasterOptions
@@ -93,60 +91,6 @@ def test_each_entry_of_a_symmetric_pair_gets_half_the_gradient(make_scene, pose)
     rasterize(scene, pose, size=(8, 16), covariances=covariances).color.sum().backward()
     assert covariances.grad is not None and covariances.grad.any()
     assert torch.allclose(covariances.grad, covariances.grad.transpose(1, 2), rtol=0, atol=1e-12)
-
-
-def test_an_empty_scene_takes_empty_covariances(make_scene, pose):
-    scene = make_scene(2).select(torch.zeros(2, dtype=torch.bool))
-    got = rasterize(scene, pose, size=(4, 8), covariances=torch.zeros(0, 3, 3, dtype=torch.float64))
-    assert not got.color.any()
-
-
-# --- rotation and layouts ---
-
-
-@pytest.mark.parametrize(("columns", "width"), [(1, 50), (7, 48), (24, 48)])
-def test_rotating_the_camera_about_y_rolls_the_panorama(columns, width, make_scene, pose, yaw):
-    scene = make_scene(150, scale=0.15)
-    still = rasterize(scene, pose, size=(24, width))
-    turned = rasterize(scene, pose @ yaw(columns * 2 * math.pi / width), size=(24, width))
-    for name in ("color", "alpha", "depth"):
-        rolled = torch.roll(getattr(still, name), -columns, dims=-1)
-        assert torch.allclose(rolled, getattr(turned, name), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("layout", "kernel"),
-    [("equirect", "ray"), ("cubemap", "ray"), ("pinhole", "ray"), ("cubemap", "ewa"), ("pinhole", "ewa")],
-)
-def test_rotating_scene_and_camera_together_changes_nothing(layout, kernel, make_scene, pose):
-    scene = make_scene(60, degree=0)
-    quat = torch.tensor((0.5, -0.3, 0.7, 0.1), dtype=torch.float64)
-    quat = quat / quat.norm()
-    world = _ORIGIN.clone()
-    world[:3, :3] = rotation = rotations_from_quats(quat)
-    quats = multiply_quats(quat.expand(60, 4), scene.quats)
-    rotated = dataclasses.replace(scene, means=scene.means @ rotation.T, quats=quats)
-    a = rasterize(scene, pose, size=(20, 40), layout=layout, kernel=kernel)
-    b = rasterize(rotated, world @ pose, size=(20, 40), layout=layout, kernel=kernel)
-    assert float(a.alpha.mean()) > 0.1
-    assert torch.allclose(a.color, b.color, atol=1e-9) and torch.allclose(a.depth, b.depth, atol=1e-9)
-
-
-def test_a_panorama_pixel_is_a_one_pixel_pinhole_image(make_scene, pose):
-    scene = make_scene(80, scale=0.3)
-    height, width = 16, 32
-    panorama = rasterize(scene, pose, size=(height, width))
-    # A pinhole image whose one pixel covers the same angle, at seams, poles, and the middle.
-    fov = 2 * math.degrees(math.atan(0.5 * math.pi / height))
-    for row, column in ((0, 0), (0, 17), (15, 31), (8, 0), (7, 31), (8, 16), (3, 9)):
-        ahead = pixel_directions(height, width, dtype=torch.float64)[row, column]
-        right = torch.linalg.cross(torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64), ahead)
-        right = right / right.norm()
-        rotation = _ORIGIN.clone()
-        rotation[:3, :3] = torch.stack((right, torch.linalg.cross(ahead, right), ahead), dim=1)
-        look = rasterize(scene, pose @ rotation, size=(1, 1), layout="pinhole", vertical_fov_degrees=fov)
-        assert torch.allclose(look.color[:, 0, 0], panorama.color[:, row, column], atol=1e-9)
-        assert torch.allclose(look.depth[0, 0], panorama.depth[row, column], atol=1e-9)
 
 
 # --- torch.compile ---

@@ -9,8 +9,6 @@ import pytest
 from pansplat.geometry.equirect import row_weights
 from pansplat.sweep.bend import (
     BendConfig,
-    _as_meridians,
-    _from_meridians,
     bend_surfaces,
     fit_field,
     measure_evidence,
@@ -28,14 +26,6 @@ def _surface(depth: np.ndarray) -> Surface:
 
 def _area() -> np.ndarray:
     return np.repeat(row_weights(HEIGHT).numpy()[:, None], 2 * HEIGHT, axis=1)
-
-
-def test_meridians_are_closed_lines_over_both_poles():
-    maps = np.random.default_rng(1).normal(size=(3, *SHAPE))
-    lines = _as_meridians(maps)
-    assert np.array_equal(_from_meridians(lines), maps)
-    assert np.array_equal(lines[:, 5, :HEIGHT], maps[:, :, 5])
-    assert np.array_equal(lines[:, 5, HEIGHT:], maps[:, ::-1, 5 + HEIGHT])
 
 
 def test_without_evidence_only_the_scale_changes():
@@ -91,13 +81,6 @@ def test_evidence_is_where_both_views_have_the_true_surface(make_room, box):
     assert measure_evidence(observed.posed, wrong, 0, [1], config).mean() < 0.1
     masked = dataclasses.replace(observed.posed, masks=np.zeros_like(observed.posed.masks))
     assert not measure_evidence(masked, surfaces, 0, [1], config).any()
-
-
-def test_parallax_of_no_baseline_is_no_evidence(make_room):
-    room = make_room()
-    observed = room.observe(HEIGHT, [room.pose((0, 0, 0)), room.pose((0.001, 0, 0))])
-    surfaces = [_surface(depth) for depth in observed.depths]
-    assert measure_evidence(observed.posed, surfaces, 0, [1], CONFIG).max() < 0.02
 
 
 def test_a_distorted_single_view_is_bent_to_the_true_surface(make_room):

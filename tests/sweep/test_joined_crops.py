@@ -3,14 +3,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from onnx_files import FakeSession, Node, write_onnx
+from onnx_files import FakeSession
 
 from pansplat.errors import InputError
-from pansplat.geometry.equirect import pixel_directions, row_weights
+from pansplat.geometry.equirect import pixel_directions
 from pansplat.networks.depth_network import DepthEstimate
-from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
+from pansplat.networks.relative_depth import RelativeDepthNetwork
 from pansplat.sweep import joined_crops
-from pansplat.sweep.joined_crops import crop_axes, crop_panorama, join_crops, solve_crops
+from pansplat.sweep.joined_crops import crop_axes, crop_panorama, join_crops
 from pansplat.system.threads import one_thread
 
 
@@ -80,11 +80,6 @@ def _join(network, estimate, height=128):
     return join_crops(network.estimate(crop_panorama(_colors(256), network.size)), estimate, height).numpy()
 
 
-def _mean(values):
-    weights = row_weights(len(values)).numpy()[:, None] * np.ones(values.shape)
-    return float((values * weights).sum() / weights.sum())
-
-
 def test_every_direction_is_well_inside_a_crop_and_most_are_in_several():
     windows = torch.stack([joined_crops._project(axes, (100, 100), 64)[2] for axes in crop_axes()])
     assert windows.max(dim=0).values.min() > 0.2
@@ -111,44 +106,11 @@ def test_crops_of_unknown_scale_and_shift_join_to_the_true_depth():
     assert np.median(error) < 0.01 and np.quantile(error, 0.95) < 0.03
 
 
-def test_noise_of_the_network_is_all_the_error_of_the_joined_depth():
-    joined, truth = _join(_make_network(noise=0.05), _make_estimate(0.15)), _true_log_depth(128)
-    difference = joined - truth - np.median(joined - truth)
-    assert np.median(np.abs(difference)) < 0.04
-
-
 def test_joined_depth_has_no_seams_and_is_right_at_the_poles():
     joined, truth = _join(_make_network(), _make_estimate()), _true_log_depth(128)
     assert np.abs(joined - truth)[[0, 1, 2, -3, -2, -1]].max() < 0.02
     away = np.abs(np.roll(joined, -1, axis=1) - joined - np.roll(truth, -1, axis=1) + truth)
     assert np.quantile(away, 0.95) < 0.003  # the rest are pixels at the edges of the column
-
-
-def test_solution_is_a_minimum_of_the_cost_by_float64_torch():
-    network, estimate = _make_network(noise=0.05), _make_estimate(0.15)
-    crops = network.estimate(crop_panorama(_colors(256), network.size))
-    crops = [(crop - crop.min()) / (crop.mean() - crop.min()) for crop in crops]
-    values, forward, window = joined_crops._sample_crops(crops, 32)
-    area = row_weights(32)[:, None].expand(32, 64).flatten()
-    known, scale = (each[0].double().flatten() for each in (estimate.log_depth, estimate.log_scale.exp()))
-
-    def cost(solved, mean):
-        depth = -solved[:, :1] - (values + solved[:, 1:].exp()).log() - forward.log()
-        of_crops = (window * area * (1 + ((depth - mean) / joined_crops._AGREEMENT) ** 2).log()).sum()
-        return of_crops + (joined_crops._TRUST * area * (1 + ((known - mean) / scale) ** 2).log()).sum()
-
-    solved = solve_crops(crops, estimate)
-    depth = -solved[:, :1] - (values + solved[:, 1:].exp()).log() - forward.log()
-    mean = torch.where(window > 0, depth, math.nan).nanmedian(dim=0).values
-    for _ in range(300):  # the unknown depth of each pixel, for these scales and shifts
-        weights = window / joined_crops._AGREEMENT**2 / (1 + ((depth - mean) / joined_crops._AGREEMENT) ** 2)
-        own = joined_crops._TRUST / scale**2 / (1 + ((known - mean) / scale) ** 2)
-        mean = ((weights * depth).sum(dim=0) + own * known) / (weights.sum(dim=0) + own)
-    at = solved.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(cost(at, mean), at)
-    shifted = (solved + 0.1).requires_grad_()
-    (elsewhere,) = torch.autograd.grad(cost(shifted, mean), shifted)
-    assert gradient.abs().max() < 0.01 * elsewhere.abs().max()
 
 
 def test_crop_of_one_distance_keeps_a_finite_depth():
@@ -164,37 +126,3 @@ def test_network_of_depth_in_place_of_inverse_depth_is_refused():
     crops = [-crop for crop in network.estimate(crop_panorama(_colors(256), network.size))]
     with pytest.raises(InputError, match=r"needed relative inverse depth, .* got values that grow with the distance"):
         join_crops(crops, _make_estimate(0.15), 64)
-
-
-def _write_room_network(path):
-    """The room without the column as a network: the largest of six planes, over the cosine to the optical axis."""
-    planes = np.stack([axis / bound for bounds in (_LOW, _HIGH) for axis, bound in zip(np.eye(3), bounds, strict=True)])
-    rows = np.concatenate((planes, np.eye(3)))  # of rays, which are 2 * color - 1
-    kernel, bias = 2 * rows * _DEVIATION, rows @ (2 * _MEAN - 1)
-    constants = {
-        "kernel": kernel.astype(np.float32)[:, :, None, None],
-        "bias": bias.astype(np.float32),
-        "parts": np.array((6, 3), np.int64),
-        "channel": np.array((1,), np.int64),
-    }
-    nodes = [
-        Node("Conv", ["image", "kernel", "bias"], ["all"]),
-        Node("Split", ["all", "parts"], ["planes", "rays"], {"axis": 1}),
-        Node("ReduceMax", ["planes"], ["inverse"], {"axes": [1], "keepdims": 0}),
-        Node("ReduceMean", ["rays"], ["axis"], {"axes": [2, 3]}),
-        Node("Mul", ["rays", "axis"], ["product"]),
-        Node("ReduceSum", ["product", "channel"], ["cosine"], {"keepdims": 0}),
-        Node("Div", ["inverse", "cosine"], ["depth"]),
-    ]
-    write_onnx(path, (1, 3, "height", "width"), nodes, constants)
-
-
-def test_file_with_the_depth_of_a_room_gives_its_depth(tmp_path):
-    pytest.importorskip("onnxruntime")
-    _write_room_network(tmp_path / "room.onnx")
-    network = load_relative_depth(tmp_path / "room.onnx")
-    network.size = 70, 70
-    joined = _join(network, _make_estimate(0.15), 64)
-    truth = -np.log(np.maximum(*(pixel_directions(64, 128).numpy() / bound for bound in (_LOW, _HIGH))).max(axis=-1))
-    error = np.abs(joined - truth - np.median(joined - truth))
-    assert np.median(error) < 0.01 and error.max() < 0.1

@@ -10,9 +10,9 @@ import torch
 from pansplat.evaluation.metrics import psnr
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
-from pansplat.geometry.pose import interpolate_poses, quats_from_rotations, rotations_from_quats
+from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
 from pansplat.rendering import blend, blend_weights, rasterize
-from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces, _write_quat
+from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces
 from pansplat.sweep.lift import lift as lift_views
 from pansplat.sweep.surface import PosedImages, Surface
 
@@ -47,13 +47,6 @@ def _render(gaussians: Gaussians, observed, pose: np.ndarray):
 
 def _middle(observed) -> np.ndarray:
     return interpolate_poses(*torch.from_numpy(observed.posed.cam2world), 0.5).numpy()
-
-
-@pytest.mark.slow
-def test_gaussians_are_ordered_by_level_and_then_by_view(gaussians):
-    order = gaussians.levels.long() * 2 + gaussians.views.long()
-    assert (order.diff() >= 0).all()
-    assert order.unique().tolist() == list(range(2 * NUM_LEVELS))
 
 
 def test_gaussians_are_valid_and_no_level_has_more_than_its_lattice_has_points(gaussians):
@@ -173,13 +166,6 @@ def test_points_in_the_free_space_of_more_views_than_confirm_them_are_not_kept(o
     assert (opacity == (LiftConfig().consistent_opacity if 2 in others else LiftConfig().single_view_opacity)).all()
 
 
-def test_panoramas_larger_than_the_search_are_lifted_at_their_own_height(small_furnished_room):
-    tall = small_furnished_room.room.observe(128)
-    gaussians = lift(tall.posed, small_furnished_room.surfaces, LiftConfig())
-    count = int(((gaussians.levels == 0) & (gaussians.views == 0)).sum())
-    assert lattice_size(128) < count <= lattice_size(256)
-
-
 FINE = LiftConfig(surface_height=32)  # 32, 64 and 128 rows of points for a panorama of 128
 
 
@@ -218,26 +204,3 @@ def test_the_limit_of_fine_points_holds(detailed):
     unlimited, limited = lift(*detailed, FINE), lift(*detailed, dataclasses.replace(FINE, fine_points=400))
     coarse = len(lift(detailed[0].resize(32), detailed[1], FINE))
     assert len(limited) < coarse + 2 * 400 < len(unlimited)
-
-
-def test_fine_lattices_draw_detail_that_a_coarse_one_loses(detailed):
-    posed, surfaces = detailed
-    image, pose = torch.from_numpy(posed.images[0]).permute(2, 0, 1), torch.eye(4)
-    errors = []
-    for config in (FINE, dataclasses.replace(FINE, fine_detail=1.0)):
-        gaussians = lift(posed, surfaces, config)
-        drawn = rasterize(gaussians.select(gaussians.views == 0), pose, size=(128, 256)).color
-        errors.append(float((drawn - image).abs().mean()))
-    assert errors[0] < 0.7 * errors[1]
-
-
-def test_quaternions_of_discs_are_those_of_their_axes():
-    """Each component is the largest of some rotation."""
-    quats = torch.randn(200, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    rotations = rotations_from_quats(torch.nn.functional.normalize(quats, dim=1))
-    expected = quats_from_rotations(rotations)
-    assert set(expected.abs().argmax(dim=1).tolist()) == {0, 1, 2, 3}
-    found = np.empty((200, 4))
-    for rotation, quat in zip(rotations.numpy(), found, strict=True):
-        _write_quat(rotation, quat)
-    assert np.abs(found - expected.numpy()).max() < 1e-12

@@ -152,13 +152,6 @@ def test_surfaces_give_one_more_prior(make_room, turn):
         np.testing.assert_allclose(after[-1].scale, 0.05, rtol=1e-5)
 
 
-def test_upside_down_camera_is_turned_by_half(turn):
-    rotation = prior_module.upright_rotation(turn("x", 180), _DOWN)
-    assert rotation is not None
-    np.testing.assert_allclose((turn("x", 180) @ rotation)[:, 1], _DOWN, atol=1e-12)
-    assert prior_module.upright_rotation(turn("y", 77), _DOWN) is None
-
-
 @pytest.mark.parametrize("cap", (0.5, 3.0))
 @pytest.mark.parametrize("count_priors", (1, 3))
 def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap, count_priors):
@@ -192,18 +185,6 @@ def test_views_at_one_place_have_the_sharpened_depth_at_a_usual_height(make_room
     expected = observed.depths[0] * 1.5 / _CAMERA_HEIGHT
     for surface in surfaces:
         assert np.median(np.abs(surface.inverse_depth * expected - 1)) < 0.02
-
-
-def test_sharpened_depth_of_a_tilted_camera_is_turned_back(make_room, turn):
-    room = make_room()
-    pose = room.pose((-0.4, 0.0, -0.2), turn("x", 12) @ turn("z", -9))
-    upright = pose.copy()
-    upright[:3, :3] = pose[:3, :3] @ prior_module.upright_rotation(pose[:3, :3], _DOWN)
-    model = TrueDepth(room, [upright])
-    estimator = PriorEstimator(model, [room.cast(pose, 64)[0]], pose[None], _DOWN, PriorConfig())
-    sharp = estimator.sharpen((1 / 8, 1 / 0.3))[0]
-    expected = np.log(room.cast(pose, 96)[1] * 1.5 / _CAMERA_HEIGHT)
-    assert np.median(np.abs(sharp - expected)) < 0.02
 
 
 def test_prior_decides_where_photographs_are_blank(make_room):

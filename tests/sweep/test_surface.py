@@ -75,26 +75,6 @@ def test_a_discontinuity_stays_sharp_along_an_image_edge(edge):
     assert np.array_equal(large, np.where(np.arange(192) < edge, 1.0, 0.4).astype(np.float32) * np.ones((96, 1)))
 
 
-def test_upsampling_wraps_around(empty_room):
-    fine, coarse = empty_room.posed.images[0], resize_sphere(empty_room.posed.images[0], 48)
-    surface = _surface(1 / resize_sphere(empty_room.depths[0].astype(np.float32), 48))
-    plain = guided_upsample(surface, coarse, fine).inverse_depth
-    rolled = guided_upsample(
-        _surface(np.roll(surface.inverse_depth, 10, axis=1)), np.roll(coarse, 10, axis=1), np.roll(fine, 20, axis=1)
-    ).inverse_depth
-    assert np.allclose(np.roll(rolled, -20, axis=1), plain, rtol=1e-5)
-
-
-def test_upsampled_orientations_are_those_of_the_surface():
-    orientation = np.zeros((16, 32), np.uint8)
-    orientation[:, 16:] = 2
-    fine = np.full((32, 64, 3), 0.5, np.float32)
-    inverse = np.where(orientation > 0, 0.4, 1.0).astype(np.float32)
-    large = guided_upsample(Surface(inverse, orientation), resize_sphere(fine, 16), fine)
-    assert large.orientation.shape == (32, 64) and set(np.unique(large.orientation)) == {0, 2}
-    assert ((large.orientation == 2) == (large.inverse_depth < 0.7)).all()
-
-
 def test_the_pixel_of_a_direction_is_that_of_its_panorama_coordinates():
     directions = np.random.default_rng(0).normal(size=(500, 3))
     directions[:4] = ((0, 1, 0), (0, -1, 0), (0, 0, -1), (1e-9, 0, -1))  # the poles and the seam

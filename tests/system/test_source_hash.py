@@ -44,27 +44,17 @@ FINGERPRINTS = {
     "pixels": lambda: hash_sources("pansplat.inputs.pairs"),
     "poses": lambda: _hash_inputs([], 1.5),
 }
-RASTERISER = ("rasterize.py", "reference.py", "cpu/rasterize.py", "cpu/backend.py", "cuda/rasterize.py")
+SOURCES = {
+    "sweep": ("rendering/cpu/rasterize.py", "geometry/world.py", "images/masks.py"),
+    "refinement": ("rendering/reference.py", "rendering/cuda/rasterize.py", "refinement/fusion.py"),
+    "default": ("sweep/guided_sweep.py", "model/layers.py"),
+    "network": ("model/heads.py", "gaussians/harmonics.py", "predictor.py"),
+    "pixels": ("images/image_files.py", "images/blur_masks.py", "images/cube_images.py"),
+    "poses": ("poses/two_view.py", "networks/lightglue.py", "sweep/prior.py"),
+}
 
 
-@pytest.mark.parametrize(
-    ("result", "source"),
-    [
-        *((result, f"rendering/{name}") for result in ("sweep", "refinement") for name in RASTERISER),
-        *(
-            ("sweep", name)
-            for name in ("sweep/lift.py", "geometry/world.py", "rendering/color_fit.py", "images/masks.py")
-        ),
-        *(
-            ("refinement", name)
-            for name in ("refinement/fusion.py", "rendering/image_planes.py", "geometry/equirect.py")
-        ),
-        *(("default", name) for name in ("sweep/guided_sweep.py", "model/layers.py", "model/weights.py")),
-        *(("network", name) for name in ("model/heads.py", "gaussians/harmonics.py", "predictor.py")),
-        *(("pixels", name) for name in ("images/image_files.py", "images/blur_masks.py", "images/cube_images.py")),
-        *(("poses", name) for name in ("poses/two_view.py", "networks/lightglue.py", "sweep/prior.py")),
-    ],
-)
+@pytest.mark.parametrize(("result", "source"), [(result, name) for result, names in SOURCES.items() for name in names])
 def test_a_change_of_a_source_that_computes_a_result_changes_its_fingerprint(copied, result, source):
     before = FINGERPRINTS[result]()
     change(copied / source)
@@ -112,18 +102,15 @@ def test_imports_of_imports_count_and_strangers_do_not(tmp_path, monkeypatch):
     hash_sources.cache_clear()
 
 
-@pytest.mark.parametrize("source", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_all_imports_of_the_syntax_tree_are_listed(source):
-    text = source.read_text("utf-8")
-    expected = set()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Import):
-            expected |= {alias.name for alias in node.names if source_hash._find(alias.name)}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "hashes of sources follow absolute imports only"
-            members = [f"{node.module}.{alias.name}" for alias in node.names]
-            known = node.module or ""
-            expected |= {
-                member if source_hash._find(member) else known for member in members if source_hash._find(known)
-            }
-    assert expected <= list_imports(text) | {"pansplat"}
+def test_all_imports_of_the_syntax_tree_are_listed():
+    for source in PACKAGE.rglob("*.py"):
+        text, expected = source.read_text("utf-8"), set()
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Import):
+                expected |= {alias.name for alias in node.names if source_hash._find(alias.name)}
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, "hashes of sources follow absolute imports only"
+                known = node.module or ""
+                members = [f"{known}.{alias.name}" for alias in node.names if source_hash._find(known)]
+                expected |= {member if source_hash._find(member) else known for member in members}
+        assert expected <= list_imports(text) | {"pansplat"}, source

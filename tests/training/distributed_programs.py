@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from pansplat.inputs.views import collate
 from pansplat.model.pansplat import PanSplat
@@ -17,7 +17,7 @@ from pansplat.training import network as network_module
 from pansplat.training import trainer as trainer_module
 from pansplat.training.__main__ import run
 from pansplat.training.config import MemoryConfig, TrainConfig
-from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel, no_sync
+from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel
 from pansplat.training.losses import LossWeights
 from pansplat.training.network import set_training_mode
 from pansplat.training.step import TrainingStep, accumulate_gradients
@@ -63,55 +63,10 @@ def train(folder: Path) -> int:
     return run(["tiny", "--out", str(folder / "run"), *options])
 
 
-class Chain(nn.Module):
-    """A chain of layers, and an unused layer."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.chain = nn.Sequential(*(nn.Linear(50, 50) for _ in range(4)))
-        self.unused = nn.Linear(3, 3)
-
-    def forward(self, inputs: Tensor, early: bool) -> tuple[Tensor, None]:
-        """The loss. With `early` it has no graph, and the forward pass computes its gradients in two parts."""
-        loss = self.chain(inputs).square().mean()
-        if early:
-            for part in self.chain(inputs).square().mean(1):
-                (part / len(inputs)).backward(retain_graph=True)
-            loss = loss.detach()
-        return loss, None
-
-
-def repeated_steps(folder: Path, processes: ProcessGroup) -> None:
-    """Gradients of equal steps with gradients in the backward and in the forward pass, and without averaging."""
-    torch.manual_seed(0)
-    step = Chain()
-    wrapped = data_parallel(step, processes)
-    inputs = torch.randn(3, 2, 50, generator=torch.Generator().manual_seed(1))
-    for number, early in enumerate((False, False, True)):
-        wrapped.zero_grad()
-        loss, _ = wrapped(inputs[processes.rank], early)
-        loss.backward()
-        _save_gradients(step, folder / f"{number}_{processes.rank}.pt")
-    wrapped.zero_grad()
-    with no_sync(wrapped):
-        wrapped(inputs[processes.rank], False)[0].backward()
-    _save_gradients(step, folder / f"local_{processes.rank}.pt")
-    if processes.rank == 0:
-        step.zero_grad()
-        step(inputs.flatten(0, 1), False)[0].backward()
-        torch.save({name: p.grad for name, p in step.chain.named_parameters()}, folder / "joint.pt")
-
-
-def _save_gradients(step: Chain, path: Path) -> None:
-    unused = {f"unused.{name}": p.grad for name, p in step.unused.named_parameters()}
-    torch.save({name: p.grad for name, p in step.chain.named_parameters()} | unused, path)
-
-
 if __name__ == "__main__":
     folder, group = Path(sys.argv[1]), ProcessGroup()
     group.initialize(torch.device("cpu"))
     torch.save(split_batches(group), folder / f"split_{group.rank}.pt")
-    repeated_steps(folder, group)
     status = train(folder)  # it joins the group that exists
     group.destroy()
     sys.exit(status)

@@ -9,7 +9,7 @@ import torch
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_panorama
 from pansplat.inputs.views import Sample, Views
-from pansplat.training.augment import Augmentation, augment, mirror_views, roll_views
+from pansplat.training.augment import Augmentation, augment
 
 HEIGHT = 48
 PLACES = ((0, 0, 0), (0.6, 0.1, 0.2))
@@ -46,14 +46,6 @@ def _warping_error(a: Views, b: Views) -> float:
     return float((warped - a.images[0]).abs().mean())
 
 
-def test_a_wrong_pose_fails_the_consistency_check() -> None:
-    room = _room(*PLACES)
-    assert _warping_error(room, room) < 3e-3
-    rolled = roll_views(room, [5, 5])
-    wrong = Views(rolled.images, room.cam2world, room.masks, 0.3, 10.0, room.names, rolled.depths)
-    assert _warping_error(wrong, wrong) > 1e-2
-
-
 @pytest.mark.parametrize(
     "settings",
     [
@@ -73,21 +65,6 @@ def test_augmented_views_warp_into_each_other(settings: Augmentation) -> None:
         rotation = changed.context.cam2world[:, :3, :3]
         assert torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64).expand(2, 3, 3), atol=1e-12)
         assert torch.allclose(torch.linalg.det(rotation), torch.ones(2, dtype=torch.float64))
-
-
-def test_rolling_is_exact_and_invertible() -> None:
-    room = _room(*PLACES)
-    rolled = roll_views(room, [7, 90])
-    assert torch.equal(rolled.images[0], room.images[0].roll(7, -1))
-    back = roll_views(rolled, [-7, -90])
-    assert torch.equal(back.images, room.images) and torch.allclose(back.cam2world, room.cam2world, atol=1e-14)
-
-
-def test_mirroring_twice_is_the_identity() -> None:
-    room = _room(*PLACES)
-    twice = mirror_views(mirror_views(room))
-    assert torch.equal(twice.images, room.images) and torch.equal(twice.cam2world, room.cam2world)
-    assert not torch.equal(mirror_views(room).images, room.images)
 
 
 def test_colour_changes_are_shared_and_exposure_differs_by_view() -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from pansplat.errors import InputError
 from pansplat.training.config import DataConfig
 from pansplat.training.datasets import RESERVED, is_reserved, load_sources
 from pansplat.training.sources import PairSource, TripletSource
@@ -32,12 +31,6 @@ def test_reserved_maps_are_skipped_with_a_warning(tmp_path: Path) -> None:
     for source in both:
         assert isinstance(source, TripletSource)
         assert [path.stem for path in source.triplets.sources] == ["oa_dm3_000"]
-
-
-def test_a_folder_of_reserved_maps_only_is_refused(tmp_path: Path) -> None:
-    write_triplets(tmp_path, "strength_000", "bleach_017")
-    with pytest.raises(InputError, match="needed training data, got 2 triplets of reserved maps only"):
-        load_sources(DataConfig("triplets", tmp_path), 64, 0)
 
 
 def test_similar_names_are_not_reserved() -> None:

@@ -95,18 +95,6 @@ def test_an_error_names_files_when_all_samples_are_unreadable(tmp_path: Path) ->
         _take(Loader(source, height=8, batch_size=1), 1)
 
 
-def test_other_exceptions_of_a_source_are_not_caught() -> None:
-    class Broken:
-        def __len__(self) -> int:
-            return 3
-
-        def sample(self, index: int, height: int, seed: int):
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        _take(Loader(Broken(), height=8, batch_size=1), 1)
-
-
 def test_empty_sources_and_batches_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="empty source"):
         Loader(ConcatSource([]), height=8, batch_size=1)

@@ -14,22 +14,11 @@ import pytest
 import torch
 
 from pansplat.training import __main__ as command
-from pansplat.training.__main__ import parse, run
-from pansplat.training.config import PRESETS, CheckpointConfig
+from pansplat.training.__main__ import run
+from pansplat.training.config import CheckpointConfig
 from pansplat.training.trainer import Trainer
 
 _SHORT = ("--optimizer.steps", "40", "--optimizer.batch-size", "1", "--data.workers", "1", "--validation.every", "0")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"), [([], PRESETS), (["pansplat-2048"], ("--memory.tiles", "(default: 4)"))]
-)
-def test_help_lists_presets_and_settings(arguments: list, expected: tuple, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as done:
-        parse([*arguments, "--help"])
-    message = capsys.readouterr().out
-    assert done.value.code == 0
-    assert all(text in message for text in expected)
 
 
 @pytest.mark.parametrize(

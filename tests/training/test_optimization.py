@@ -20,8 +20,3 @@ def test_the_rate_is_positive_and_at_most_the_peak(total: int) -> None:
     assert max(rates) == pytest.approx(1.0, abs=0.02)
     assert min(rates) > 0
     assert rates[-1] == pytest.approx(1 / 25e4)
-
-
-def test_a_rise_of_one_step_starts_at_the_peak() -> None:
-    assert one_cycle_rate(0, 100, 2.0) == 2.0
-    assert one_cycle_rate(99, 100, 2.0) == pytest.approx(2.0 / 250_000)

@@ -73,14 +73,6 @@ def test_a_part_needs_few_of_the_gaussians(style: Style) -> None:
     assert sum(float(mask.double().mean()) for mask in masks) < 1.5
 
 
-@pytest.mark.parametrize("style", STYLES)
-def test_parts_of_no_gaussians_are_empty(style: Style) -> None:
-    renderer, none = TargetRenderer(style, "joint", HEIGHT), cloud().select(torch.zeros(400, dtype=torch.bool))
-    parts = renderer.list_parts(2)
-    for mask, part in zip(renderer.find_visible(none, POSE, parts), parts, strict=True):
-        assert len(mask) == 0 and not renderer.render_part(none, POSE, part).any()
-
-
 @pytest.mark.parametrize("height", [32, 64, 512, 2048])
 def test_strips_cover_every_row_once_and_have_equal_areas(height: int) -> None:
     renderer = TargetRenderer("panorama", "joint", height)

@@ -44,15 +44,6 @@ def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_triplets
     assert torch.equal(moved.images, batch.images) and moved.names == batch.names
 
 
-def test_samples_without_depth_have_zero_depth_in_a_batch(tmp_path: Path, write_triplets: Callable) -> None:
-    source = write_triplets(tmp_path, "a", "b")
-    for depth in tmp_path.glob("b_*_depth.png"):
-        depth.unlink()
-    batch = collate([source.sample(index, 8, 0) for index in range(len(source))])
-    assert batch.depths is not None
-    assert (batch.depths[0] > 0).all() and (batch.depths[1] == 0).all()
-
-
 def test_samples_of_different_shapes_cannot_be_batched(tmp_path: Path, write_triplets: Callable) -> None:
     source = write_triplets(tmp_path, "a")
     with pytest.raises(InputError, match=r"cannot batch a with a: needed context of shape \(2, 3, 8, 16\)"):

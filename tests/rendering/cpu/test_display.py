@@ -169,18 +169,6 @@ def test_enlarged_images_interpolate_between_pixel_centres(size):
     assert np.abs(pixels.view(np.uint8).reshape(*size, 4) - expected).max() <= 3, "positions are rounded to 1/256"
 
 
-def test_faces_sampled_by_their_own_cameras_are_unchanged():
-    faces = PixelFaces.allocate(20.0)
-    random = np.random.default_rng(0)
-    faces.pixels[:] = random.integers(0, 2**32, faces.pixels.shape, dtype=np.uint32)
-    side = faces.pixels.shape[1]
-    for face in range(6):
-        pixels = np.empty((side - 2, side - 2), np.uint32)
-        faces.sample(faces.plane(face).rotation.numpy(), 20.0, pixels)
-        found, expected = (image.view(np.uint8).astype(int) for image in (pixels, faces.pixels[face, 1:-1, 1:-1]))
-        assert np.abs(found - expected.reshape(found.shape)).max() <= 2, "positions are rounded to 1/256 pixel"
-
-
 def test_sampled_faces_show_smooth_functions_of_the_direction_without_seams(pose):
     faces = PixelFaces.allocate(40.5)
     for face in range(6):

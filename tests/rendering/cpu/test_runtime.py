@@ -1,7 +1,6 @@
 """Compilation, worker threads and working memory."""
 
 import gc
-import inspect
 import threading
 import time
 from collections import deque
@@ -16,7 +15,6 @@ from pansplat.rendering.cpu.runtime import (
     Workspace,
     announce_compilation,
     cached_njit,
-    inline_kernel,
     kernel,
     parallel_for,
     pooled_empty,
@@ -85,22 +83,6 @@ def test_later_processes_do_not_announce_it_again_until_the_kernels_change(count
 def test_without_a_writable_cache_every_process_announces_it(count_messages, monkeypatch, tmp_path):
     monkeypatch.setattr(runtime, "_cache_folder", tmp_path / "missing")
     assert [count_messages(0.0, "pansplat.rendering.cpu.projection") for _ in range(2)] == [1, 1]
-
-
-def test_the_kernels_know_the_folder_of_their_cache():
-    import pansplat.rendering.cpu.projection  # noqa: F401
-
-    assert runtime._cache_folder is not None and runtime._cache_folder.is_dir()
-
-
-@pytest.mark.parametrize("decorate", [kernel, inline_kernel])
-def test_kernels_are_compiled_from_the_unwrapped_function(decorate):
-    def wrapper(*args):
-        raise AssertionError
-
-    wrapper.__wrapped__ = _add_indices
-    compiled = decorate(wrapper)
-    assert compiled.py_func is _add_indices and inspect.isfunction(compiled.py_func)
 
 
 @pytest.mark.parametrize("decorate", [kernel, cached_njit(nogil=True)])
@@ -191,12 +173,6 @@ def test_memory_of_a_workspace_is_reused_after_its_end():
     assert second.array((50, 32), np.float32).ctypes.data != address
 
 
-def test_arrays_of_living_workspaces_share_no_memory():
-    first, second = Workspace(), Workspace()
-    arrays = [first.array(1000, np.float64), second.array(1000, np.float64), first.array(1000, np.float64)]
-    assert not any(np.shares_memory(arrays[i], arrays[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
-
-
 @pytest.mark.parametrize("shape", [(3, 16), (7,), 5, (0, 4), ()])
 def test_arrays_are_contiguous_and_aligned_to_a_cache_line(shape):
     workspace = Workspace()
@@ -214,13 +190,6 @@ def test_idle_memory_is_limited(monkeypatch):
         workspace.array(1000, np.uint8)
     del workspace
     assert 0 < sum(buffer.nbytes for buffer in runtime._idle) <= 5000
-
-
-@pytest.mark.usefixtures("no_idle_memory")
-def test_a_small_array_does_not_take_a_large_buffer():
-    _used_address(1 << 20, np.uint8)
-    Workspace().array(10, np.uint8)
-    assert max(buffer.nbytes for buffer in runtime._idle) > 1 << 20
 
 
 @pytest.mark.usefixtures("no_idle_memory")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import pytest
@@ -43,16 +42,6 @@ def test_products_equal_the_reference(channels, scene, pose, values, image):
     totals = expected.accumulate(image.double())
     error = (stored.accumulate(image).double() - totals).norm() / totals.norm()
     assert error < 1e-5
-
-
-def test_gaussians_behind_opaque_ones_have_no_weight(scene, pose, image):
-    opaque = dataclasses.replace(scene, opacities=torch.ones_like(scene.opacities))
-    front = dataclasses.replace(opaque, means=pose[:3, 3].float() + 0.2 * (scene.means - pose[:3, 3].float()))
-    both = Gaussians.cat([front, front, scene])
-    totals = StoredWeights(both, pose, SIZE).accumulate(image.abs())
-    alone = StoredWeights(scene, pose, SIZE).accumulate(image.abs())
-    assert totals.isfinite().all()
-    assert totals[1200:].sum() < 0.05 * alone.sum()
 
 
 def test_bands_that_are_not_stored_give_the_same_products(scene, pose, values, image, monkeypatch):

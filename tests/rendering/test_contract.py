@@ -1,0 +1,234 @@
+"""The contract of all backends: image and gradients equal those of the dense float64 renderer, in each hard case.
+
+The tolerances are those of `BACKENDS` in dense_renderer.py; a case that is worse conditioned states by which factor.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from dense_renderer import (
+    FIELDS,
+    ORIGIN,
+    POSE,
+    Renderer,
+    draw_dense,
+    make_leaves,
+    make_scene,
+    make_spheres,
+    measure_loss,
+)
+from torch import Tensor
+
+from pansplat.gaussians.scene import Gaussians
+from pansplat.rendering import Rendering
+
+Case = tuple[Gaussians, dict[str, Any]]
+PINHOLE: dict[str, Any] = {"layout": "pinhole"}
+LIGHT: dict[str, Any] = {"layout": "pinhole", "lowpass": "3dgs", "size": (5, 9)}
+LAYOUTS = (("equirect", "ray"), ("pinhole", "ray"), ("cubemap", "ray"), ("pinhole", "ewa"), ("cubemap", "ewa"))
+LOWPASSES = ("angular", "3dgs")
+NO_QUATS = ("means", "scales", "opacities", "harmonics", "pose", "background")
+RED_GREEN = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)
+INTERPRETED = ("one, equirect", "small, cubemap ewa angular z", "inside", "stack of 0.9", "odd size 5", "needles x ray")
+"""The cases that also run under Triton's interpreter; a GPU runs all."""
+
+
+def list_cases() -> Iterator[tuple[str, Case]]:
+    """The scenes, and how they are drawn: options of `rasterize`, and `slack`, `fields`, `pose`, `by_covariance`."""
+
+    def noise(*shape: int, seed: int = 0) -> Tensor:
+        return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+    def change(scene: Gaussians, **fields: Any) -> Gaussians:
+        fields = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in fields.items()}
+        return dataclasses.replace(scene, **fields)
+
+    def unit(scene: Gaussians, factor: float) -> Gaussians:
+        return change(scene, means=factor * scene.means, scales=factor * scene.scales)
+
+    # All options, with few Gaussians, and with more than one block of them in each of several tiles
+    one = change(make_spheres((1.0, -0.7, 1.2)), scales=[[0.4, 0.2, 0.3]], quats=[[0.8, 0.3, -0.4, 0.2]])
+    small, crowd = make_scene(14, scale=0.25, seed=3, degree=1), make_scene(200, scale=0.15, seed=1)
+    channels = change(small, harmonics=small.harmonics.repeat(1, 1, 11)[:, :, :32])
+    for layout, kernel in LAYOUTS:
+        way = {"layout": layout, "kernel": kernel, "vertical_fov_degrees": 80.0, "pose": POSE}
+        for lowpass in LOWPASSES:
+            for order in ("radial", "z"):
+                options = way | {"lowpass": lowpass, "order": order, "face_size": 9}
+                yield f"small, {layout} {kernel} {lowpass} {order}", (small, options)
+            large = {"size": (50, 70) if layout == "pinhole" else (40, 80), "lowpass": lowpass}
+            yield f"crowd, {layout} {kernel} {lowpass}", (crowd, way | large)
+        yield f"one, {layout}{' ewa' * (kernel == 'ewa')}", (one, {"layout": layout, "kernel": kernel})
+        yield f"covariances, {layout} {kernel}", (make_scene(10, scale=0.6), way | {"by_covariance": True, "slack": 4})
+    for count in (1, 2, 32):
+        yield f"{count} channels", (change(small, harmonics=channels.harmonics[..., :count]), {})
+    for degree in range(5):
+        yield f"degree {degree}", (make_scene(5, scale=0.4, degree=degree, seed=7), {"pose": POSE})
+    yield "clamped colours", (make_spheres((0, 0, 2.0), 1.0, colours=(-0.1, 0.05, 1.5)), {})
+
+    # Places
+    on_edge, at_corner = make_spheres((1.4, 0, 1.4), 0.3), make_spheres((1.2, 1.2, 1.2), 0.4)
+    for kernel in ("ray", "ewa"):
+        for num in (1, 2, 3, 5, 7):
+            faces = {"size": (7, 15), "layout": "cubemap", "face_size": num, "kernel": kernel}
+            yield f"edge, {kernel} of {num} pixels", (on_edge, faces)
+            yield f"corner, {kernel} of {num} pixels", (at_corner, faces)
+        beside = [(14 * 0.3, 0.1, 0.3), (-0.5, 0.9, 0.21), (0.3, 1.4, 1.0), (0.1, -0.1, 2.0)]
+        outside = make_spheres(beside, [1.5, 0.4, 0.5, 0.3], colours=noise(4, 3).abs())
+        for lowpass in LOWPASSES:
+            wide = PINHOLE | {"kernel": kernel, "lowpass": lowpass, "order": "z", "fields": NO_QUATS}
+            yield f"outside the view, {kernel} {lowpass}", (outside, wide)
+        behind = make_spheres([(0, 0, -2.0), (0.5, 0.2, -2.0), (1.0, 0, -0.9)], 0.1)
+        yield f"behind, {kernel}", (behind, PINHOLE | {"vertical_fov_degrees": 100.0, "kernel": kernel})
+    for name, mean in {"up": (0, -2.0, 0), "down": (0, 2.0, 0), "seam": (0, 0.3, -2.0)}.items():
+        yield name, (make_spheres(mean, 0.5), {})
+    around = make_scene(8, scale=1.2, extent=0.6, seed=2, degree=0)
+    around = around.select(around.means.norm(dim=1) > 0.1)
+    yield "inside", (around, {})
+    yield "inside, pinhole", (around, PINHOLE | {"vertical_fov_degrees": 140.0})
+    for distance in (0.0, 1e-6, 0.5 * (1 - 1e-5), 0.5 * (1 + 1e-5)):
+        yield (
+            f"near, {distance}",
+            (make_spheres([(0, 0, distance), (0, 0.4, 2.0)], 0.2), {"near": 0.5, "fields": NO_QUATS}),
+        )
+
+    # Order
+    pair = make_spheres([(0.4, 0.1, 2.0)] * 2, 0.4, colours=RED_GREEN)
+    ties = Gaussians.cat([pair, make_scene(9, degree=0), pair.select(torch.tensor([1, 0, 0]))])
+    for layout in ("equirect", "cubemap"):
+        for order in ("radial", "z"):
+            yield f"ties, {layout} {order}", (ties, {"layout": layout, "order": order})
+
+    # Shapes
+    for axis, name in enumerate("xyz"):
+        for kernel in ("ray", "ewa"):
+            scales = torch.full((2, 3), 1e-4, dtype=torch.float64)
+            scales[:, axis] = 1.0
+            needles = change(
+                make_spheres([(0.1, 0.1, 2.0), (-0.6, 0.3, 1.5)], colours=noise(2, 3).abs()),
+                scales=scales,
+                quats=[[0.95, 0.1, -0.05, 0.2], [1.0, 0, 0, 0]],
+            )
+            options = PINHOLE | {"kernel": kernel, "lowpass": "3dgs", "fields": NO_QUATS}
+            yield f"needles {name} {kernel}", (needles, options)
+    flat = {"disc": (0.5, 0.5, 0), "disc on edge": (0, 0.5, 0.5), "line": (0, 0, 0.5), "aside": (0.5, 0, 0)}
+    for name, scales in (flat | {"point": (0, 0, 0)}).items():
+        for kernel in ("ray", "ewa"):
+            shape = change(make_spheres((0.02, 0.01, 2.0)), scales=[scales])
+            options = PINHOLE | {"kernel": kernel, "lowpass": "3dgs", "fields": NO_QUATS}
+            yield f"{name}, {kernel}", (shape, options)
+    count, apart, focal = 9, 5, 1000.0
+    grid = torch.stack(torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij"), dim=-1).double()
+    grid = (grid.reshape(-1, 2) * (apart + 1 / count) + 2.5 - 0.5 * count * apart) / focal  # all sub-pixel positions
+    ahead = torch.nn.functional.normalize(torch.nn.functional.pad(grid, (0, 1), value=1.0), dim=1)
+    fov = 2 * math.degrees(math.atan(0.5 * count * apart / focal))
+    for lowpass in LOWPASSES:
+        options = PINHOLE | {"size": (count * apart,) * 2, "vertical_fov_degrees": fov, "lowpass": lowpass}
+        yield (
+            f"specks, {lowpass}",
+            (make_spheres(ahead, 0.05 / focal, 1.0), options | {"fields": NO_QUATS, "slack": 4}),
+        )
+    turned = make_scene(8, scale=0.3, degree=0)
+    for factor in (-1.0, 2.0, 1e-6, 1e6):
+        yield f"quaternions times {factor}", (change(turned, quats=factor * turned.quats), {"pose": POSE})
+    yield "quaternions of zero", (change(turned, quats=0 * turned.quats), {"pose": POSE, "fields": NO_QUATS})
+
+    # Light
+    for opacity in (0.0, -0.5, -1e29, (1 - 1e-3) / 255, (1 + 1e-3) / 255, 0.5, 1.0, 5.0, 1e29):
+        yield f"opacity {opacity:.4g}", (make_spheres((0, 0, 2.0), 1.9, opacity), LIGHT | {"size": (5, 5)})
+    for opacity in (0.3, 0.9, 0.999):
+        far = 2 + 0.01 * torch.arange(12, dtype=torch.float64)
+        means = torch.stack((0 * far, 0 * far, far), dim=1) + 0.2 * noise(12, 3, seed=2) * torch.tensor((1.0, 1, 0))
+        stack = make_spheres(means, 0.9, opacity, noise(12, 3).abs())
+        yield f"stack of {opacity}", (stack, LIGHT | {"fields": NO_QUATS})
+
+    # Units and sizes
+    some = make_scene(10, scale=0.5, degree=0)
+    some = some.select((some.means - POSE[:3, 3]).norm(dim=1) > 0.2)
+    for metre in (1e-18, 1e-9, 1e-3, 1e4, 1e9, 1e18):
+        camera = POSE.clone()
+        camera[:3, 3] *= metre
+        for layout, kernel in (LAYOUTS[0], LAYOUTS[4]):
+            options = {"layout": layout, "kernel": kernel, "near": 0.05 * metre, "pose": camera}
+            yield f"metre of {metre}, {kernel}", (unit(some, metre), options | {"metre": metre})
+    distances = (1e-3, 1e-2, 1e-1, 1.0, 1e1)
+    means = [(0.3 * r * (-1) ** i, 0.1 * r, r) for i, r in enumerate(distances)]
+    wide = make_spheres(means, [0.15 * r for r in distances], 0.5, noise(5, 3).abs())
+    yield "millimetre to ten metres", (wide, {"near": 1e-4, "fields": NO_QUATS})
+    five = make_spheres(2 * torch.nn.functional.normalize(noise(5, 3, seed=1), dim=1), 0.6)
+    for height in (1, 2, 3, 5, 17, 31, 33, 100):
+        yield f"odd size {height}", (five, {"size": (height, 2 * height + height % 3), "fields": NO_QUATS})
+        yield f"odd size {height}, pinhole", (five, PINHOLE | {"size": (height, height + 3), "fields": NO_QUATS})
+    three = make_spheres([(0, 0.1, 2.0), (-1.0, 0.2, 0.9), (0.3, -0.5, -1.0)], 0.1)
+    yield "more tiles than Gaussians", (three, {"size": (256, 512), "fields": NO_QUATS})
+
+
+CASES = dict(list_cases())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_images_and_gradients_equal_the_dense_renderers(case: str, render: Renderer) -> None:
+    scene, options = CASES[case]
+    if options.get("kernel") == "ewa" and render.name == "auto":
+        pytest.skip("numba has no EWA kernel")
+    if render.interpreted and case not in INTERPRETED:
+        pytest.skip("takes too long under Triton's interpreter")
+    check(render, scene, options)
+
+
+def check(render: Renderer, scene: Gaussians, options: dict[str, Any]) -> None:
+    """Assert that a backend's image, counts and gradients equal those of the dense renderer."""
+    options = {"size": render.size, **options}
+    chosen = {name: options.pop(name, None) for name in ("pose", "slack", "fields", "by_covariance", "metre")}
+    pose = ORIGIN if chosen["pose"] is None else chosen["pose"]
+    slack, metre = chosen["slack"] or 1.0, chosen["metre"] or 1.0
+    background = torch.linspace(0.2, 0.9, scene.harmonics.shape[2], dtype=torch.float64)
+    # The scene is rounded to the backend's type first, for the dense renderer too.
+    rounded = scene.to(dtype=render.dtype)
+    names = ("kernel", "order", "lowpass", "near", "layout", "face_size")
+    dense_options = {name: options[name] for name in names if name in options}
+
+    def draw_truth(truth: Gaussians, camera: Tensor, ground: Tensor) -> tuple[Rendering, Tensor]:
+        fov = options.get("vertical_fov_degrees", 90.0)
+        sums = draw_dense(truth, camera, options["size"], fov=fov, **dense_options)
+        color, (alpha, weighted, close) = sums[:-3], sums[-3:]
+        depth = torch.where(alpha > 0, weighted / torch.where(alpha > 0, alpha, 1), 0)
+        color = color + (1 - alpha) * ground[:, None, None]
+        return Rendering(color, alpha, depth), (close == 0).detach()
+
+    def draw(given: Gaussians, camera: Tensor, ground: Tensor) -> tuple[Rendering, None]:
+        covariances = given.covariances if chosen["by_covariance"] else None
+        return render(given, camera, background=ground, covariances=covariances, **options), None
+
+    images, gradients, shown = [], [], None
+    for function, given in ((draw_truth, rounded.to(dtype=torch.float64)), (draw, rounded)):
+        inputs, camera, ground = make_leaves(given), pose.clone().requires_grad_(), background.clone().requires_grad_()
+        image, mask = function(inputs, camera, ground)
+        shown = mask if shown is None else shown
+        measure_loss(image, shown).backward()
+        images.append(image)
+        leaves = {name: getattr(inputs, name) for name in FIELDS} | {"pose": camera, "background": ground}
+        found = {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+        turn = pose[:3, :3].T @ found["pose"][:3, :3]  # both formulas agree along rigid motions only
+        found["pose"] = torch.cat((turn - turn.T, metre * found["pose"][:3, 3:]), dim=1)
+        gradients.append(found)
+    truth, got = images
+    assert shown.double().mean() > 0.8, "most pixels are not at a cut"
+    for name, weight in (("color", 1.0), ("alpha", 1.0), ("depth", truth.alpha.detach() / metre)):
+        error = (getattr(got, name) - getattr(truth, name)).detach() * weight * shown
+        size = max(1.0, float((getattr(truth, name).detach() * weight).abs().max()))
+        assert float(error.abs().max()) <= slack * render.image * size, f"{name} off by {float(error.abs().max()):.2g}"
+    radius = (rounded.means.double() - pose[:3, 3]).norm(dim=1)
+    near = int((radius < options.get("near", 0.05)).sum())
+    assert (got.info.total, got.info.dropped, got.info.near) == (len(scene), 0, near)
+    for name in chosen["fields"] or (*NO_QUATS, "quats"):
+        expected, found = gradients[0][name].double(), gradients[1][name].double()
+        assert torch.isfinite(found).all(), name
+        unit = metre if name in ("means", "scales") else 1.0
+        norm = max(unit * float(expected.norm()), 1e-6)  # a sphere's quaternion has only rounding errors as gradient
+        error = unit * float((found - expected).norm()) / norm
+        assert error <= slack * render.gradient, f"gradient of {name} off by {error:.2g}"
