@@ -13,13 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from typing_extensions import Unpack
 
 from pansplat.cache import CachedPrediction, CachedScene
 from pansplat.errors import InputError, InputWarning
@@ -30,7 +29,7 @@ from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs import folders
 from pansplat.inputs.pairs import Pair
-from pansplat.inputs.views import CAMERA_HEIGHT, ONE_POSITION, Views
+from pansplat.inputs.views import ONE_POSITION, Views
 from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
@@ -49,7 +48,7 @@ from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import expand_home, find_scene_suffix
-from pansplat.system.options import MIN_HEIGHT
+from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT
 from pansplat.tours.graph import (
     MAX_SCENE_VIEWS,
     TourGraph,
@@ -116,15 +115,10 @@ def load_pairs(
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     try:
-        pairs = folders.load_pairs(path, convention=convention, near=near, far=far)
+        return folders.load_pairs(path, convention=convention, near=near, far=far, camera_height=camera_height)
     except folders.UnposedPanoramasError as error:
         options = {"near": near, "far": far, "camera_height": camera_height}
-        pairs = estimate_pairs(error.folder, error.panoramas, **options, progress=progress, on_unposed=on_unposed)
-    return [_with_camera_height(pair, camera_height) for pair in pairs]
-
-
-def _with_camera_height(pair: Pair, camera_height: float) -> Pair:
-    return replace(pair, context=tuple(replace(view, camera_height=camera_height) for view in pair.context))
+        return estimate_pairs(error.folder, error.panoramas, **options, progress=progress, on_unposed=on_unposed)
 
 
 def load_model(
@@ -296,22 +290,6 @@ def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
     return pair.load_context(height)
 
 
-class PredictKeywords(TypedDict, total=False):
-    """Keywords of predictions, which `predict` documents."""
-
-    compat: CompatChoice
-    precision: Precision
-    depth_network: str | Path | None
-    height: int | None
-    refine_seconds: float | None
-    gaussians: int | None
-    joint: bool
-    cache: bool
-
-
-_UNREFINED: PredictKeywords = {"refine_seconds": 0.0}  # by default; commands refine
-
-
 @dataclass(frozen=True)
 class _Task:
     """What is predicted and how; `options` has no defaults that are still to be chosen."""
@@ -340,11 +318,12 @@ class _Task:
 @with_progress_bar
 def predict(
     source: Pair | Views | str | Path | Sequence[str | Path],
-    model: str | Path | Predictor = "default",
+    model: str | Path | Predictor | None = None,
     *,
+    options: PredictOptions | None = None,
     progress: Progress | None = None,
     on_predicted: Callable[[Scene], None] | None = None,
-    **options: Unpack[PredictKeywords],
+    **keywords: Any,
 ) -> Scene:
     """Predict the scene of a pair's context panoramas, and refine it.
 
@@ -353,47 +332,57 @@ def predict(
     Args:
         source: a pair; the path of a panorama or of a folder that holds exactly one pair; the panoramas of one folder
             to use, whose poses are estimated if they have none; or loaded panoramas (never cached).
-        model: the name of a predictor, a file of weights, or a predictor.
+        model: the name of a predictor, a file of weights, or a predictor; by default that of the options.
+        options: all of the following keywords in one object; a keyword replaces its value.
         progress: called with a description of the current work and the completed fraction.
         on_predicted: called with the prediction before it is refined.
         compat, precision, depth_network: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
-        refine_seconds: time limit of the refinement. By default 0, for none; commands have None, which is
+        refine_seconds: time limit of the refinement. By default 0, for none; that of `PredictOptions` is None, which is
             `choose_refine_seconds`. A single view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it.
         joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without
             a refinement, only the colours are fitted.
         cache: whether to read and write the cache.
     """
-    task = _prepare(source, model, options, progress)
+    task = _prepare(source, *_choose_options(model, options, keywords), progress)
     if task.options.refine_seconds:
         return _refine_prediction(task, progress, on_predicted)
     scene = _predict_views(task, part_of(progress))
     return fuse(scene, task.views) if task.options.joint else scene
 
 
+def _choose_options(
+    model: str | Path | Predictor | None, options: PredictOptions | None, keywords: dict[str, Any]
+) -> tuple[Predictor, PredictOptions]:
+    """The predictor and the options of a call; without options, what is predicted is not refined."""
+    is_named = isinstance(model, (str, Path))
+    options = PredictOptions(refine_seconds=0.0) if options is None else options
+    options = options.replace(**keywords, **({"model": str(model)} if is_named else {}))
+    RefineConfig(gaussians=options.gaussians)
+    seconds = options.refine_seconds
+    if seconds is not None and not 0 <= seconds < math.inf:
+        raise InputError(f"`refine_seconds` must be at least 0, got {seconds}")
+    return load_predictor(options) if model is None or is_named else model, options
+
+
 def _prepare(
     source: Pair | Views | str | Path | Sequence[str | Path],
-    model: str | Path | Predictor,
-    options: PredictKeywords,
+    predictor: Predictor,
+    options: PredictOptions,
     progress: Progress | None,
 ) -> _Task:
     """The task of `predict`; what cannot be predicted is refused."""
-    settings = PredictOptions(**(_UNREFINED | options))
-    RefineConfig(gaussians=settings.gaussians)
-    seconds = settings.refine_seconds
-    if seconds is not None and not 0 <= seconds < math.inf:
-        raise InputError(f"`refine_seconds` must be at least 0, got {seconds}")
-    predictor = _choose_model(model, settings)
+    seconds = options.refine_seconds
     pair = _load_source(source, progress)
     _require_views(pair, predictor)
     is_single = len(pair.images if isinstance(pair, Views) else pair.context) == 1
-    joint = settings.joint and not is_single
+    joint = options.joint and not is_single
     if seconds is None:
-        seconds = choose_refine_seconds(settings.gaussians, joint=joint)
-    height = pair.images.shape[-2] if isinstance(pair, Views) else settings.height or choose_height(pair, predictor)
-    chosen = replace(settings, height=height, refine_seconds=0.0 if is_single else seconds, joint=joint)
+        seconds = choose_refine_seconds(options.gaussians, joint=joint)
+    height = pair.images.shape[-2] if isinstance(pair, Views) else options.height or choose_height(pair, predictor)
+    chosen = replace(options, height=height, refine_seconds=0.0 if is_single else float(seconds), joint=joint)
     task = _Task(pair, predictor, chosen)
     if not is_single and float(torch.pdist(task.cam2world[:, :3, 3]).max()) < ONE_POSITION * pair.near:
         names = pair.names if isinstance(pair, Views) else [view.name for view in pair.context]
@@ -404,10 +393,6 @@ def _prepare(
             stacklevel=3,
         )
     return task
-
-
-def _choose_model(model: str | Path | Predictor, options: PredictOptions) -> Predictor:
-    return load_predictor(replace(options, model=str(model))) if isinstance(model, (str, Path)) else model
 
 
 def _predict_views(task: _Task, progress: Progress) -> Scene:
@@ -527,10 +512,11 @@ def _run_refinement(
 @with_progress_bar
 def predict_tour(
     tour: TourGraph | str | Path,
-    model: str | Path | Predictor = "default",
+    model: str | Path | Predictor | None = None,
     *,
+    options: PredictOptions | None = None,
     progress: Progress | None = None,
-    **options: Unpack[PredictKeywords],
+    **keywords: Any,
 ) -> Scene:
     """Predict one scene of all panoramas of a tour: the scenes of its parts, merged.
 
@@ -539,36 +525,35 @@ def predict_tour(
 
     Args:
         tour: of `pansplat.tours.overlap.connect`, or the path of a folder that holds the panoramas of one tour.
-        model, progress, compat, precision, depth_network, refine_seconds, cache: see `predict`; the time limit is that
-            of three panoramas.
+        model, options, progress, compat, precision, depth_network, refine_seconds, cache: see `predict`; the time limit
+            is that of three panoramas.
         height: panoramas are resized to (height, 2 height); by default that of the photographs, at most 512.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.
         joint: see `predict`; the refinement is then that of each part of the tour as a whole, and not cached.
     """
-    settings = PredictOptions(**(_UNREFINED | options))
-    if settings.refine_seconds is None:
-        settings = replace(settings, refine_seconds=choose_refine_seconds(None, joint=settings.joint))
-    predictor = _choose_model(model, settings)
+    predictor, options = _choose_options(model, options, keywords)
+    if options.refine_seconds is None:
+        options = replace(options, refine_seconds=choose_refine_seconds(None, joint=options.joint))
     tour = _load_only_tour(tour, progress) if isinstance(tour, (str, Path)) else tour
     warn_of_single_views(tour, predictor)
-    max_views, is_refined = find_max_views(predictor), bool(settings.joint and settings.refine_seconds)
+    max_views, is_refined = find_max_views(predictor), bool(options.joint and options.refine_seconds)
     total = len(tour.choose_sources(max_views))
-    part = math.inf if settings.gaussians is None else settings.gaussians / len(tour)  # of a panorama
+    part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # of a panorama
     counter, predicted = itertools.count(), 0.5 if is_refined else 1.0
-    each = replace(settings, joint=False, refine_seconds=0.0) if settings.joint else settings
+    each = replace(options, joint=False, refine_seconds=0.0) if options.joint else options
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
         number, pair = next(counter), tour.make_pair(views)
         begun = predicted * number
         shown = part_of(progress, begun / total, (begun + predicted) / total, f"scene {number + 1} of {total}: ")
         fitted = fit_to_scene(each, pair, part)
-        return predict(pair, choose_predictor(pair, predictor), progress=shown, **fitted.keywords)
+        return predict(pair, choose_predictor(pair, predictor), options=fitted, progress=shown)
 
     scene = merge_scenes(tour, predict_scene, max_views)
-    if not settings.joint:
+    if not options.joint:
         return scene
-    return fuse_tour(tour, scene, refine_seconds=settings.refine_seconds or 0.0, progress=part_of(progress, predicted))
+    return fuse_tour(tour, scene, refine_seconds=options.refine_seconds or 0.0, progress=part_of(progress, predicted))
 
 
 def fuse(scene: Scene, views: Views) -> Scene:
@@ -619,12 +604,13 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
 def predict_to_file(
     source: Pair | Views | str | Path | Sequence[str | Path],
     path: str | Path,
-    model: str | Path | Predictor = "default",
+    model: str | Path | Predictor | None = None,
     *,
+    options: PredictOptions | None = None,
     degree: int | None = None,
     min_opacity: float = 0.0,
     progress: Progress | None = None,
-    **options: Unpack[PredictKeywords],
+    **keywords: Any,
 ) -> int:
     """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
 
@@ -632,21 +618,22 @@ def predict_to_file(
     is written tile by tile, too. The Gaussians are those of `predict`, ordered by tile.
 
     Args:
-        source, model, progress, **options: see `predict`.
+        source, model, options, progress, **keywords: see `predict`.
         path: the file.
         degree: highest degree of harmonics in the file; None keeps all.
         min_opacity: Gaussians of lower opacity are omitted.
-        cache: whether to read and write the cache, by default not; networks do not cache heights above 512.
+        cache: see `predict`; without options by default not, and networks do not cache heights above 512.
 
     Returns:
         The number of Gaussians in the file.
     """
     suffix = find_scene_suffix(path)
-    options.setdefault("cache", False)
-    task = _prepare(source, model, options, progress)
-    predictor, settings = task.predictor, task.options
-    is_cached = settings.cache and (settings.height or 0) <= _MAX_CACHED_HEIGHT
-    if can_stream(predictor) and not (settings.joint or settings.refine_seconds or is_cached):
+    if options is None:
+        keywords.setdefault("cache", False)
+    task = _prepare(source, *_choose_options(model, options, keywords), progress)
+    predictor, options = task.predictor, task.options
+    is_cached = options.cache and (options.height or 0) <= _MAX_CACHED_HEIGHT
+    if can_stream(predictor) and not (options.joint or options.refine_seconds or is_cached):
         views = task.views
         parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
             views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
@@ -656,7 +643,7 @@ def predict_to_file(
             return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), task), pruned, path)
         scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), task)
     else:
-        scene = predict(task.source, predictor, progress=progress, **settings.keywords)
+        scene = predict(task.source, predictor, options=options, progress=progress)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
     save(scene, path)
     return len(scene.gaussians)

@@ -60,8 +60,6 @@ class Options:
     pair: str | None = None
     """Name or number of the tour, pair or scene to show first if the path holds several; offscreen also "all"."""
     prediction: PredictOptions = field(default_factory=PredictOptions)
-    no_cache: bool = False
-    """Predict even if the pair's folder has a cached result."""
     reading: ReadOptions = field(default_factory=ReadOptions)
     mode: Mode = "deferred"
     """How the Gaussians of the input views are combined."""
@@ -107,7 +105,7 @@ class Options:
     @property
     def load_options(self) -> LoadOptions:
         """Options of reading and prediction."""
-        return LoadOptions(self.reading, replace(self.prediction, cache=not self.no_cache))
+        return LoadOptions(self.reading, self.prediction)
 
     @property
     def settings(self) -> DrawSettings:

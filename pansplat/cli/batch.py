@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from pansplat.cli.export import Export, Page
-from pansplat.cli.inputs import Out, PairChoice, SceneOptions, ScenePrediction, Writer
+from pansplat.cli.inputs import Out, PairChoice, ScenePrediction, Writer
 from pansplat.errors import InputError, collect_notes
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import is_out_of_memory, print_message, progress_bar
@@ -144,7 +144,7 @@ class Batch(Writer):
             panoramas = source.context if isinstance(source, Pair) else source.panoramas
             content = hash_pixels(panoramas, source.siblings), *map(hash_panorama, panoramas)
             for step in (step for step in STEPS if step in self.steps):
-                options = SceneOptions(**vars(self.prediction))
+                options = self.prediction
                 if step == "predict" or "refine" not in self.steps:
                     options = replace(options, refine_seconds=0.0)
                 suffix = f".{self.format}" if step == "export" else ".ply"

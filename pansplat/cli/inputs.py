@@ -57,7 +57,9 @@ class SceneOptions(PredictOptions):
 class ScenePrediction:
     """How the scene of a path is predicted."""
 
-    options: Annotated[SceneOptions, arg(name="prediction", prefix_name=False)] = field(default_factory=SceneOptions)
+    options: Annotated[PredictOptions, arg(name="prediction", prefix_name=False, constructor=SceneOptions)] = field(
+        default_factory=SceneOptions
+    )
     choice: Annotated[PairChoice, arg(prefix_name=False)] = field(default_factory=PairChoice)
 
     def open(self, path: Path) -> tuple[Scene, Pair | None]:
@@ -139,8 +141,8 @@ def predict_scene(source: Pair | TourGraph, options: PredictOptions) -> Scene:
     options = replace(options, joint=options.joint and not pipeline.can_stream(model))
     with progress_bar() as progress:
         if isinstance(source, Pair):
-            return pipeline.predict(source, model, progress=progress, **options.keywords)
-        return pipeline.predict_tour(source, model, progress=progress, **options.keywords)
+            return pipeline.predict(source, model, options=options, progress=progress)
+        return pipeline.predict_tour(source, model, options=options, progress=progress)
 
 
 def parse_blend(text: str) -> str | int:

@@ -94,7 +94,7 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
     tour = replace(tour, overlaps={(0, 0): 1.0, (1, 2): 0.4, (2, 3): 0.4})
     monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: tour)
     scene = load_house(TourScenes(tour).make_entry((0,))).scene
-    monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, **options: scene)
+    monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, model, **options: scene)
     single = replace(tour, panoramas=(alone,), overlaps={(0, 0): 1.0})
     for each in (tour, single):
         loaded = load_entry(SceneEntry("house", tour=each), LoadOptions(), ignore)
@@ -107,9 +107,9 @@ def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_f
     monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: connected)
     asked = []
 
-    def predict(pair, refine_seconds, on_predicted, **options):
+    def predict(pair, model, *, options, on_predicted, progress):
         views = tuple(int(view.name[-1]) for view in pair.context)
-        asked.append((views, refine_seconds, on_predicted is not None))
+        asked.append((views, options.refine_seconds, on_predicted is not None))
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
@@ -240,13 +240,13 @@ def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene)
     entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
     options = LoadOptions(prediction=PredictOptions("sweep", height=256, cache=False))
     loaded = load_entry(entry, options, lambda task, done: tasks.append(task))
-    assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)
+    assert arguments["options"] is options.prediction
     assert loaded.scene is small_scene and tasks[0] == "predicting"
 
 
 def test_an_entry_shows_its_prediction_before_the_refined_scene(monkeypatch, small_scene):
     def predict(pair, **options):
-        assert options["refine_seconds"] == 3.0
+        assert options["options"].refine_seconds == 3.0
         options["on_predicted"](small_scene)
         return small_scene
 
