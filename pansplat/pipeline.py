@@ -47,6 +47,7 @@ from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
+from pansplat.system.devices import choose_device, note_full_card, with_device
 from pansplat.system.files import expand_home, find_scene_suffix
 from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT
 from pansplat.tours.graph import (
@@ -83,9 +84,11 @@ _MAX_CACHED_HEIGHT = 512  # of predictions of networks; taller ones are written 
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
 _GAUSSIANS_PER_SQUARE = 0.75  # of a panorama, over the square of its height; about those of the default model
 _BRIGHTEST = 1.5  # value of an image in [0, 1], after any filter
+_PIXEL_SECONDS = 2e-7  # of an image of a scene of a pair, on two cores (docs/bench_raster.md)
 _MAX_MERGED = 4  # Gaussians that become one on average
 
 
+@with_device
 @with_progress_bar
 def load_pairs(
     path: Path | str,
@@ -121,6 +124,7 @@ def load_pairs(
         return estimate_pairs(error.folder, error.panoramas, **options, progress=progress, on_unposed=on_unposed)
 
 
+@with_device
 def load_model(
     name: str | Path = "default",
     *,
@@ -141,6 +145,7 @@ def load_model(
             surfaces have (docs/depth_network.md).
         **options: of "sweep", the arguments of `pansplat.sweep.Sweep`; of the weights of a network, those of
             `pansplat.model.network.load_predictor`; others have none.
+        device: see `predict`.
     """
     if compat not in get_args(CompatChoice):
         raise InputError(f"`compat` must be one of {', '.join(get_args(CompatChoice))}, got {compat!r}")
@@ -315,6 +320,7 @@ class _Task:
         return CachedPrediction(self.source, self.predictor, self.options, refined=refined)
 
 
+@with_device
 @with_progress_bar
 def predict(
     source: Pair | Views | str | Path | Sequence[str | Path],
@@ -345,6 +351,7 @@ def predict(
         joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without
             a refinement, only the colours are fitted.
         cache: whether to read and write the cache.
+        device: of all work in the call, "cpu", "cuda" or "auto": a graphics card for long work (docs/platforms.md).
     """
     task = _prepare(source, *_choose_options(model, options, keywords), progress)
     if task.options.refine_seconds:
@@ -431,12 +438,13 @@ def _refine_prediction(task: _Task, progress: Progress | None, on_predicted: Cal
     photographs = task.views
     if isinstance(task.source, Pair) and options.gaussians is not None:
         photographs = load_photographs(task.source, scene.height, options.gaussians)
-    refinement = Refinement(scene, photographs, RefineConfig(gaussians=options.gaussians))
-    report = refinement.run(seconds=options.refine_seconds, progress=part_of(progress, 0.5))
-    content = cached.write_refinement(refinement.scene(), report, time.process_time() - began)
+    config, shown = RefineConfig(gaussians=options.gaussians), part_of(progress, 0.5)
+    refined, report = _refine_scene(scene, photographs, config, seconds=options.refine_seconds, progress=shown)
+    content = cached.write_refinement(refined, report, time.process_time() - began)
     return _make_scene(content, task, options.joint)
 
 
+@with_device
 @with_progress_bar
 def refine(
     scene: Scene,
@@ -459,6 +467,7 @@ def refine(
         steps: number of steps instead, for the same result in every run.
         config: settings of the objective, the step sizes and the number of Gaussians.
         seed: of the blocks of pixels that are held out of the loss.
+        device: see `predict`; a scene on a card is refined there.
         progress: called with a description of the current work and the completed fraction.
 
     Returns:
@@ -467,6 +476,7 @@ def refine(
     return _run_refinement(scene, views, config, seed, seconds=seconds, steps=steps, progress=progress)[0]
 
 
+@with_device
 @with_progress_bar
 def refine_to_file(
     scene: Scene,
@@ -502,13 +512,37 @@ def _run_refinement(
 ) -> tuple[Scene, RefineReport]:
     """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`."""
     poses = scene.frame.localize(views.frame.globalize(views.cam2world))
-    refinement = Refinement(scene, replace(views, cam2world=poses, frame=scene.frame), config, seed=seed)
     if run["steps"] is None and run["seconds"] is None:
         run["seconds"] = choose_refine_seconds(None if config is None else config.gaussians, joint=scene.joint)
-    report = refinement.run(**run)
-    return refinement.scene(), report
+    return _refine_scene(scene, replace(views, cam2world=poses, frame=scene.frame), config, seed, **run)
 
 
+def _refine_scene(
+    scene: Scene, views: Views, config: RefineConfig | None = None, seed: int = 0, **run: Any
+) -> tuple[Scene, RefineReport]:
+    """The refined scene and what the refinement did, which runs on the device of `choose_device`, or a given card's."""
+    device = given = scene.gaussians.means.device
+
+    def run_refinement(device: torch.device) -> tuple[Scene, RefineReport]:
+        moved = replace(scene, gaussians=scene.gaussians.to(device=device))
+        refinement = Refinement(moved, views, config, seed=seed)
+        report = refinement.run(**run)
+        refined = refinement.scene()
+        return replace(refined, gaussians=refined.gaussians.to(device=given)), report
+
+    if given.type == "cpu":
+        seconds = run.get("seconds")
+        device = choose_device("refinement", math.inf if seconds is None else seconds, kernels=True)
+    try:
+        return run_refinement(device)
+    except torch.cuda.OutOfMemoryError:
+        if device == given:
+            raise
+        note_full_card("refinement")  # outside of the block the card's tensors are free
+    return run_refinement(given)
+
+
+@with_device
 @with_progress_bar
 def predict_tour(
     tour: TourGraph | str | Path,
@@ -570,6 +604,7 @@ def fuse(scene: Scene, views: Views) -> Scene:
     return replace(fused, gaussians=colors)
 
 
+@with_device
 @with_progress_bar
 def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, progress: Progress | None = None) -> Scene:
     """The scene of a whole tour with each surface once, and fitted to all photographs of each part.
@@ -588,10 +623,9 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
             pair = tour.make_pair(nodes)
             views = replace(pair.load_context(scene.height), cam2world=part.cam2world, frame=part.frame)
             if refine_seconds:
-                refinement = Refinement(fuse_views(part), views)
                 shown = part_of(progress, number / len(parts), (number + 1) / len(parts))
-                refinement.run(seconds=scale_seconds(refine_seconds, pair), progress=shown)
-                part = refinement.scene()
+                seconds = scale_seconds(refine_seconds, pair)
+                part, _ = _refine_scene(fuse_views(part), views, seconds=seconds, progress=shown)
             else:
                 part = fuse(part, views)
         for view, node in enumerate(nodes):
@@ -600,6 +634,7 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
     return replace(scene, gaussians=Gaussians.cat(fused), gains=tuple(gains), joint=True)
 
 
+@with_device
 @with_progress_bar
 def predict_to_file(
     source: Pair | Views | str | Path | Sequence[str | Path],
@@ -721,10 +756,36 @@ def render(
         return rasterize_gaussians(gaussians, pose)
     group = shown if tour is None or edge is None else list(tour.choose_scene_views()[edge])
     weights = torch.zeros(num_views, dtype=torch.float64, device=pose.device)
-    weights[group] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].to(pose))
+    near = torch.tensor(group, device=pose.device)
+    weights[near] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].to(pose))
     views = [scene.gaussians.select(scene.gaussians.views == view) for view in shown]
     renderings = [rasterize_gaussians(view, pose) for view in views]
-    return blend_renderings(renderings, weights[shown])
+    return blend_renderings(renderings, weights[torch.tensor(shown, device=pose.device)])
+
+
+def make_renderer(scene: Scene, work: str, count: int, **options: Any) -> Callable[[Tensor], Rendering]:
+    """A function from poses to images: on the device for their number, out of a card's memory on the processor.
+
+    Args:
+        scene: in main memory, as the images are.
+        work: name of the images.
+        count: of images.
+        options: keywords of `render`, with the size.
+    """
+    device = choose_device(work, count * math.prod(options["size"]) * _PIXEL_SECONDS, kernels=True)
+    placed = replace(scene, gaussians=scene.gaussians.to(device=device))
+
+    def draw(cam2world: Tensor) -> Rendering:
+        nonlocal placed
+        try:
+            image = render(placed, cam2world, **options)
+        except torch.cuda.OutOfMemoryError:
+            note_full_card(work)
+            placed = scene
+            return draw(cam2world)
+        return replace(image, color=image.color.cpu(), alpha=image.alpha.cpu(), depth=image.depth.cpu())
+
+    return draw
 
 
 def _choose_rasterizer(

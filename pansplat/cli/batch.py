@@ -26,11 +26,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from pansplat.cli.export import Export, Page
-from pansplat.cli.inputs import Out, PairChoice, ScenePrediction, Writer
+from pansplat.cli.inputs import Computation, Out, PairChoice, ScenePrediction
 from pansplat.errors import InputError, collect_notes
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import is_out_of_memory, print_message, progress_bar
 from pansplat.system.descriptions import describe_count
+from pansplat.system.devices import with_device
 from pansplat.system.files import expand_home, make_portable_name, require_output_folder, require_replaceable
 from pansplat.system.options import Count, Threads
 
@@ -44,7 +45,7 @@ _MEMORY = 4 << 30  # bytes of a worker; decides the default number of workers
 
 
 @dataclass(frozen=True)
-class Batch(Writer):
+class Batch(Computation):
     """Predict, refine and export many pairs and tours; what is up to date is not made again (docs/batch.md).
 
     An item that fails is reported and stops no other; the exit status is 1 then.
@@ -181,6 +182,7 @@ def list_items(path: Path) -> dict[str, Path]:
     return {f.name if name == "." else name: f for f, name in inside.items()}
 
 
+@with_device
 def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict[str, Any]:
     """Make the outputs of a folder that are missing, and remove those in whose place they are.
 
@@ -326,7 +328,7 @@ def run_items(address: str, items: Mapping[str, Path], batch: Batch) -> Iterator
         ) from error
     run = secrets.token_hex(4)  # the scheduler would answer a repeated key with an old report
     names = {f"pansplat-{run}-{name}": name for name in items}
-    arguments = {"batch": batch, "fingerprint": fingerprint_work(batch.prediction)}
+    arguments = {"batch": batch, "fingerprint": fingerprint_work(batch.prediction), "device": batch.device}
     with client:
         futures = client.map(process_item, list(items.items()), key=list(names), pure=False, **arguments)
         for future in as_completed(futures, loop=client.loop):

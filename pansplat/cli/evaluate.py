@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from tyro.conf import Fixed, Positional, Suppress, arg
 
-from pansplat.cli.inputs import Out, Writer, parse_blend
+from pansplat.cli.inputs import Computation, Out, parse_blend
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import make_table_console, progress_bar
@@ -68,7 +68,7 @@ class ProtocolChoice:
 
 
 @dataclass(frozen=True)
-class Evaluate(Writer):
+class Evaluate(Computation):
     """Compare predictions with the real panoramas between the inputs, and with the cross-fade baseline.
 
     With --protocol: compute a table of the paper, with the paper's rows and ours.

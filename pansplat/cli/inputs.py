@@ -16,6 +16,7 @@ from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count
+from pansplat.system.devices import Device
 from pansplat.system.files import is_scene_file
 from pansplat.system.options import Height
 
@@ -34,6 +35,17 @@ class Writer:
 
     overwrite: bool = field(default=False, kw_only=True)
     """Replace files that pansplat did not write, too."""
+
+
+@dataclass(frozen=True)
+class Computation(Writer):
+    """A command that computes what it writes."""
+
+    device: Device = field(default="auto", kw_only=True)
+    """auto: the graphics card for long work if there is one that torch can use, else the processor; cpu, cuda: for all
+    work (docs/platforms.md)."""
+    verbose: bool = field(default=False, kw_only=True)
+    """Print what runs where."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import OptionalOut, Writer
+from pansplat.cli.inputs import Computation, OptionalOut
 from pansplat.errors import InputError
 from pansplat.system.console import make_table_console, print_message, progress_bar
 from pansplat.system.files import require_output_file, require_output_folder
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Pose(Writer):
+class Pose(Computation):
     """Estimate the camera poses of equirectangular panoramas of one place."""
 
     paths: Positional[tuple[Path, ...]]

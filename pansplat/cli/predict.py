@@ -10,7 +10,7 @@ from typing import Annotated
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, PairChoice, Writer, choose_pair
+from pansplat.cli.inputs import Computation, Out, PairChoice, choose_pair
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, require_output_file
@@ -18,7 +18,7 @@ from pansplat.system.options import Fraction
 
 
 @dataclass(frozen=True)
-class Predict(Writer):
+class Predict(Computation):
     """Predict the 3D Gaussians of one panorama or of a pair, and write them in the format of the file's suffix
     (docs/formats.md). Networks predict heights above 512 tile by tile, in bounded memory, and do not cache the
     result."""
