@@ -39,17 +39,15 @@ class CachedScene:
 class CachedPrediction:
     """The entry of one prediction, or of its refinement.
 
-    Its key is that of the files, poses and depth range, the predictor's fingerprint, and for a refinement its options.
+    Its key is that of the files, poses and depth range, the predictor's fingerprint, and the options.
     There is none of loaded panoramas, and without `PredictOptions.cache`.
     """
 
     def __init__(self, source: Pair | Views, predictor: Predictor, options: PredictOptions, *, refined: bool) -> None:
         self._pair = source if isinstance(source, Pair) and options.cache else None
         self._kind, self._found = "refinement" if refined else "prediction", None
-        self._settings = [predictor.fingerprint, str(options.height)]
-        if refined:
-            fingerprint = refinement_fingerprint(RefineConfig(gaussians=options.gaussians))
-            self._settings += [fingerprint, f"{options.refine_seconds:g} s", f"joint {options.joint}"]
+        code = refinement_fingerprint(RefineConfig(gaussians=options.gaussians)) if refined else ""
+        self._settings = [predictor.fingerprint, code, *options.describe(refined=refined)]
         self._key = self._make_key()
         self._store = Store(None if self._pair is None else self._pair.folder, (CachedScene, Gaussians))
 

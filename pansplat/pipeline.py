@@ -13,13 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from typing_extensions import Unpack
 
 from pansplat.cache import CachedPrediction, CachedScene
 from pansplat.errors import InputError, InputWarning
@@ -30,7 +29,7 @@ from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs import folders
 from pansplat.inputs.pairs import Pair
-from pansplat.inputs.views import CAMERA_HEIGHT, ONE_POSITION, Views
+from pansplat.inputs.views import ONE_POSITION, Views
 from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
@@ -48,8 +47,9 @@ from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
+from pansplat.system.devices import choose_device, note_full_card, with_device
 from pansplat.system.files import expand_home, find_scene_suffix
-from pansplat.system.options import MIN_HEIGHT
+from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT
 from pansplat.tours.graph import (
     MAX_SCENE_VIEWS,
     TourGraph,
@@ -84,9 +84,11 @@ _MAX_CACHED_HEIGHT = 512  # of predictions of networks; taller ones are written 
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
 _GAUSSIANS_PER_SQUARE = 0.75  # of a panorama, over the square of its height; about those of the default model
 _BRIGHTEST = 1.5  # value of an image in [0, 1], after any filter
+_PIXEL_SECONDS = 2e-7  # of an image of a scene of a pair, on two cores (docs/bench_raster.md)
 _MAX_MERGED = 4  # Gaussians that become one on average
 
 
+@with_device
 @with_progress_bar
 def load_pairs(
     path: Path | str,
@@ -116,17 +118,13 @@ def load_pairs(
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     try:
-        pairs = folders.load_pairs(path, convention=convention, near=near, far=far)
+        return folders.load_pairs(path, convention=convention, near=near, far=far, camera_height=camera_height)
     except folders.UnposedPanoramasError as error:
         options = {"near": near, "far": far, "camera_height": camera_height}
-        pairs = estimate_pairs(error.folder, error.panoramas, **options, progress=progress, on_unposed=on_unposed)
-    return [_with_camera_height(pair, camera_height) for pair in pairs]
+        return estimate_pairs(error.folder, error.panoramas, **options, progress=progress, on_unposed=on_unposed)
 
 
-def _with_camera_height(pair: Pair, camera_height: float) -> Pair:
-    return replace(pair, context=tuple(replace(view, camera_height=camera_height) for view in pair.context))
-
-
+@with_device
 def load_model(
     name: str | Path = "default",
     *,
@@ -147,6 +145,7 @@ def load_model(
             surfaces have (docs/depth_network.md).
         **options: of "sweep", the arguments of `pansplat.sweep.Sweep`; of the weights of a network, those of
             `pansplat.model.network.load_predictor`; others have none.
+        device: see `predict`.
     """
     if compat not in get_args(CompatChoice):
         raise InputError(f"`compat` must be one of {', '.join(get_args(CompatChoice))}, got {compat!r}")
@@ -296,22 +295,6 @@ def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
     return pair.load_context(height)
 
 
-class PredictKeywords(TypedDict, total=False):
-    """Keywords of predictions, which `predict` documents."""
-
-    compat: CompatChoice
-    precision: Precision
-    depth_network: str | Path | None
-    height: int | None
-    refine_seconds: float | None
-    gaussians: int | None
-    joint: bool
-    cache: bool
-
-
-_UNREFINED: PredictKeywords = {"refine_seconds": 0.0}  # by default; commands refine
-
-
 @dataclass(frozen=True)
 class _Task:
     """What is predicted and how; `options` has no defaults that are still to be chosen."""
@@ -337,14 +320,16 @@ class _Task:
         return CachedPrediction(self.source, self.predictor, self.options, refined=refined)
 
 
+@with_device
 @with_progress_bar
 def predict(
     source: Pair | Views | str | Path | Sequence[str | Path],
-    model: str | Path | Predictor = "default",
+    model: str | Path | Predictor | None = None,
     *,
+    options: PredictOptions | None = None,
     progress: Progress | None = None,
     on_predicted: Callable[[Scene], None] | None = None,
-    **options: Unpack[PredictKeywords],
+    **keywords: Any,
 ) -> Scene:
     """Predict the scene of a pair's context panoramas, and refine it.
 
@@ -353,47 +338,58 @@ def predict(
     Args:
         source: a pair; the path of a panorama or of a folder that holds exactly one pair; the panoramas of one folder
             to use, whose poses are estimated if they have none; or loaded panoramas (never cached).
-        model: the name of a predictor, a file of weights, or a predictor.
+        model: the name of a predictor, a file of weights, or a predictor; by default that of the options.
+        options: all of the following keywords in one object; a keyword replaces its value.
         progress: called with a description of the current work and the completed fraction.
         on_predicted: called with the prediction before it is refined.
         compat, precision, depth_network: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
-        refine_seconds: time limit of the refinement. By default 0, for none; commands have None, which is
+        refine_seconds: time limit of the refinement. By default 0, for none; that of `PredictOptions` is None, which is
             `choose_refine_seconds`. A single view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it.
         joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without
             a refinement, only the colours are fitted.
         cache: whether to read and write the cache.
+        device: of all work in the call, "cpu", "cuda" or "auto": a graphics card for long work (docs/platforms.md).
     """
-    task = _prepare(source, model, options, progress)
+    task = _prepare(source, *_choose_options(model, options, keywords), progress)
     if task.options.refine_seconds:
         return _refine_prediction(task, progress, on_predicted)
     scene = _predict_views(task, part_of(progress))
     return fuse(scene, task.views) if task.options.joint else scene
 
 
+def _choose_options(
+    model: str | Path | Predictor | None, options: PredictOptions | None, keywords: dict[str, Any]
+) -> tuple[Predictor, PredictOptions]:
+    """The predictor and the options of a call; without options, what is predicted is not refined."""
+    is_named = isinstance(model, (str, Path))
+    options = PredictOptions(refine_seconds=0.0) if options is None else options
+    options = options.replace(**keywords, **({"model": str(model)} if is_named else {}))
+    RefineConfig(gaussians=options.gaussians)
+    seconds = options.refine_seconds
+    if seconds is not None and not 0 <= seconds < math.inf:
+        raise InputError(f"`refine_seconds` must be at least 0, got {seconds}")
+    return load_predictor(options) if model is None or is_named else model, options
+
+
 def _prepare(
     source: Pair | Views | str | Path | Sequence[str | Path],
-    model: str | Path | Predictor,
-    options: PredictKeywords,
+    predictor: Predictor,
+    options: PredictOptions,
     progress: Progress | None,
 ) -> _Task:
     """The task of `predict`; what cannot be predicted is refused."""
-    settings = PredictOptions(**(_UNREFINED | options))
-    RefineConfig(gaussians=settings.gaussians)
-    seconds = settings.refine_seconds
-    if seconds is not None and not 0 <= seconds < math.inf:
-        raise InputError(f"`refine_seconds` must be at least 0, got {seconds}")
-    predictor = _choose_model(model, settings)
+    seconds = options.refine_seconds
     pair = _load_source(source, progress)
     _require_views(pair, predictor)
     is_single = len(pair.images if isinstance(pair, Views) else pair.context) == 1
-    joint = settings.joint and not is_single
+    joint = options.joint and not is_single
     if seconds is None:
-        seconds = choose_refine_seconds(settings.gaussians, joint=joint)
-    height = pair.images.shape[-2] if isinstance(pair, Views) else settings.height or choose_height(pair, predictor)
-    chosen = replace(settings, height=height, refine_seconds=0.0 if is_single else seconds, joint=joint)
+        seconds = choose_refine_seconds(options.gaussians, joint=joint)
+    height = pair.images.shape[-2] if isinstance(pair, Views) else options.height or choose_height(pair, predictor)
+    chosen = replace(options, height=height, refine_seconds=0.0 if is_single else float(seconds), joint=joint)
     task = _Task(pair, predictor, chosen)
     if not is_single and float(torch.pdist(task.cam2world[:, :3, 3]).max()) < ONE_POSITION * pair.near:
         names = pair.names if isinstance(pair, Views) else [view.name for view in pair.context]
@@ -404,10 +400,6 @@ def _prepare(
             stacklevel=3,
         )
     return task
-
-
-def _choose_model(model: str | Path | Predictor, options: PredictOptions) -> Predictor:
-    return load_predictor(replace(options, model=str(model))) if isinstance(model, (str, Path)) else model
 
 
 def _predict_views(task: _Task, progress: Progress) -> Scene:
@@ -446,12 +438,13 @@ def _refine_prediction(task: _Task, progress: Progress | None, on_predicted: Cal
     photographs = task.views
     if isinstance(task.source, Pair) and options.gaussians is not None:
         photographs = load_photographs(task.source, scene.height, options.gaussians)
-    refinement = Refinement(scene, photographs, RefineConfig(gaussians=options.gaussians))
-    report = refinement.run(seconds=options.refine_seconds, progress=part_of(progress, 0.5))
-    content = cached.write_refinement(refinement.scene(), report, time.process_time() - began)
+    config, shown = RefineConfig(gaussians=options.gaussians), part_of(progress, 0.5)
+    refined, report = _refine_scene(scene, photographs, config, seconds=options.refine_seconds, progress=shown)
+    content = cached.write_refinement(refined, report, time.process_time() - began)
     return _make_scene(content, task, options.joint)
 
 
+@with_device
 @with_progress_bar
 def refine(
     scene: Scene,
@@ -474,6 +467,7 @@ def refine(
         steps: number of steps instead, for the same result in every run.
         config: settings of the objective, the step sizes and the number of Gaussians.
         seed: of the blocks of pixels that are held out of the loss.
+        device: see `predict`; a scene on a card is refined there.
         progress: called with a description of the current work and the completed fraction.
 
     Returns:
@@ -482,6 +476,7 @@ def refine(
     return _run_refinement(scene, views, config, seed, seconds=seconds, steps=steps, progress=progress)[0]
 
 
+@with_device
 @with_progress_bar
 def refine_to_file(
     scene: Scene,
@@ -517,20 +512,45 @@ def _run_refinement(
 ) -> tuple[Scene, RefineReport]:
     """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`."""
     poses = scene.frame.localize(views.frame.globalize(views.cam2world))
-    refinement = Refinement(scene, replace(views, cam2world=poses, frame=scene.frame), config, seed=seed)
     if run["steps"] is None and run["seconds"] is None:
         run["seconds"] = choose_refine_seconds(None if config is None else config.gaussians, joint=scene.joint)
-    report = refinement.run(**run)
-    return refinement.scene(), report
+    return _refine_scene(scene, replace(views, cam2world=poses, frame=scene.frame), config, seed, **run)
 
 
+def _refine_scene(
+    scene: Scene, views: Views, config: RefineConfig | None = None, seed: int = 0, **run: Any
+) -> tuple[Scene, RefineReport]:
+    """The refined scene and what the refinement did, which runs on the device of `choose_device`, or a given card's."""
+    device = given = scene.gaussians.means.device
+
+    def run_refinement(device: torch.device) -> tuple[Scene, RefineReport]:
+        moved = replace(scene, gaussians=scene.gaussians.to(device=device))
+        refinement = Refinement(moved, views, config, seed=seed)
+        report = refinement.run(**run)
+        refined = refinement.scene()
+        return replace(refined, gaussians=refined.gaussians.to(device=given)), report
+
+    if given.type == "cpu":
+        seconds = run.get("seconds")
+        device = choose_device("refinement", math.inf if seconds is None else seconds, kernels=True)
+    try:
+        return run_refinement(device)
+    except torch.cuda.OutOfMemoryError:
+        if device == given:
+            raise
+        note_full_card("refinement")  # outside of the block the card's tensors are free
+    return run_refinement(given)
+
+
+@with_device
 @with_progress_bar
 def predict_tour(
     tour: TourGraph | str | Path,
-    model: str | Path | Predictor = "default",
+    model: str | Path | Predictor | None = None,
     *,
+    options: PredictOptions | None = None,
     progress: Progress | None = None,
-    **options: Unpack[PredictKeywords],
+    **keywords: Any,
 ) -> Scene:
     """Predict one scene of all panoramas of a tour: the scenes of its parts, merged.
 
@@ -539,36 +559,35 @@ def predict_tour(
 
     Args:
         tour: of `pansplat.tours.overlap.connect`, or the path of a folder that holds the panoramas of one tour.
-        model, progress, compat, precision, depth_network, refine_seconds, cache: see `predict`; the time limit is that
-            of three panoramas.
+        model, options, progress, compat, precision, depth_network, refine_seconds, cache: see `predict`; the time limit
+            is that of three panoramas.
         height: panoramas are resized to (height, 2 height); by default that of the photographs, at most 512.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.
         joint: see `predict`; the refinement is then that of each part of the tour as a whole, and not cached.
     """
-    settings = PredictOptions(**(_UNREFINED | options))
-    if settings.refine_seconds is None:
-        settings = replace(settings, refine_seconds=choose_refine_seconds(None, joint=settings.joint))
-    predictor = _choose_model(model, settings)
+    predictor, options = _choose_options(model, options, keywords)
+    if options.refine_seconds is None:
+        options = replace(options, refine_seconds=choose_refine_seconds(None, joint=options.joint))
     tour = _load_only_tour(tour, progress) if isinstance(tour, (str, Path)) else tour
     warn_of_single_views(tour, predictor)
-    max_views, is_refined = find_max_views(predictor), bool(settings.joint and settings.refine_seconds)
+    max_views, is_refined = find_max_views(predictor), bool(options.joint and options.refine_seconds)
     total = len(tour.choose_sources(max_views))
-    part = math.inf if settings.gaussians is None else settings.gaussians / len(tour)  # of a panorama
+    part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # of a panorama
     counter, predicted = itertools.count(), 0.5 if is_refined else 1.0
-    each = replace(settings, joint=False, refine_seconds=0.0) if settings.joint else settings
+    each = replace(options, joint=False, refine_seconds=0.0) if options.joint else options
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
         number, pair = next(counter), tour.make_pair(views)
         begun = predicted * number
         shown = part_of(progress, begun / total, (begun + predicted) / total, f"scene {number + 1} of {total}: ")
         fitted = fit_to_scene(each, pair, part)
-        return predict(pair, choose_predictor(pair, predictor), progress=shown, **fitted.keywords)
+        return predict(pair, choose_predictor(pair, predictor), options=fitted, progress=shown)
 
     scene = merge_scenes(tour, predict_scene, max_views)
-    if not settings.joint:
+    if not options.joint:
         return scene
-    return fuse_tour(tour, scene, refine_seconds=settings.refine_seconds or 0.0, progress=part_of(progress, predicted))
+    return fuse_tour(tour, scene, refine_seconds=options.refine_seconds or 0.0, progress=part_of(progress, predicted))
 
 
 def fuse(scene: Scene, views: Views) -> Scene:
@@ -585,6 +604,7 @@ def fuse(scene: Scene, views: Views) -> Scene:
     return replace(fused, gaussians=colors)
 
 
+@with_device
 @with_progress_bar
 def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, progress: Progress | None = None) -> Scene:
     """The scene of a whole tour with each surface once, and fitted to all photographs of each part.
@@ -603,10 +623,9 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
             pair = tour.make_pair(nodes)
             views = replace(pair.load_context(scene.height), cam2world=part.cam2world, frame=part.frame)
             if refine_seconds:
-                refinement = Refinement(fuse_views(part), views)
                 shown = part_of(progress, number / len(parts), (number + 1) / len(parts))
-                refinement.run(seconds=scale_seconds(refine_seconds, pair), progress=shown)
-                part = refinement.scene()
+                seconds = scale_seconds(refine_seconds, pair)
+                part, _ = _refine_scene(fuse_views(part), views, seconds=seconds, progress=shown)
             else:
                 part = fuse(part, views)
         for view, node in enumerate(nodes):
@@ -615,16 +634,18 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, pro
     return replace(scene, gaussians=Gaussians.cat(fused), gains=tuple(gains), joint=True)
 
 
+@with_device
 @with_progress_bar
 def predict_to_file(
     source: Pair | Views | str | Path | Sequence[str | Path],
     path: str | Path,
-    model: str | Path | Predictor = "default",
+    model: str | Path | Predictor | None = None,
     *,
+    options: PredictOptions | None = None,
     degree: int | None = None,
     min_opacity: float = 0.0,
     progress: Progress | None = None,
-    **options: Unpack[PredictKeywords],
+    **keywords: Any,
 ) -> int:
     """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
 
@@ -632,21 +653,22 @@ def predict_to_file(
     is written tile by tile, too. The Gaussians are those of `predict`, ordered by tile.
 
     Args:
-        source, model, progress, **options: see `predict`.
+        source, model, options, progress, **keywords: see `predict`.
         path: the file.
         degree: highest degree of harmonics in the file; None keeps all.
         min_opacity: Gaussians of lower opacity are omitted.
-        cache: whether to read and write the cache, by default not; networks do not cache heights above 512.
+        cache: see `predict`; without options by default not, and networks do not cache heights above 512.
 
     Returns:
         The number of Gaussians in the file.
     """
     suffix = find_scene_suffix(path)
-    options.setdefault("cache", False)
-    task = _prepare(source, model, options, progress)
-    predictor, settings = task.predictor, task.options
-    is_cached = settings.cache and (settings.height or 0) <= _MAX_CACHED_HEIGHT
-    if can_stream(predictor) and not (settings.joint or settings.refine_seconds or is_cached):
+    if options is None:
+        keywords.setdefault("cache", False)
+    task = _prepare(source, *_choose_options(model, options, keywords), progress)
+    predictor, options = task.predictor, task.options
+    is_cached = options.cache and (options.height or 0) <= _MAX_CACHED_HEIGHT
+    if can_stream(predictor) and not (options.joint or options.refine_seconds or is_cached):
         views = task.views
         parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
             views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
@@ -656,7 +678,7 @@ def predict_to_file(
             return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), task), pruned, path)
         scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), task)
     else:
-        scene = predict(task.source, predictor, progress=progress, **settings.keywords)
+        scene = predict(task.source, predictor, options=options, progress=progress)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
     save(scene, path)
     return len(scene.gaussians)
@@ -734,10 +756,36 @@ def render(
         return rasterize_gaussians(gaussians, pose)
     group = shown if tour is None or edge is None else list(tour.choose_scene_views()[edge])
     weights = torch.zeros(num_views, dtype=torch.float64, device=pose.device)
-    weights[group] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].to(pose))
+    near = torch.tensor(group, device=pose.device)
+    weights[near] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].to(pose))
     views = [scene.gaussians.select(scene.gaussians.views == view) for view in shown]
     renderings = [rasterize_gaussians(view, pose) for view in views]
-    return blend_renderings(renderings, weights[shown])
+    return blend_renderings(renderings, weights[torch.tensor(shown, device=pose.device)])
+
+
+def make_renderer(scene: Scene, work: str, count: int, **options: Any) -> Callable[[Tensor], Rendering]:
+    """A function from poses to images: on the device for their number, out of a card's memory on the processor.
+
+    Args:
+        scene: in main memory, as the images are.
+        work: name of the images.
+        count: of images.
+        options: keywords of `render`, with the size.
+    """
+    device = choose_device(work, count * math.prod(options["size"]) * _PIXEL_SECONDS, kernels=True)
+    placed = replace(scene, gaussians=scene.gaussians.to(device=device))
+
+    def draw(cam2world: Tensor) -> Rendering:
+        nonlocal placed
+        try:
+            image = render(placed, cam2world, **options)
+        except torch.cuda.OutOfMemoryError:
+            note_full_card(work)
+            placed = scene
+            return draw(cam2world)
+        return replace(image, color=image.color.cpu(), alpha=image.alpha.cpu(), depth=image.depth.cpu())
+
+    return draw
 
 
 def _choose_rasterizer(

@@ -5,13 +5,16 @@ Imports no torch, so that `--help` is fast.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Fixed, Suppress, arg
 
-from pansplat.system.options import Count, Depth, Height, Positive, Seconds
+from pansplat.errors import InputError
+from pansplat.system.options import CAMERA_HEIGHT, Count, Depth, Height, Positive, Seconds
 
 CompatChoice = Literal["trained", "official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
@@ -29,7 +32,7 @@ class ReadOptions:
     """Nearest depth to search, metres; by default the folder's."""
     far: Depth | None = None
     """Farthest depth to search, metres; by default the folder's."""
-    camera_height: Positive = 1.5  # `inputs.views.CAMERA_HEIGHT`, whose module imports torch
+    camera_height: Positive = CAMERA_HEIGHT
     """Height of the cameras over the floor, metres: the scale of a single photograph, and of a folder without poses."""
 
 
@@ -37,7 +40,7 @@ class ReadOptions:
 class PredictOptions:
     """How the scene of panoramas is predicted and refined."""
 
-    # The names are those of the keywords of `pansplat.predict`.
+    # The names are those of the keywords of `pansplat.predict`, which documents those that no command has.
     model: str = "default"
     """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an official
     .ckpt)."""
@@ -57,9 +60,22 @@ class PredictOptions:
     once 20, for the page of a pair 30."""
     gaussians: Annotated[Count | None, Fixed, Suppress] = None
     joint: Annotated[bool, Fixed, Suppress] = False
-    cache: Annotated[bool, Fixed, Suppress] = True
+    cache: bool = True
+    """Read results from the folder of the panoramas, and keep them there; --no-cache does neither."""
 
-    @property
-    def keywords(self) -> dict[str, Any]:
-        """All but the model, which is loaded once for many scenes."""
-        return {name: value for name, value in vars(self).items() if name != "model"}
+    def replace(self, **changes: Any) -> PredictOptions:
+        """The options with other values; an InputError for what is no option."""
+        names = [field.name for field in dataclasses.fields(PredictOptions)]
+        for name in changes.keys() - names:
+            near = "".join(f" (did you mean {each}?)" for each in get_close_matches(name, names, n=1))
+            raise InputError(f"needed an option of a prediction, got {name!r}{near}; they are {', '.join(names)}")
+        return dataclasses.replace(self, **changes)
+
+    def describe(self, *, refined: bool) -> list[str]:
+        """What a prediction or its refinement depends on, beside its input and its predictor: for the cache's key."""
+        omitted = {*_OF_PREDICTOR, *(() if refined else _OF_REFINEMENT), "cache"}
+        return [f"{name} {value}" for name, value in vars(self).items() if name not in omitted]
+
+
+_OF_PREDICTOR = "model", "compat", "precision", "depth_network"  # parts of its fingerprint
+_OF_REFINEMENT = "refine_seconds", "gaussians", "joint"

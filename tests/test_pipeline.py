@@ -18,6 +18,7 @@ from pansplat.cli import run
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.harmonics import official_harmonics
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.inputs.pairs import Pair
 from pansplat.model import network
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
@@ -32,6 +33,7 @@ from pansplat.pipeline import (
     render,
     save,
 )
+from pansplat.prediction_options import PredictOptions
 from pansplat.rendering import blend, rasterize
 from pansplat.tours.graph import TourGraph, find_tours, select_views
 
@@ -83,6 +85,35 @@ def test_a_single_view_has_the_scale_of_its_camera_height(tmp_path: Path, sphere
     assert torch.equal(tall.cam2world, usual.cam2world)
     with pytest.raises(InputError, match="camera_height"):
         load_pairs(photograph, camera_height=0.0)
+
+
+def test_photographs_that_are_shown_before_their_poses_are_estimated_have_the_camera_height(
+    tmp_path: Path, write_pair
+) -> None:
+    folder = write_pair(tmp_path / "pair")
+    (folder / "poses.json").unlink()
+    shown: list[Pair] = []
+
+    def stop(pairs: list[Pair]) -> None:
+        shown.extend(pairs)
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        load_pairs(folder, camera_height=3.0, on_unposed=stop)
+    assert [view.camera_height for pair in shown for view in pair.context] == [3.0, 3.0]
+
+
+def test_the_options_of_a_command_are_keywords(pair_folder: Path, sphere_predictor, tmp_path: Path) -> None:
+    options, named = PredictOptions(height=64, refine_seconds=0.0, cache=False), {"height": 64, "cache": False}
+    scenes = (
+        predict(pair_folder, sphere_predictor(), options=options),
+        predict(pair_folder, sphere_predictor(), **named),
+    )
+    assert torch.equal(*(scene.gaussians.means for scene in scenes))
+    assert predict(pair_folder, sphere_predictor(), options=options, height=96).height == 96
+    for call in (predict, predict_tour, lambda path, **words: predict_to_file(path, tmp_path / "x.ply", **words)):
+        with pytest.raises(InputError, match=r"got 'heigth' \(did you mean height\?\); they are model, .*, cache"):
+            call(pair_folder, heigth=64)
 
 
 def test_predict_refuses_a_folder_of_several_pairs(tmp_path: Path, sphere_predictor, write_pair) -> None:

@@ -13,6 +13,7 @@ from msgspec import Meta
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import own_warnings, parse_arguments, progress_bar
+from pansplat.system.devices import Device, use_device
 from pansplat.system.files import expand_home, require_output_file, require_output_folder, require_replaceable
 from pansplat.system.options import EYE_DISTANCE, EyeDistance, check_numbers
 from pansplat_viewer.scene.loader import (
@@ -60,8 +61,6 @@ class Options:
     pair: str | None = None
     """Name or number of the tour, pair or scene to show first if the path holds several; offscreen also "all"."""
     prediction: PredictOptions = field(default_factory=PredictOptions)
-    no_cache: bool = False
-    """Predict even if the pair's folder has a cached result."""
     reading: ReadOptions = field(default_factory=ReadOptions)
     mode: Mode = "deferred"
     """How the Gaussians of the input views are combined."""
@@ -72,6 +71,8 @@ class Options:
     stereo in a window, and cpu where OpenGL is software."""
     at: Annotated[float, Meta(ge=0, le=1)] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
+    device: Device = "auto"
+    """Where predictions are refined: auto is a graphics card if torch can use one, else the processor."""
     projection: Projection = "perspective"
     """What the frames of --out show: a perspective image, or all directions as a panorama or as six cube faces."""
     stereo: Stereo = "mono"
@@ -107,7 +108,7 @@ class Options:
     @property
     def load_options(self) -> LoadOptions:
         """Options of reading and prediction."""
-        return LoadOptions(self.reading, replace(self.prediction, cache=not self.no_cache))
+        return LoadOptions(self.reading, self.prediction)
 
     @property
     def settings(self) -> DrawSettings:
@@ -134,7 +135,7 @@ def run_arguments(args: Sequence[str] | None = None) -> int:
         args,
     )
     check_numbers(options)
-    with own_warnings():
+    with own_warnings(), use_device(options.device):
         return _run(options)
 
 

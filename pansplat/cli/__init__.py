@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
+from functools import partial
 from importlib import import_module
 from typing import Annotated, Any, Protocol, Union
 
 from pansplat.errors import InputError
-from pansplat.system.console import own_warnings, parse_arguments, run_command
+from pansplat.system.console import own_warnings, parse_arguments, print_message, run_command
+from pansplat.system.devices import use_device
 
 _COMMANDS = (
     "predict", "refine", "render", "export", "batch", "evaluate", "pose", "check", "info", "bench", "convert"
@@ -38,7 +40,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 
         command = parse(argv)
         check_numbers(command)
-        with own_warnings():
+        say = partial(print_message, "note") if getattr(command, "verbose", False) else None
+        with own_warnings(), use_device(getattr(command, "device", None), say):
             return command.run()
 
     return run_command(

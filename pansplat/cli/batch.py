@@ -26,11 +26,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from pansplat.cli.export import Export, Page
-from pansplat.cli.inputs import Out, PairChoice, SceneOptions, ScenePrediction, Writer
+from pansplat.cli.inputs import Computation, Out, PairChoice, ScenePrediction
 from pansplat.errors import InputError, collect_notes
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import is_out_of_memory, print_message, progress_bar
 from pansplat.system.descriptions import describe_count
+from pansplat.system.devices import with_device
 from pansplat.system.files import expand_home, make_portable_name, require_output_folder, require_replaceable
 from pansplat.system.options import Count, Threads
 
@@ -44,7 +45,7 @@ _MEMORY = 4 << 30  # bytes of a worker; decides the default number of workers
 
 
 @dataclass(frozen=True)
-class Batch(Writer):
+class Batch(Computation):
     """Predict, refine and export many pairs and tours; what is up to date is not made again (docs/batch.md).
 
     An item that fails is reported and stops no other; the exit status is 1 then.
@@ -144,7 +145,7 @@ class Batch(Writer):
             panoramas = source.context if isinstance(source, Pair) else source.panoramas
             content = hash_pixels(panoramas, source.siblings), *map(hash_panorama, panoramas)
             for step in (step for step in STEPS if step in self.steps):
-                options = SceneOptions(**vars(self.prediction))
+                options = self.prediction
                 if step == "predict" or "refine" not in self.steps:
                     options = replace(options, refine_seconds=0.0)
                 suffix = f".{self.format}" if step == "export" else ".ply"
@@ -181,6 +182,7 @@ def list_items(path: Path) -> dict[str, Path]:
     return {f.name if name == "." else name: f for f, name in inside.items()}
 
 
+@with_device
 def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict[str, Any]:
     """Make the outputs of a folder that are missing, and remove those in whose place they are.
 
@@ -326,7 +328,7 @@ def run_items(address: str, items: Mapping[str, Path], batch: Batch) -> Iterator
         ) from error
     run = secrets.token_hex(4)  # the scheduler would answer a repeated key with an old report
     names = {f"pansplat-{run}-{name}": name for name in items}
-    arguments = {"batch": batch, "fingerprint": fingerprint_work(batch.prediction)}
+    arguments = {"batch": batch, "fingerprint": fingerprint_work(batch.prediction), "device": batch.device}
     with client:
         futures = client.map(process_item, list(items.items()), key=list(names), pure=False, **arguments)
         for future in as_completed(futures, loop=client.loop):

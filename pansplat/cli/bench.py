@@ -17,7 +17,7 @@ from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, pr
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.files import is_scene_file, require_output_folder, require_replaceable
-from pansplat.system.options import Positive, Threads
+from pansplat.system.options import CAMERA_HEIGHT, Positive, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -228,7 +228,7 @@ class BenchPose(_Options):
 
     paths: Positional[tuple[Path, ...]] = ()
     """Folders of panoramas with poses; by default the sample, if it is there."""
-    camera_height: Positive = 1.5
+    camera_height: Positive = CAMERA_HEIGHT
     """Mean height of the cameras over the floor, metres."""
     tours: Literal["no", "also", "only"] = "no"
     """Whether to estimate all panoramas of each folder together: not, beside its pairs, or instead of them."""

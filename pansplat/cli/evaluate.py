@@ -5,17 +5,17 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
-from tyro.conf import Positional
+from tyro.conf import Fixed, Positional, Suppress, arg
 
-from pansplat.cli.inputs import Out, Writer, parse_blend
+from pansplat.cli.inputs import Computation, Out, parse_blend
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import make_table_console, progress_bar
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
-from pansplat.system.options import Count, CountOrNone
+from pansplat.system.options import Count, CountOrNone, Height, Seconds
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,6 +28,15 @@ _WRITTEN = "results.json", "*/prediction.png", "*/target.png", "*/error.png"
 _WRITTEN_OF_PROTOCOL = "results.json", "table.md", "frame_distance.png", "*/*/*.png"
 _HEIGHT = 512  # pixels, of the paper's panoramas
 _PROTOCOL_WIDTH = 150  # characters of a protocol's tables if there is no terminal
+
+
+@dataclass(frozen=True)
+class _Prediction(PredictOptions):
+    """How scenes are predicted. The cache is not used, so that times are valid."""
+
+    height: Height | None = _HEIGHT
+    refine_seconds: Annotated[Seconds | None, arg(name="refine")] = 0.0
+    cache: Annotated[bool, Fixed, Suppress] = False
 
 
 @dataclass(frozen=True)
@@ -59,18 +68,17 @@ class ProtocolChoice:
 
 
 @dataclass(frozen=True)
-class Evaluate(Writer):
+class Evaluate(Computation):
     """Compare predictions with the real panoramas between the inputs, and with the cross-fade baseline.
 
-    With --protocol: compute a table of the paper, with the paper's rows and ours. The cache is not used, so that times
-    are valid.
+    With --protocol: compute a table of the paper, with the paper's rows and ours.
     """
 
     paths: Positional[tuple[Path, ...]]
     """Folders of pairs; pairs without target views are skipped. None with --protocol."""
     out: Out
     """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
-    prediction: PredictOptions = field(default_factory=lambda: PredictOptions(height=_HEIGHT, refine_seconds=0.0))
+    prediction: _Prediction = field(default_factory=_Prediction)
     blend: str | None = None
     """deferred, joint, or view0, view1, ...; by default deferred, with --protocol that of the paper's table. For joint,
     each surface is kept once, except of networks."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, ScenePrediction, Writer
+from pansplat.cli.inputs import Computation, Out, ScenePrediction
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count, list_first
@@ -333,7 +333,7 @@ class _Photographs:
 
 
 @dataclass(frozen=True)
-class Export(Writer):
+class Export(Computation):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
     web page (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan
     with straight walls and areas (.svg, .png, .dxf), as textured triangles (.obj, .glb with --mesh), or as a folder

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
+from pansplat.errors import InputError
 from pansplat.system.console import can_print, make_table_console
+from pansplat.system.devices import describe_devices
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -26,13 +28,21 @@ _MAX_COLUMNS = 64  # of views in the table
 class Info:
     """Print the contents of a scene file: Gaussians by level and view, opacities, scales, bounds, cameras."""
 
-    path: Positional[Path]
+    path: Positional[Path | None] = None
     """The scene file, of any format (docs/formats.md)."""
+    devices: Annotated[bool, arg(name="device")] = False
+    """Print what runs on the processor and what on a graphics card."""
 
     def run(self) -> int:
         """Print the contents of the scene."""
         from pansplat import pipeline
 
+        if self.devices:
+            print("\n".join(describe_devices()))
+        if self.path is None:
+            if self.devices:
+                return 0
+            raise InputError("`pansplat info` needs a scene file or --device, got neither; give one")
         scene = pipeline.load(self.path)
         scene = scene.scaled(scene.frame.unit)
         gaussians = scene.gaussians

@@ -16,6 +16,7 @@ from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count
+from pansplat.system.devices import Device
 from pansplat.system.files import is_scene_file
 from pansplat.system.options import Height
 
@@ -34,6 +35,17 @@ class Writer:
 
     overwrite: bool = field(default=False, kw_only=True)
     """Replace files that pansplat did not write, too."""
+
+
+@dataclass(frozen=True)
+class Computation(Writer):
+    """A command that computes what it writes."""
+
+    device: Device = field(default="auto", kw_only=True)
+    """auto: the graphics card for long work if there is one that torch can use, else the processor; cpu, cuda: for all
+    work (docs/platforms.md)."""
+    verbose: bool = field(default=False, kw_only=True)
+    """Print what runs where."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +69,9 @@ class SceneOptions(PredictOptions):
 class ScenePrediction:
     """How the scene of a path is predicted."""
 
-    options: Annotated[SceneOptions, arg(name="prediction", prefix_name=False)] = field(default_factory=SceneOptions)
+    options: Annotated[PredictOptions, arg(name="prediction", prefix_name=False, constructor=SceneOptions)] = field(
+        default_factory=SceneOptions
+    )
     choice: Annotated[PairChoice, arg(prefix_name=False)] = field(default_factory=PairChoice)
 
     def open(self, path: Path) -> tuple[Scene, Pair | None]:
@@ -139,8 +153,8 @@ def predict_scene(source: Pair | TourGraph, options: PredictOptions) -> Scene:
     options = replace(options, joint=options.joint and not pipeline.can_stream(model))
     with progress_bar() as progress:
         if isinstance(source, Pair):
-            return pipeline.predict(source, model, progress=progress, **options.keywords)
-        return pipeline.predict_tour(source, model, progress=progress, **options.keywords)
+            return pipeline.predict(source, model, options=options, progress=progress)
+        return pipeline.predict_tour(source, model, options=options, progress=progress)
 
 
 def parse_blend(text: str) -> str | int:

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import OptionalOut, Writer
+from pansplat.cli.inputs import Computation, OptionalOut
 from pansplat.errors import InputError
 from pansplat.system.console import make_table_console, print_message, progress_bar
 from pansplat.system.files import require_output_file, require_output_folder
-from pansplat.system.options import Count, Positive
+from pansplat.system.options import CAMERA_HEIGHT, Count, Positive
 
 if TYPE_CHECKING:
     from pansplat.poses.estimate import PoseEstimate
 
 
 @dataclass(frozen=True)
-class Pose(Writer):
+class Pose(Computation):
     """Estimate the camera poses of equirectangular panoramas of one place."""
 
     paths: Positional[tuple[Path, ...]]
@@ -28,7 +28,7 @@ class Pose(Writer):
     out: OptionalOut = None
     """File to write: poses.json, or a trajectory .tum or .kitti. Without it, only the table is shown. For a video, a
     folder for the key frames and their poses.json."""
-    camera_height: Positive = 1.5
+    camera_height: Positive = CAMERA_HEIGHT
     """Mean height of the cameras over the floor, metres; it sets the scale."""
     baseline: tuple[str, str, float] | None = None
     """Two of the files and their distance in metres, instead of the camera's height."""

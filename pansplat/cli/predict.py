@@ -10,7 +10,7 @@ from typing import Annotated
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, PairChoice, Writer, choose_pair
+from pansplat.cli.inputs import Computation, Out, PairChoice, choose_pair
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, require_output_file
@@ -18,7 +18,7 @@ from pansplat.system.options import Fraction
 
 
 @dataclass(frozen=True)
-class Predict(Writer):
+class Predict(Computation):
     """Predict the 3D Gaussians of one panorama or of a pair, and write them in the format of the file's suffix
     (docs/formats.md). Networks predict heights above 512 tile by tile, in bounded memory, and do not cache the
     result."""
@@ -36,8 +36,6 @@ class Predict(Writer):
     panoramas has 5 GB with degree 4, 1 GB with degree 0."""
     min_opacity: Fraction = 0.0
     """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
-    no_cache: bool = False
-    """Predict again even if the pair's folder holds a cached result."""
     prediction: PredictOptions = field(default_factory=PredictOptions)
     choice: PairChoice = field(default_factory=PairChoice)
 
@@ -49,7 +47,7 @@ class Predict(Writer):
         pair = choose_pair(self.path, self.choice)
         model = pipeline.load_predictor(self.prediction)
         joint = not self.layers and len(pair.context) > 1 and not pipeline.can_stream(model)
-        options = replace(self.prediction, joint=joint, cache=not self.no_cache)
+        options = replace(self.prediction, joint=joint)
         if options.refine_seconds is None and not joint:
             options = replace(options, refine_seconds=0.0)
         began = time.perf_counter()
@@ -58,10 +56,10 @@ class Predict(Writer):
                 pair,
                 self.out,
                 model,
+                options=options,
                 degree=self.degree,
                 min_opacity=self.min_opacity,
                 progress=progress,
-                **options.keywords,
             )
         seconds = time.perf_counter() - began
         names = ", ".join(panorama.name for panorama in pair.context)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Fixed, Positional, Suppress
 
-from pansplat.cli.inputs import Out, PairChoice, Writer, choose_pair, predict_scene
+from pansplat.cli.inputs import Computation, Out, PairChoice, choose_pair, predict_scene
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import call_at_first_signal, progress_bar
@@ -33,7 +33,7 @@ class _Prediction(PredictOptions):
 
 
 @dataclass(frozen=True)
-class Refine(Writer):
+class Refine(Computation):
     """Fit a scene to its own photographs by rendering and comparison, and write it in the format of the file's suffix.
 
     Ctrl+C ends the refinement early and writes the scene as it is then.

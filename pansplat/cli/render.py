@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, ScenePrediction, Writer, parse_blend
+from pansplat.cli.inputs import Computation, Out, ScenePrediction, parse_blend
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count
@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     from pansplat.export.film import FilmPhotographs
     from pansplat.gaussians.scene import Scene
     from pansplat.predictor import Progress
+    from pansplat.rendering import Rendering
     from pansplat.tours.route import Route
 
+    Renderer = Callable[[Tensor], Rendering]
     Frame = list[tuple[Tensor, float]]  # poses whose images are mixed, and their weights
 
 _VIDEO_SUFFIXES = (".mp4", ".webm")
@@ -36,7 +38,7 @@ _MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
 
 
 @dataclass(frozen=True)
-class Render(Writer):
+class Render(Computation):
     """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4, .webm) that
     shows the photograph while the camera stands at a panorama."""
 
@@ -101,13 +103,15 @@ class Render(Writer):
             photographs = list_photographs(source, range(len(scene.cam2world))) if shows_photographs else ()
             stops = FilmPhotographs(photographs, scene.cam2world, scene.gains if scene.joint else ())
             with progress_bar() as progress:
-                frames = self._render_frames(scene, path, options, stops, progress)
+                count = 0 if self.stereo else len(path)  # a card has no kernels of stereo
+                draw = pipeline.make_renderer(scene, "film", count, **options)
+                frames = self._render_frames(draw, path, options, stops, progress)
                 count = write_video(self.out, frames, self.fps, panorama=layout != "perspective", stereo=stereo)
             print(f"{self.out}: {describe_count(count, 'frame')} of {size}, {layout}")
             return 0
         pose = self._pose_between_cameras(scene) if poses is None else poses[0]
         with torch.no_grad():
-            image = pipeline.render(scene, pose, **options)
+            image = pipeline.make_renderer(scene, "image", 1, **options)(pose)
         panorama = layout != "perspective" and not self.stereo  # GPano has no property for stereo
         depth = image.depth * scene.frame.unit
         if self.depth:
@@ -177,13 +181,12 @@ class Render(Writer):
         return [[(torch.from_numpy(pose), weight) for pose, weight in route.fade(at)] for at in fractions]
 
     def _render_frames(
-        self, scene: Scene, frames: list[Frame], options: dict[str, Any], stops: FilmPhotographs, progress: Progress
+        self, render: Renderer, frames: list[Frame], options: dict[str, Any], stops: FilmPhotographs, progress: Progress
     ) -> Iterator[np.ndarray]:
         """8-bit RGB images of the frames."""
         import numpy as np
         import torch
 
-        from pansplat import pipeline
         from pansplat.rendering.image_planes import image_planes
 
         layout = "equirect" if options["layout"] == "cubemap" else options["layout"]  # the same directions
@@ -191,7 +194,7 @@ class Render(Writer):
 
         @torch.no_grad()
         def draw(pose: Tensor) -> np.ndarray:
-            return pipeline.render(scene, pose, **options).color.permute(1, 2, 0).cpu().numpy()
+            return render(pose).color.permute(1, 2, 0).numpy()
 
         for index, frame in enumerate(frames):
             progress(f"frame {index + 1} of {len(frames)}", index / len(frames))

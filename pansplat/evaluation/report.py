@@ -8,9 +8,9 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import torch
@@ -70,7 +70,7 @@ def evaluate(
         raise InputError("none of the pairs has a target view to compare with; name targets in pairs.json")
     make_folder(out)
     warm_up(predictor)
-    render = partial(pipeline.render, blend=blend, size=(height, 2 * height), drawing=drawing)
+    options = {"blend": blend, "size": (height, 2 * height), "drawing": drawing}
     rows: list[Row] = []
     for index, pair in enumerate(with_targets):
 
@@ -80,7 +80,7 @@ def evaluate(
 
         taken = {row.case["name"] for row in rows}
         joint = blend == "joint" and not pipeline.can_stream(predictor)
-        rows += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, joint, render, lpips, report)
+        rows += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, joint, options, lpips, report)
         write_json([row.as_json() for row in rows], out / "results.json")
     return rows
 
@@ -101,7 +101,7 @@ def _evaluate_pair(
     height: int,
     refine_seconds: float,
     joint: bool,
-    render: Callable[[Scene, Tensor], Rendering],
+    options: dict[str, Any],
     lpips: Lpips | None,
     progress: Progress,
 ) -> Iterator[Row]:
@@ -113,13 +113,14 @@ def _evaluate_pair(
         start = time.perf_counter()
         scene = pipeline.refine(scene, context, seconds=refine_seconds, progress=progress)
         refine_seconds = time.perf_counter() - start
-    own_ws_psnr = measure_own_views(scene, context, render)
+    render = pipeline.make_renderer(scene, "images", len(context.images) + len(targets.images), **options)
+    own_ws_psnr = measure_own_views(scene, context, lambda _, pose: render(pose))
     for view, target in enumerate(targets.images):
         progress("rendering", 1.0)
         pose = targets.cam2world[view]
         start = time.perf_counter()
         with torch.no_grad():
-            image = render(scene, pose).color.float()
+            image = render(pose).color.float()
         render_seconds = time.perf_counter() - start
         name = pair.name if len(targets.images) == 1 else f"{pair.name} {Path(targets.names[view]).stem}"
         folder = out / _choose_folder_name(name, taken)

@@ -79,8 +79,9 @@ def orthonormal_error(pose: Float[Tensor, "4 4"]) -> float:
     rotation = pose[:3, :3].double()
     if not torch.isfinite(pose).all() or torch.linalg.det(rotation) <= 0:
         return float("inf")
-    gram = (rotation @ rotation.T - torch.eye(3).to(rotation)).abs().max()
-    bottom = (pose[3].double() - torch.tensor((0.0, 0.0, 0.0, 1.0)).to(rotation)).abs().max()
+    identity = torch.eye(4, dtype=torch.float64, device=pose.device)
+    gram = (rotation @ rotation.T - identity[:3, :3]).abs().max()
+    bottom = (pose[3].double() - identity[3]).abs().max()
     return float(torch.maximum(gram, bottom))
 
 

@@ -48,6 +48,7 @@ from pansplat.inputs.web_tours import find_web_tour, is_web_tour_file, read_web_
 from pansplat.inputs.web_tours.entries import make_panorama
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import expand_home, is_scene_file, is_written, require_text
+from pansplat.system.options import CAMERA_HEIGHT
 
 VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
 _RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
@@ -59,7 +60,12 @@ _MAX_DEPTH = 4  # levels of nested folders that are searched
 
 @list_folders_once()
 def load_pairs(
-    path: Path | str, *, convention: str | None = None, near: float | None = None, far: float | None = None
+    path: Path | str,
+    *,
+    convention: str | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    camera_height: float = CAMERA_HEIGHT,
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
@@ -72,6 +78,7 @@ def load_pairs(
             is a pair of one view.
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
+        camera_height: of the cameras over the floor, metres.
 
     Raises:
         UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
@@ -86,7 +93,7 @@ def load_pairs(
         require_known_masks(root, error.panoramas)
         raise
     require_known_masks(root, [view for pair in pairs for view in pair.context + pair.targets])
-    return localize_pairs(pairs)
+    return localize_pairs(pairs, camera_height)
 
 
 def load_panoramas(path: Path | str) -> list[Panorama]:

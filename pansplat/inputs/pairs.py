@@ -27,9 +27,10 @@ from pansplat.images.image_files import (
 )
 from pansplat.images.masks import lift_black_surfaces, scene_mask_of_files
 from pansplat.inputs.placements import PLACED, Placement
-from pansplat.inputs.views import CAMERA_HEIGHT, Views
+from pansplat.inputs.views import Views
 from pansplat.system.descriptions import describe_range, list_first
 from pansplat.system.files import require_text
+from pansplat.system.options import CAMERA_HEIGHT
 
 NEAR, FAR = 0.45, 10.0  # metres; depth range of the official indoor data (docs/official.md, section 2.1)
 FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, sections 2.2 and 2.3)
@@ -338,8 +339,8 @@ class Collection:
         return sorted(edges)
 
 
-def localize_pairs(pairs: Sequence[Pair]) -> list[Pair]:
-    """The pairs in working worlds (`WorldFrame`), one for all panoramas of a world of a folder."""
+def localize_pairs(pairs: Sequence[Pair], camera_height: float = CAMERA_HEIGHT) -> list[Pair]:
+    """The pairs of one camera height in working worlds (`WorldFrame`), one for all panoramas of a world of a folder."""
     worlds: dict[tuple[Path, int], list[tuple[Tensor, float]]] = {}
     for pair in pairs:
         for view in pair.context + pair.targets:
@@ -351,7 +352,7 @@ def localize_pairs(pairs: Sequence[Pair]) -> list[Pair]:
     localized = []
     for pair in pairs:
         context, targets = (
-            tuple(view.in_frame(frames[pair.folder, view.world]) for view in part)
+            tuple(replace(view.in_frame(frames[pair.folder, view.world]), camera_height=camera_height) for view in part)
             for part in (pair.context, pair.targets)
         )
         near, far = (bound / context[0].frame.unit for bound in (pair.near, pair.far))

@@ -12,8 +12,8 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.geometry.world import USER_FRAME, WorldFrame
 from pansplat.system.descriptions import describe_count, describe_range, list_first
+from pansplat.system.options import CAMERA_HEIGHT
 
-CAMERA_HEIGHT = 1.5  # metres over the floor, if it is not known; tripods of tours stand at 1.3 to 1.6 m
 ONE_POSITION = 1e-3  # largest distance of cameras without parallax, relative to near
 
 

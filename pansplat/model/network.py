@@ -35,6 +35,7 @@ from pansplat.model.weights import (
 )
 from pansplat.prediction_options import CompatChoice
 from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
+from pansplat.system.devices import choose_device, note_full_card
 from pansplat.system.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
@@ -124,8 +125,18 @@ class NetworkPredictor:
         progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
         """Predict Gaussians like `__call__`, and the radial depth maps of the swept levels, metres, coarse to fine."""
-        matched, tiles = self._match(images, cam2world, near, far, masks, progress)
-        parts = list(self._lift(matched, tiles, progress))
+        tiles = first = self.tiles or choose_tiles(images.shape[-2])
+        while True:
+            try:
+                matched = self._match(images, cam2world, near, far, masks, progress, tiles)
+                parts = list(self._lift(matched, tiles, progress))
+                break
+            except torch.cuda.OutOfMemoryError:  # of a graphics card only
+                tiles *= 2
+            if tiles > 4 * first:
+                self.network.cpu()
+                tiles = first
+            note_full_card(self.name, f"{tiles}x{tiles} tiles" if tiles > first else "it runs on the processor")
         gaussians = merge_tiles(parts, self.network.compat)[0].to(device=images.device)
         if masks is not None:
             gaussians = remove_masked_gaussians(gaussians, cam2world, masks)
@@ -143,7 +154,8 @@ class NetworkPredictor:
     ) -> Iterator[Gaussians]:
         """Yield the Gaussians of `__call__` tile by tile, in bounded memory; errors are raised at the first part."""
         with torch.no_grad():
-            matched, tiles = self._match(images, cam2world, near, far, masks, progress)
+            tiles = self.tiles or choose_tiles(images.shape[-2])
+            matched = self._match(images, cam2world, near, far, masks, progress, tiles)
         parts = self._lift(matched, tiles, progress)
         while True:
             with torch.no_grad():  # closed before each yield: the caller keeps its own grad mode
@@ -162,11 +174,11 @@ class NetworkPredictor:
         far: float | Tensor,
         masks: Tensor | None,
         progress: Progress | None,
-    ) -> tuple[Any, int]:
-        """Check and match the views of one item; returns the match and the number of tiles along each side."""
+        tiles: int,
+    ) -> Any:
+        """Check and match the views of one item, for a number of tiles along each side."""
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
-        tiles = self.tiles or choose_tiles(images.shape[-2])
         _check_inputs(images, cam2world, low, high, masks, self.network.compat)
         if progress is not None:
             progress("matching views", 0.0)
@@ -174,8 +186,7 @@ class NetworkPredictor:
         images, _ = fit_panoramas(images, None, max(_MULTIPLE, 8 * tiles))
         pose = cam2world.to(device=weight.device, dtype=weight.dtype)
         near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
-        matched = self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views)
-        return matched, tiles
+        return self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views)
 
     def _lift(self, matched: Any, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
         report = part_of(progress, _MATCHING_FRACTION)
@@ -239,8 +250,9 @@ def load_predictor(
         precision: number type of PanSplat's convolutions; docs/bench_model.md lists the time and error of bfloat16.
         attention_precision: number type that attention rounds to; bfloat16 in the official code.
     """
-    path = Path(path)
-    require_precision(precision)
+    path, device = Path(path), choose_device("network")
+    if device.type == "cpu" or precision not in get_args(Precision):
+        require_precision(precision)
     weights = (
         convert_checkpoint(read_checkpoint(path), path)
         if path.suffix.lower() in CHECKPOINT_SUFFIXES
@@ -253,7 +265,7 @@ def load_predictor(
         precision=precision,
         attention_precision=attention_precision,
     )
-    return NetworkPredictor(weights.model, network)
+    return NetworkPredictor(weights.model, network.to(device))
 
 
 def convert_checkpoint(content: Mapping[str, object], source: object) -> WeightsFile:

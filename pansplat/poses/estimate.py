@@ -54,6 +54,7 @@ from pansplat.predictor import Progress, part_of
 from pansplat.sweep.guided_sweep import list_default_weights
 from pansplat.system.console import with_progress_bar
 from pansplat.system.descriptions import describe_count, describe_range, list_first
+from pansplat.system.devices import choose_device
 from pansplat.system.files import require_file, require_text
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_file, hash_parts
@@ -66,6 +67,7 @@ _THOROUGH = 6  # pairs of each panorama that are compared with all features, at 
 _ALL_PAIRS_UP_TO = 3  # panoramas, of which all pairs are compared with all features
 _NEEDED_PAIRS = 4  # certain pairs of a panorama; more are not looked for within a group
 _LEAST_BATCH = 4  # pairs that are compared before others are chosen
+_MATCHER_SECONDS = 1.5  # of the learned matcher for a panorama on two cores, about
 _PAIR_TIME = 1.3  # of a comparison, over that of the features of a panorama
 _MASK_KEPT_SHARE = 0.6  # of the panoramas whose common mask is kept when others are added
 _BLANK_BRIGHTNESS = 8.0  # mean grey value of an image that shows nothing
@@ -466,7 +468,7 @@ def _describe_views(
     is_compass = len(headings) > 1  # one value for all pictures is a program's default
     hashes = {n: hash_parts(fingerprint_estimates(), pixels[n]) for n in kept}
     static = _find_scene_mask([paths[n] for n in kept], list(hashes.values()), cache)
-    matcher = _load_matcher()
+    matcher = _load_matcher(len(kept))
 
     def look_up(n: int) -> _View:
         mask = masks.get(paths[n])
@@ -556,7 +558,7 @@ def _relate_views(
             chosen |= set(own[:_THOROUGH])
         pairs = sorted(chosen, key=lambda pair: (-overlap[pair], pair))
 
-    matcher = None if views[0].learned is None else load_matcher()
+    matcher = None if views[0].learned is None else _load_matcher(len(views))
 
     def relate(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
@@ -609,10 +611,10 @@ def fingerprint_estimates() -> str:
     return hash_parts(hash_sources(__name__), *(hash_file(file) for file in files if file.is_file()))
 
 
-def _load_matcher() -> Matcher | None:
-    """The learned matcher; None, with a warning, if its weights are not installed."""
+def _load_matcher(count: int) -> Matcher | None:
+    """The learned matcher for some panoramas; None, with a warning, if its weights are not installed."""
     try:
-        return load_matcher()
+        return load_matcher(device=choose_device("learned matcher", count * _MATCHER_SECONDS))
     except MatcherMissingError as error:
         warnings.warn(f"poses are estimated by SIFT alone: {error}.", InputWarning, stacklevel=2)
         return None

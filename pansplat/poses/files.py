@@ -188,13 +188,14 @@ def estimate_pairs(
     if content is None:
         if on_unposed is not None:
             single = single_view_pairs(panoramas, folder, near, far, siblings=panoramas)
-            on_unposed(localize_pairs(make_names_unique(single)))
+            on_unposed(localize_pairs(make_names_unique(single), camera_height))
         content = _estimate(folder, panoramas, camera_height, progress)
         store.write(_KIND, key, content)
     sources = store.find(_KIND, key)
     if not sources:
         raise InputError(f"{folder}: needed a writable cache folder for the poses, got none; make one.")
-    return _make_pairs(folder, panoramas, content, sources[0], near, far)
+    pairs = _make_pairs(folder, panoramas, content, sources[0], near, far)
+    return localize_pairs(make_names_unique(pairs), camera_height)
 
 
 def _estimate(
@@ -279,8 +280,7 @@ def _make_pairs(
         if panorama.name in unplaced
     ]
     first_world = len(content["worlds"])
-    pairs += single_view_pairs(single, folder, near, far, siblings=readable, first_world=first_world)
-    return localize_pairs(make_names_unique(pairs))
+    return pairs + single_view_pairs(single, folder, near, far, siblings=readable, first_world=first_world)
 
 
 def _describe(panorama: Panorama, folder: Path) -> str:

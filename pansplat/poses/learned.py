@@ -66,7 +66,7 @@ def default_weights() -> Path:
 
 
 @functools.cache
-def load_matcher(path: Path | None = None) -> Matcher:
+def load_matcher(path: Path | None = None, device: torch.device | None = None) -> Matcher:
     """The learned matcher of a weights file, by default the package's, in eval mode.
 
     Raises:
@@ -81,7 +81,7 @@ def load_matcher(path: Path | None = None) -> Matcher:
     matcher = Matcher().requires_grad_(False)
     require_shapes(weights.tensors, matcher.state_dict(), path)
     matcher.load_state_dict(weights.tensors)
-    return matcher.eval()
+    return matcher.eval().to(device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ def detect_learned(
         frame: axes of the walls in the camera's frame, as columns x, y (down), z; by default the camera's own.
         count: largest number of features of a face.
     """
-    focal = image.shape[1] / (2 * math.pi)
+    focal, device = image.shape[1] / (2 * math.pi), next(matcher.parameters()).device
     rotations = FACE_ROTATIONS[:_FACES] if frame is None else frame @ FACE_ROTATIONS[:_FACES]
     bearings, descriptors, places, starts = [], [], [], [0]
     for rotation in rotations:
@@ -163,7 +163,8 @@ def detect_learned(
             allowed = torch.from_numpy(sample_mask(mask, rays).reshape(side, side))
         with torch.inference_mode():
             rgb = torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
-            points, described = matcher.aliked(rgb, allowed, count)
+            found = matcher.aliked(rgb.to(device), allowed.to(device), count)
+        points, described = (each.cpu() for each in found)
         xy = (points.double().numpy() + 0.5 - centre) / focal
         rays = np.concatenate((xy, np.ones((len(xy), 1))), axis=1)
         bearings.append(rays / np.linalg.norm(rays, axis=1, keepdims=True) @ rotation.T)
@@ -177,12 +178,13 @@ def detect_learned(
 
 def match_learned(matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures) -> LearnedMatches:
     """Matches of two panoramas."""
-    common = count_common(first, second)
+    common, device = count_common(first, second), next(matcher.parameters()).device
     order = np.argsort(-common, axis=None, kind="stable")[:_FACE_PAIRS]
     found = []
     for i, j in np.stack(np.unravel_index(order, common.shape), axis=1).tolist():
         with torch.inference_mode():
-            indices, scores = matcher.lightglue(first.face(i), second.face(j))
+            faces = (tuple(each.to(device) for each in face) for face in (first.face(i), second.face(j)))
+            indices, scores = (each.cpu() for each in matcher.lightglue(*faces))
         found.append((indices.numpy() + np.array((first.starts[i], second.starts[j])), scores.double().numpy()))
     return _join_faces(first, second, found)
 

@@ -117,7 +117,7 @@ class ViewParameters:
         self.tensors["distance"].clamp_(-_MAX_LOG_DISTANCE, _MAX_LOG_DISTANCE)
         limits = self._initial_log_scales - _MAX_LOG_SCALE, self._initial_log_scales + _MAX_LOG_SCALE
         self.tensors["scale"].clamp_(*limits)
-        bound = torch.tensor(_MAX_REFINED_OPACITY).logit()
+        bound = float(torch.tensor(_MAX_REFINED_OPACITY).logit())
         self.tensors["opacity"].clamp_(-bound, bound)
 
 
@@ -133,8 +133,8 @@ class CameraParameters:
     """
 
     def __init__(self, cam2world: Float[Tensor, "view 4 4"], *, correct_poses: bool) -> None:
-        self._cam2world = cam2world.double()
-        positions = self._cam2world[:, :3, 3]
+        self.cam2world = cam2world.double()
+        positions = self.cam2world[:, :3, 3]
         self._baseline = float(torch.pdist(positions).max()) if len(positions) > 1 else 0.0
         self.log_gains = torch.zeros(len(cam2world), 3, device=cam2world.device, requires_grad=True)
         self.twists = torch.zeros(
@@ -152,15 +152,15 @@ class CameraParameters:
         Of several views (None) it is the given one: these have no corrections.
         """
         if view is None or view == photograph or not self.twists.requires_grad:
-            return self._cam2world[photograph]
-        given = self._cam2world[view]
+            return self.cam2world[photograph]
+        given = self.cam2world[view]
         undo = given @ torch.matrix_exp(-self._generator(view)) @ invert_pose(given)
-        return undo @ self._cam2world[photograph] @ torch.matrix_exp(self._generator(photograph))
+        return undo @ self.cam2world[photograph] @ torch.matrix_exp(self._generator(photograph))
 
     @torch.no_grad()
     def corrected_pose(self, view: int) -> Float[Tensor, "4 4"]:
         """The pose of a photograph with its correction."""
-        return self._cam2world[view] @ torch.matrix_exp(self._generator(view))
+        return self.cam2world[view] @ torch.matrix_exp(self._generator(view))
 
     @torch.no_grad()
     def move(self, gaussians: Gaussians, view: int) -> Gaussians:
@@ -170,7 +170,7 @@ class CameraParameters:
         """
         if not self.twists[view].any():
             return gaussians
-        motion = self.corrected_pose(view) @ invert_pose(self._cam2world[view])
+        motion = self.corrected_pose(view) @ invert_pose(self.cam2world[view])
         rotation = motion[:3, :3]
         means = gaussians.means.double() @ rotation.T + motion[:3, 3]
         quats = multiply_quats(quats_from_rotations(rotation).expand(len(gaussians), 4), gaussians.quats.double())

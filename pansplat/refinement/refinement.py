@@ -249,7 +249,8 @@ class Refinement:
             gaussians, size = self._build(layer), (self._size[0] // 2, self._size[1] // 2)  # a quarter of the time
             for target in layer.photographs:
                 weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), size)
-                self._seen.append(weights.accumulate(torch.ones(1, *size).to(gaussians.means))[:, 0] > _SEEN)
+                everywhere = torch.ones(1, *size, device=gaussians.means.device)
+                self._seen.append(weights.accumulate(everywhere)[:, 0] > _SEEN)
         return self._seen
 
     @torch.no_grad()
@@ -282,7 +283,7 @@ class Refinement:
             error = error * pixels * (pixels / math.prod(half))  # of weights that sum to 1; a sum over pixels
             weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), half)
             errors += weights.accumulate(error)[:, 0] / len(layer.photographs) * len(layer.views)
-        cameras = self._start.cam2world[:, :3, 3].to(gaussians.means)
+        cameras = self._cameras.cam2world[:, :3, 3].to(gaussians.means)
         distances = (gaussians.means - cameras[gaussians.views.long()]).norm(dim=1)
         return errors * (gaussians.scales.amax(1) > math.pi / self._size[0] * distances)
 

@@ -252,7 +252,7 @@ def _shape_from_axes(
     axes = rotation * size[:, None, :]
     turned = frame @ axes
     cosine2 = (frame[:, 2:] @ rotation)[:, 0, :].square()
-    minors2 = (size[:, (1, 2, 0)] * size[:, (2, 0, 1)]).square()
+    minors2 = (size.roll(-1, 1) * size.roll(-2, 1)).square()
     return _Shape(
         covariance=axes @ axes.transpose(1, 2),
         in_frame=turned @ turned.transpose(1, 2),

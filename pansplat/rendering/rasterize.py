@@ -19,13 +19,13 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import orthonormal_error
 from pansplat.rendering.image_planes import ImagePlane, Layout, Stitching, image_planes, stitch_faces
 from pansplat.system.descriptions import describe_count, describe_range
+from pansplat.system.devices import find_triton_problem
 
 Kernel = Literal["ray", "ewa"]
 Order = Literal["radial", "z"]
 Lowpass = Literal["angular", "3dgs"]
 Backend = Literal["auto", "torch", "numba", "triton"]
 
-MIN_TRITON = 3, 2  # the kernels join tuples, which earlier versions do not compile
 MAX_EYE_OFFSET = 1e6  # metres
 _MAX_POSE_ERROR = 1e-4  # of a rotation, see `orthonormal_error`
 
@@ -265,7 +265,7 @@ def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> Rast
     """Select the backend of this name; "auto" chooses by the kernel and the Gaussians' type and device."""
     if name == "auto":
         on_cpu = gaussians.means.device.type == "cpu"
-        available = kernel == "ray" if on_cpu else gaussians.means.is_cuda and get_triton_version() >= MIN_TRITON
+        available = kernel == "ray" if on_cpu else gaussians.means.is_cuda and find_triton_problem() is None
         fast: Backend = "numba" if on_cpu else "triton"
         name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
     if name == "numba":
@@ -275,15 +275,6 @@ def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> Rast
     else:
         from pansplat.rendering.reference import rasterize_planes
     return rasterize_planes
-
-
-def get_triton_version() -> tuple[int, ...]:
-    """The major and minor version of Triton; empty if it is not installed."""
-    try:
-        import triton
-    except ImportError:
-        return ()
-    return tuple(int(number) for number in triton.__version__.split(".")[:2])
 
 
 def _check_choice(name: str, value: str, choices: object) -> None:

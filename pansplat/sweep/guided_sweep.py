@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -35,6 +36,7 @@ from pansplat.sweep.predictor import SweepConfig
 from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.search import SearchConfig
 from pansplat.sweep.surface import resize_sphere
+from pansplat.system.devices import choose_device
 from pansplat.system.source_hash import hash_sources
 
 # Names in files of weights, and types of settings.
@@ -42,6 +44,7 @@ _KINDS: dict[type, tuple[str, type]] = {
     DepthRefinement: ("depth", RefinementConfig),
     DepthSharpening: ("depth_sharpening", SharpeningConfig),
 }
+_SECONDS = 1.0  # that the networks take for a panorama on two cores, about
 _SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
 
 
@@ -132,16 +135,22 @@ class NetworkPrior:
     @torch.no_grad()
     def observe(self, images: Sequence[np.ndarray]) -> NetworkObservation:
         """Observe upright panoramas (h, w, 3), RGB in [0, 1]."""
+        device = choose_device("depth networks", len(images) * _SECONDS)
+        network, sharpening = self.network, self.sharpening
+        if device.type != "cpu":  # other threads use these networks, too
+            network, sharpening = (copy.deepcopy(each).to(device) for each in (network, sharpening))
         maps = torch.stack([torch.from_numpy(image).permute(2, 0, 1) for image in images]).float()
         small = interpolate(maps, (self.height, 2 * self.height), mode="area")
-        estimate, observed = self.network.observe(to_channels_last(small))
-        return NetworkObservation(self.network, estimate, observed, partial(self._sharpen, maps, estimate))
+        estimate, observed = network.observe(to_channels_last(small.to(device)))
+        return NetworkObservation(network, estimate, observed, partial(self._sharpen, sharpening, maps, estimate))
 
     @torch.no_grad()
-    def _sharpen(self, maps: Float[Tensor, "view 3 h w"], estimate: DepthEstimate) -> list[np.ndarray]:
+    def _sharpen(
+        self, sharpening: DepthSharpening, maps: Float[Tensor, "view 3 h w"], estimate: DepthEstimate
+    ) -> list[np.ndarray]:
         """Sharpened log-depth of the panoramas, in camera heights; one after another, in bounded memory."""
-        height = self.sharpening.config.height
-        each = [DepthEstimate(*(map[n : n + 1] for map in estimate)) for n in range(len(maps))]
+        height, device = sharpening.config.height, "cpu" if self.relative else estimate.log_depth.device
+        each = [DepthEstimate(*(map[n : n + 1].to(device) for map in estimate)) for n in range(len(maps))]
         if self.relative is not None:
             rows = min(height, maps.shape[-2])
             return [
@@ -149,8 +158,8 @@ class NetworkPrior:
                 for image, own in zip(maps, each, strict=True)
             ]
         large = [torch.from_numpy(resize_sphere(_as_image(m), height)).permute(2, 0, 1)[None] for m in maps]
-        sharp = [self.sharpening(to_channels_last(image), own)[0] for image, own in zip(large, each, strict=True)]
-        return [log_depth[0].float().numpy() for log_depth in sharp]
+        sharp = [sharpening(to_channels_last(image.to(device)), own)[0] for image, own in zip(large, each, strict=True)]
+        return [log_depth[0].float().cpu().numpy() for log_depth in sharp]
 
 
 class NetworkObservation:
@@ -175,12 +184,13 @@ class NetworkObservation:
         iterations: int,
     ) -> list[DepthPrior]:
         """Estimates in the unit of the poses (v, 4, 4), refined by comparison of each view with its neighbours."""
-        log_depth = torch.from_numpy(np.stack([estimate.log_depth for estimate in estimates])).float()
-        log_scale = torch.from_numpy(np.stack([estimate.scale for estimate in estimates])).float().log()
+        device = next(self.network.parameters()).device
+        log_depth = torch.from_numpy(np.stack([estimate.log_depth for estimate in estimates])).float().to(device)
+        log_scale = torch.from_numpy(np.stack([estimate.scale for estimate in estimates])).float().to(device).log()
         estimate = DepthEstimate(log_depth, log_scale)
         pairs = [(view, other) for view, others in enumerate(neighbours) for other in others]
         for _ in range(iterations):
-            estimate = self.network.refine(self._observed, estimate, torch.from_numpy(cam2world), pairs)
+            estimate = self.network.refine(self._observed, estimate, torch.from_numpy(cam2world).to(device), pairs)
         return _as_priors(estimate)
 
 
@@ -190,6 +200,6 @@ def _as_image(maps: Float[Tensor, "c h w"]) -> np.ndarray:
 
 def _as_priors(estimate: DepthEstimate) -> list[DepthPrior]:
     return [
-        DepthPrior(log_depth.float().numpy(), log_scale.exp().float().numpy())
+        DepthPrior(log_depth.float().cpu().numpy(), log_scale.exp().float().cpu().numpy())
         for log_depth, log_scale in zip(estimate.log_depth, estimate.log_scale, strict=True)
     ]

@@ -16,6 +16,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from pansplat.system.strict_json import convert
 
+CAMERA_HEIGHT = 1.5  # metres over the floor, if it is not known; tripods of tours stand at 1.3 to 1.6 m
 EYE_DISTANCE = 0.063  # metres, the mean of adults
 MIN_HEIGHT, MAX_HEIGHT = 64, 8192  # pixels, of panoramas that are predicted from
 

@@ -19,6 +19,15 @@ def test_info_prints_counts_and_cameras(scene: Path, capsys: pytest.CaptureFixtu
     assert "camera 1" in out and "(1, 0, 0) m" in out and "bounds" in out
 
 
+def test_info_says_what_runs_where(
+    monkeypatch: pytest.MonkeyPatch, refusal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert run(["info", "--device"]) == 0
+    assert "can use no graphics card: all work runs on the processor" in capsys.readouterr().out
+    assert "needs a scene file or --device" in refusal("info")
+
+
 @pytest.mark.shared
 def test_check_exits_with_1_if_the_convention_is_wrong(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pair = str(shared / "data" / "mp3d_sample")

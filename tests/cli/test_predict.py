@@ -7,6 +7,7 @@ import torch
 
 from pansplat import pipeline
 from pansplat.cli import run
+from pansplat.prediction_options import PredictOptions
 
 
 def test_predict_writes_the_scene(scene: Path) -> None:
@@ -67,8 +68,8 @@ def test_each_surface_is_written_once_and_fitted_to_the_photographs(room: Path, 
 def test_the_default_refinement_is_longer_for_joint_drawing(room: Path, tmp_path: Path, monkeypatch) -> None:
     seconds = []
 
-    def record(*args, refine_seconds: float, **options) -> int:
-        seconds.append(refine_seconds)
+    def record(*args, options: PredictOptions, **others) -> int:
+        seconds.append(options.refine_seconds)
         return 0
 
     monkeypatch.setattr(pipeline, "predict_to_file", record)

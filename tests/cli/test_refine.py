@@ -31,6 +31,20 @@ def test_a_pair_is_predicted_and_refined_with_a_report(room: Path, scene: Path, 
     assert len(refined.gaussians) < 0.9 * len(predicted.gaussians)
 
 
+def test_a_command_says_what_runs_where_and_refuses_a_card_that_is_not_there(
+    room: Path, scene: Path, tmp_path: Path, refusal, capsys, monkeypatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert refine(scene, tmp_path / "scene.ply", "--photographs", room, "--verbose") == 0
+    assert "note: refinement: on the processor\n" in capsys.readouterr().err
+    picture, arguments = tmp_path / "middle.png", ("--height", "32", "--overwrite")
+    assert run(["render", str(scene), "-o", str(picture), "--verbose", *arguments]) == 0
+    assert "note: image: on the processor\n" in capsys.readouterr().err
+    assert run(["render", str(scene), "-o", str(picture), *arguments]) == 0
+    assert capsys.readouterr().err == ""
+    assert "`device` cuda needs a graphics card" in refusal("render", scene, "-o", picture, "--device", "cuda")
+
+
 def test_layers_keep_all_gaussians(room: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "layers.ply"
     assert refine(room, out, "--model", "sphere", "--height", HEIGHT, "--layers", "--poses") == 0

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import lattice_size
@@ -159,6 +159,27 @@ def test_any_height_is_predicted_from(small_config, height: int, compat: Literal
     gaussians = _predictor(small_config, compat)(images, poses, 0.5, 20.0, masks=masks)
     assert isinstance(gaussians, Gaussians) and len(gaussians) > 0
     assert gaussians.means.isfinite().all()
+
+
+@pytest.mark.parametrize(("failures", "tried"), [(1, [1, 2]), (3, [1, 2, 4, 1])])
+def test_out_of_a_cards_memory_a_network_has_more_tiles_and_then_the_processor(
+    small_config, prediction: Gaussians, monkeypatch: pytest.MonkeyPatch, failures: int, tried: list[int]
+) -> None:
+    predictor, given = _predictor(small_config), []
+    lift = predictor.network.lift_gaussians
+
+    def lift_gaussians(matched, *, tiles: int):
+        given.append(tiles)
+        if len(given) <= failures:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return lift(matched, tiles=tiles)
+
+    monkeypatch.setattr(predictor.network, "lift_gaussians", lift_gaussians)
+    with pytest.warns(InputWarning, match="small: the graphics card has too little memory; ") as notes:
+        gaussians = predictor(*_inputs(), 0.5, 20.0)
+    ending = "it runs on the processor" if tried[-1] == 1 else f"{tried[-1]}x{tried[-1]} tiles"
+    assert given == tried and len(notes) == failures and str(notes[-1].message).endswith(ending)
+    assert len(gaussians) == len(prediction)
 
 
 # Loading

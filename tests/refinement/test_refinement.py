@@ -5,12 +5,14 @@ import math
 
 import pytest
 import torch
+from fake_card import CARD, pretend_card
 
 import pansplat
-from pansplat.errors import InputError
+from pansplat import pipeline
+from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import empty_gaussians
 from pansplat.geometry.pose import invert_pose
-from pansplat.refinement import RefineConfig, Refinement, refinement_fingerprint
+from pansplat.refinement import RefineConfig, Refinement, fuse_views, refinement_fingerprint
 from pansplat.refinement.budget import merge_to
 from pansplat.rendering import rasterize
 
@@ -235,3 +237,73 @@ def test_invalid_limits_are_refused(room, limits: dict) -> None:
 def test_the_fingerprint_depends_on_the_settings() -> None:
     assert refinement_fingerprint() == refinement_fingerprint(RefineConfig())
     assert refinement_fingerprint() != refinement_fingerprint(RefineConfig(hold=1.0))
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_a_step_on_a_card_moves_nothing_between_card_and_memory(room, joint: bool) -> None:
+    scene = fuse_views(room.predicted) if joint else room.predicted
+    refinements = []
+    for device in (torch.device("cpu"), CARD):
+        with pretend_card() as count:
+            moved = dataclasses.replace(scene, gaussians=scene.gaussians.to(device=device))
+            refinement = Refinement(moved, room.views, RefineConfig())
+            for step in range(6):  # with a split
+                if step == 1:  # the first one finds out which Gaussians a photograph shows
+                    count.clear()
+                refinement.step(step / 6)
+            assert {name for name in count if count[name]} <= {"reads", "constants"}
+            refinements.append((refinement.held_out_error(), len(refinement.scene().gaussians)))
+    (expected, number), (got, number_on_card) = refinements
+    assert got == pytest.approx(expected, rel=0.02) and number_on_card == pytest.approx(number, rel=0.02)
+
+
+@pytest.fixture
+def only_card(monkeypatch: pytest.MonkeyPatch):
+    """All work is that of a pretended card."""
+    monkeypatch.setattr(pipeline, "choose_device", lambda *_, **__: CARD)
+    with pretend_card() as count:
+        yield count
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_what_a_card_has_refined_and_drawn_is_in_main_memory(room, only_card, joint: bool) -> None:
+    scene, pose = fuse_views(room.predicted) if joint else room.predicted, room.truth.pose_between(0.5)
+    refined = pansplat.refine(scene, room.views, steps=8)
+    drawn = pipeline.make_renderer(refined, "image", 1, size=(16, 32))(pose)
+    assert only_card["copies"] and not any("mixed" in name for name in only_card if only_card[name])
+    assert {tensor.device.type for tensor in (*_tensors(refined), drawn.color, drawn.alpha, drawn.depth)} == {"cpu"}
+    expected = pipeline.render(refined, pose, size=(16, 32))
+    assert torch.allclose(drawn.color, expected.color, atol=1e-4)
+    assert room.error(refined, pose) < room.error(scene, pose)
+
+
+@pytest.mark.usefixtures("only_card")
+def test_a_refinement_that_a_card_has_no_memory_for_is_the_processors(room, monkeypatch) -> None:
+    def refuse(scene, *arguments, **options):
+        if scene.gaussians.means.device == CARD:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return Refinement(scene, *arguments, **options)
+
+    monkeypatch.setattr(pipeline, "Refinement", refuse)
+    with pytest.warns(InputWarning, match="refinement: the graphics card has too little memory; it runs on the proces"):
+        refined = pansplat.refine(room.predicted, room.views, steps=2)
+    expected = _refine(room, steps=2)[0]
+    assert all(torch.equal(a, b) for a, b in zip(_tensors(refined), _tensors(expected), strict=True))
+    moved = dataclasses.replace(room.predicted, gaussians=room.predicted.gaussians.to(device=CARD))
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        pansplat.refine(moved, room.views, steps=2)
+
+
+def test_an_image_that_a_card_has_no_memory_for_is_the_processors(room, only_card, monkeypatch) -> None:
+    pose, render = room.truth.pose_between(0.5), pipeline.render
+
+    def draw(scene, pose, **options):
+        if scene.gaussians.means.device == CARD:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return render(scene, pose, **options)
+
+    monkeypatch.setattr(pipeline, "render", draw)
+    renderer = pipeline.make_renderer(room.truth, "film", 1, size=(16, 32))
+    with pytest.warns(InputWarning, match="film: the graphics card has too little memory; it runs on the processor"):
+        first = renderer(pose)
+    assert torch.equal(first.color, renderer(pose).color), "the second one without a note"

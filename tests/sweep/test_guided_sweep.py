@@ -1,3 +1,4 @@
+import contextlib
 import dataclasses
 import math
 from pathlib import Path
@@ -5,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fake_card import CARD, pretend_card
 from onnx_files import Node, write_onnx
 
 from pansplat.errors import InputError
@@ -90,6 +92,26 @@ def test_refined_depth_is_in_the_unit_of_the_poses():
     small, large = observed.refine(starts[0], poses, others, 2), observed.refine(starts[1], far, others, 2)
     for a, b in zip(small, large, strict=True):
         np.testing.assert_allclose(a.log_depth + np.log(10), b.log_depth, atol=5e-3)
+
+
+def test_networks_on_a_card_estimate_what_those_on_the_processor_do(monkeypatch):
+    prior, poses = NetworkPrior(_network(), _sharpening(), "", 64), np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 0.5
+
+    def estimate():
+        observed = prior.observe(_images())
+        refined = observed.refine(observed.priors, poses, [[1], [0]], 1)
+        return [prior.log_depth for prior in (*observed.priors, *refined)] + observed.sharpen()
+
+    expected = estimate()
+    monkeypatch.setattr("pansplat.sweep.guided_sweep.choose_device", lambda *_: CARD)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # the pretended card has none
+    with pretend_card() as count:
+        got = estimate()
+    assert count["copies"] and not any("mixed" in name for name in count if count[name])
+    for first, second in zip(expected, got, strict=True):
+        np.testing.assert_allclose(second, first, atol=1e-4)
+    assert {weight.device.type for weight in prior.network.parameters()} == {"cpu"}, "which other threads use"
 
 
 def test_fingerprint_depends_on_the_weights(weights, tmp_path):

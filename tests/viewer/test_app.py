@@ -199,8 +199,8 @@ def test_pairs_are_chosen_by_name_or_number():
 
 def test_options_are_passed_on(tmp_path):
     reading, prediction = ReadOptions("world2cam opengl", 0.3, 9.0), PredictOptions("w.safetensors", height=256)
-    expected = LoadOptions(reading, replace(prediction, cache=False))
-    assert Options(tmp_path, no_cache=True, prediction=prediction, reading=reading).load_options == expected
+    expected = LoadOptions(reading, prediction)
+    assert Options(tmp_path, prediction=prediction, reading=reading).load_options == expected
     assert Options(tmp_path, preset="3dgs").renderer_choice == "gl"
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
 from typing import Generic, TypeVar
 
 Result = TypeVar("Result")
@@ -24,7 +25,7 @@ class _Task(Generic[Result]):
 
     def __init__(self, executor: ThreadPoolExecutor, work: Callable[[Report], Result], description: str) -> None:
         self.description, self.fraction, self.is_cancelled = description, 0.0, False
-        self.future: Future[Result] = executor.submit(work, self.report)
+        self.future: Future[Result] = executor.submit(copy_context().run, work, self.report)  # with its device
 
     def report(self, description: str | None = None, fraction: float = 0.0) -> None:
         if self.is_cancelled:

@@ -223,10 +223,9 @@ def load_entry(
         return _load_tour_scene(replace(entry, tour=tour, merged=scene), options, progress, show)
     scene = pipeline.predict(
         entry.pair,
-        model=options.prediction.model,
+        options=options.prediction,
         progress=progress,
         on_predicted=None if show is None else lambda scene: show(LoadedScene(entry, scene, is_final=False)),
-        **options.prediction.keywords,
     )
     return LoadedScene(entry, scene)
 
@@ -279,10 +278,10 @@ def _load_tour_scene(
 
     scene = pipeline.predict(
         pair,
-        model=pipeline.choose_predictor(pair, predictor),
+        pipeline.choose_predictor(pair, predictor),
+        options=fitted,
         progress=progress,
         on_predicted=None if show is None or not fitted.refine_seconds else lambda s: show(finish(s, is_final=False)),
-        **fitted.keywords,
     )
     return finish(scene, is_final=True)
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Runs the benchmarks, both trainings and an evaluation of the new weights on a GPU, in a quarter of an hour.
+# Runs the benchmarks, refinement and films on both devices, both trainings and an evaluation of the new weights on a GPU.
 #
-#   OUT=results bash assets/recipe/homes/gpu.sh [truth|training|judge ...]     all three parts by default
+#   OUT=results bash assets/recipe/homes/gpu.sh [truth|devices|training|judge ...]     all parts by default
 #
 # SIZE=tiny runs each part with tiny sizes, also on a processor (DEVICE=cpu): try that before. Each part has its own
 # limit; one that fails or runs out of time leaves what it has in $OUT, and the next one starts. SHARED is the folder
@@ -17,9 +17,9 @@ mkdir -p "$OUT"
 OUT=$(realpath "$OUT")
 
 if [ "$SIZE" = tiny ]; then
-    limits=(1200 600 400) homes=16 height=64 rows=128 steps=2 minutes=2 quick=--quick pairs=1 workers=0 real=
+    limits=(1200 600 400 1800) film=.2 refined=4 homes=16 height=64 rows=128 steps=2 minutes=2 quick=--quick pairs=1 workers=0 real=
 else
-    limits=(180 480 120) homes=1600 height=256 rows=512 steps=1500 minutes=1.2 quick= pairs=16 workers=8 real=$SHARED/data/zind
+    limits=(180 480 120 120) film=4 refined=40 homes=1600 height=256 rows=512 steps=1500 minutes=1.2 quick= pairs=16 workers=8 real=$SHARED/data/zind
 fi
 [ -d "$FURNITURE" ] && furniture="--furniture $FURNITURE" || furniture=
 
@@ -27,13 +27,31 @@ step() { # limit in seconds, name, command...
     local limit=$1 name=$2
     shift 2
     printf '== %s\n' "$name"
+    local began=$SECONDS
     timeout -k 10 "$limit" "$@" >> "$OUT/$name.log" 2>&1 || printf '%s: exit status %s, see %s.log\n' "$name" $? "$name"
+    echo $((SECONDS - began)) > "$OUT/$name.seconds"
 }
 
 truth() {
     local each=$((limits[0] / 4)) suite
     [ "$DEVICE" = cuda ] && step $each triton env TRITON_INTERPRET=0 $bin/pytest -q -m "exhaustive or not exhaustive" tests/rendering/cuda
     for suite in raster model viewer; do step $each $suite $bin/pansplat bench $suite $quick --overwrite --json "$OUT/$suite.json"; done
+}
+
+# Refinement for equal steps and for 10 s, and a film, on each device: time beside error, in devices.md.
+devices() {
+    local each=$((limits[3] / 6)) names=cpu name
+    [ "$DEVICE" = cuda ] && names="cuda cpu"
+    for name in $names; do
+        local common=(assets/living_room --device "$name" --verbose --overwrite)
+        step $each "steps-$name" $bin/pansplat refine "${common[@]}" --layers --height $rows --steps $refined \
+            -o "$OUT/steps-$name.ply" --report "$OUT/steps-$name.json"
+        step $each "seconds-$name" $bin/pansplat refine "${common[@]}" --layers --height $rows --seconds 10 \
+            -o "$OUT/seconds-$name.ply" --report "$OUT/seconds-$name.json"
+        step $each "film-$name" $bin/pansplat render "${common[@]}" --predict-height $rows --refine 0 --seconds $film \
+            -o "$OUT/film-$name.mp4"
+    done
+    $bin/python assets/recipe/homes/devices.py "$OUT" > "$OUT/devices.md" && cat "$OUT/devices.md"
 }
 
 # The cores of the processor make homes while the device trains; each round reads those that are there.
@@ -66,7 +84,7 @@ judge() {
     done
 }
 
-for part in "${@:-truth training judge}"; do
+for part in "${@:-truth devices training judge}"; do
     for name in $part; do $name; done
 done
 ls -R "$OUT" | tail -40

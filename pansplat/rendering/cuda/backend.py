@@ -26,7 +26,8 @@ from pansplat.rendering.projection import (
     ray_footprints,
     select_drawable,
 )
-from pansplat.rendering.rasterize import MIN_TRITON, RasterInfo, RasterOptions, RasterSums, get_triton_version
+from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
+from pansplat.system.devices import find_triton_problem
 
 if TYPE_CHECKING:
     from pansplat.rendering.cuda.tiling import Instances
@@ -65,13 +66,9 @@ def rasterize_planes(
 
 def _check_device(device: torch.device) -> None:
     """Raise an error if Triton cannot run on the device; kernels are imported later, where they are launched."""
-    version, needed = get_triton_version(), ".".join(map(str, MIN_TRITON))
-    if version < MIN_TRITON:
-        found = f"has version {'.'.join(map(str, version))}" if version else "is not installed"
-        raise InputError(
-            f"backend 'triton' needs the package triton {needed} or newer, which {found}; install it (pip install "
-            f"'triton>={needed}', on Linux), or use backend='auto'"
-        )
+    problem = find_triton_problem()
+    if problem is not None:
+        raise InputError(f"backend 'triton' {problem}; install it (on Linux), or use backend='auto'")
     if device.type != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
         raise InputError(
             f"backend 'triton' needs Gaussians on a CUDA device, got them on '{device}'; move them there "

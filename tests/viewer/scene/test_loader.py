@@ -90,7 +90,7 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
     tour = replace(tour, overlaps={(0, 0): 1.0, (1, 2): 0.4, (2, 3): 0.4})
     monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: tour)
     scene = load_house(TourScenes(tour).make_entry((0,))).scene
-    monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, **options: scene)
+    monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, model, **options: scene)
     single = replace(tour, panoramas=(alone,), overlaps={(0, 0): 1.0})
     for each in (tour, single):
         loaded = load_entry(SceneEntry("house", tour=each), LoadOptions(), ignore)
@@ -103,9 +103,9 @@ def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_f
     monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: connected)
     asked = []
 
-    def predict(pair, refine_seconds, on_predicted, **options):
+    def predict(pair, model, *, options, on_predicted, progress):
         views = tuple(int(view.name[-1]) for view in pair.context)
-        asked.append((views, refine_seconds, on_predicted is not None))
+        asked.append((views, options.refine_seconds, on_predicted is not None))
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
@@ -196,23 +196,19 @@ def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
     assert not list_loader_threads(), "the end cancels the request and joins its thread"
 
 
-def test_a_prediction_has_the_arguments_of_the_options_and_is_shown_before_the_refined_scene(monkeypatch, small_scene):
-    def predict(pair, **options):
-        assert (options["model"], options["height"], options["cache"], options["refine_seconds"]) == (
-            "sweep",
-            256,
-            False,
-            3.0,
-        )
-        options["progress"]("predicting", 0.5)
-        options["on_predicted"](small_scene)
+def test_a_prediction_has_the_options_and_is_shown_before_the_refined_scene(monkeypatch, small_scene):
+    options = LoadOptions(prediction=PredictOptions("sweep", height=256, cache=False, refine_seconds=3.0))
+
+    def predict(pair, **arguments):
+        assert arguments["options"] is options.prediction
+        arguments["progress"]("predicting", 0.5)
+        arguments["on_predicted"](small_scene)
         return small_scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     shown = []
     entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
-    prediction = PredictOptions("sweep", height=256, cache=False, refine_seconds=3.0)
-    final = load_entry(entry, LoadOptions(prediction=prediction), ignore, shown.append)
+    final = load_entry(entry, options, ignore, shown.append)
     assert [loaded.is_final for loaded in (*shown, final)] == [False, True]
 
 
