@@ -438,7 +438,7 @@ def _describe_scene(
         "views": views_of_page,
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(link_parts(tour), positions, heights, level) if flights.edges else [],
+        "links": _describe_links(link_parts(tour), spots, heights) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
@@ -536,29 +536,27 @@ def _describe_rooms(
     return {"ranges": packed.rooms, "storeys": storeys, "boxes": boxes} if any(boxes) else None
 
 
-def _describe_links(
-    tour: TourGraph,
-    positions: Float[np.ndarray, "node 3"],
-    heights: list[float],
-    level: Float[np.ndarray, "3 3"],
-) -> list[dict[str, Any]]:
-    """The links of a page; those to other parts have a ring on the floor, and a place where the fade begins.
+def _describe_links(tour: TourGraph, spots: Sequence[dict[str, Any]], heights: Sequence[float]) -> list[dict[str, Any]]:
+    """The links of a page. Those to other parts, and those to panoramas whose marks are hidden, have a ring on the
+    floor; the first ones a place where the fade begins.
 
     Args:
         tour: of the scene.
-        positions: of the cameras, relative to the page's origin.
+        spots: the descriptions of the panoramas.
         heights: of the cameras over the floor.
-        level: axes of a level camera.
     """
     links = []
     for (start, end), link in tour.links.items():
         found: dict[str, Any] = {"from": start, "to": end, "text": link.text}
+        position, is_elsewhere = np.array(spots[start]["position"]), tour.parts[start] != tour.parts[end]
         way = find_way_along_link(tour, start, end)
         ring = find_link_ring(tour, start, end, heights[start])
-        if way is not None and ring is not None and tour.parts[start] != tour.parts[end]:
-            found["mark"] = _round(positions[start] + ring)
-            found["leave"] = _round(positions[start] + way)
-            found["yaw"] = round(find_angles(level.T @ way / np.linalg.norm(way))[0], 5)
+        if way is not None and ring is not None:
+            if is_elsewhere or end in spots[start]["hidden"]:
+                found["mark"] = _round(position + ring)
+            if is_elsewhere:
+                found["leave"] = _round(position + way)
+                found["yaw"] = round(find_angles(tour.level_axes.T @ way / np.linalg.norm(way))[0], 5)
         links.append(found)
     return links
 

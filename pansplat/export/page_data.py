@@ -72,7 +72,8 @@ class PageSpot(_Record):
 
 
 class PageLink(_Record):
-    """A link of the tour; one to another part has a ring, and a place and a yaw with which the fade begins."""
+    """A link of the tour. One to another part, or to a hidden panorama, has a ring; the first one also a place and a
+    yaw with which the fade begins."""
 
     source: int = msgspec.field(name="from")
     target: int = msgspec.field(name="to")

@@ -167,10 +167,6 @@ class TourGraph:
         """The edge of a node with the largest overlap."""
         return max((edge for edge in self.overlaps if node in edge), key=self.overlaps.__getitem__)
 
-    def list_reachable(self, edge: Edge) -> set[int]:
-        """The nodes of an edge, and those that share an edge with one of them."""
-        return {*edge, *(node for end in edge for node in self.neighbours(end))}
-
     def choose_scene_views(self) -> dict[Edge, ViewNumbers]:
         """The panoramas of the scene of each edge: two, or three that overlap with each other; one of a self-edge.
 

@@ -48,12 +48,6 @@ export function followEdge(graph, position, current) {
   return distanceToEdge(graph, current, position) <= limit ? current : nearest;
 }
 
-// list_reachable
-export function isReachable(graph, edge, node) {
-  const ends = graph.edges[edge].slice(0, 2);
-  return graph.edges.some(([a, b]) => (a === node && ends.includes(b)) || (b === node && ends.includes(a)));
-}
-
 // is_fade
 export const isFade = (graph, from, to) => {
   return graph.parts[from] !== graph.parts[to] || graph.poor.some((edge) => edge.includes(from) && edge.includes(to) && from !== to);

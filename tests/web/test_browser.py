@@ -361,12 +361,13 @@ def test_an_arrival_faces_no_wall(chromium: Any, folder: Path) -> None:
         assert page.messages == []
 
 
-def test_rings_behind_furniture_are_hidden_unless_all_are(chromium: Any, folder: Path) -> None:
-    with opened(chromium, folder / "tour.html") as page:
-        shown = "Array.from(document.querySelectorAll('#spots button:not([hidden])'), (button) => button.title).sort()"
-        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
-        for hidden, expected in (([], [1, 2]), ([2], [1]), ([1, 2], [1, 2])):
-            page.run("(hidden) => { HEADER.spots[0].hidden = hidden; }", hidden)
+def test_rings_behind_furniture_are_hidden_but_the_nearest_one(chromium: Any, folder: Path) -> None:
+    shown = "Array.from(document.querySelectorAll('#spots button:not([hidden])'), (button) => button.title).sort()"
+    for hidden, expected in (([], [1, 2]), ([2], [1]), ([1, 2], [1])):
+        with opened(chromium, folder / "tour.html") as page:
+            page.run("(hidden) => HEADER.spots.forEach((spot, node) => { spot.hidden = node ? [] : hidden; })", hidden)
+            page.run("pansplat.goTo(2, { jump: true }).then(() => null)")
+            page.settle()
             found = set()
             for yaw in range(0, 360, 60):
                 page.run(
@@ -375,6 +376,31 @@ def test_rings_behind_furniture_are_hidden_unless_all_are(chromium: Any, folder:
                 page.settle()
                 found |= set(page.run(shown))
             assert sorted(found) == [f"Go to room {node}" for node in expected]
+
+
+def test_no_ring_is_under_the_buttons(chromium: Any, folder: Path) -> None:
+    """The second panorama comes nearer to the right edge, along the bottom row of the picture."""
+    shown = """() => {
+        const boxes = (of) => [...document.querySelectorAll(of)].map((each) => each.getBoundingClientRect());
+        const [bar] = boxes("#buttons"), rings = boxes("#spots button:not([hidden])");
+        const isBeside = (ring) => ring.right < bar.left || ring.left > bar.right;
+        const isUnder = (ring) => ring.bottom >= bar.top && ring.top <= bar.bottom && !isBeside(ring);
+        return rings.map(isUnder);
+    }"""
+    with opened(chromium, folder / "tour.html", size=(640, 240)) as page:
+        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        position, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
+        right, down, forward = in_level(page, np.subtract(mark, position))
+        yaw = math.degrees(math.atan2(right, forward))
+        pitch = -math.degrees(math.atan2(down, math.hypot(right, forward))) + 28  # it is near the lower edge
+        counts = []
+        for turn in (30, 0):
+            page.run("([yaw, pitch]) => pansplat.setPose({ yaw, pitch, fov: 75 })", [yaw + turn, pitch])
+            page.settle()
+            rings = page.run(shown)
+            assert not any(rings), turn
+            counts.append(len(rings))
+        assert max(counts) > 0 and min(counts) == 0, "it is shown left of the buttons"
 
 
 def test_a_note_of_the_tour_is_a_marker_at_its_panorama_that_opens_plain_text(

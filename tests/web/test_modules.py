@@ -21,7 +21,7 @@ from pansplat.tours.layout import REACH
 
 FOLDER = Path(str(resources.files("pansplat.web")))
 MODULES = {file.name: file.read_text("utf-8") for file in FOLDER.glob("*.js")}
-WITHOUT_BROWSER = ("graph.js", "state.js", "camera.js", "doll.js")
+WITHOUT_BROWSER = ("graph.js", "state.js", "camera.js", "choices.js", "doll.js")
 IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+\.js)";$', re.MULTILINE)
 
 
@@ -161,7 +161,6 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
             nearest: graph.edges[nearestEdge(graph, position)],
             ofPart: graph.edges[nearestEdge(graph, position, partOfEdge(graph, current[i]))],
             followed: graph.edges[followEdge(graph, position, current[i])],
-            reachable: graph.positions.map((_, node) => isReachable(graph, current[i], node)),
             ways: graph.positions.map((_, node) => findWay(graph, position, node)),
             waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
             fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
@@ -175,7 +174,6 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         assert tuple(case["nearest"]) == tour.find_nearest_edge(position)[0]
         assert tuple(case["ofPart"]) == tour.find_nearest_edge(position, tour.parts[edge[0]])[0]
         assert tuple(case["followed"]) == tour.follow_edge(position, edge)
-        assert set(np.flatnonzero(case["reachable"])) == tour.list_reachable(edge)
         assert case["ways"] == [tour.find_way(position, node) for node in nodes]
         assert case["waysOfPart"] == [tour.find_way(position, node, 0) for node in nodes]
         assert case["fades"] == [tour.is_fade(node, edge[0]) for node in nodes]
@@ -185,6 +183,37 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         (tour.parts[edge[0]], tour.parts[edges[number][0]]) for edge, number in zip(followed, current, strict=True)
     ]
     assert len({a == b for a, b in parts}) == 2, "a position near another part is in it"
+
+
+def choose_rings(node: str, folder: Path, *, links: Any = (), hidden: Any = (), rooms: Any = (), here: int = 0) -> list:
+    """The rings of a panorama in a row of four, the last one in another part, with `{from, to, mark}` of links."""
+    header = make_header(ROW, [(0, 1), (0, 2), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"links": list(links)}
+    header["plan"] = {"rooms": [{"nodes": nodes} for nodes in rooms]}
+    for number, spot in enumerate(header["spots"]):
+        spot["hidden"] = list(hidden) if number == here else []
+    found = run(node, folder, header, "(here) => chooseRings(here)", here)
+    return [(ring["node"], None if ring["link"] is None else ring["link"]["from"]) for ring in found]
+
+
+def test_the_rings_of_a_panorama_are_its_own_links_and_its_flights(node: str, tmp_path: Path) -> None:
+    door = {"from": 1, "to": 3, "mark": [0, 0, 0]}
+    assert choose_rings(node, tmp_path, links=[door]) == [(1, None), (2, None), (0, None)], "not those of the next one"
+    assert choose_rings(node, tmp_path, links=[door], here=1)[0] == (3, 1)
+    assert choose_rings(node, tmp_path, links=[{"from": 0, "to": 3}]) == [(1, None), (2, None), (0, None)], "no place"
+
+
+def test_surfaces_hide_rings_but_those_of_the_photographs_own_links(node: str, tmp_path: Path) -> None:
+    assert choose_rings(node, tmp_path, hidden=[1]) == [(2, None), (0, None)]
+    assert choose_rings(node, tmp_path, hidden=[1, 2]) == [(1, None), (0, None)], "the nearest one is left"
+    arrow = {"from": 0, "to": 2, "mark": [0, 0, 0]}
+    assert choose_rings(node, tmp_path, hidden=[1, 2], links=[arrow]) == [(2, 0), (0, None)], "on its arrow"
+
+
+def test_another_room_has_one_ring(node: str, tmp_path: Path) -> None:
+    assert choose_rings(node, tmp_path, rooms=[[1, 2]]) == [(1, None), (0, None)], "the nearest one"
+    assert choose_rings(node, tmp_path, rooms=[[0, 1, 2]]) == [(1, None), (2, None), (0, None)], "its own one has all"
+    linked = choose_rings(node, tmp_path, rooms=[[1, 2]], links=[{"from": 0, "to": 2}])
+    assert linked == [(2, None), (0, None)], "that of a link comes before"
 
 
 def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp_path: Path) -> None:
