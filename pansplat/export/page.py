@@ -55,7 +55,7 @@ from pansplat.tours.floor import choose_camera_height, find_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
-from pansplat.tours.outlook import choose_heading, find_blank, is_hidden, measure_outlook
+from pansplat.tours.outlook import choose_arrival, find_turned, is_hidden, measure_outlook
 from pansplat.tours.plan import Plan
 from pansplat.tours.route import Route, find_angles, plan_route
 from pansplat.tours.surfaces import locate_surfaces
@@ -251,10 +251,8 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
         first = tour.find_start_view(0) if len(tour) else None
         start = path_poses(scene.cam2world)[0]
         level = start[:3, :3].numpy()
-        if first is None:
-            yaw, pitch = choose_heading(measure_outlook(scene, 0, level), 0.0), 0.0
-        else:
-            yaw, pitch = find_angles(level.T @ first)
+        view = None if first is None else find_angles(level.T @ first)
+        yaw, pitch = choose_arrival(measure_outlook(scene, 0, level), 0.0, start=view)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
@@ -263,7 +261,7 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
     samples, jumps = _resample(route)
     start, (yaw, pitch) = torch.from_numpy(route.pose(0.0)), samples[0, 3:].tolist()
     if tour.find_start_view(walk[0]) is None:
-        _, yaw = find_blank(measure_outlook(scene, walk[0], route.level))
+        _, (yaw, pitch) = find_turned(measure_outlook(scene, walk[0], route.level))
     start[:3, :3] = torch.from_numpy(route.level)
     return _Flights(
         _look(start, route.level, yaw, pitch),
@@ -417,9 +415,8 @@ def _describe_scene(
             "position": _round(position),
             "mark": _round(mark),
             "notes": [],
-            **_describe_outlook(scene, view, level, (marks - position) @ level),
+            **_describe_outlook(scene, view, level, (marks - position) @ level, start),
             "radius": round(0.12 * height, 6),
-            **({} if start is None else {"start": _round(np.array(find_angles(level.T @ start)))}),
         }
         for view, (name, position, mark, height, start) in enumerate(
             zip(scene.names, positions, marks, heights, starts, strict=True)
@@ -467,20 +464,26 @@ def _describe_scene(
 
 
 def _describe_outlook(
-    scene: Scene, view: int, level: Float[np.ndarray, "3 3"], marks: Float[np.ndarray, "node 3"]
+    scene: Scene,
+    view: int,
+    level: Float[np.ndarray, "3 3"],
+    marks: Float[np.ndarray, "node 3"],
+    start: Float[np.ndarray, "3"] | None,
 ) -> dict[str, Any]:
-    """Where a camera at a view faces a wall (bits of the directions of `measure_outlook`), and the yaw of the widest
-    view; and the panoramas whose marks furniture or walls hide.
+    """The rule of `choose_arrival` at a view, as the bits of the directions from which a camera turns, and yaw and
+    pitch to which it does; and the panoramas whose marks furniture or walls hide.
 
     Args:
         level: axes of a level camera.
         marks: of all panoramas on the floor, relative to the camera.
+        start: direction of the start view.
     """
-    is_blank, widest = find_blank(measure_outlook(scene, view, level))
+    angles = None if start is None else find_angles(level.T @ start)
+    is_turned, ahead = find_turned(measure_outlook(scene, view, level), angles)
     places = locate_surfaces(scene, view, level, min_opacity=0.5)
     hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
-    blank = sum(1 << number for number in np.flatnonzero(is_blank).tolist())
-    return {"blank": blank, "ahead": round(widest, 3), "hidden": hidden}
+    turned = sum(1 << number for number in np.flatnonzero(is_turned).tolist())
+    return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": hidden}
 
 
 def _describe_plan(

@@ -54,10 +54,9 @@ class PageSpot(_Record):
     """A panorama: its camera, the mark and the radius of its ring on the floor, and where there is something to see.
 
     Attributes:
-        blank: bits of the directions in which a camera faces a wall.
-        ahead: yaw of the widest view, radians.
+        turned: bits of the directions from which a camera that arrives turns (`choose_arrival`).
+        ahead: yaw and pitch to which it turns, radians.
         hidden: panoramas whose marks surfaces hide.
-        start: yaw and pitch of the start view, radians.
     """
 
     name: str
@@ -65,10 +64,9 @@ class PageSpot(_Record):
     mark: Vector
     radius: float
     notes: tuple[PageNote, ...]
-    blank: int
-    ahead: float
+    turned: int
+    ahead: tuple[float, float]
     hidden: tuple[int, ...]
-    start: tuple[float, float] | msgspec.UnsetType = msgspec.UNSET
 
 
 class PageLink(_Record):

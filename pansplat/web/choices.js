@@ -1,4 +1,4 @@
-// What is offered at a panorama: functions of HEADER, which need no browser.
+// What is offered at a panorama, and where a way ends there: functions of HEADER, which need no browser.
 
 import { distanceOf } from "./graph.js";
 import { edges, GRAPH, parts } from "./state.js";
@@ -27,6 +27,21 @@ export function chooseRings(here) {
     return room >= 0 && room === roomOf(here) || !offered.slice(0, k).some(isBefore);
   });
   return [...first, { node: here, link: null }];
+}
+
+export const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
+
+const DIRECTIONS = 24;  // of the bits of `turned`
+
+// Yaw and pitch at the end of a way to a panorama, by the table of choose_arrival (pansplat/tours/outlook.py). From another part
+// the camera comes away from the link back; without one, the directions of another world are unknown.
+export function chooseArrival(node, { yaw, pitch }, from = node) {
+  const { turned, ahead } = HEADER.spots[node], { worlds } = HEADER.plan, back = findLink(node, from);
+  const isElsewhere = parts[node] !== parts[from], isBack = isElsewhere && back && back.leave;
+  const end = isBack ? { yaw: back.yaw + Math.PI, pitch: 0 } : { yaw, pitch: isElsewhere ? 0 : pitch };
+  const turns = end.yaw / (2 * Math.PI) + 0.5, isUnknown = !isBack && worlds[node] !== worlds[from];
+  const isTurned = isUnknown || turned >> Math.floor(DIRECTIONS * (turns - Math.floor(turns))) & 1;
+  return isTurned ? { yaw: ahead[0], pitch: ahead[1] } : end;
 }
 
 // Whether two boxes have a place in common; `[left, top, right, bottom]`.

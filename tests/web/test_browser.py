@@ -346,18 +346,22 @@ def test_the_dolls_house_is_the_picture_of_the_fronts_in_the_rooms_and_a_click_g
     home.page.emulate_media(reduced_motion="no-preference")
 
 
-def test_an_arrival_faces_no_wall(chromium: Any, folder: Path) -> None:
-    """Where a panorama says that the directions of a heading are blank, the camera turns to its widest view."""
+def test_flights_jumps_and_keys_end_alike_and_face_no_wall(chromium: Any, folder: Path) -> None:
+    """Where a panorama says that a camera turns from the directions of a heading, it does."""
     with opened(chromium, folder / "tour.html") as page:
-        page.run("Object.assign(HEADER.spots[1], { blank: 1 << 13, ahead: -2 })")  # 15 to 30 degrees
+        page.run("Object.assign(HEADER.spots[1], { turned: 1 << 13, ahead: [-2, 0.1] })")  # 15 to 30 degrees
         ahead = math.degrees(-2)
-        for jump, yaw, expected in ((False, 20, ahead), (False, 40, 40), (True, 20, ahead), (True, -20, -20)):
+        for way, yaw, expected in (("key", 20, ahead), ("fly", 40, 40), ("jump", 20, ahead), ("jump", -20, -20)):
             page.run("pansplat.goTo(1, { jump: true }).then(() => null)")
             page.run("(yaw) => pansplat.setPose({ yaw, pitch: 0 })", yaw)
-            assert page.run("(jump) => pansplat.goTo(2, { jump })", jump)
-            assert page.run("pansplat.getPose().yaw") == pytest.approx(expected, abs=1e-3), (jump, yaw)
-        page.run("HEADER.spots[1].start = [1, 0.2]; pansplat.setPose({ position: HEADER.spots[0].position, yaw: 20 })")
-        assert page.run("pansplat.goTo(2)") and page.camera["yaw"] == pytest.approx(1)
+            if way == "key":
+                page.page.keyboard.press("2")
+                page.wait("document.getElementById('name').textContent === 'room 1'")
+                page.settle()
+            else:
+                assert page.run("(jump) => pansplat.goTo(2, { jump })", way == "jump")
+            assert page.run("pansplat.getPose().yaw") == pytest.approx(expected, abs=1e-3), (way, yaw)
+            assert page.camera["pitch"] == pytest.approx(0.1 if expected == ahead else 0, abs=1e-3)
         assert page.messages == []
 
 
@@ -548,7 +552,7 @@ def test_a_fade_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(
     shutil.copytree(folder / "poor", tmp_path / "poor")
     with opened(chromium, tmp_path / "poor" / "index.html", is_stepped=True) as page:
         page.settle()
-        page.run("HEADER.spots.forEach((spot) => { spot.blank = 0; })")
+        page.run("HEADER.spots.forEach((spot) => { spot.turned = 0; })")
         if case == "missing":
             (tmp_path / "poor" / "index_files" / f"{page.run('HEADER.photographs[1].name')}_0.js").unlink()
         else:
@@ -1027,7 +1031,7 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         assert (page.camera["yaw"], page.camera["pitch"]) == pytest.approx((3.1, 0.2), abs=1e-5)
         assert page.run(shown) == []
         # Directions of before say nothing in a world of its own: it shows its widest view.
-        page.run("Object.assign(HEADER.spots[3], { ahead: 2.2, blank: 0, start: undefined })")
+        page.run("Object.assign(HEADER.spots[3], { ahead: [2.2, 0], turned: 0 })")
         for world, expected in ((2, 2.2), (0, 0.7)):
             page.run("(world) => { HEADER.plan.worlds[3] = world; }", world)
             page.run("pansplat.goTo(1, { jump: true }).then(() => pansplat.setPose({ yaw: 0.7 * 180 / Math.PI }))")
@@ -1053,7 +1057,7 @@ def test_along_a_poor_edge_the_image_grows_and_fades_fast_into_that_of_the_panor
     with opened(chromium, folder / "house.html", script=FRAMES) as page:
         page.settle()
         spots = page.run("HEADER.spots.map(({ position }) => position)")
-        page.run("HEADER.poor.push([0, 1]); HEADER.spots.forEach((spot) => { spot.blank = 0; }); passed = []")
+        page.run("HEADER.poor.push([0, 1]); HEADER.spots.forEach((spot) => { spot.turned = 0; }); passed = []")
         way = np.array(page.run("HEADER.level")).T @ (np.array(spots[1]) - spots[0])
         page.run("(yaw) => pansplat.setPose({ yaw, pitch: 0 })", math.degrees(math.atan2(way[0], way[2])))
         page.run("""scales = []; record(); (function follow() {

@@ -171,7 +171,9 @@ def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: 
     assert distances[0, 0] < 1e-3 and distances[-1, 0] < 1e-3, "it ends where it begins"
     assert np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1).max() < 1.05 / header["routeRate"], "1 m/s"
     assert header["start"]["position"] == pytest.approx(route[0, :3], abs=1e-3)
-    assert header["start"]["yaw"] == pytest.approx(header["spots"][0]["ahead"], abs=1e-3), "not along the first flight"
+    assert header["start"]["yaw"] == pytest.approx(header["spots"][0]["ahead"][0], abs=1e-3), (
+        "not along the first flight"
+    )
 
 
 def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scene, tmp_path: Path) -> None:
@@ -186,7 +188,8 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     start, spots, level = header["start"], header["spots"], np.array(header["level"])
     assert start["position"] == pytest.approx(spots[0]["position"], abs=1e-5)
     assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
-    assert spots[3]["start"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and "start" not in spots[1]
+    assert spots[3]["ahead"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and spots[3]["turned"] == 2**24 - 1
+    assert spots[1]["turned"] < 2**24 - 1 and spots[1]["ahead"][1] == 0
     to, back = header["links"]
     assert (to["from"], to["to"], to["text"]) == (0, 2, "<i>down") and (back["from"], back["to"]) == (2, 0)
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4)

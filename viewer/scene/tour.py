@@ -18,6 +18,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours.floor import FloorOutline, choose_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
 from pansplat.tours.links import find_link_ring, link_parts
+from pansplat.tours.outlook import BINS
 from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.life import SceneLife
@@ -303,8 +304,9 @@ class TourScenes:
         return plan_route(self.tour, walk, camera)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
-        """A route from a pose to a panorama; it does not end with the face to a wall."""
-        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, self._outlooks.get(node))
+        """A route from a pose to a panorama, which ends as `choose_arrival` states."""
+        outlook = self._outlooks.get(node, np.zeros(BINS))
+        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, outlook)
 
     def _find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
         return self.tour.find_way(position, node, self._find_part(position))
