@@ -1,6 +1,7 @@
 """The modules of the page in node: their imports, and those that need no browser as functions of HEADER and state."""
 
 import json
+import math
 import os
 import re
 import shutil
@@ -18,6 +19,7 @@ from pansplat.export.page_data import PageHeader
 from pansplat.inputs.pairs import Link, Panorama
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
 from pansplat.tours.layout import REACH
+from pansplat.tours.outlook import choose_arrival, find_turned
 
 FOLDER = Path(str(resources.files("pansplat.web")))
 MODULES = {file.name: file.read_text("utf-8") for file in FOLDER.glob("*.js")}
@@ -153,21 +155,24 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
     positions = random.uniform((-1, -0.5, -1), (3, 0.5, 4), (60, 3))
     positions[40:] = random.uniform((3, -0.5, -1), (11, 0.5, 11), (20, 3))
     nodes, current = range(len(places)), random.integers(len(edges), size=60)
+    starts = positions + random.uniform(-0.4, 0.4, (60, 3))
     found = run(
         node,
         tmp_path,
         make_header(ROW, [(0, 1)], [0, 0, 0, 1]),
-        """(graph, positions, current) => positions.map((position, i) => ({
+        """(graph, positions, current, starts) => positions.map((position, i) => ({
             nearest: graph.edges[nearestEdge(graph, position)],
             ofPart: graph.edges[nearestEdge(graph, position, partOfEdge(graph, current[i]))],
             followed: graph.edges[followEdge(graph, position, current[i])],
             ways: graph.positions.map((_, node) => findWay(graph, position, node)),
             waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
             fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
+            step: limitStep(graph, starts[i], position),
         }))""",
         graph,
         positions.tolist(),
         current.tolist(),
+        starts.tolist(),
     )
     for position, number, case in zip(positions, current, found, strict=True):
         edge = edges[number]
@@ -177,6 +182,9 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         assert case["ways"] == [tour.find_way(position, node) for node in nodes]
         assert case["waysOfPart"] == [tour.find_way(position, node, 0) for node in nodes]
         assert case["fades"] == [tour.is_fade(node, edge[0]) for node in nodes]
+    steps = [tour.limit_step(start, end) for start, end in zip(starts, positions, strict=True)]
+    np.testing.assert_allclose([case["step"] for case in found], steps, atol=1e-9)
+    assert 0 < np.any(np.abs(positions - steps) > 1e-6, axis=1).sum() < 30
     followed = [tuple(case["followed"]) for case in found]
     assert len({edge == tuple(case["nearest"]) for edge, case in zip(followed, found, strict=True)}) == 2, "hysteresis"
     parts = [
@@ -216,6 +224,37 @@ def test_another_room_has_one_ring(node: str, tmp_path: Path) -> None:
     assert linked == [(2, None), (0, None)], "that of a link comes before"
 
 
+def test_arrivals_follow_the_table_of_the_panorama_and_come_away_from_the_link_back(node: str, tmp_path: Path) -> None:
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+    header |= {"links": [{"from": 3, "to": 2, "leave": [0, 0, 0], "yaw": 1.0}], "plan": {"worlds": [0, 0, 0, 1]}}
+    outlook = np.full(24, 3.0)
+    outlook[11:14] = 1.0
+    outlook[4] = 9.0
+    for spot, start in zip(header["spots"], (None, (0.4, 0.3), None, None), strict=True):
+        is_turned, ahead = find_turned(outlook, start)
+        spot |= {"turned": sum(1 << k for k in np.flatnonzero(is_turned).tolist()), "ahead": ahead}
+    yaws = np.linspace(-7, 7, 61)
+    found = run(
+        node,
+        tmp_path,
+        header,
+        "(yaws) => [0, 1].map((node) => yaws.map((yaw) => Object.values(chooseArrival(node, { yaw, pitch: 0.2 }))))",
+        yaws.tolist(),
+    )
+    for row, start in zip(found, (None, (0.4, 0.3)), strict=True):
+        wrapped = [choose_arrival(outlook, math.remainder(yaw, 2 * math.pi), 0.2, start) for yaw in yaws]
+        expected = [(yaw if end[1] == 0.2 else end[0], end[1]) for yaw, end in zip(yaws, wrapped, strict=True)]
+        np.testing.assert_allclose(row, expected)
+        assert len({end[1] for end in row}) == (2 if start is None else 1)
+    arrive = (
+        "(from) => [chooseArrival(3, { yaw: 0.5, pitch: 0.2 }, from), chooseArrival(0, { yaw: 2, pitch: 0.2 }, from)]"
+    )
+    away, kept = run(node, tmp_path, header, arrive, 2)
+    assert (away, kept) == ({"yaw": pytest.approx(1 + math.pi), "pitch": 0}, {"yaw": 2, "pitch": 0.2})
+    unknown, _ = run(node, tmp_path, header, arrive, 1)
+    assert unknown == {"yaw": pytest.approx(find_turned(outlook)[1][0]), "pitch": 0}, "of another world, without a link"
+
+
 def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp_path: Path) -> None:
     program = f"""() => {{
         {SORTED}
@@ -227,6 +266,29 @@ def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp
     steps = np.diff(places[:, 0])
     assert (places[:, 1:] == 0).all() and 1.9 < places[-1, 0] <= 2 and (steps >= 0).all()
     assert steps[0] == pytest.approx(0.05) and steps[-1] < 0.005
+
+
+def test_a_camera_stops_half_a_metre_along_a_poor_edge_but_a_script_may_place_it_there(
+    node: str, tmp_path: Path
+) -> None:
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"poor": [(0, 1)]}
+    walked = f"""(position) => {{
+        {SORTED}
+        camera.position = cameraFor({{ position }}).position;
+        const first = [...camera.position];
+        const walkedTo = [1, -1].map((forward) => {{
+            for (let k = 0; k < 90; k++) walk(0.005, 0, 0.05 * forward);
+            return [...camera.position];
+        }});
+        return [first, ...walkedTo];
+    }}"""
+    _, ahead, back = run(node, tmp_path, header, walked, [0, 0, 0])
+    assert ahead[2] == pytest.approx(0.5) and ahead[0] > 0.2, "it slides along"
+    assert back[2] < -0.5
+    placed, ahead, back = run(node, tmp_path, header, walked, [0, 0, 0.9])
+    assert placed[2] == 0.9 and ahead[2] == pytest.approx(0.9) and back[2] < 0, "it can go back"
+    _, ahead, back = run(node, tmp_path, header, walked, [0, 0, 2])
+    assert ahead[2] > 4 and back[2] == pytest.approx(1.5), "the other edge can be walked"
 
 
 def test_nothing_walks_before_the_gaussians_are_sorted_or_in_the_dolls_house(node: str, tmp_path: Path) -> None:

@@ -214,3 +214,18 @@ def test_a_scene_without_cameras_is_seen_from_outside_and_has_no_flight(small_sc
     assert (ahead > 0).mean() > 0.95
     press(state, "space", "1", ".")
     assert not state.playing
+
+
+def test_a_camera_that_flies_by_hand_stops_along_a_poor_edge(state, house):
+    """The state of a tour is the graph with the poor edges that were found."""
+    (a, b), *_ = house.overlaps
+    state.tour = replace(house, poor=((a, b),))
+    way = house.positions[b] - house.positions[a]
+    ahead = np.linalg.inv(np.asarray(state.camera.level)) @ way
+    state.camera = replace(
+        state.camera, position=tuple(house.positions[a]), yaw_radians=float(np.arctan2(ahead[0], ahead[2]))
+    )
+    for _ in range(200):
+        send(state, held=frozenset("w"), seconds=0.05 * float(np.linalg.norm(way)))
+    away = np.linalg.norm(np.array(state.camera.position) - house.positions[a])
+    assert away == pytest.approx(min(0.5, np.linalg.norm(way) / 4), abs=1e-6)
