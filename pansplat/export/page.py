@@ -29,7 +29,7 @@ import shapely
 import torch
 from jaxtyping import Float, Int
 from PIL import Image
-from shapely.geometry import Polygon
+from shapely.geometry import Point, Polygon
 from torch import Tensor
 
 from pansplat import constants, pipeline
@@ -51,12 +51,12 @@ from pansplat.system.console import with_progress_bar
 from pansplat.system.files import SOFTWARE, is_written
 from pansplat.tours.doll_house import Rooms, find_rooms, measure_box
 from pansplat.tours.edges import find_poor_edges
-from pansplat.tours.floor import choose_camera_height, find_camera_height
+from pansplat.tours.floor import assign_storeys, choose_camera_height, find_camera_height, find_floor_outline
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
 from pansplat.tours.outlook import choose_arrival, find_turned, is_hidden, measure_outlook
-from pansplat.tours.plan import Plan
+from pansplat.tours.plan import Plan, Room
 from pansplat.tours.route import Route, find_angles, plan_route
 from pansplat.tours.surfaces import locate_surfaces
 
@@ -72,6 +72,10 @@ _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _START_FOV = 75.0  # degrees, vertical, of a landscape image
 _TALLEST = 1.5  # height of a portrait image relative to it; the poster has this height
 _POSTER_SIZE = (810, 960)  # height and width, pixels
+_UNKNOWN_FLOOR, _ROUGH_OUTLINE = (
+    1.5,
+    0.1,
+)  # metres, around a panorama without a floor; of what is smoothed of a floor's end
 _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
@@ -165,6 +169,7 @@ def write_page(
     rooms = find_rooms(scene) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
     if rooms is not None and not rooms.plan.num_heights:
         rooms = None  # without a floor the doll's house is a heap
+    floors = _outline_floors(scene, tour, () if rooms is None else rooms.plan.rooms)
     scene = _prepare(scene)
     flights = _plan_flights(scene, tour)
     if len(scene.gaussians) > gaussians:
@@ -192,7 +197,7 @@ def write_page(
     header = _describe_scene(scene, packed, origin, flights, tour)
     header |= {"embed": embed, "doll": None, "photographs": [picture.describe() for picture in pictures]}
     header["rough"] = [] if rooms is None else [view for view, clear in enumerate(rooms.is_clear) if not clear]
-    header["plan"] = _describe_plan(None if rooms is None else rooms.plan, tour, origin, flights.level)
+    header["plan"] = _describe_plan(None if rooms is None else rooms.plan, floors, tour, origin, flights.level)
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
         spot["notes"] = [
             {
@@ -486,24 +491,60 @@ def _describe_outlook(
     return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": hidden}
 
 
+def _outline_floors(scene: Scene, tour: TourGraph, rooms: Sequence[Room]) -> list[Room]:
+    """Rooms around the panoramas that stand in none of the floor plan: where their floor ends, else a circle."""
+    floors: list[Room] = []
+    if not len(tour):
+        return floors
+    level, storeys = tour.level_axes, assign_storeys(tour)
+    for node, center in enumerate(tour.positions @ level[:, (0, 2)]):
+        point = Point(center)
+        if not any(room.storey == storeys[node] and Polygon(room.outline).contains(point) for room in rooms):
+            found = find_floor_outline(scene, node, level)
+            shape = point.buffer(_UNKNOWN_FLOOR) if found is None else Polygon(found.corners)
+            outline = np.array(shape.simplify(_ROUGH_OUTLINE).exterior.coords)[:-1]
+            name = tour.panoramas[node].title or tour.panoramas[node].name
+            floors.append(Room(name, (node,), outline, storeys[node], tour.is_placed(node)))
+    return floors
+
+
 def _describe_plan(
-    plan: Plan | None, tour: TourGraph, origin: Float[np.ndarray, "3"], level: Float[np.ndarray, "3 3"]
+    plan: Plan | None,
+    floors: Sequence[Room],
+    tour: TourGraph,
+    origin: Float[np.ndarray, "3"],
+    level: Float[np.ndarray, "3 3"],
 ) -> dict[str, Any]:
     """The floor plan: outlines and names of rooms and the doors, to the right and forward of the origin, and the world
-    of each panorama; panoramas of other worlds are elsewhere."""
+    of each panorama; panoramas of other worlds are elsewhere.
+
+    Args:
+        floors: of `_outline_floors`.
+    """
     worlds = tour.worlds or (0,)
-    if plan is None or not plan.rooms:
+    known = [] if plan is None else [*plan.rooms]
+    if not known and not floors:
         return {"worlds": worlds, "turns": [0.0] * (max(worlds) + 1), "rooms": [], "doors": []}
     turn, middle = tour.level_axes[:, (0, 2)].T @ level[:, (0, 2)], origin @ level[:, (0, 2)]
-    turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in plan.rooms]
-    plan, rooms = dataclasses.replace(plan, rooms=tuple(turned)), []
-    for room in plan.rooms:
+    turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in (*known, *floors)]
+    turns = Plan(tour, tuple(turned), (), math.nan, None, None, 0, 0).turns
+    rooms = []
+    for number, room in enumerate(turned):
         circle = shapely.maximum_inscribed_circle(Polygon(room.outline))
         label = [*_round(np.array(circle.coords[0]) - middle), round(2 * circle.length, 4)]
         outline = [_round(corner) for corner in room.outline - middle]
-        rooms.append({"name": room.name, "nodes": room.panoramas, "outline": outline, "label": label})
-    doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in plan.doors]
-    return {"worlds": worlds, "turns": _round(np.array(plan.turns)), "rooms": rooms, "doors": doors}
+        rooms.append(
+            {
+                "name": room.name,
+                "nodes": room.panoramas,
+                "outline": outline,
+                "label": label,
+                "hasWalls": number < len(known),
+            }
+        )
+    doors = [] if plan is None else plan.doors
+    doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in doors]
+    return {"worlds": worlds, "turns": _round(np.array(turns)), "rooms": rooms, "doors": doors}
 
 
 def _find_cameras(scene: Scene, rooms: Rooms) -> Int[np.ndarray, "n"]:

@@ -99,12 +99,14 @@ class PagePhotograph(_Record):
 
 
 class PageRoom(_Record):
-    """A room of the floor plan; `label` is the middle and the width of its name. To the right and forward."""
+    """A room of the floor plan, or without walls where the floor of a panorama ends; `label` is the middle and the width
+    of its name. To the right and forward."""
 
     name: str
     nodes: tuple[int, ...]
     outline: tuple[tuple[float, float], ...]
     label: Vector
+    has_walls: bool
 
 
 class PageDoor(_Record):

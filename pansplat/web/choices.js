@@ -1,6 +1,6 @@
 // What is offered at a panorama, and where a way ends there: functions of HEADER, which need no browser.
 
-import { distanceOf } from "./graph.js";
+import { clamp, distanceOf } from "./graph.js";
 import { edges, GRAPH, parts } from "./state.js";
 
 const isFlown = (from, to) => {
@@ -46,3 +46,21 @@ export function chooseArrival(node, { yaw, pitch }, from = node) {
 
 // Whether two boxes have a place in common; `[left, top, right, bottom]`.
 export const isCovered = (a, b) => a[0] <= b[2] && a[2] >= b[0] && a[1] <= b[3] && a[3] >= b[1];
+
+const DOT = 7, GAP = 3;  // pixels: half of a panorama's dot in the plan, and between a name and the border
+
+// Where names stand in a plan: the middle of each, as near to its own as it covers neither a dot nor a name before; null where
+// there is no such place.
+export function placeNames(names, dots, size) {
+  const taken = dots.map(([x, y]) => [x - DOT, y - DOT, x + DOT, y + DOT]);
+  return names.map(({ x, y, width, height }) => {
+    const half = 0.5 * width + GAP, middle = clamp(x, half, Math.max(size - half, half));
+    for (const step of [0, -1, 1, -2, 2, -3, 3]) {
+      const at = y + 0.6 * step * height, box = [middle - half, at - 0.5 * height, middle + half, at + 0.5 * height];
+      if (box[1] < 0 || box[3] > size || taken.some((other) => isCovered(box, other))) continue;
+      taken.push(box);
+      return [middle, at];
+    }
+    return null;
+  });
+}

@@ -255,6 +255,25 @@ def test_arrivals_follow_the_table_of_the_panorama_and_come_away_from_the_link_b
     assert unknown == {"yaw": pytest.approx(find_turned(outlook)[1][0]), "pitch": 0}, "of another world, without a link"
 
 
+def test_names_of_a_plan_cover_neither_dots_nor_each_other(node: str, tmp_path: Path) -> None:
+    random = np.random.default_rng(3)
+    dots = random.uniform(20, 280, (9, 2))
+    names = [{"x": x, "y": y, "width": 60, "height": 13} for x, y in [*dots, *dots[:4], (-5, 150), (299, 150)]]
+    places = run(
+        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names, dots.tolist(), 300
+    )
+    boxes = [(x - 30, y - 6.5, x + 30, y + 6.5) for x, y in filter(None, places)]
+    assert len(boxes) > 9 and all(0 <= box[0] and box[2] <= 300 and 0 <= box[1] and box[3] <= 300 for box in boxes)
+    for number, (left, top, right, bottom) in enumerate(boxes):
+        assert not any(left - 5 < x < right + 5 and top - 5 < y < bottom + 5 for x, y in dots)
+        others = boxes[:number]
+        assert not any(left < box[2] and right > box[0] and top < box[3] and bottom > box[1] for box in others)
+    crowd = [[x, y] for x in range(0, 300, 10) for y in range(0, 300, 10)]
+    assert run(
+        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names[:1], crowd, 300
+    ) == [None]
+
+
 def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp_path: Path) -> None:
     program = f"""() => {{
         {SORTED}

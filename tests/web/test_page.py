@@ -111,8 +111,24 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
     write_page(scene, tmp_path / "floor.html")
     write_page(dataclasses.replace(scene, gaussians=above), tmp_path / "none.html")
     headers = [read_header(tmp_path / f"{name}.html") for name in ("floor", "none")]
-    assert headers[0]["doll"] and headers[1]["doll"] is None and headers[1]["plan"]["rooms"] == []
+    assert headers[0]["doll"] and headers[1]["doll"] is None
+    assert not any(room["hasWalls"] for room in headers[1]["plan"]["rooms"])
     assert headers[1]["plan"]["worlds"] == [0, 0, 0]
+
+
+def test_every_panorama_stands_in_an_outline_of_its_storey(flat: Scene) -> None:
+    tour = make_graph(flat)
+    floors = page_module._outline_floors(flat, tour, ())
+    assert [room.panoramas for room in floors] == [(0,), (1,), (2,), (3,)]
+    places = tour.positions @ tour.level_axes[:, (0, 2)]
+    assert all(shapely.Polygon(room.outline).contains(shapely.Point(places[room.panoramas[0]])) for room in floors)
+    around = dataclasses.replace(floors[0], outline=shapely.Point(places[0]).buffer(60).exterior.coords[:])
+    assert page_module._outline_floors(flat, tour, [around]) == [], "all stand in it"
+    above = dataclasses.replace(around, storey=around.storey + 1)
+    assert len(page_module._outline_floors(flat, tour, [above])) == 4
+    hidden = flat.gaussians.select(flat.gaussians.means[:, 1] < -2)  # no floor
+    (circle, *_) = page_module._outline_floors(dataclasses.replace(flat, gaussians=hidden), tour, ())
+    assert shapely.Polygon(circle.outline).area == pytest.approx(math.pi * 1.5**2, rel=0.1)
 
 
 def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Path) -> None:
