@@ -48,7 +48,7 @@ from pansplat.rendering.image_planes import image_planes
 from pansplat.shaders import load_shader
 from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
-from pansplat.system.files import SOFTWARE, is_written
+from pansplat.system.files import is_written
 from pansplat.tours.doll_house import Rooms, find_rooms, measure_box
 from pansplat.tours.edges import find_poor_edges
 from pansplat.tours.floor import assign_storeys, choose_camera_height, find_camera_height, find_floor_outline
@@ -653,35 +653,36 @@ def _write_files(
     Args:
         contents: of the Gaussians of each view.
     """
-    count, scripts = header["count"], {}
+    count = header["count"]
+    parts: dict[str, bytes] = {}
     tags: dict[int, list[str]] = {}  # by view
     for view, content in enumerate(contents):
-        ends = [*range(_PART_BYTES, len(content), _PART_BYTES), len(content)]
-        parts = [base64.b64encode(content[k:end]).decode() for k, end in pairwise((0, *ends))]
-        calls = [f"addPart({view}, {'true' if part is parts[-1] else 'false'}" for part in parts]
-        texts = [f'{call}, "{part}"); // {SOFTWARE}\n' for call, part in zip(calls, parts, strict=True)]
-        named = {f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js": text for text in texts}
+        ends = [len(content)] if split else [*range(_PART_BYTES, len(content), _PART_BYTES), len(content)]
+        chunks = [content[start:end] for start, end in pairwise((0, *ends))]
+        named = {f"{hashlib.blake2b(chunk, digest_size=8).hexdigest()}.bin": chunk for chunk in chunks}
         header["views"][view]["files"] = [*named]
-        scripts |= named if split else {}
+        parts |= named
+        calls = [f"addPart({view}, {'true' if chunk is chunks[-1] else 'false'})" for chunk in chunks]
         tags[view] = [
-            f'<script type="text/plain">{part}</script><script>{call})</script>'
-            for call, part in zip(calls, parts, strict=True)
+            f'<script type="text/plain">{base64.b64encode(chunk).decode()}</script><script>{call}</script>'
+            for call, chunk in zip(calls, chunks, strict=True)
         ]
     folder = path.with_name(f"{path.stem}_files")
     folder_address = quote(os.fsencode(folder.name)) if split else None
     elements: list[str] = []
     if split:
         for picture in pictures:
-            scripts |= picture.make_scripts()
+            parts |= picture.make_files()
     else:
+        parts = {}
         first, *others = header["loading"]
         shown = [picture.make_elements() for picture in pictures] or [[] for _ in tags]
         # The smallest photograph of the first panorama, its Gaussians, and then its photograph.
         elements = [*shown[first][:1], *tags[first], *shown[first][1:]]
-        for part in (tags, shown):
-            elements += [element for view in others for element in part[view]]
+        for kind in (tags, shown):
+            elements += [element for view in others for element in kind[view]]
     page = _fill_template(
-        script_sources="'self' file: blob:" if split else "blob:",
+        connections="'self'" if split else "'none'",
         title=html.escape(title),
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
@@ -698,17 +699,17 @@ def _write_files(
             f"{path}: needed a page of at most {MAX_FILE_BYTES // 1_000_000} MB in one file, got "
             f"{len(page) / 1e6:.0f} MB; split it (--split), or keep at most {fitting:,} Gaussians (--gaussians)"
         )
-    files = [folder / name for name in scripts]
+    files = [folder / name for name in parts]
     if split:
         _make_folder(folder)
-    for file, text in zip(files, scripts.values(), strict=True):
+    for file, part in zip(files, parts.values(), strict=True):
         with replacing(file) as temporary:
-            temporary.write_text(text, "utf-8")
+            temporary.write_bytes(part)
     with replacing(path) as temporary:
         temporary.write_bytes(page)
-    _remove_old_parts(folder, set(scripts) if split else set())
+    _remove_old_parts(folder, set(parts))
     files.insert(0, path)
-    total = len(page) + sum(map(len, scripts.values()))
+    total = len(page) + sum(map(len, parts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
     names = [spot["name"] for spot in header["spots"]]
     fades = tuple((names[a], names[b]) for a, b in header["poor"])
@@ -749,8 +750,8 @@ def _make_folder(folder: Path) -> None:
 
 def _remove_old_parts(folder: Path, kept: set[str]) -> None:
     """Remove the parts of the page that was replaced, by their names and content, and the folder if that empties it."""
-    name = re.compile(r"[0-9a-f]{16}(_\d+)?\.js")
-    old = [file for file in folder.glob("*.js") if file.name not in kept and name.fullmatch(file.name)]
+    name = re.compile(r"[0-9a-f]{16}(_\d+)?\.(js|bin|jpg)")
+    old = [file for file in folder.glob("*") if file.name not in kept and name.fullmatch(file.name)]
     old = [file for file in old if is_written(file)]
     for file in old:
         with suppress(OSError):

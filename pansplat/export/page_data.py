@@ -6,6 +6,7 @@ The layout of the bytes is in docs/web.md.
 from __future__ import annotations
 
 import gzip
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from jaxtyping import Float, Int, UInt8
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.morton import morton_codes
+from pansplat.system.files import SOFTWARE
 
 MAX_DEGREE = 3  # of the harmonics of a page
 _CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
@@ -99,8 +101,8 @@ class PagePhotograph(_Record):
 
 
 class PageRoom(_Record):
-    """A room of the floor plan, or without walls where the floor of a panorama ends; `label` is the middle and the width
-    of its name. To the right and forward."""
+    """A room of the floor plan, or without walls where the floor of a panorama ends; `label` is the middle and the
+    width of its name. To the right and forward."""
 
     name: str
     nodes: tuple[int, ...]
@@ -258,10 +260,18 @@ def pack_gaussians(
     blocks = [
         b"".join(plane[start:end].tobytes() for plane in (*planes, *quantised.T)) for start, end in pairwise(ends)
     ]
-    contents = tuple(gzip.compress(blocks[rank], 9, mtime=0) for rank in np.argsort(order))
+    contents = tuple(_compress(blocks[rank]) for rank in np.argsort(order))
     starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
     rooms = _list_runs(ranks[chosen], cameras[chosen])
     return PackedGaussians(contents, tuple(order), starts, counts, degree, (low, high), scale, rooms)
+
+
+def _compress(block: bytes) -> bytes:
+    """gzip, whose header names the software: another page may replace the file."""
+    with io.BytesIO() as file:
+        with gzip.GzipFile(SOFTWARE, "wb", 9, file, mtime=0) as stream:
+            stream.write(block)
+        return file.getvalue()
 
 
 def _list_runs(ranks: Int[np.ndarray, "n"], cameras: Int[np.ndarray, "n"]) -> tuple[tuple[int, int, int], ...]:

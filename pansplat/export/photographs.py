@@ -38,10 +38,10 @@ MAX_HEIGHT = 4096  # of a photograph in a folder
 _FACE = 0.65  # size of a face, of the photograph's height; its centre is as dense
 _STEP = 16  # divides the size of a face, pixels
 _PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels
-_TILE = 672  # largest size of a tile
+_TILE = 1344  # largest size of a tile; a photograph of 4,096 rows has 36
 # Of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the gradient.
 _QUALITY, _FOLDER_QUALITY, _PREVIEW_QUALITY, _LOWER_QUALITIES = 82, 90, 75, (75, 65)
-_SHRINK = 0.8  # of a height that is too large for the page
+_SHRINK = 0.95  # of a height that is too large for the page, at most
 _HIDDEN_ROWS = 512  # of the image of the Gaussians in what masks hide
 _GUARD, _FEATHER = 3, 1 / 128  # around it: pixels of which nothing is shown, and of the height, which fade
 
@@ -87,13 +87,9 @@ class PackedPhotograph:
             if chosen
         ]
 
-    def make_scripts(self) -> dict[str, str]:
-        """A script for each tile by its file name: a page from disk may not read the pixels of image files."""
-        name = self.name
-        return {
-            f"{name}_{n}.js": f'addTile("{name}", {n}, "{base64.b64encode(tile).decode()}"); // {SOFTWARE}\n'
-            for n, tile in enumerate(self.tiles)
-        }
+    def make_files(self) -> dict[str, bytes]:
+        """The tiles by their file names."""
+        return {f"{self.name}_{n}.jpg": tile for n, tile in enumerate(self.tiles)}
 
 
 def list_photographs(source: Pair | TourGraph, views: Sequence[int]) -> list[Pair]:
@@ -201,6 +197,6 @@ def _encode(pixels: UInt8[np.ndarray, "size size 3"], tile: int, quality: int) -
         for left in range(0, len(pixels), tile):
             with io.BytesIO() as file:
                 part = np.ascontiguousarray(pixels[top : top + tile, left : left + tile])
-                Image.fromarray(part).save(file, "JPEG", quality=quality, optimize=True)
+                Image.fromarray(part).save(file, "JPEG", quality=quality, optimize=True, comment=SOFTWARE.encode())
                 encoded.append(file.getvalue())
     return encoded

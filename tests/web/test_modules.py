@@ -263,7 +263,7 @@ def test_names_of_a_plan_cover_neither_dots_nor_each_other(node: str, tmp_path: 
         node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names, dots.tolist(), 300
     )
     boxes = [(x - 30, y - 6.5, x + 30, y + 6.5) for x, y in filter(None, places)]
-    assert len(boxes) > 9 and all(0 <= box[0] and box[2] <= 300 and 0 <= box[1] and box[3] <= 300 for box in boxes)
+    assert len(boxes) > 9 and all(box[0] >= 0 and box[2] <= 300 and box[1] >= 0 and box[3] <= 300 for box in boxes)
     for number, (left, top, right, bottom) in enumerate(boxes):
         assert not any(left - 5 < x < right + 5 and top - 5 < y < bottom + 5 for x, y in dots)
         others = boxes[:number]

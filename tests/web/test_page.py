@@ -1,6 +1,7 @@
 """The files of a page, without a browser."""
 
 import dataclasses
+import gzip
 import json
 import math
 import os
@@ -385,10 +386,7 @@ def test_what_is_no_origin_is_refused(scene: Scene, tmp_path: Path, origin: str)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_parts_of_a_split_page_replace_the_old_ones(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page_module, "_PART_BYTES", 30_000)
+def test_the_parts_of_a_split_page_replace_the_old_ones(scene: Scene, tmp_path: Path) -> None:
     other = tmp_path / "tour_files" / "other.js"
     first = write_page(scene, tmp_path / "tour.html", split=True)
     other.write_text("")
@@ -400,6 +398,8 @@ def test_the_parts_of_a_split_page_replace_the_old_ones(
     header = read_header(tmp_path / "tour.html")
     assert header["folder"] == "tour_files" and "<script src" not in text, "they are loaded when they are needed"
     assert [name for view in header["views"] for name in view["files"]] == [file.name for file in second.files[1:]]
+    assert {file.suffix for file in second.files[1:]} == {".bin"} and "connect-src 'self'" in text
+    assert sum(len(gzip.decompress(file.read_bytes())) for file in second.files[1:]) % header["count"] == 0
 
 
 @pytest.mark.parametrize("is_shared", [False, True])
@@ -408,7 +408,7 @@ def test_a_page_in_one_file_removes_the_parts_of_the_split_one_before(
 ) -> None:
     """`is_shared`: a user's file is beside the parts."""
     write_page(scene, tmp_path / "tour.html", split=True)
-    other = tmp_path / "tour_files" / "0123456789abcdef.js"
+    other = tmp_path / "tour_files" / "0123456789abcdef.bin"
     if is_shared:
         other.write_text("mine")
     write_page(scene, tmp_path / "tour.html")
