@@ -13,7 +13,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
@@ -36,7 +36,7 @@ from pansplat import constants, pipeline
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.film import FilmPhotographs
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, PageHeader, count_bytes, pack_gaussians
-from pansplat.export.photographs import PackedPhotograph, pack_photographs
+from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Pair
@@ -52,10 +52,10 @@ from pansplat.system.files import is_written
 from pansplat.tours.doll_house import Rooms, find_rooms, measure_box
 from pansplat.tours.edges import find_poor_edges
 from pansplat.tours.floor import assign_storeys, choose_camera_height, find_camera_height, find_floor_outline
-from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
+from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, make_graph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
-from pansplat.tours.outlook import choose_arrival, find_turned, is_hidden, measure_outlook
+from pansplat.tours.outlook import choose_arrival, find_bin, find_turned, is_hidden, measure_outlook
 from pansplat.tours.plan import Plan, Room
 from pansplat.tours.route import Route, find_angles, plan_route
 from pansplat.tours.surfaces import locate_surfaces
@@ -65,7 +65,12 @@ PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
 MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
 MAX_FILE_BYTES = 64_000_000  # of a page in one file
 _TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages, and photographs are smaller
-_GAUSSIANS_SHARE = 2 / 3  # of it, beside photographs
+_GAUSSIANS_SHARE = 1 / 2  # of it, beside photographs
+_FLOWN_SHARE, _STILL_SHARE = (
+    2 / 3,
+    1 / 4,
+)  # of the Gaussians of a panorama, with and without flights, beside photographs
+_GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # of a page: a Gaussian, and a photograph as a fraction of its squared rows
 _PROGRAM_BYTES = 200_000  # of a page without its data
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
 _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
@@ -172,11 +177,14 @@ def write_page(
     floors = _outline_floors(scene, tour, () if rooms is None else rooms.plan.rooms)
     scene = _prepare(scene)
     flights = _plan_flights(scene, tour)
-    if len(scene.gaussians) > gaussians:
-        report("merging Gaussians", 0.1)
-        scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0)
-    report("compressing", 0.6)
     has_pictures = len(photographs) > 0 and photo_height != 0
+    heights = [min(each.image_height, photo_height or MAX_HEIGHT) for each in photographs if has_pictures and not split]
+    shares = _share_gaussians(flights, tour.poor, gaussians, heights)
+    kept = round(gaussians * sum(shares[part] for part in flights.parts) / len(flights.parts))
+    if len(scene.gaussians) > kept:
+        report("merging Gaussians", 0.1)
+        scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0, shares=shares)
+    report("compressing", 0.6)
     degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if has_pictures and not split else 1))
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     cameras = None if rooms is None else _find_cameras(scene, rooms)
@@ -330,19 +338,41 @@ def _prepare(scene: Scene) -> Scene:
     return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, names=names)
 
 
-def _merge(scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS) -> Scene:
+def _share_gaussians(
+    flights: _Flights, poor: Sequence[Edge], gaussians: int, heights: Sequence[int]
+) -> dict[int, float]:
+    """The share of an equal number of Gaussians that the panoramas of each part keep in one file.
+
+    It is all if photographs of their full height fit beside them. Else it is less: they are seen in motion only.
+
+    Args:
+        poor: edges along which no camera flies.
+        gaussians: of the page.
+        heights: of the photographs in the file.
+    """
+    left = _TARGET_BYTES - _PROGRAM_BYTES - _GAUSSIAN_BYTES * gaussians
+    if _PHOTO_BYTES * sum(height**2 for height in heights) <= left or not heights:
+        return dict.fromkeys(flights.parts, 1.0)
+    flown = {flights.parts[a] for a, b, _ in flights.edges if a != b and (a, b) not in poor}
+    return {part: _FLOWN_SHARE if part in flown or not flights.edges else _STILL_SHARE for part in flights.parts}
+
+
+def _merge(
+    scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS, shares: Mapping[int, float] | None = None
+) -> Scene:
     """At most `count` Gaussians, an equal number for each panorama of different parts.
 
     Args:
         scene: of `_prepare`.
         parts: of each view; they are merged one after the other.
         steps: of the fit of shapes; 0 fits colours only.
+        shares: of the equal number that a part keeps; by default all.
     """
     merged = []
     for part in dict.fromkeys(parts):
         views = tuple(view for view, other in enumerate(parts) if other == part)
         chosen = select_views(scene, views)
-        kept = max(count * len(views) // len(parts), 1)
+        kept = max(int(count * len(views) * (1.0 if shares is None else shares[part])) // len(parts), 1)
         if len(chosen.gaussians) > kept:
             chosen = _merge_part(chosen, kept, steps)
         labels = torch.tensor(views)[chosen.gaussians.views.long()]
@@ -414,13 +444,14 @@ def _describe_scene(
     heights = [height or usual_height for height in known]
     starts = [tour.find_start_view(node) for node in range(len(tour))] or [None]
     marks = positions + np.outer(heights, level[:, 1])
+    outlooks = [measure_outlook(scene, view, level) for view in range(len(positions))]
     spots = [
         {
             "name": name,
             "position": _round(position),
             "mark": _round(mark),
             "notes": [],
-            **_describe_outlook(scene, view, level, (marks - position) @ level, start),
+            **_describe_outlook(scene, view, outlooks[view], level, (marks - position) @ level, start),
             "radius": round(0.12 * height, 6),
         }
         for view, (name, position, mark, height, start) in enumerate(
@@ -440,7 +471,7 @@ def _describe_scene(
         "views": views_of_page,
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(link_parts(tour), spots, heights) if flights.edges else [],
+        "links": _describe_links(link_parts(tour), spots, heights, outlooks) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
@@ -471,6 +502,7 @@ def _describe_scene(
 def _describe_outlook(
     scene: Scene,
     view: int,
+    outlook: Float[np.ndarray, "bin"],
     level: Float[np.ndarray, "3 3"],
     marks: Float[np.ndarray, "node 3"],
     start: Float[np.ndarray, "3"] | None,
@@ -479,12 +511,13 @@ def _describe_outlook(
     pitch to which it does; and the panoramas whose marks furniture or walls hide.
 
     Args:
+        outlook: of the view (`measure_outlook`).
         level: axes of a level camera.
         marks: of all panoramas on the floor, relative to the camera.
         start: direction of the start view.
     """
     angles = None if start is None else find_angles(level.T @ start)
-    is_turned, ahead = find_turned(measure_outlook(scene, view, level), angles)
+    is_turned, ahead = find_turned(outlook, angles)
     places = locate_surfaces(scene, view, level, min_opacity=0.5)
     hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
     turned = sum(1 << number for number in np.flatnonzero(is_turned).tolist())
@@ -580,7 +613,12 @@ def _describe_rooms(
     return {"ranges": packed.rooms, "storeys": storeys, "boxes": boxes} if any(boxes) else None
 
 
-def _describe_links(tour: TourGraph, spots: Sequence[dict[str, Any]], heights: Sequence[float]) -> list[dict[str, Any]]:
+def _describe_links(
+    tour: TourGraph,
+    spots: Sequence[dict[str, Any]],
+    heights: Sequence[float],
+    outlooks: Sequence[Float[np.ndarray, "bin"]],
+) -> list[dict[str, Any]]:
     """The links of a page. Those to other parts, and those to panoramas whose marks are hidden, have a ring on the
     floor; the first ones a place where the fade begins.
 
@@ -588,19 +626,22 @@ def _describe_links(tour: TourGraph, spots: Sequence[dict[str, Any]], heights: S
         tour: of the scene.
         spots: the descriptions of the panoramas.
         heights: of the cameras over the floor.
+        outlooks: of the panoramas (`measure_outlook`).
     """
     links = []
     for (start, end), link in tour.links.items():
         found: dict[str, Any] = {"from": start, "to": end, "text": link.text}
         position, is_elsewhere = np.array(spots[start]["position"]), tour.parts[start] != tour.parts[end]
         way = find_way_along_link(tour, start, end)
-        ring = find_link_ring(tour, start, end, heights[start])
-        if way is not None and ring is not None:
+        if way is not None:
+            yaw, _ = find_angles(tour.level_axes.T @ way / np.linalg.norm(way))
+            ring = find_link_ring(tour, start, end, heights[start], outlooks[start][find_bin(yaw)] or math.inf)
+            assert ring is not None
             if is_elsewhere or end in spots[start]["hidden"]:
                 found["mark"] = _round(position + ring)
             if is_elsewhere:
                 found["leave"] = _round(position + way)
-                found["yaw"] = round(find_angles(tour.level_axes.T @ way / np.linalg.norm(way))[0], 5)
+                found["yaw"] = round(yaw, 5)
         links.append(found)
     return links
 

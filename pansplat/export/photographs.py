@@ -111,25 +111,24 @@ def pack_photographs(
         height: largest height, pixels, whatever their size; by default what fits.
     """
     rows = min(height or MAX_HEIGHT, max(photograph.image_height for photograph in photographs))
-    tries = [(rows, _QUALITY if num_bytes < math.inf else _FOLDER_QUALITY)]
-    if height is None and num_bytes < math.inf:
-        while (rows := max(round(_SHRINK * rows), MIN_HEIGHT)) < tries[-1][0]:
-            tries.append((rows, _QUALITY))
-        tries += [(tries[-1][0], quality) for quality in _LOWER_QUALITIES]
-    packed: list[PackedPhotograph] = []
-    for rows, quality in tries:
-        packed.clear()
-        is_last = (rows, quality) == tries[-1]
+    qualities = [_QUALITY, *_LOWER_QUALITIES] if num_bytes < math.inf else [_FOLDER_QUALITY]
+    while True:
+        packed: list[PackedPhotograph] = []
+        can_shrink, expected = height is None and rows > MIN_HEIGHT, 0.0
         for view, photograph in enumerate(photographs):
             progress("packing photographs", view / len(photographs))
             image = read_photograph(scene, view, photograph, rows)
-            packed.append(_pack(image, scene.cam2world[view, :3, :3].double().numpy(), quality))
+            packed.append(_pack(image, scene.cam2world[view, :3, :3].double().numpy(), qualities[0]))
             expected = sum(each.num_bytes for each in packed) * len(photographs) / len(packed)
-            if expected > (1.5 if len(packed) < len(photographs) else 1) * num_bytes and not is_last:
+            limit = (1.5 if len(packed) < len(photographs) else 1) * num_bytes
+            if expected > limit and (can_shrink or (height is None and len(qualities) > 1)):
                 break
         else:
-            break
-    return packed
+            return packed
+        if can_shrink:  # bytes grow by less than the number of pixels
+            rows = max(round(rows * min(math.sqrt(num_bytes / expected), _SHRINK)), MIN_HEIGHT)
+        else:
+            qualities.pop(0)
 
 
 @torch.no_grad()
@@ -186,7 +185,8 @@ def _pack(image: Float[Tensor, "3 height width"], rotation: np.ndarray, quality:
         pixels = (255 * face + 0.5).astype(np.uint8)
         for level, (smaller, tile) in enumerate(levels):
             reduced = cv2.resize(pixels, (smaller, smaller), interpolation=cv2.INTER_AREA)
-            tiles[level] += _encode(reduced, tile, quality if level == len(levels) - 1 else _PREVIEW_QUALITY)
+            is_preview = level == 0 < len(levels) - 1
+            tiles[level] += _encode(reduced, tile, _PREVIEW_QUALITY if is_preview else quality)
     return PackedPhotograph(height, levels, tuple(each for level in tiles for each in level), rotation)
 
 

@@ -47,7 +47,12 @@ def choose_arrival(
         start: yaw and pitch of the panorama's start view.
     """
     is_turned, ahead = find_turned(outlook, start)
-    return ahead if is_turned[int((yaw / (2 * math.pi) + 0.5) * BINS) % BINS] else (yaw, pitch)
+    return ahead if is_turned[find_bin(yaw)] else (yaw, pitch)
+
+
+def find_bin(yaw: float) -> int:
+    """The bin of an outlook in a direction."""
+    return int((yaw / (2 * math.pi) + 0.5) * BINS) % BINS
 
 
 def find_turned(

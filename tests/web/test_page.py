@@ -8,6 +8,7 @@ import os
 import re
 import warnings
 from collections.abc import Callable
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from pansplat.tours import doll_house, edges
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.floor import find_camera_height
 from pansplat.tours.graph import make_graph, select_views
+from pansplat.tours.outlook import find_bin, measure_outlook
 from pansplat.tours.plan import make_plan
 
 
@@ -212,7 +214,9 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4)
     right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
     assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
-    assert right == pytest.approx(min(max(down / np.tan(0.6), 1), 3), abs=1e-5) and ahead == pytest.approx(0, abs=1e-5)
+    wall = measure_outlook(flat, 0, level)[find_bin(0.5 * math.pi)]
+    expected = min(max(down / np.tan(0.6), 1), 3, 0.8 * wall)
+    assert right == pytest.approx(expected, rel=0.01) and ahead == pytest.approx(0, abs=1e-5)
     assert level.T @ np.subtract(to["leave"], spots[0]["position"]) == pytest.approx((0.7, 0, 0), abs=1e-5)
     assert header["limits"] == pytest.approx([2.0, 1.0, 1.0]), "the part with two views, and single views"
     route, jumps = np.array(header["route"]), header["jumps"]
@@ -249,6 +253,23 @@ def test_panoramas_of_all_parts_keep_as_many_gaussians(flat: Scene) -> None:
     counts = np.bincount(merged.gaussians.views.numpy())
     assert counts[0] + counts[1] == 400 and counts[2] == counts[3] == 200
     assert torch.equal(merged.cam2world, flat.cam2world)
+
+
+def test_gaussians_leave_bytes_to_photographs_that_need_them_more_where_no_camera_flies() -> None:
+    edges = ((0, 1, 0), (2, 3, 1), (4, 4, 2))
+    flights = page_module._Flights(torch.eye(4), np.eye(3), 0.0, 0.0, (0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), edges)
+    share = partial(page_module._share_gaussians, flights, [(2, 3)], 450_000)
+    assert set(share([1024] * 5).values()) == set(share([]).values()) == {1.0}, "all fit, and a folder has all"
+    shares = share([4096] * 5)
+    assert 0 < shares[1] == shares[2] < shares[0] < 1
+    alone = dataclasses.replace(flights, edges=(), parts=(0,) * 5)
+    assert page_module._share_gaussians(alone, (), 450_000, [4096] * 5) == {0: shares[0]}, "of a pair"
+
+
+def test_parts_keep_their_shares(flat: Scene) -> None:
+    merged = page_module._merge(flat, (0, 0, 1, 2), 800, shares={0: 1.0, 1: 0.25, 2: 0.25})
+    counts = np.bincount(merged.gaussians.views.numpy())
+    assert counts[0] + counts[1] == 400 and counts[2] == counts[3] == 50
 
 
 def test_the_page_loads_nothing_from_elsewhere(scene: Scene, tmp_path: Path) -> None:
