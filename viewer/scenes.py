@@ -379,6 +379,7 @@ class Scenes:
             return
         route = state.route if state.playing else None
         tour.move(np.asarray(state.camera.position), route, state.flight)
+        state.tour = tour.tour  # poor edges and walls are found later
         self._show_place(tour)
         self._stage.fade.move(state.camera.cam2world, tour.part)
         if self._loads_for_tour:

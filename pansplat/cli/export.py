@@ -203,13 +203,13 @@ class Page:
                 progress=progress,
             )
         beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if split else ""
-        pictures = (
-            f" {describe_count(len(photographs), 'photograph')} of {page.photo_height} rows," if has_photographs else ""
-        )
-        print(
-            f"{out}{beside}: {page.num_gaussians:,} Gaussians,{pictures} {page.num_bytes / 1e6:.1f} MB; open it in a "
-            "browser"
-        )
+        pictures, rows = "", max((photograph.image_height for photograph in photographs), default=0)
+        if has_photographs:
+            kept = f"{page.photo_height} rows" if page.photo_height == rows else f"{page.photo_height} of {rows} rows"
+            all_kept = "" if page.photo_height >= min(rows, 4096) or split else " (a folder, -o NAME, keeps all)"
+            pictures = f" {describe_count(len(photographs), 'photograph')} of {kept}{all_kept},"
+        how = "upload them, or show them with --serve" if split else "open it in a browser"
+        print(f"{out}{beside}: {page.num_gaussians:,} Gaussians,{pictures} {page.num_bytes / 1e6:.1f} MB; {how}")
         if page.fades:
             flights, fades = describe_count(page.num_flights, "flight"), describe_count(len(page.fades), "fade")
             names = list_first([" and ".join(ends) for ends in page.fades])

@@ -13,7 +13,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
@@ -29,14 +29,14 @@ import shapely
 import torch
 from jaxtyping import Float, Int
 from PIL import Image
-from shapely.geometry import Polygon
+from shapely.geometry import Point, Polygon
 from torch import Tensor
 
 from pansplat import constants, pipeline
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.film import FilmPhotographs
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, PageHeader, count_bytes, pack_gaussians
-from pansplat.export.photographs import PackedPhotograph, pack_photographs
+from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, pack_photographs
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Pair
@@ -48,15 +48,15 @@ from pansplat.rendering.image_planes import image_planes
 from pansplat.shaders import load_shader
 from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
-from pansplat.system.files import SOFTWARE, is_written
+from pansplat.system.files import is_written
 from pansplat.tours.doll_house import Rooms, find_rooms, measure_box
 from pansplat.tours.edges import find_poor_edges
-from pansplat.tours.floor import choose_camera_height, find_camera_height
-from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
+from pansplat.tours.floor import assign_storeys, choose_camera_height, find_camera_height, find_floor_outline
+from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, make_graph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
-from pansplat.tours.outlook import choose_heading, find_blank, is_hidden, measure_outlook
-from pansplat.tours.plan import Plan
+from pansplat.tours.outlook import choose_arrival, find_bin, find_turned, is_hidden, measure_outlook
+from pansplat.tours.plan import Plan, Room
 from pansplat.tours.route import Route, find_angles, plan_route
 from pansplat.tours.surfaces import locate_surfaces
 
@@ -65,13 +65,22 @@ PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
 MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
 MAX_FILE_BYTES = 64_000_000  # of a page in one file
 _TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages, and photographs are smaller
-_GAUSSIANS_SHARE = 2 / 3  # of it, beside photographs
+_GAUSSIANS_SHARE = 1 / 2  # of it, beside photographs
+_FLOWN_SHARE, _STILL_SHARE = (
+    2 / 3,
+    1 / 4,
+)  # of the Gaussians of a panorama, with and without flights, beside photographs
+_GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # of a page: a Gaussian, and a photograph as a fraction of its squared rows
 _PROGRAM_BYTES = 200_000  # of a page without its data
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
 _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _START_FOV = 75.0  # degrees, vertical, of a landscape image
 _TALLEST = 1.5  # height of a portrait image relative to it; the poster has this height
 _POSTER_SIZE = (810, 960)  # height and width, pixels
+_UNKNOWN_FLOOR, _ROUGH_OUTLINE = (
+    1.5,
+    0.1,
+)  # metres, around a panorama without a floor; of what is smoothed of a floor's end
 _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
@@ -165,13 +174,17 @@ def write_page(
     rooms = find_rooms(scene) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
     if rooms is not None and not rooms.plan.num_heights:
         rooms = None  # without a floor the doll's house is a heap
+    floors = _outline_floors(scene, tour, () if rooms is None else rooms.plan.rooms)
     scene = _prepare(scene)
     flights = _plan_flights(scene, tour)
-    if len(scene.gaussians) > gaussians:
-        report("merging Gaussians", 0.1)
-        scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0)
-    report("compressing", 0.6)
     has_pictures = len(photographs) > 0 and photo_height != 0
+    heights = [min(each.image_height, photo_height or MAX_HEIGHT) for each in photographs if has_pictures and not split]
+    shares = _share_gaussians(flights, tour.poor, gaussians, heights)
+    kept = round(gaussians * sum(shares[part] for part in flights.parts) / len(flights.parts))
+    if len(scene.gaussians) > kept:
+        report("merging Gaussians", 0.1)
+        scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0, shares=shares)
+    report("compressing", 0.6)
     degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if has_pictures and not split else 1))
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     cameras = None if rooms is None else _find_cameras(scene, rooms)
@@ -192,7 +205,7 @@ def write_page(
     header = _describe_scene(scene, packed, origin, flights, tour)
     header |= {"embed": embed, "doll": None, "photographs": [picture.describe() for picture in pictures]}
     header["rough"] = [] if rooms is None else [view for view, clear in enumerate(rooms.is_clear) if not clear]
-    header["plan"] = _describe_plan(None if rooms is None else rooms.plan, tour, origin, flights.level)
+    header["plan"] = _describe_plan(None if rooms is None else rooms.plan, floors, tour, origin, flights.level)
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
         spot["notes"] = [
             {
@@ -251,10 +264,8 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
         first = tour.find_start_view(0) if len(tour) else None
         start = path_poses(scene.cam2world)[0]
         level = start[:3, :3].numpy()
-        if first is None:
-            yaw, pitch = choose_heading(measure_outlook(scene, 0, level), 0.0), 0.0
-        else:
-            yaw, pitch = find_angles(level.T @ first)
+        view = None if first is None else find_angles(level.T @ first)
+        yaw, pitch = choose_arrival(measure_outlook(scene, 0, level), 0.0, start=view)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
@@ -263,7 +274,7 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
     samples, jumps = _resample(route)
     start, (yaw, pitch) = torch.from_numpy(route.pose(0.0)), samples[0, 3:].tolist()
     if tour.find_start_view(walk[0]) is None:
-        _, yaw = find_blank(measure_outlook(scene, walk[0], route.level))
+        _, (yaw, pitch) = find_turned(measure_outlook(scene, walk[0], route.level))
     start[:3, :3] = torch.from_numpy(route.level)
     return _Flights(
         _look(start, route.level, yaw, pitch),
@@ -327,19 +338,41 @@ def _prepare(scene: Scene) -> Scene:
     return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, names=names)
 
 
-def _merge(scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS) -> Scene:
+def _share_gaussians(
+    flights: _Flights, poor: Sequence[Edge], gaussians: int, heights: Sequence[int]
+) -> dict[int, float]:
+    """The share of an equal number of Gaussians that the panoramas of each part keep in one file.
+
+    It is all if photographs of their full height fit beside them. Else it is less: they are seen in motion only.
+
+    Args:
+        poor: edges along which no camera flies.
+        gaussians: of the page.
+        heights: of the photographs in the file.
+    """
+    left = _TARGET_BYTES - _PROGRAM_BYTES - _GAUSSIAN_BYTES * gaussians
+    if _PHOTO_BYTES * sum(height**2 for height in heights) <= left or not heights:
+        return dict.fromkeys(flights.parts, 1.0)
+    flown = {flights.parts[a] for a, b, _ in flights.edges if a != b and (a, b) not in poor}
+    return {part: _FLOWN_SHARE if part in flown or not flights.edges else _STILL_SHARE for part in flights.parts}
+
+
+def _merge(
+    scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS, shares: Mapping[int, float] | None = None
+) -> Scene:
     """At most `count` Gaussians, an equal number for each panorama of different parts.
 
     Args:
         scene: of `_prepare`.
         parts: of each view; they are merged one after the other.
         steps: of the fit of shapes; 0 fits colours only.
+        shares: of the equal number that a part keeps; by default all.
     """
     merged = []
     for part in dict.fromkeys(parts):
         views = tuple(view for view, other in enumerate(parts) if other == part)
         chosen = select_views(scene, views)
-        kept = max(count * len(views) // len(parts), 1)
+        kept = max(int(count * len(views) * (1.0 if shares is None else shares[part])) // len(parts), 1)
         if len(chosen.gaussians) > kept:
             chosen = _merge_part(chosen, kept, steps)
         labels = torch.tensor(views)[chosen.gaussians.views.long()]
@@ -411,15 +444,15 @@ def _describe_scene(
     heights = [height or usual_height for height in known]
     starts = [tour.find_start_view(node) for node in range(len(tour))] or [None]
     marks = positions + np.outer(heights, level[:, 1])
+    outlooks = [measure_outlook(scene, view, level) for view in range(len(positions))]
     spots = [
         {
             "name": name,
             "position": _round(position),
             "mark": _round(mark),
             "notes": [],
-            **_describe_outlook(scene, view, level, (marks - position) @ level),
+            **_describe_outlook(scene, view, outlooks[view], level, (marks - position) @ level, start),
             "radius": round(0.12 * height, 6),
-            **({} if start is None else {"start": _round(np.array(find_angles(level.T @ start)))}),
         }
         for view, (name, position, mark, height, start) in enumerate(
             zip(scene.names, positions, marks, heights, starts, strict=True)
@@ -438,7 +471,7 @@ def _describe_scene(
         "views": views_of_page,
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(link_parts(tour), positions, heights, level) if flights.edges else [],
+        "links": _describe_links(link_parts(tour), spots, heights, outlooks) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
@@ -467,40 +500,84 @@ def _describe_scene(
 
 
 def _describe_outlook(
-    scene: Scene, view: int, level: Float[np.ndarray, "3 3"], marks: Float[np.ndarray, "node 3"]
+    scene: Scene,
+    view: int,
+    outlook: Float[np.ndarray, "bin"],
+    level: Float[np.ndarray, "3 3"],
+    marks: Float[np.ndarray, "node 3"],
+    start: Float[np.ndarray, "3"] | None,
 ) -> dict[str, Any]:
-    """Where a camera at a view faces a wall (bits of the directions of `measure_outlook`), and the yaw of the widest
-    view; and the panoramas whose marks furniture or walls hide.
+    """The rule of `choose_arrival` at a view, as the bits of the directions from which a camera turns, and yaw and
+    pitch to which it does; and the panoramas whose marks furniture or walls hide.
 
     Args:
+        outlook: of the view (`measure_outlook`).
         level: axes of a level camera.
         marks: of all panoramas on the floor, relative to the camera.
+        start: direction of the start view.
     """
-    is_blank, widest = find_blank(measure_outlook(scene, view, level))
+    angles = None if start is None else find_angles(level.T @ start)
+    is_turned, ahead = find_turned(outlook, angles)
     places = locate_surfaces(scene, view, level, min_opacity=0.5)
     hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
-    blank = sum(1 << number for number in np.flatnonzero(is_blank).tolist())
-    return {"blank": blank, "ahead": round(widest, 3), "hidden": hidden}
+    turned = sum(1 << number for number in np.flatnonzero(is_turned).tolist())
+    return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": hidden}
+
+
+def _outline_floors(scene: Scene, tour: TourGraph, rooms: Sequence[Room]) -> list[Room]:
+    """Rooms around the panoramas that stand in none of the floor plan: where their floor ends, else a circle."""
+    floors: list[Room] = []
+    if not len(tour):
+        return floors
+    level, storeys = tour.level_axes, assign_storeys(tour)
+    for node, center in enumerate(tour.positions @ level[:, (0, 2)]):
+        point = Point(center)
+        if not any(room.storey == storeys[node] and Polygon(room.outline).contains(point) for room in rooms):
+            found = find_floor_outline(scene, node, level)
+            shape = point.buffer(_UNKNOWN_FLOOR) if found is None else Polygon(found.corners)
+            outline = np.array(shape.simplify(_ROUGH_OUTLINE).exterior.coords)[:-1]
+            name = tour.panoramas[node].title or tour.panoramas[node].name
+            floors.append(Room(name, (node,), outline, storeys[node], tour.is_placed(node)))
+    return floors
 
 
 def _describe_plan(
-    plan: Plan | None, tour: TourGraph, origin: Float[np.ndarray, "3"], level: Float[np.ndarray, "3 3"]
+    plan: Plan | None,
+    floors: Sequence[Room],
+    tour: TourGraph,
+    origin: Float[np.ndarray, "3"],
+    level: Float[np.ndarray, "3 3"],
 ) -> dict[str, Any]:
     """The floor plan: outlines and names of rooms and the doors, to the right and forward of the origin, and the world
-    of each panorama; panoramas of other worlds are elsewhere."""
+    of each panorama; panoramas of other worlds are elsewhere.
+
+    Args:
+        floors: of `_outline_floors`.
+    """
     worlds = tour.worlds or (0,)
-    if plan is None or not plan.rooms:
+    known = [] if plan is None else [*plan.rooms]
+    if not known and not floors:
         return {"worlds": worlds, "turns": [0.0] * (max(worlds) + 1), "rooms": [], "doors": []}
     turn, middle = tour.level_axes[:, (0, 2)].T @ level[:, (0, 2)], origin @ level[:, (0, 2)]
-    turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in plan.rooms]
-    plan, rooms = dataclasses.replace(plan, rooms=tuple(turned)), []
-    for room in plan.rooms:
+    turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in (*known, *floors)]
+    turns = Plan(tour, tuple(turned), (), math.nan, None, None, 0, 0).turns
+    rooms = []
+    for number, room in enumerate(turned):
         circle = shapely.maximum_inscribed_circle(Polygon(room.outline))
         label = [*_round(np.array(circle.coords[0]) - middle), round(2 * circle.length, 4)]
         outline = [_round(corner) for corner in room.outline - middle]
-        rooms.append({"name": room.name, "nodes": room.panoramas, "outline": outline, "label": label})
-    doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in plan.doors]
-    return {"worlds": worlds, "turns": _round(np.array(plan.turns)), "rooms": rooms, "doors": doors}
+        rooms.append(
+            {
+                "name": room.name,
+                "nodes": room.panoramas,
+                "outline": outline,
+                "label": label,
+                "hasWalls": number < len(known),
+            }
+        )
+    doors = [] if plan is None else plan.doors
+    doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in doors]
+    return {"worlds": worlds, "turns": _round(np.array(turns)), "rooms": rooms, "doors": doors}
 
 
 def _find_cameras(scene: Scene, rooms: Rooms) -> Int[np.ndarray, "n"]:
@@ -538,27 +615,33 @@ def _describe_rooms(
 
 def _describe_links(
     tour: TourGraph,
-    positions: Float[np.ndarray, "node 3"],
-    heights: list[float],
-    level: Float[np.ndarray, "3 3"],
+    spots: Sequence[dict[str, Any]],
+    heights: Sequence[float],
+    outlooks: Sequence[Float[np.ndarray, "bin"]],
 ) -> list[dict[str, Any]]:
-    """The links of a page; those to other parts have a ring on the floor, and a place where the fade begins.
+    """The links of a page. Those to other parts, and those to panoramas whose marks are hidden, have a ring on the
+    floor; the first ones a place where the fade begins.
 
     Args:
         tour: of the scene.
-        positions: of the cameras, relative to the page's origin.
+        spots: the descriptions of the panoramas.
         heights: of the cameras over the floor.
-        level: axes of a level camera.
+        outlooks: of the panoramas (`measure_outlook`).
     """
     links = []
     for (start, end), link in tour.links.items():
         found: dict[str, Any] = {"from": start, "to": end, "text": link.text}
+        position, is_elsewhere = np.array(spots[start]["position"]), tour.parts[start] != tour.parts[end]
         way = find_way_along_link(tour, start, end)
-        ring = find_link_ring(tour, start, end, heights[start])
-        if way is not None and ring is not None and tour.parts[start] != tour.parts[end]:
-            found["mark"] = _round(positions[start] + ring)
-            found["leave"] = _round(positions[start] + way)
-            found["yaw"] = round(find_angles(level.T @ way / np.linalg.norm(way))[0], 5)
+        if way is not None:
+            yaw, _ = find_angles(tour.level_axes.T @ way / np.linalg.norm(way))
+            ring = find_link_ring(tour, start, end, heights[start], outlooks[start][find_bin(yaw)] or math.inf)
+            assert ring is not None
+            if is_elsewhere or end in spots[start]["hidden"]:
+                found["mark"] = _round(position + ring)
+            if is_elsewhere:
+                found["leave"] = _round(position + way)
+                found["yaw"] = round(yaw, 5)
         links.append(found)
     return links
 
@@ -611,35 +694,36 @@ def _write_files(
     Args:
         contents: of the Gaussians of each view.
     """
-    count, scripts = header["count"], {}
+    count = header["count"]
+    parts: dict[str, bytes] = {}
     tags: dict[int, list[str]] = {}  # by view
     for view, content in enumerate(contents):
-        ends = [*range(_PART_BYTES, len(content), _PART_BYTES), len(content)]
-        parts = [base64.b64encode(content[k:end]).decode() for k, end in pairwise((0, *ends))]
-        calls = [f"addPart({view}, {'true' if part is parts[-1] else 'false'}" for part in parts]
-        texts = [f'{call}, "{part}"); // {SOFTWARE}\n' for call, part in zip(calls, parts, strict=True)]
-        named = {f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js": text for text in texts}
+        ends = [len(content)] if split else [*range(_PART_BYTES, len(content), _PART_BYTES), len(content)]
+        chunks = [content[start:end] for start, end in pairwise((0, *ends))]
+        named = {f"{hashlib.blake2b(chunk, digest_size=8).hexdigest()}.bin": chunk for chunk in chunks}
         header["views"][view]["files"] = [*named]
-        scripts |= named if split else {}
+        parts |= named
+        calls = [f"addPart({view}, {'true' if chunk is chunks[-1] else 'false'})" for chunk in chunks]
         tags[view] = [
-            f'<script type="text/plain">{part}</script><script>{call})</script>'
-            for call, part in zip(calls, parts, strict=True)
+            f'<script type="text/plain">{base64.b64encode(chunk).decode()}</script><script>{call}</script>'
+            for call, chunk in zip(calls, chunks, strict=True)
         ]
     folder = path.with_name(f"{path.stem}_files")
     folder_address = quote(os.fsencode(folder.name)) if split else None
     elements: list[str] = []
     if split:
         for picture in pictures:
-            scripts |= picture.make_scripts()
+            parts |= picture.make_files()
     else:
+        parts = {}
         first, *others = header["loading"]
         shown = [picture.make_elements() for picture in pictures] or [[] for _ in tags]
         # The smallest photograph of the first panorama, its Gaussians, and then its photograph.
         elements = [*shown[first][:1], *tags[first], *shown[first][1:]]
-        for part in (tags, shown):
-            elements += [element for view in others for element in part[view]]
+        for kind in (tags, shown):
+            elements += [element for view in others for element in kind[view]]
     page = _fill_template(
-        script_sources="'self' file: blob:" if split else "blob:",
+        connections="'self'" if split else "'none'",
         title=html.escape(title),
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
@@ -656,17 +740,17 @@ def _write_files(
             f"{path}: needed a page of at most {MAX_FILE_BYTES // 1_000_000} MB in one file, got "
             f"{len(page) / 1e6:.0f} MB; split it (--split), or keep at most {fitting:,} Gaussians (--gaussians)"
         )
-    files = [folder / name for name in scripts]
+    files = [folder / name for name in parts]
     if split:
         _make_folder(folder)
-    for file, text in zip(files, scripts.values(), strict=True):
+    for file, part in zip(files, parts.values(), strict=True):
         with replacing(file) as temporary:
-            temporary.write_text(text, "utf-8")
+            temporary.write_bytes(part)
     with replacing(path) as temporary:
         temporary.write_bytes(page)
-    _remove_old_parts(folder, set(scripts) if split else set())
+    _remove_old_parts(folder, set(parts))
     files.insert(0, path)
-    total = len(page) + sum(map(len, scripts.values()))
+    total = len(page) + sum(map(len, parts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
     names = [spot["name"] for spot in header["spots"]]
     fades = tuple((names[a], names[b]) for a, b in header["poor"])
@@ -707,8 +791,8 @@ def _make_folder(folder: Path) -> None:
 
 def _remove_old_parts(folder: Path, kept: set[str]) -> None:
     """Remove the parts of the page that was replaced, by their names and content, and the folder if that empties it."""
-    name = re.compile(r"[0-9a-f]{16}(_\d+)?\.js")
-    old = [file for file in folder.glob("*.js") if file.name not in kept and name.fullmatch(file.name)]
+    name = re.compile(r"[0-9a-f]{16}(_\d+)?\.(js|bin|jpg)")
+    old = [file for file in folder.glob("*") if file.name not in kept and name.fullmatch(file.name)]
     old = [file for file in old if is_written(file)]
     for file in old:
         with suppress(OSError):

@@ -6,6 +6,7 @@ The layout of the bytes is in docs/web.md.
 from __future__ import annotations
 
 import gzip
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from jaxtyping import Float, Int, UInt8
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.morton import morton_codes
+from pansplat.system.files import SOFTWARE
 
 MAX_DEGREE = 3  # of the harmonics of a page
 _CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
@@ -54,10 +56,9 @@ class PageSpot(_Record):
     """A panorama: its camera, the mark and the radius of its ring on the floor, and where there is something to see.
 
     Attributes:
-        blank: bits of the directions in which a camera faces a wall.
-        ahead: yaw of the widest view, radians.
+        turned: bits of the directions from which a camera that arrives turns (`choose_arrival`).
+        ahead: yaw and pitch to which it turns, radians.
         hidden: panoramas whose marks surfaces hide.
-        start: yaw and pitch of the start view, radians.
     """
 
     name: str
@@ -65,14 +66,14 @@ class PageSpot(_Record):
     mark: Vector
     radius: float
     notes: tuple[PageNote, ...]
-    blank: int
-    ahead: float
+    turned: int
+    ahead: tuple[float, float]
     hidden: tuple[int, ...]
-    start: tuple[float, float] | msgspec.UnsetType = msgspec.UNSET
 
 
 class PageLink(_Record):
-    """A link of the tour; one to another part has a ring, and a place and a yaw with which the fade begins."""
+    """A link of the tour. One to another part, or to a hidden panorama, has a ring; the first one also a place and a
+    yaw with which the fade begins."""
 
     source: int = msgspec.field(name="from")
     target: int = msgspec.field(name="to")
@@ -100,12 +101,14 @@ class PagePhotograph(_Record):
 
 
 class PageRoom(_Record):
-    """A room of the floor plan; `label` is the middle and the width of its name. To the right and forward."""
+    """A room of the floor plan, or without walls where the floor of a panorama ends; `label` is the middle and the
+    width of its name. To the right and forward."""
 
     name: str
     nodes: tuple[int, ...]
     outline: tuple[tuple[float, float], ...]
     label: Vector
+    has_walls: bool
 
 
 class PageDoor(_Record):
@@ -257,10 +260,18 @@ def pack_gaussians(
     blocks = [
         b"".join(plane[start:end].tobytes() for plane in (*planes, *quantised.T)) for start, end in pairwise(ends)
     ]
-    contents = tuple(gzip.compress(blocks[rank], 9, mtime=0) for rank in np.argsort(order))
+    contents = tuple(_compress(blocks[rank]) for rank in np.argsort(order))
     starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
     rooms = _list_runs(ranks[chosen], cameras[chosen])
     return PackedGaussians(contents, tuple(order), starts, counts, degree, (low, high), scale, rooms)
+
+
+def _compress(block: bytes) -> bytes:
+    """gzip, whose header names the software: another page may replace the file."""
+    with io.BytesIO() as file:
+        with gzip.GzipFile(SOFTWARE, "wb", 9, file, mtime=0) as stream:
+            stream.write(block)
+        return file.getvalue()
 
 
 def _list_runs(ranks: Int[np.ndarray, "n"], cameras: Int[np.ndarray, "n"]) -> tuple[tuple[int, int, int], ...]:

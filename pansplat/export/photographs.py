@@ -38,10 +38,10 @@ MAX_HEIGHT = 4096  # of a photograph in a folder
 _FACE = 0.65  # size of a face, of the photograph's height; its centre is as dense
 _STEP = 16  # divides the size of a face, pixels
 _PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels
-_TILE = 672  # largest size of a tile
+_TILE = 1344  # largest size of a tile; a photograph of 4,096 rows has 36
 # Of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the gradient.
 _QUALITY, _FOLDER_QUALITY, _PREVIEW_QUALITY, _LOWER_QUALITIES = 82, 90, 75, (75, 65)
-_SHRINK = 0.8  # of a height that is too large for the page
+_SHRINK = 0.95  # of a height that is too large for the page, at most
 _HIDDEN_ROWS = 512  # of the image of the Gaussians in what masks hide
 _GUARD, _FEATHER = 3, 1 / 128  # around it: pixels of which nothing is shown, and of the height, which fade
 
@@ -87,13 +87,9 @@ class PackedPhotograph:
             if chosen
         ]
 
-    def make_scripts(self) -> dict[str, str]:
-        """A script for each tile by its file name: a page from disk may not read the pixels of image files."""
-        name = self.name
-        return {
-            f"{name}_{n}.js": f'addTile("{name}", {n}, "{base64.b64encode(tile).decode()}"); // {SOFTWARE}\n'
-            for n, tile in enumerate(self.tiles)
-        }
+    def make_files(self) -> dict[str, bytes]:
+        """The tiles by their file names."""
+        return {f"{self.name}_{n}.jpg": tile for n, tile in enumerate(self.tiles)}
 
 
 def list_photographs(source: Pair | TourGraph, views: Sequence[int]) -> list[Pair]:
@@ -115,25 +111,24 @@ def pack_photographs(
         height: largest height, pixels, whatever their size; by default what fits.
     """
     rows = min(height or MAX_HEIGHT, max(photograph.image_height for photograph in photographs))
-    tries = [(rows, _QUALITY if num_bytes < math.inf else _FOLDER_QUALITY)]
-    if height is None and num_bytes < math.inf:
-        while (rows := max(round(_SHRINK * rows), MIN_HEIGHT)) < tries[-1][0]:
-            tries.append((rows, _QUALITY))
-        tries += [(tries[-1][0], quality) for quality in _LOWER_QUALITIES]
-    packed: list[PackedPhotograph] = []
-    for rows, quality in tries:
-        packed.clear()
-        is_last = (rows, quality) == tries[-1]
+    qualities = [_QUALITY, *_LOWER_QUALITIES] if num_bytes < math.inf else [_FOLDER_QUALITY]
+    while True:
+        packed: list[PackedPhotograph] = []
+        can_shrink, expected = height is None and rows > MIN_HEIGHT, 0.0
         for view, photograph in enumerate(photographs):
             progress("packing photographs", view / len(photographs))
             image = read_photograph(scene, view, photograph, rows)
-            packed.append(_pack(image, scene.cam2world[view, :3, :3].double().numpy(), quality))
+            packed.append(_pack(image, scene.cam2world[view, :3, :3].double().numpy(), qualities[0]))
             expected = sum(each.num_bytes for each in packed) * len(photographs) / len(packed)
-            if expected > (1.5 if len(packed) < len(photographs) else 1) * num_bytes and not is_last:
+            limit = (1.5 if len(packed) < len(photographs) else 1) * num_bytes
+            if expected > limit and (can_shrink or (height is None and len(qualities) > 1)):
                 break
         else:
-            break
-    return packed
+            return packed
+        if can_shrink:  # bytes grow by less than the number of pixels
+            rows = max(round(rows * min(math.sqrt(num_bytes / expected), _SHRINK)), MIN_HEIGHT)
+        else:
+            qualities.pop(0)
 
 
 @torch.no_grad()
@@ -190,7 +185,8 @@ def _pack(image: Float[Tensor, "3 height width"], rotation: np.ndarray, quality:
         pixels = (255 * face + 0.5).astype(np.uint8)
         for level, (smaller, tile) in enumerate(levels):
             reduced = cv2.resize(pixels, (smaller, smaller), interpolation=cv2.INTER_AREA)
-            tiles[level] += _encode(reduced, tile, quality if level == len(levels) - 1 else _PREVIEW_QUALITY)
+            is_preview = level == 0 < len(levels) - 1
+            tiles[level] += _encode(reduced, tile, _PREVIEW_QUALITY if is_preview else quality)
     return PackedPhotograph(height, levels, tuple(each for level in tiles for each in level), rotation)
 
 
@@ -201,6 +197,6 @@ def _encode(pixels: UInt8[np.ndarray, "size size 3"], tile: int, quality: int) -
         for left in range(0, len(pixels), tile):
             with io.BytesIO() as file:
                 part = np.ascontiguousarray(pixels[top : top + tile, left : left + tile])
-                Image.fromarray(part).save(file, "JPEG", quality=quality, optimize=True)
+                Image.fromarray(part).save(file, "JPEG", quality=quality, optimize=True, comment=SOFTWARE.encode())
                 encoded.append(file.getvalue())
     return encoded

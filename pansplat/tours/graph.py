@@ -31,6 +31,7 @@ ViewNumbers = tuple[int, ...]
 """The panoramas of a scene, by their number in the tour."""
 
 EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
+POOR_REACH = 0.5  # metres that a camera may walk from a panorama along a poor edge, at most a quarter of it
 MAX_SCENE_VIEWS = 3  # of a scene of an edge
 _MAX_PREDICTED = 16  # panoramas that a window predicts at once; bounds its memory and the time until they are shown
 _MIN_PANORAMAS = 3  # of a tour of one part
@@ -166,10 +167,6 @@ class TourGraph:
     def find_edge(self, node: int) -> Edge:
         """The edge of a node with the largest overlap."""
         return max((edge for edge in self.overlaps if node in edge), key=self.overlaps.__getitem__)
-
-    def list_reachable(self, edge: Edge) -> set[int]:
-        """The nodes of an edge, and those that share an edge with one of them."""
-        return {*edge, *(node for end in edge for node in self.neighbours(end))}
 
     def choose_scene_views(self) -> dict[Edge, ViewNumbers]:
         """The panoramas of the scene of each edge: two, or three that overlap with each other; one of a self-edge.
@@ -313,6 +310,31 @@ class TourGraph:
         if self.parts[nearest[0]] != part and distance > REACH:
             nearest, distance = self.find_nearest_edge(position, part)
         return current if self.measure_distance(current, position) <= distance + EDGE_HYSTERESIS else nearest
+
+    def limit_step(
+        self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], part: int | None = None
+    ) -> Float[np.ndarray, "3"]:
+        """Where a step of a camera that walks ends: near a poor edge not between its panoramas, as before a wall.
+
+        Args:
+            start, end: of the step.
+            part: of the camera, if it is known.
+        """
+        edge, _ = self.find_nearest_edge(end, part)
+        if edge not in self.poor:
+            return end
+        first, last = self.positions[list(edge)]
+        length = max(float(np.linalg.norm(last - first)), 1e-9)
+        along, reach = (last - first) / length, min(POOR_REACH, length / 4)
+
+        def measure_depth(place: Float[np.ndarray, "3"]) -> float:
+            walked = float((place - first) @ along)
+            return min(walked, length - walked)
+
+        if self.find_nearest_edge(start, part)[0] != edge:
+            return end if measure_depth(end) <= reach else start
+        excess = max(measure_depth(end) - max(measure_depth(start), reach), 0.0)
+        return end - math.copysign(excess, length / 2 - float((end - first) @ along)) * along
 
     def measure_distance(self, edge: Edge, position: Float[np.ndarray, "3"]) -> float:
         """Distance of a position from the line between an edge's cameras, metres."""

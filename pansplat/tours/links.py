@@ -13,6 +13,7 @@ from pansplat.tours.graph import TourGraph
 
 _WAY_METRES = 0.7  # that the camera goes along a link, before the fade
 _RING_METRES = (1.0, 3.0)  # distance of a link's ring
+_BEFORE_WALL = 0.8  # of the distance of a wall, at most
 _MIN_LEVEL = 0.1  # level length of the direction of a link that is not vertical
 
 
@@ -36,15 +37,18 @@ def find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarr
     return None if direction is None else _WAY_METRES * direction
 
 
-def find_link_ring(tour: TourGraph, start: int, end: int, height: float) -> Float[np.ndarray, "3"] | None:
+def find_link_ring(
+    tour: TourGraph, start: int, end: int, height: float, wall: float = math.inf
+) -> Float[np.ndarray, "3"] | None:
     """From a camera to the ring of a link, in world axes; None without a link, or if it is vertical.
 
-    It is where the link meets the floor, 1 to 3 m away.
+    It is where the link meets the floor, 1 to 3 m away, but before a wall.
 
     Args:
         tour: the graph.
         start, end: nodes.
         height: of the camera over the floor, metres.
+        wall: distance of what stands in the direction of the link, metres.
     """
     along, direction = _find_level_direction(tour, start, end), tour.find_direction(start, end)
     if along is None or direction is None:
@@ -52,7 +56,7 @@ def find_link_ring(tour: TourGraph, start: int, end: int, height: float) -> Floa
     down = tour.level_axes[:, 1]
     fall = float(direction @ down)
     distance = height * float(direction @ along) / fall if fall > 0 else _RING_METRES[1]
-    return min(max(distance, _RING_METRES[0]), _RING_METRES[1]) * along + height * down
+    return min(max(distance, _RING_METRES[0]), _RING_METRES[1], _BEFORE_WALL * wall) * along + height * down
 
 
 def _find_level_direction(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:

@@ -1,4 +1,4 @@
-"""What there is to see at a panorama: a flight does not end with the face to a wall, and furniture hides marks."""
+"""What there is to see at a panorama: where a way ends there, and which marks furniture hides."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pansplat.tours.surfaces import locate_surfaces
 BINS = 24  # of the horizon; the first one begins at the yaw -pi
 _ELEVATION = math.sin(math.radians(20))  # of the surfaces that count, above and below the horizon
 _OPAQUE = 0.5  # least opacity of a surface
-_BLANK = 0.45  # of the median distance of surfaces, below which a view is blank
+_WALL = 1.2  # metres, the distance of surfaces below which a view faces a wall
 _WINDOW = 3  # bins of a view, 45 degrees
 _CONE = math.cos(math.radians(2))  # around the direction of a mark
 _IN_FRONT, _HIDING = 0.8, 0.5  # of its distance, and the share of the surfaces there that hide it
@@ -35,23 +35,36 @@ def measure_outlook(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) ->
     return np.array([np.median(own) if len(own) else 0.0 for own in found])
 
 
-def choose_heading(outlook: Float[np.ndarray, "bin"], yaw: float) -> float:
-    """The yaw at which a flight ends: the given one, or that of the widest view if it faces a wall.
+def choose_arrival(
+    outlook: Float[np.ndarray, "bin"], yaw: float, pitch: float = 0.0, start: tuple[float, float] | None = None
+) -> tuple[float, float]:
+    """Yaw and pitch at which a way ends: the start view, else the given ones, but those of the widest view if these
+    face a wall.
 
     Args:
-        outlook: of `measure_outlook`.
-        yaw: in which the camera arrives, radians.
+        outlook: of `measure_outlook`; zeros if it is unknown.
+        yaw, pitch: with which the camera arrives, radians.
+        start: yaw and pitch of the panorama's start view.
     """
-    is_blank, widest = find_blank(outlook)
-    return widest if is_blank[int((yaw / (2 * math.pi) + 0.5) * BINS) % BINS] else yaw
+    is_turned, ahead = find_turned(outlook, start)
+    return ahead if is_turned[find_bin(yaw)] else (yaw, pitch)
 
 
-def find_blank(outlook: Float[np.ndarray, "bin"]) -> tuple[Bool[np.ndarray, "bin"], float]:
-    """Which directions of an outlook face a wall, and the yaw of the widest view, radians."""
+def find_bin(yaw: float) -> int:
+    """The bin of an outlook in a direction."""
+    return int((yaw / (2 * math.pi) + 0.5) * BINS) % BINS
+
+
+def find_turned(
+    outlook: Float[np.ndarray, "bin"], start: tuple[float, float] | None = None
+) -> tuple[Bool[np.ndarray, "bin"], tuple[float, float]]:
+    """From which directions `choose_arrival` turns, and the yaw and pitch to which it does."""
     around = np.stack([np.roll(outlook, shift) for shift in range(-(_WINDOW // 2), _WINDOW // 2 + 1)])
-    views = around.mean(axis=0)
-    is_blank = (views < _BLANK * np.median(outlook)) & outlook.any()
-    return is_blank, ((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi
+    counts = (around > 0).sum(axis=0)  # nothing is seen in the sky
+    views = around.sum(axis=0) / np.maximum(counts, 1)
+    if start is not None:
+        return np.ones(BINS, dtype=bool), start
+    return (views < _WALL) & (counts > 0), (((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi, 0.0)
 
 
 def is_hidden(places: Float[np.ndarray, "n 3"], mark: Float[np.ndarray, "3"]) -> bool:

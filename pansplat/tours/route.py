@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.links import find_way_along_link
-from pansplat.tours.outlook import choose_heading
+from pansplat.tours.outlook import choose_arrival
 
 FADE_SECONDS = 1.0
 STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
@@ -116,14 +116,15 @@ def plan_route(
 
     Before a fade along a link the camera turns in the direction of the link, and goes 0.7 m. Before another one, at a
     panorama alone, it turns by 90 degrees; so it does at the end, unless a start pose is given. After a fade, it looks
-    away from the link back; without one, in the direction of the panorama's start view; else its heading stays.
+    in the direction of the panorama's start view; without one, away from the link back; else its heading stays.
 
     Args:
         tour: the graph.
         walk: nodes; consecutive ones share an edge, or are of different parts.
         start: pose from which the first node is approached; None starts at that node, in the direction of its start
             view, or of the second node.
-        outlook: of the last node (`measure_outlook`): a flight that ends at a wall turns to the widest view.
+        outlook: of the last node (`measure_outlook`), at which the flight ends as `choose_arrival` states; None leaves
+            it as it is.
     """
     steps = list(itertools.pairwise(walk))
     fades = [leg for leg, step in enumerate(steps) if tour.is_fade(*step)]
@@ -154,8 +155,11 @@ def plan_route(
             yaw, pitch = _find_arrival(tour, *steps[first]) or (yaw, 0.0)
         is_seen = start is None or 0 <= first < last < len(steps)  # of a user's flight, not the ends
         around = math.radians(_LOOK_AROUND_DEGREES) if is_seen and len(places) == 1 and steps else 0.0
-        seen = outlook if last == len(steps) else None
-        sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch, around, seen))
+        arrival = None
+        if outlook is not None and last == len(steps):
+            view = tour.find_start_view(walk[-1])
+            arrival = partial(choose_arrival, outlook, start=None if view is None else find_angles(level.T @ view))
+        sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch, around, arrival))
         yaw = float(sections[-1][3][-1])
     *positions, yaws, pitches, numbers = (np.concatenate(values) for values in zip(*sections, strict=True))
     return Route(
@@ -179,9 +183,9 @@ def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
 def _find_arrival(tour: TourGraph, start: int, end: int) -> tuple[float, float] | None:
     """Yaw and pitch of a camera after a fade; None to keep the heading."""
     back, view = find_way_along_link(tour, end, start), tour.find_start_view(end)
-    if back is not None:
-        return find_angles(-tour.level_axes.T @ back / np.linalg.norm(back))
-    return None if view is None else find_angles(tour.level_axes.T @ view)
+    if view is not None:
+        return find_angles(tour.level_axes.T @ view)
+    return None if back is None else find_angles(-tour.level_axes.T @ back / np.linalg.norm(back))
 
 
 def _fly(
@@ -191,7 +195,7 @@ def _fly(
     yaw: float | None,
     pitch: float,
     around: float = 0.0,
-    outlook: Float[np.ndarray, "bin"] | None = None,
+    arrival: Callable[[float], tuple[float, float]] | None = None,
 ) -> tuple[np.ndarray, ...]:
     """The flight through places of one part: right, down, forward, yaw, pitch and leg of each sample.
 
@@ -202,7 +206,7 @@ def _fly(
         yaw: at the start, radians; None looks along the path.
         pitch: at the start, radians.
         around: turn to the right at the end, radians.
-        outlook: of the end; the camera turns away from a wall.
+        arrival: yaw and pitch of the end, of the yaw with which the camera arrives.
     """
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     kept = lengths > 1e-6
@@ -229,14 +233,17 @@ def _fly(
         places.append(place)
         yaws.append(yaw)
     yaws[0] = yaws[1] if len(yaws) > 1 and yaws[0] is None else yaws[0] or 0.0
-    if outlook is not None:
-        around += math.remainder(choose_heading(outlook, yaws[-1]) - yaws[-1], 2 * math.pi)
+    end = None if arrival is None else arrival(yaws[-1])
+    if end is not None:
+        around += math.remainder(end[0] - yaws[-1], 2 * math.pi)
     turns = (math.copysign(1, around) * np.arange(0, abs(around), math.radians(_TURN_DEGREES) * step)).tolist()
     places += [place for _ in turns]
     yaws += [yaws[-1] + turn for turn in turns]
     along = np.array(places)
     pitches = np.zeros(len(yaws))
     pitches[0] = pitch
+    if end is not None:  # the camera looks up or down while it turns, or at the end
+        pitches[-len(turns) - 1 :] = np.linspace(0, end[1], len(turns) + 2)[1:]
     positions = [np.interp(along, ends, column) for column in path.T]
     numbers = numbers[np.clip(np.searchsorted(ends, along, side="right") - 1, 0, len(numbers) - 1)]
     half = round(_SMOOTHING_SECONDS / 2 * _SAMPLES_PER_SECOND)

@@ -269,8 +269,8 @@ _MVSPLAT = NetworkConfig(shape="mvsplat")
 
 _PRESETS: dict[str, tuple[str, TrainConfig]] = {
     "tiny": (
-        "no files, minutes on a CPU: a very small network, rooms of boxes, 64x128",
-        _small_preset("tiny", (64,), 300, 2, 2e-3, 100, DataConfig()),
+        "no files, about 6 minutes on two cores: a very small network, rooms of boxes, 64x128",
+        _small_preset("tiny", (64,), 300, 2, 2e-3, 100, DataConfig(workers=0)),  # workers would start for seconds
     ),
     "small": (
         "a day on a CPU: a small network, triplets (of `pansplat-homes`, for example), 128x256 then 256x512",

@@ -44,6 +44,7 @@ from pansplat.training.stopping import StopRequest
 from pansplat.training.validation import MEASURES, describe_measures, validate
 
 _EXTRA_STEPS = 10  # of the learning-rate schedule beyond the last step, as in the official code
+_TINY_SECONDS = 1.2  # of a step of `tiny` on two cores (docs/training.md)
 _COLUMNS = (*LOSS_TERMS, "rate", "gradient_norm", "seconds")
 
 
@@ -276,9 +277,12 @@ class Trainer:
 
     def _describe(self) -> str:
         count = sum(p.numel() for p in trainable_parameters(self.network, self.auxiliary))
+        left = (self.config.optimizer.steps - self.step) * _TINY_SECONDS / 60
+        is_tiny = self.config.network.shape == "tiny" and self.config.heights == (64,)
+        duration = f", about {left:.0f} min on two cores" if is_tiny else ""
         return (
             f"{self.config.network.shape}: {count:,} trainable parameters, "
             f"{self.config.data.kind} at {', '.join(f'{h}x{2 * h}' for h in self.config.heights)}, "
             f"perceptual loss {self.perceptual_name}, "
-            f"{self.processes.count} process(es), from step {self.step} of {self.config.optimizer.steps}"
+            f"{self.processes.count} process(es), from step {self.step} of {self.config.optimizer.steps}{duration}"
         )

@@ -2,6 +2,7 @@
 // image of the camera before covers the new one until that is sorted, then it fades out.
 
 import { cameraFor, DOLLY_MS, FADE_MS, nearestNode, nodeHere, rotationOf, settleAt, turn } from "./camera.js";
+import { chooseArrival, findLink } from "./choices.js";
 import { frameDoll, isInDoll, listBoxes, nearestInDoll } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import {
@@ -14,27 +15,9 @@ import { camera, changed, currentPart, edges, GRAPH, isComplete, isSortedAs, mak
 const DOLL_SECONDS = 1.6;            // of a flight out of the rooms, or into one
 const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
 const NEAR = HEADER.speed;          // metres: a second's walk
-const DIRECTIONS = 24;              // of the bits of `blank`
 const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
 const PHOTO_WAIT_MS = 2000;         // of a fade along a poor edge, at most, for the photograph where it ends
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
-
-// The heading after a fade: away from the link back, or the start view; else that of before, or from another world, whose
-// directions are unknown, the widest view.
-function arriveAt(node, from) {
-  const back = findLink(node, from), { start, ahead } = HEADER.spots[node], { worlds } = HEADER.plan;
-  if (back && back.leave) return { yaw: lookOn(node, back.yaw + Math.PI), pitch: 0 };
-  if (start) return { yaw: start[0], pitch: start[1] };
-  return { yaw: worlds[node] === worlds[from] ? lookOn(node, camera.yaw) : ahead, pitch: 0 };
-}
-
-// A yaw at a panorama; if it faces a wall, that of the start view or of the widest view (choose_heading).
-export function lookOn(node, yaw) {
-  const { start, blank, ahead } = HEADER.spots[node], turns = yaw / (2 * Math.PI) + 0.5;
-  return blank >> Math.floor(DIRECTIONS * (turns - Math.floor(turns))) & 1 ? start ? start[0] : ahead : yaw;
-}
-
-const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
 
 // `zoom`: of the image of before, by which a fast fade along a poor edge looks like a step.
 export function jump(position, { yaw, pitch }, zoom = null) {
@@ -82,7 +65,7 @@ function enterDoll() {
 }
 
 // Flies into a panorama, and ends there; by default it looks where the camera looks from outside.
-function visit(node, heading = { yaw: lookOn(node, camera.yaw), pitch: 0 }) {
+function visit(node, heading = chooseArrival(node, { yaw: camera.yaw, pitch: 0 })) {
   if (!isInDoll(node)) {
     jumpTo(node);
     return;
@@ -169,8 +152,7 @@ export function advanceFlight(now) {
   const leg = state.flight.legs[0];
   if (leg.to !== undefined) {
     const isElsewhere = parts[leg.from] !== parts[leg.to], isDolly = !isElsewhere && isFade(GRAPH, leg.from, leg.to) && !calm.matches;
-    const arrival = isElsewhere ? arriveAt(leg.to, leg.from) : { ...camera, yaw: lookOn(leg.to, camera.yaw) };
-    jump(GRAPH.positions[leg.to], arrival, isDolly ? zoomTowards(GRAPH.positions[leg.to]) : null);
+    jump(GRAPH.positions[leg.to], chooseArrival(leg.to, camera, leg.from), isDolly ? zoomTowards(GRAPH.positions[leg.to]) : null);
     state.flight.legs.shift();
     if (!state.flight.legs.length) state.flight = null;
     return;
@@ -200,9 +182,9 @@ function beginLeg(leg, now) {
   state.flight.began = now;
   leg.length = lengthOf(leg.path);
   leg.done = 0;
-  const yaw = leg.yaw === undefined && leg.end !== undefined ? lookOn(leg.end, camera.yaw) : leg.yaw;
-  const across = yaw === undefined || state.headset.session ? 0 : Math.atan2(Math.sin(yaw - camera.yaw), Math.cos(yaw - camera.yaw));
-  leg.turn = [across, leg.yaw === undefined ? 0 : -camera.pitch];
+  const { yaw, pitch } = leg.yaw !== undefined ? { yaw: leg.yaw, pitch: 0 } : leg.end !== undefined ? chooseArrival(leg.end, camera) : camera;
+  const across = state.headset.session ? 0 : Math.atan2(Math.sin(yaw - camera.yaw), Math.cos(yaw - camera.yaw));
+  leg.turn = [across, pitch - camera.pitch];
   const turning = state.headset.session ? 0 : Math.hypot(...leg.turn) / TURN_SPEED;  // the head turns itself
   leg.seconds = leg.rest || Math.max(turning, leg.length ? clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : 0);
 }
@@ -287,8 +269,7 @@ export function goTo(node) {
 // Goes to a panorama without a flight.
 export function jumpTo(node) {
   setTouring(false);
-  const isSame = parts[node] === currentPart(), from = edges.length ? nodeHere() : node;
-  jump(GRAPH.positions[node], isSame ? { ...camera, yaw: lookOn(node, camera.yaw) } : arriveAt(node, from));
+  jump(GRAPH.positions[node], chooseArrival(node, camera, edges.length ? nodeHere() : node));
 }
 
 export const isFlying = () => state.flight !== null || state.route !== null;

@@ -6,6 +6,7 @@
 // within which a camera that has jumped is in it. Edges are numbers in `edges`.
 
 export const DEGREE = Math.PI / 180;
+const POOR_REACH = 0.5;  // metres that a camera may walk from a panorama along a poor edge, at most a quarter of it
 
 export const minus = (a, b) => a.map((value, i) => value - b[i]);
 export const plus = (a, b) => a.map((value, i) => value + b[i]);
@@ -48,10 +49,18 @@ export function followEdge(graph, position, current) {
   return distanceToEdge(graph, current, position) <= limit ? current : nearest;
 }
 
-// list_reachable
-export function isReachable(graph, edge, node) {
-  const ends = graph.edges[edge].slice(0, 2);
-  return graph.edges.some(([a, b]) => (a === node && ends.includes(b)) || (b === node && ends.includes(a)));
+// limit_step
+export function limitStep(graph, start, end, part = null) {
+  const edge = nearestEdge(graph, end, part), ends = graph.edges[edge].slice(0, 2), [first, last] = ends.map((node) => graph.positions[node]);
+  if (!isFade(graph, ...ends)) return end;
+  const length = Math.max(distanceOf(first, last), 1e-9), along = scaled(minus(last, first), 1 / length), reach = Math.min(POOR_REACH, length / 4);
+  const depthOf = (place) => {
+    const walked = dot(minus(place, first), along);
+    return Math.min(walked, length - walked);
+  };
+  if (nearestEdge(graph, start, part) !== edge) return depthOf(end) <= reach ? end : start;
+  const excess = Math.max(depthOf(end) - Math.max(depthOf(start), reach), 0);
+  return minus(end, scaled(along, dot(minus(end, first), along) < length / 2 ? excess : -excess));
 }
 
 // is_fade

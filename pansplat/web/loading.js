@@ -8,6 +8,7 @@ import { camera, currentPart, edges, isSortedFor, parts, refresh, state } from "
 
 export let failure = null;
 let worker = null, chunksArrived = 0;
+let queue = Promise.resolve();             // of files: the first view comes first
 let onMissing = fail;                      // reports a chunk that does not arrive
 
 export function fail(error) {
@@ -20,19 +21,28 @@ export function fail(error) {
   console.error(error);
 }
 
-// A script for each chunk of the data calls this. In a page of one file the chunk is the element before: unlike text in a
-// program, it is not kept.
-window.addPart = (view, isLast, text) => {
-  const { currentScript: script } = document;
-  if (text === undefined) {
-    text = script.previousElementSibling.textContent;
-    script.previousElementSibling.remove();
-  }
-  script.remove();
+// `chunk`: base64, or bytes.
+function receive(view, isLast, chunk) {
   chunksArrived += 1;
   byId("bar").value = chunksArrived / countChunks();
-  if (worker) worker.postMessage({ view, text, isLast });
+  if (worker) worker.postMessage({ view, chunk, isLast });
+}
+
+// In a page of one file a script for each chunk of the data calls this. The chunk is the element before: unlike text in a
+// program, it is not kept.
+window.addPart = (view, isLast) => {
+  const { currentScript: script } = document, { previousElementSibling: element } = script;
+  element.remove();
+  script.remove();
+  receive(view, isLast, element.textContent);
 };
+
+// Of the folder beside the page.
+export async function fetchFile(name) {
+  const response = await fetch(`${HEADER.folder}/${name}`);
+  if (!response.ok) throw new Error(`${response.url} is missing`);
+  return response;
+}
 
 const countChunks = () => [...state.asked].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
 
@@ -48,12 +58,10 @@ export function loadAround() {
     if (state.asked.has(view) || !(isAll || near.has(view) || state.doll.isOn && parts[view] === currentPart())) continue;
     state.asked.add(view);
     canvas.ariaBusy = true;
-    for (const file of HEADER.folder === null ? [] : HEADER.views[view].files) {
-      const script = document.createElement("script");
-      const end = () => { if (script.isConnected) onMissing(new Error("A part of the scene is missing. Copy the whole folder.")); };
-      Object.assign(script, { src: `${HEADER.folder}/${file}`, async: false, onload: end, onerror: end });  // in this order
-      document.head.append(script);
-    }
+    if (HEADER.folder === null) continue;
+    queue = queue.then(() => fetchFile(...HEADER.views[view].files)).then((response) => response.arrayBuffer()).then(
+      (chunk) => receive(view, true, chunk), () => onMissing(new Error("A part of the scene is missing. Copy the whole folder.")),
+    );
   }
 }
 

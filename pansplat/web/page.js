@@ -18,6 +18,7 @@ import { camera, changed, currentPart, isComplete, isSortedFor, redraw, shown, s
 import { headset } from "./xr.js";
 
 const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later";  // that have all that the page uses
+const FROM_DISK = "Browsers read this folder only from a web server. Upload it, or show it with pansplat export --serve. A page that opens from disk is a file: export to a name that ends in .html.";
 const lack = (what) => new Error(`This page needs ${what}, which is in ${BROWSERS}, unless the device lacks it.`);
 
 // The poster has the scale and the place of the picture that follows.
@@ -38,6 +39,7 @@ function setRenderer(value) {
 async function main() {
   placePoster();
   addEventListener("resize", placePoster);
+  if (HEADER.folder !== null && location.protocol === "file:") throw new Error(FROM_DISK);
   if (!window.DecompressionStream) throw lack("DecompressionStream");
   const linked = parsePose(location.hash);
   if (linked) Object.assign(camera, cameraFor(linked));

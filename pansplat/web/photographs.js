@@ -1,16 +1,16 @@
 // The photographs of the panoramas: where the camera stands at one, its photograph is shown, and Gaussians while it moves.
-// docs/web.md describes it. Tiles of cube faces arrive as text in scripts: a page from disk may not read the pixels of
-// image files. A large level is drawn over the smallest one, as far as it has arrived.
+// docs/web.md describes it. Tiles of cube faces are files, or text in a page of one file. A large level is drawn over the smallest one, as far as it has arrived.
 
 import { nodeHere, rotationOf, tangentOf } from "./camera.js";
 import { fullSize, say } from "./dom.js";
 import { clamp, column, distanceOf, dot, multiply, scaled } from "./graph.js";
+import { fetchFile } from "./loading.js";
 import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
 const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
 const GONE = 0.3;                   // metres from a panorama, where its photograph has faded at any rate
 const PHOTO_FADE = 0.2;             // seconds
-const DENSITY = 0.8;                // texels of a pixel in the middle of a face, at least
+const DENSITY = 1.3;                // texels of a pixel in the middle of a face, at least
 const KEPT = 3;                     // photographs whose textures are kept
 const AT_ONCE = 6;                  // tiles that are read at the same time
 const TRIES = 3, PAUSE_AFTER_ERROR = 2000;  // of a tile that does not arrive, ms between them
@@ -21,39 +21,26 @@ const FACES = [
   [[0, 0, 1], [0, 1, 0], [-1, 0, 0], 1], [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2], [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
 ];
 const texts = new Map();            // of a page in one file: base64 of the tiles that have arrived
-const requests = new Map();         // of other pages: what takes the text of a tile that has not arrived
 
-// A script for each tile calls this; in a page of one file, one for the smallest tiles of a photograph and one for the others,
-// which are in the element before.
-window.addTile = (name, number, text) => {
-  if (text !== undefined) {
-    requests.get(`${name}_${number}`)(text);
-    return;
-  }
+// In a page of one file there is a script for the smallest tiles of a photograph and one for the others; they are in the
+// element before.
+window.addTile = (name, number) => {
   const { currentScript: script } = document, { previousElementSibling: element } = script;
   element.textContent.split(" ").forEach((each, k) => texts.set(`${name}_${number + k}`, each));
   element.remove();
   script.remove();
 };
 
-function readText(key) {
-  if (HEADER.folder === null) return Promise.resolve(texts.get(key));
-  return new Promise((resolve, reject) => {
-    const script = document.createElement("script");
-    const end = () => {
-      script.remove();
-      requests.delete(key);  // it holds the text
-      reject(new Error(`${script.src} is missing, or is no tile`));  // unless it has arrived
-    };
-    requests.set(key, resolve);
-    Object.assign(script, { src: `${HEADER.folder}/${key}.js`, onload: end, onerror: end });
-    document.head.append(script);
-  });
-}
-
 async function readTile(key) {
+  if (HEADER.folder !== null) {
+    try {
+      return await createImageBitmap(await (await fetchFile(`${key}.jpg`)).blob());
+    } catch {
+      throw new Error(`${key}.jpg is missing, or is no tile`);  // a web server may answer with a page
+    }
+  }
   const image = new Image();
-  image.src = `data:image/jpeg;base64,${await readText(key)}`;
+  image.src = `data:image/jpeg;base64,${texts.get(key)}`;
   await image.decode();
   return image;
 }

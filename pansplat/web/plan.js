@@ -1,6 +1,7 @@
 // The floor plan: outlines of rooms, doors, panoramas and the camera from above, the longest wall horizontal. It shows the
 // world of the panorama at the camera; rooms of other worlds, whose places are unknown, are a list.
 
+import { placeNames } from "./choices.js";
 import { byId, make } from "./dom.js";
 import { goTo } from "./flight.js";
 import { clamp, column, DEGREE, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
@@ -51,37 +52,41 @@ class Plan {
       this.marks.push([node, element]);
       return element;
     };
+    const names = [], dots = nodes.map((node) => this.toPlan(this.placeOf(node)));
     const write = (node, [x, y], text, width) => {
-      svg.append(add(node, drawSvg("text", { x, y, "font-size": clamp(1.6 * width / text.length, 10, PLAN_TEXT) }, text)));
+      const element = drawSvg("text", { "font-size": clamp(1.6 * width / text.length, 10, PLAN_TEXT) }, text);
+      names.push({ x, y, element: add(node, element) });
     };
-    rooms.forEach(({ name, nodes: [node, ...others], label: [right, forward, width] }, k) => {
+    rooms.forEach(({ name, nodes: [node, ...others], label: [right, forward, width], hasWalls }, k) => {
       if (!outlines[k]) return;
       const group = add(node, drawSvg("g", {})), [x, y] = this.toPlan(this.turned([right, forward]));
-      group.append(drawSvg("polygon", { points: outlines[k].map(this.toPlan).join(" ") }));
+      group.append(drawSvg("polygon", { class: hasWalls ? "" : "open", points: outlines[k].map(this.toPlan).join(" ") }));
       for (const { ends } of doors.filter(({ room }) => room === k)) {
         const [[x1, y1], [x2, y2]] = ends.map((end) => this.toPlan(this.turned(end)));
         group.append(drawSvg("line", { x1, y1, x2, y2 }));
       }
       svg.append(group);
+      if ([node, ...others].every((each) => named.has(each))) return;  // of a room whose outline is beside it
       [node, ...others].forEach((each) => named.add(each));
-      const near = [node, ...others].some((each) => distanceOf(this.toPlan(this.placeOf(each)), [x, y]) < PLAN_TEXT);
-      write(node, [x, near ? y - 12 : y], name, scale * width / HEADER.unit);
+      write(node, [x, y], name, scale * width / HEADER.unit);
     });
     this.camera = drawSvg("path", { d: "M0 0L-9 -22L9 -22Z" });
     svg.append(this.camera);
     const buttons = nodes.map((node) => {
       const button = make("button", ""), [left, top] = this.toPlan(this.placeOf(node));
-      if (!named.has(node)) write(node, [left, top - 10], HEADER.spots[node].name, 80);
+      if (!named.has(node)) write(node, [left, top], HEADER.spots[node].name, 80);
       button.title = button.ariaLabel = `Go to ${HEADER.spots[node].name}`;
       button.style.transform = `translate(${left - 22}px, ${top - 22}px)`;
       button.onclick = ({ detail, clientX, clientY }) => goTo(detail ? this.nearest(nodes, clientX, clientY) : node);
       return add(node, button);
     });
     byId("drawing").replaceChildren(svg, ...buttons);
-    for (const text of svg.querySelectorAll("text")) {  // names stay in the drawing
-      const half = 0.5 * text.getComputedTextLength() + 4;
-      text.setAttribute("x", clamp(Number(text.getAttribute("x")), half, Math.max(size - half, half)));
-    }
+    svg.append(...names.map(({ element }) => element));  // over all outlines; then their width is known
+    const sizes = names.map(({ x, y, element }) => ({ x, y, width: element.getComputedTextLength(), height: PLAN_TEXT }));
+    placeNames(sizes, dots, size).forEach((place, k) => {
+      if (place) ["x", "y"].forEach((axis, i) => names[k].element.setAttribute(axis, place[i]));
+      else names[k].element.remove();
+    });
     byId("elsewhere").replaceChildren(make("p", "", "Not on the plan"), ...[...worlds.keys()].filter((node) => !nodes.includes(node)).map((node) => {
       const button = make("button", "", HEADER.spots[node].name);
       button.onclick = () => goTo(node);

@@ -8,7 +8,7 @@ let first = null;  // what is sorted as soon as a view of its part has arrived, 
 
 onmessage = ({ data }) => {
   if (data.header) begin(data.header);
-  else if (data.text !== undefined) receive(data);
+  else if (data.chunk !== undefined) receive(data);
   else sort(data);
 };
 
@@ -19,14 +19,14 @@ function begin(header) {
   if (terms) Object.assign(scene, { harmonics: new Int8Array(3 * terms * count), base: new Uint8Array(4 * count), colors: new Uint8ClampedArray(4 * count) });
 }
 
-function receive({ view, text, isLast }) {
+function receive({ view, chunk, isLast }) {
   if (!writers.has(view)) {
     const stream = new DecompressionStream("gzip");
     writers.set(view, stream.writable.getWriter());
     readView(view, stream.readable.getReader()).catch((error) => postMessage({ error: String(error.message || error) }));
   }
   const writer = writers.get(view);
-  writer.write(decode(text)).catch(() => {});  // its error is that of the reader
+  writer.write(typeof chunk === "string" ? decode(chunk) : new Uint8Array(chunk)).catch(() => {});  // its error is that of the reader
   if (isLast) writer.close().catch(() => {});
 }
 

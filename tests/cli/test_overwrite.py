@@ -79,6 +79,17 @@ def test_files_beside_a_mesh_are_checked_before_the_first_is_written(
     assert run([*EXPORT, str(room), *COARSE, "-o", str(out)]) == 0
 
 
+def test_the_folder_of_a_split_page_keeps_files_of_the_user(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page.html"
+    own = write_own(tmp_path / "page_files" / "0123456789abcdef.bin")
+    for count in ("100", "50"):
+        assert run(["export", str(scene), "-o", str(out), "--split", "--gaussians", count]) == 0
+    others = [file for file in own.parent.iterdir() if file != own]
+    assert own.read_bytes() == OWN and len(others) == 2 and all(map(is_written, others)), (
+        "parts of the first page are removed"
+    )
+
+
 @pytest.mark.parametrize(
     ("name", "command"),
     [

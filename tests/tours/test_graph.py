@@ -14,7 +14,7 @@ from synthetic_scenes import make_balls
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.tours import graph
-from pansplat.tours.graph import _find_shortest_ways, find_tours
+from pansplat.tours.graph import TourGraph, _find_shortest_ways, find_tours
 from pansplat.tours.route import plan_route
 
 
@@ -95,7 +95,7 @@ def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
     assert home.parts == (0, 0, 0, 1, 2, 2, 3) and home.name == "home tour"
     scenes = home.choose_scene_views()
     assert scenes[3, 3] == (3,) and scenes[4, 5] == (4, 5) and set(home.choose_sources()) == set(scenes.values())
-    assert home.neighbours(3) == [] and home.list_reachable((3, 3)) == {3}
+    assert home.neighbours(3) == []
     pairs = [home.make_pair((node,)) for node in (3, 6)]
     (tour,) = find_tours(pairs)
     assert set(tour.overlaps) == {(0, 0), (1, 1)}, "two photographs are a tour of two parts"
@@ -300,7 +300,6 @@ def test_the_cheapest_ways_are_those_of_scipy(seed):
 def test_an_edge_is_followed_until_another_one_is_clearly_nearer(comb):
     assert comb.follow_edge(np.array((0.0, 0, 1.2)), (0, 1)) == (0, 1)
     assert comb.follow_edge(np.array((0.0, 0, 1.3)), (0, 1)) == (1, 2)
-    assert comb.list_reachable((1, 4)) == {0, 1, 2, 4}
 
 
 def test_a_way_begins_at_the_better_end_of_the_nearest_edge(comb):
@@ -337,3 +336,20 @@ def test_no_flight_leads_through_a_wall_and_places_stay_known(comb):
     again = comb.with_overlaps(tour.list_overlaps())
     assert again.overlaps == tour.overlaps and again.walls == tour.walls
     assert not comb.with_overlaps(((0, 1, 0.5), *((node, node, 1.0) for node in range(2, 6)))).is_placed(5)
+
+
+def test_a_walk_ends_half_a_metre_from_the_ends_of_a_poor_edge(comb):
+    """Of one shorter than 2 m after a quarter of it."""
+    poor = dataclasses.replace(comb, poor=((0, 1),))
+    start, end = comb.positions[0], comb.positions[1]
+    places = [start + t * (end - start) for t in np.linspace(0, 1, 41)]
+
+    def walk(tour: TourGraph, path: list[np.ndarray]) -> float:
+        place = path[0]
+        for before, after in itertools.pairwise(path):
+            place = tour.limit_step(place, place + after - before)
+        return float(np.linalg.norm(place - path[0]))
+
+    assert walk(poor, places) == pytest.approx(0.25) == walk(poor, places[::-1])
+    assert walk(comb, places) == pytest.approx(comb.length((0, 1))) == 1
+    assert walk(poor, places[20::-1]) == pytest.approx(0.5), "from the middle it goes back"

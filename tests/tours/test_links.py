@@ -24,6 +24,12 @@ def test_a_ring_is_where_the_link_meets_the_floor_one_to_three_metres_away(make_
         assert np.allclose(way, (0.7, 0, 0))
 
 
+def test_a_ring_is_before_the_wall_that_the_link_leads_through(make_tour) -> None:
+    tour = _link(make_tour(((0, 0), (0, 1)), ((0, 0), (1, 1))), 0.05)
+    for wall, distance in ((1.5, 1.2), (0.8, 0.64), (9.0, 3.0)):
+        assert np.allclose(find_link_ring(tour, 0, 1, 1.5, wall), (distance, 1.5, 0))
+
+
 def test_a_vertical_link_and_none_have_no_ring(make_tour) -> None:
     tour = _link(make_tour(((0, 0), (0, 1)), ((0, 0), (1, 1))), 0.5 * math.pi)
     assert find_link_ring(tour, 0, 1, 1.5) is None and find_way_along_link(tour, 0, 1) is None

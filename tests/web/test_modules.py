@@ -1,6 +1,7 @@
 """The modules of the page in node: their imports, and those that need no browser as functions of HEADER and state."""
 
 import json
+import math
 import os
 import re
 import shutil
@@ -18,10 +19,11 @@ from pansplat.export.page_data import PageHeader
 from pansplat.inputs.pairs import Link, Panorama
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
 from pansplat.tours.layout import REACH
+from pansplat.tours.outlook import choose_arrival, find_turned
 
 FOLDER = Path(str(resources.files("pansplat.web")))
 MODULES = {file.name: file.read_text("utf-8") for file in FOLDER.glob("*.js")}
-WITHOUT_BROWSER = ("graph.js", "state.js", "camera.js", "doll.js")
+WITHOUT_BROWSER = ("graph.js", "state.js", "camera.js", "choices.js", "doll.js")
 IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+\.js)";$', re.MULTILINE)
 
 
@@ -153,38 +155,123 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
     positions = random.uniform((-1, -0.5, -1), (3, 0.5, 4), (60, 3))
     positions[40:] = random.uniform((3, -0.5, -1), (11, 0.5, 11), (20, 3))
     nodes, current = range(len(places)), random.integers(len(edges), size=60)
+    starts = positions + random.uniform(-0.4, 0.4, (60, 3))
     found = run(
         node,
         tmp_path,
         make_header(ROW, [(0, 1)], [0, 0, 0, 1]),
-        """(graph, positions, current) => positions.map((position, i) => ({
+        """(graph, positions, current, starts) => positions.map((position, i) => ({
             nearest: graph.edges[nearestEdge(graph, position)],
             ofPart: graph.edges[nearestEdge(graph, position, partOfEdge(graph, current[i]))],
             followed: graph.edges[followEdge(graph, position, current[i])],
-            reachable: graph.positions.map((_, node) => isReachable(graph, current[i], node)),
             ways: graph.positions.map((_, node) => findWay(graph, position, node)),
             waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
             fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
+            step: limitStep(graph, starts[i], position),
         }))""",
         graph,
         positions.tolist(),
         current.tolist(),
+        starts.tolist(),
     )
     for position, number, case in zip(positions, current, found, strict=True):
         edge = edges[number]
         assert tuple(case["nearest"]) == tour.find_nearest_edge(position)[0]
         assert tuple(case["ofPart"]) == tour.find_nearest_edge(position, tour.parts[edge[0]])[0]
         assert tuple(case["followed"]) == tour.follow_edge(position, edge)
-        assert set(np.flatnonzero(case["reachable"])) == tour.list_reachable(edge)
         assert case["ways"] == [tour.find_way(position, node) for node in nodes]
         assert case["waysOfPart"] == [tour.find_way(position, node, 0) for node in nodes]
         assert case["fades"] == [tour.is_fade(node, edge[0]) for node in nodes]
+    steps = [tour.limit_step(start, end) for start, end in zip(starts, positions, strict=True)]
+    np.testing.assert_allclose([case["step"] for case in found], steps, atol=1e-9)
+    assert 0 < np.any(np.abs(positions - steps) > 1e-6, axis=1).sum() < 30
     followed = [tuple(case["followed"]) for case in found]
     assert len({edge == tuple(case["nearest"]) for edge, case in zip(followed, found, strict=True)}) == 2, "hysteresis"
     parts = [
         (tour.parts[edge[0]], tour.parts[edges[number][0]]) for edge, number in zip(followed, current, strict=True)
     ]
     assert len({a == b for a, b in parts}) == 2, "a position near another part is in it"
+
+
+def choose_rings(node: str, folder: Path, *, links: Any = (), hidden: Any = (), rooms: Any = (), here: int = 0) -> list:
+    """The rings of a panorama in a row of four, the last one in another part, with `{from, to, mark}` of links."""
+    header = make_header(ROW, [(0, 1), (0, 2), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"links": list(links)}
+    header["plan"] = {"rooms": [{"nodes": nodes} for nodes in rooms]}
+    for number, spot in enumerate(header["spots"]):
+        spot["hidden"] = list(hidden) if number == here else []
+    found = run(node, folder, header, "(here) => chooseRings(here)", here)
+    return [(ring["node"], None if ring["link"] is None else ring["link"]["from"]) for ring in found]
+
+
+def test_the_rings_of_a_panorama_are_its_own_links_and_its_flights(node: str, tmp_path: Path) -> None:
+    door = {"from": 1, "to": 3, "mark": [0, 0, 0]}
+    assert choose_rings(node, tmp_path, links=[door]) == [(1, None), (2, None), (0, None)], "not those of the next one"
+    assert choose_rings(node, tmp_path, links=[door], here=1)[0] == (3, 1)
+    assert choose_rings(node, tmp_path, links=[{"from": 0, "to": 3}]) == [(1, None), (2, None), (0, None)], "no place"
+
+
+def test_surfaces_hide_rings_but_those_of_the_photographs_own_links(node: str, tmp_path: Path) -> None:
+    assert choose_rings(node, tmp_path, hidden=[1]) == [(2, None), (0, None)]
+    assert choose_rings(node, tmp_path, hidden=[1, 2]) == [(1, None), (0, None)], "the nearest one is left"
+    arrow = {"from": 0, "to": 2, "mark": [0, 0, 0]}
+    assert choose_rings(node, tmp_path, hidden=[1, 2], links=[arrow]) == [(2, 0), (0, None)], "on its arrow"
+
+
+def test_another_room_has_one_ring(node: str, tmp_path: Path) -> None:
+    assert choose_rings(node, tmp_path, rooms=[[1, 2]]) == [(1, None), (0, None)], "the nearest one"
+    assert choose_rings(node, tmp_path, rooms=[[0, 1, 2]]) == [(1, None), (2, None), (0, None)], "its own one has all"
+    linked = choose_rings(node, tmp_path, rooms=[[1, 2]], links=[{"from": 0, "to": 2}])
+    assert linked == [(2, None), (0, None)], "that of a link comes before"
+
+
+def test_arrivals_follow_the_table_of_the_panorama_and_come_away_from_the_link_back(node: str, tmp_path: Path) -> None:
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+    header |= {"links": [{"from": 3, "to": 2, "leave": [0, 0, 0], "yaw": 1.0}], "plan": {"worlds": [0, 0, 0, 1]}}
+    outlook = np.full(24, 3.0)
+    outlook[11:14] = 1.0
+    outlook[4] = 9.0
+    for spot, start in zip(header["spots"], (None, (0.4, 0.3), None, None), strict=True):
+        is_turned, ahead = find_turned(outlook, start)
+        spot |= {"turned": sum(1 << k for k in np.flatnonzero(is_turned).tolist()), "ahead": ahead}
+    yaws = np.linspace(-7, 7, 61)
+    found = run(
+        node,
+        tmp_path,
+        header,
+        "(yaws) => [0, 1].map((node) => yaws.map((yaw) => Object.values(chooseArrival(node, { yaw, pitch: 0.2 }))))",
+        yaws.tolist(),
+    )
+    for row, start in zip(found, (None, (0.4, 0.3)), strict=True):
+        wrapped = [choose_arrival(outlook, math.remainder(yaw, 2 * math.pi), 0.2, start) for yaw in yaws]
+        expected = [(yaw if end[1] == 0.2 else end[0], end[1]) for yaw, end in zip(yaws, wrapped, strict=True)]
+        np.testing.assert_allclose(row, expected)
+        assert len({end[1] for end in row}) == (2 if start is None else 1)
+    arrive = (
+        "(from) => [chooseArrival(3, { yaw: 0.5, pitch: 0.2 }, from), chooseArrival(0, { yaw: 2, pitch: 0.2 }, from)]"
+    )
+    away, kept = run(node, tmp_path, header, arrive, 2)
+    assert (away, kept) == ({"yaw": pytest.approx(1 + math.pi), "pitch": 0}, {"yaw": 2, "pitch": 0.2})
+    unknown, _ = run(node, tmp_path, header, arrive, 1)
+    assert unknown == {"yaw": pytest.approx(find_turned(outlook)[1][0]), "pitch": 0}, "of another world, without a link"
+
+
+def test_names_of_a_plan_cover_neither_dots_nor_each_other(node: str, tmp_path: Path) -> None:
+    random = np.random.default_rng(3)
+    dots = random.uniform(20, 280, (9, 2))
+    names = [{"x": x, "y": y, "width": 60, "height": 13} for x, y in [*dots, *dots[:4], (-5, 150), (299, 150)]]
+    places = run(
+        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names, dots.tolist(), 300
+    )
+    boxes = [(x - 30, y - 6.5, x + 30, y + 6.5) for x, y in filter(None, places)]
+    assert len(boxes) > 9 and all(box[0] >= 0 and box[2] <= 300 and box[1] >= 0 and box[3] <= 300 for box in boxes)
+    for number, (left, top, right, bottom) in enumerate(boxes):
+        assert not any(left - 5 < x < right + 5 and top - 5 < y < bottom + 5 for x, y in dots)
+        others = boxes[:number]
+        assert not any(left < box[2] and right > box[0] and top < box[3] and bottom > box[1] for box in others)
+    crowd = [[x, y] for x in range(0, 300, 10) for y in range(0, 300, 10)]
+    assert run(
+        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names[:1], crowd, 300
+    ) == [None]
 
 
 def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp_path: Path) -> None:
@@ -198,6 +285,29 @@ def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp
     steps = np.diff(places[:, 0])
     assert (places[:, 1:] == 0).all() and 1.9 < places[-1, 0] <= 2 and (steps >= 0).all()
     assert steps[0] == pytest.approx(0.05) and steps[-1] < 0.005
+
+
+def test_a_camera_stops_half_a_metre_along_a_poor_edge_but_a_script_may_place_it_there(
+    node: str, tmp_path: Path
+) -> None:
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"poor": [(0, 1)]}
+    walked = f"""(position) => {{
+        {SORTED}
+        camera.position = cameraFor({{ position }}).position;
+        const first = [...camera.position];
+        const walkedTo = [1, -1].map((forward) => {{
+            for (let k = 0; k < 90; k++) walk(0.005, 0, 0.05 * forward);
+            return [...camera.position];
+        }});
+        return [first, ...walkedTo];
+    }}"""
+    _, ahead, back = run(node, tmp_path, header, walked, [0, 0, 0])
+    assert ahead[2] == pytest.approx(0.5) and ahead[0] > 0.2, "it slides along"
+    assert back[2] < -0.5
+    placed, ahead, back = run(node, tmp_path, header, walked, [0, 0, 0.9])
+    assert placed[2] == 0.9 and ahead[2] == pytest.approx(0.9) and back[2] < 0, "it can go back"
+    _, ahead, back = run(node, tmp_path, header, walked, [0, 0, 2])
+    assert ahead[2] > 4 and back[2] == pytest.approx(1.5), "the other edge can be walked"
 
 
 def test_nothing_walks_before_the_gaussians_are_sorted_or_in_the_dolls_house(node: str, tmp_path: Path) -> None:

@@ -1,12 +1,14 @@
 """The files of a page, without a browser."""
 
 import dataclasses
+import gzip
 import json
 import math
 import os
 import re
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes, urljoin, urlsplit
@@ -31,6 +33,7 @@ from pansplat.tours import doll_house, edges
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.floor import find_camera_height
 from pansplat.tours.graph import make_graph, select_views
+from pansplat.tours.outlook import find_bin, measure_outlook
 from pansplat.tours.plan import make_plan
 
 
@@ -110,8 +113,24 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
     write_page(scene, tmp_path / "floor.html")
     write_page(dataclasses.replace(scene, gaussians=above), tmp_path / "none.html")
     headers = [read_header(tmp_path / f"{name}.html") for name in ("floor", "none")]
-    assert headers[0]["doll"] and headers[1]["doll"] is None and headers[1]["plan"]["rooms"] == []
+    assert headers[0]["doll"] and headers[1]["doll"] is None
+    assert not any(room["hasWalls"] for room in headers[1]["plan"]["rooms"])
     assert headers[1]["plan"]["worlds"] == [0, 0, 0]
+
+
+def test_every_panorama_stands_in_an_outline_of_its_storey(flat: Scene) -> None:
+    tour = make_graph(flat)
+    floors = page_module._outline_floors(flat, tour, ())
+    assert [room.panoramas for room in floors] == [(0,), (1,), (2,), (3,)]
+    places = tour.positions @ tour.level_axes[:, (0, 2)]
+    assert all(shapely.Polygon(room.outline).contains(shapely.Point(places[room.panoramas[0]])) for room in floors)
+    around = dataclasses.replace(floors[0], outline=shapely.Point(places[0]).buffer(60).exterior.coords[:])
+    assert page_module._outline_floors(flat, tour, [around]) == [], "all stand in it"
+    above = dataclasses.replace(around, storey=around.storey + 1)
+    assert len(page_module._outline_floors(flat, tour, [above])) == 4
+    hidden = flat.gaussians.select(flat.gaussians.means[:, 1] < -2)  # no floor
+    (circle, *_) = page_module._outline_floors(dataclasses.replace(flat, gaussians=hidden), tour, ())
+    assert shapely.Polygon(circle.outline).area == pytest.approx(math.pi * 1.5**2, rel=0.1)
 
 
 def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Path) -> None:
@@ -170,7 +189,9 @@ def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: 
     assert distances[0, 0] < 1e-3 and distances[-1, 0] < 1e-3, "it ends where it begins"
     assert np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1).max() < 1.05 / header["routeRate"], "1 m/s"
     assert header["start"]["position"] == pytest.approx(route[0, :3], abs=1e-3)
-    assert header["start"]["yaw"] == pytest.approx(header["spots"][0]["ahead"], abs=1e-3), "not along the first flight"
+    assert header["start"]["yaw"] == pytest.approx(header["spots"][0]["ahead"][0], abs=1e-3), (
+        "not along the first flight"
+    )
 
 
 def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scene, tmp_path: Path) -> None:
@@ -185,13 +206,16 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     start, spots, level = header["start"], header["spots"], np.array(header["level"])
     assert start["position"] == pytest.approx(spots[0]["position"], abs=1e-5)
     assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
-    assert spots[3]["start"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and "start" not in spots[1]
+    assert spots[3]["ahead"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and spots[3]["turned"] == 2**24 - 1
+    assert spots[1]["turned"] < 2**24 - 1 and spots[1]["ahead"][1] == 0
     to, back = header["links"]
     assert (to["from"], to["to"], to["text"]) == (0, 2, "<i>down") and (back["from"], back["to"]) == (2, 0)
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4)
     right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
     assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
-    assert right == pytest.approx(min(max(down / np.tan(0.6), 1), 3), abs=1e-5) and ahead == pytest.approx(0, abs=1e-5)
+    wall = measure_outlook(flat, 0, level)[find_bin(0.5 * math.pi)]
+    expected = min(max(down / np.tan(0.6), 1), 3, 0.8 * wall)
+    assert right == pytest.approx(expected, rel=0.01) and ahead == pytest.approx(0, abs=1e-5)
     assert level.T @ np.subtract(to["leave"], spots[0]["position"]) == pytest.approx((0.7, 0, 0), abs=1e-5)
     assert header["limits"] == pytest.approx([2.0, 1.0, 1.0]), "the part with two views, and single views"
     route, jumps = np.array(header["route"]), header["jumps"]
@@ -228,6 +252,23 @@ def test_panoramas_of_all_parts_keep_as_many_gaussians(flat: Scene) -> None:
     counts = np.bincount(merged.gaussians.views.numpy())
     assert counts[0] + counts[1] == 400 and counts[2] == counts[3] == 200
     assert torch.equal(merged.cam2world, flat.cam2world)
+
+
+def test_gaussians_leave_bytes_to_photographs_that_need_them_more_where_no_camera_flies() -> None:
+    edges = ((0, 1, 0), (2, 3, 1), (4, 4, 2))
+    flights = page_module._Flights(torch.eye(4), np.eye(3), 0.0, 0.0, (0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), edges)
+    share = partial(page_module._share_gaussians, flights, [(2, 3)], 450_000)
+    assert set(share([1024] * 5).values()) == set(share([]).values()) == {1.0}, "all fit, and a folder has all"
+    shares = share([4096] * 5)
+    assert 0 < shares[1] == shares[2] < shares[0] < 1
+    alone = dataclasses.replace(flights, edges=(), parts=(0,) * 5)
+    assert page_module._share_gaussians(alone, (), 450_000, [4096] * 5) == {0: shares[0]}, "of a pair"
+
+
+def test_parts_keep_their_shares(flat: Scene) -> None:
+    merged = page_module._merge(flat, (0, 0, 1, 2), 800, shares={0: 1.0, 1: 0.25, 2: 0.25})
+    counts = np.bincount(merged.gaussians.views.numpy())
+    assert counts[0] + counts[1] == 400 and counts[2] == counts[3] == 50
 
 
 def test_the_page_loads_nothing_from_elsewhere(scene: Scene, tmp_path: Path) -> None:
@@ -337,10 +378,7 @@ def test_what_is_no_origin_is_refused(scene: Scene, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_parts_of_a_split_page_replace_the_old_ones(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page_module, "_PART_BYTES", 30_000)
+def test_the_parts_of_a_split_page_replace_the_old_ones(scene: Scene, tmp_path: Path) -> None:
     other = tmp_path / "tour_files" / "other.js"
     first = write_page(scene, tmp_path / "tour.html", split=True)
     other.write_text("")
@@ -352,6 +390,8 @@ def test_the_parts_of_a_split_page_replace_the_old_ones(
     header = read_header(tmp_path / "tour.html")
     assert header["folder"] == "tour_files" and "<script src" not in text, "they are loaded when they are needed"
     assert [name for view in header["views"] for name in view["files"]] == [file.name for file in second.files[1:]]
+    assert {file.suffix for file in second.files[1:]} == {".bin"} and "connect-src 'self'" in text
+    assert sum(len(gzip.decompress(file.read_bytes())) for file in second.files[1:]) % header["count"] == 0
 
 
 @pytest.mark.parametrize("is_shared", [False, True])
@@ -360,7 +400,7 @@ def test_a_page_in_one_file_removes_the_parts_of_the_split_one_before(
 ) -> None:
     """`is_shared`: a user's file is beside the parts."""
     write_page(scene, tmp_path / "tour.html", split=True)
-    other = tmp_path / "tour_files" / "0123456789abcdef.js"
+    other = tmp_path / "tour_files" / "0123456789abcdef.bin"
     if is_shared:
         other.write_text("mine")
     write_page(scene, tmp_path / "tour.html")

@@ -57,7 +57,7 @@ def test_the_page_and_its_parts_are_served_and_nothing_else(server: PageServer, 
         assert get(server, path) == (200, "text/html; charset=utf-8", page)
     part, *_ = (tmp_path / "our home_files").iterdir()
     status, kind, content = get(server, f"/our%20home_files/{part.name}")
-    assert (status, kind, content) == (200, "text/javascript; charset=utf-8", part.read_bytes())
+    assert (status, kind, content) == (200, "application/octet-stream", part.read_bytes())
     assert b'"our%20home_files"' in page and f'"{part.name}"'.encode() in page
     wrong = ("secret.html", "our%20home_files/", "../secret.html", "our%20home_files/../secret.html", "/etc/passwd")
     for path in map("/{}".format, wrong):

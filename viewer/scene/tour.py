@@ -18,6 +18,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours.floor import FloorOutline, choose_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
 from pansplat.tours.links import find_link_ring, link_parts
+from pansplat.tours.outlook import BINS
 from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.life import SceneLife
@@ -303,8 +304,9 @@ class TourScenes:
         return plan_route(self.tour, walk, camera)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
-        """A route from a pose to a panorama; it does not end with the face to a wall."""
-        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, self._outlooks.get(node))
+        """A route from a pose to a panorama, which ends as `choose_arrival` states."""
+        outlook = self._outlooks.get(node, np.zeros(BINS))
+        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, outlook)
 
     def _find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
         return self.tour.find_way(position, node, self._find_part(position))
@@ -438,23 +440,21 @@ class Hotspot:
 
 
 def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> list[Hotspot]:
-    """The panoramas that can be reached next, and that are in the image; the nearest last.
-
-    They share an edge with those near the camera, or a link leads to them from there, to another part.
-    """
+    """The panoramas that the nearest one leads to, by its edges and its own links, and that are in the image; the
+    nearest last."""
     tour, position = scenes.tour, np.asarray(camera.position)
+    here = scenes.find_nearest(position)
     below = scenes.camera_height * np.asarray(camera.level)[:, 1]
     feet = {
         node: (tour.positions[node] + below, tour.panoramas[node].label)
-        for node in tour.list_reachable(scenes.edge)
+        for node in (here, *tour.neighbours(here))
         if np.linalg.norm(tour.positions[node] - position) >= 3 * _HOTSPOT_RADIUS
     }
-    for start in sorted(set(scenes.edge), key=lambda node: float(np.linalg.norm(tour.positions[node] - position))):
-        for (first, node), link in tour.links.items():
-            if first == start and tour.is_fade(first, node) and node not in feet:
-                ring = find_link_ring(tour, first, node, scenes.camera_height)
-                if ring is not None:
-                    feet[node] = (tour.positions[first] + ring, link.text or tour.panoramas[node].label)
+    for (start, node), link in tour.links.items():
+        if start == here and tour.is_fade(start, node) and node not in feet:
+            ring = find_link_ring(tour, start, node, scenes.camera_height)
+            if ring is not None:
+                feet[node] = (tour.positions[start] + ring, link.text or tour.panoramas[node].label)
     found = []
     for node, (foot, label) in feet.items():
         hotspot = make_hotspot(camera, size, node, label, foot, is_fade=tour.is_fade(scenes.edge[0], node))

@@ -257,6 +257,9 @@ def _move_camera(state: ViewerState, events: Input) -> None:
     if any(events.pan):
         metres = camera.distance / max(events.height, 1)
         camera = cameras.fly(camera, -events.pan[0] * metres, events.pan[1] * metres, 0.0)
+    if state.tour is not None and not state.orbiting and camera.position != state.camera.position:
+        ends = (np.array(each.position) for each in (state.camera, camera))
+        camera = replace(camera, position=tuple(state.tour.limit_step(*ends).tolist()))
     if camera != state.camera:
         # Moving the camera stops the flight; a change of the field of view alone does not.
         moved = replace(camera, vertical_fov_degrees=state.camera.vertical_fov_degrees) != state.camera
