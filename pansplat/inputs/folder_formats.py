@@ -1,8 +1,6 @@
 """Folders of posed panoramas by format: poses.json, data sets, and sequences of frames (docs/input.md).
 
-Each format has a function that recognises a folder and one that reads it into a `Collection`. The argument `convention`
-of the readers, one of `CONVENTIONS`, overrides that of the format. Readers raise an InputError for missing or invalid
-files; the message names the file and the entry.
+`pansplat.inputs.formats` describes the functions that find and read them.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ import difflib
 import os
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +25,6 @@ from pansplat.inputs.pairs import (
     FAR,
     FAR_SEQUENCE,
     MAX_CONTEXT,
-    MAX_NAMES,
     NEAR,
     Collection,
     Panorama,
@@ -37,13 +34,13 @@ from pansplat.inputs.pairs import (
     list_panorama_files,
     too_many_panoramas,
 )
-from pansplat.inputs.photographs import list_further_photographs
+from pansplat.inputs.photographs import list_further, with_further
 from pansplat.inputs.placements import Placement, is_by_hand, judge, read_rejected, read_ties
 from pansplat.inputs.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import find_inside, locate_inside
-from pansplat.inputs.web_tours import find_web_tour, read_web_tour
+from pansplat.inputs.web_tours import find_web_tours, read_web_tour
 from pansplat.inputs.web_tours.entries import plain_text
-from pansplat.system.descriptions import describe_count, list_first
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import read_file
 from pansplat.system.strict_json import read_field, read_json
 
@@ -59,12 +56,11 @@ CAMERA_POSES = "camera_pose.json"  # of 360Loc
 # poses.json with an optional pairs.json: the package's own format.
 
 
-def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collection:
+def read_pose_file(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder.
 
     Warns about other panoramas of the folder, and of the folders of those in poses.json, which have no pose.
     """
-    source = folder / POSES
     content = read_json(source)
     entries = content.get("poses") if isinstance(content, dict) else None
     if not isinstance(entries, dict):
@@ -84,7 +80,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     folders = tuple(dict.fromkeys((folder, *(view.image.parent for view in panoramas))))
     reasons, known = _read_reasons(content), {view.image for view in panoramas}
     rest = [view for view in dict.fromkeys(tour.values()) if view.image not in known]
-    further = rest if tour else _list_further(source, folders, panoramas, reasons)
+    further = rest if tour else list_further(source, folders, panoramas, reasons)
     unposed = [_explain_unposed(view, reasons, source) for view in further]
     ranges = _read_ranges(content, source)
     near, far = (
@@ -99,6 +95,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     is_single = count == 1 and (len(panoramas) > 1 or not unposed)
     return Collection(
         source,
+        folder,
         panoramas,
         groups,
         near=near,
@@ -115,9 +112,8 @@ def _read_tour_of_folder(folder: Path) -> dict[str, Panorama]:
 
     Empty without a tour, and for a faulty one, with a warning. The names are those of scenes, and files' paths.
     """
-    source = find_web_tour(folder)
     try:
-        views = [] if source is None else read_web_tour(source)
+        views = [view for source in find_web_tours(folder) for view in read_web_tour(source, folder).unposed]
     except InputError as error:
         warnings.warn(f"the web tour is left out: {error}", category=InputWarning, stacklevel=4)
         return {}
@@ -180,29 +176,6 @@ def _read_ranges(content: dict[str, Any], source: Path) -> dict[int, tuple[float
         if near is not None and far is not None:
             ranges[number] = near, far
     return ranges
-
-
-def with_further(sequence: Collection) -> Collection:
-    """A sequence or reconstruction with the panoramas beside its frames that have no pose."""
-    folders = tuple(dict.fromkeys(view.image.parent for view in sequence.panoramas))
-    unposed = tuple(_list_further(sequence.source, folders, sequence.panoramas))
-    return dataclasses.replace(sequence, unposed=unposed, folders=folders)
-
-
-def _list_further(
-    source: Path, folders: Sequence[Path], panoramas: Sequence[Panorama], stated: Iterable[str] = ()
-) -> list[Panorama]:
-    """The panoramas of folders that have no pose, with a warning that names them."""
-    files = [file for view in panoramas for file in (view.image, view.mask, view.depth) if file is not None]
-    unposed = list_further_photographs(folders, files, [view.name for view in panoramas], set(stated))
-    if unposed:
-        warnings.warn(
-            f"{source} has no pose of {list_first([view.file_label for view in unposed], MAX_NAMES)}; "
-            "each is a scene of its own.",
-            category=InputWarning,
-            stacklevel=5,
-        )
-    return unposed
 
 
 def _read_pose_entry(
@@ -328,26 +301,28 @@ def _find_name(name: str, names: dict[str, int], where: str) -> int:
 # (uint16, millimetres), rot.txt (3x3) and tran.txt (3), camera to world with Habitat's axes (camera and world y up).
 
 
-def is_matterport3d_scene(folder: Path) -> bool:
-    """Whether subfolders have a rot.txt or tran.txt."""
-    return bool(_view_folders(folder))
+def list_panogrf_files(folder: Path) -> list[Path]:
+    """The poses of the views of a scene folder."""
+    folders = [view for view in sorted(folder.iterdir()) if view.is_dir()]
+    return [file for view in folders for name in ("rot.txt", "tran.txt") if (file := view / name).is_file()]
 
 
-def read_matterport3d_scene(folder: Path, convention: str | None = None) -> Collection:
+def find_panogrf(folder: Path) -> list[Path]:
+    """The folder, if it is that of a scene."""
+    return [folder] if list_panogrf_files(folder) else []
+
+
+def read_panogrf_scene(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The views of a scene folder, sorted by name: the first and last are the context, those between are targets.
 
     The world is rotated to z-up, as in the official code.
     """
     convention = convention or "cam2world opengl"
-    panoramas = tuple(_read_view_folder(view, folder, convention) for view in _view_folders(folder))
+    views = dict.fromkeys(file.parent for file in list_panogrf_files(source))
+    panoramas = tuple(_read_view_folder(view, folder, convention) for view in views)
     last = len(panoramas) - 1
     groups = (((0, last), tuple(range(1, last))),) if last > 0 else None
-    return Collection(folder, panoramas, groups, name=folder.resolve().name)
-
-
-def _view_folders(folder: Path) -> list[Path]:
-    names = ("rot.txt", "tran.txt")
-    return [v for v in sorted(folder.iterdir()) if v.is_dir() and any((v / name).is_file() for name in names)]
+    return Collection(source, folder, panoramas, groups, name=folder.resolve().name)
 
 
 def _read_view_folder(view: Path, folder: Path, convention: str) -> Panorama:
@@ -380,12 +355,12 @@ def _read_numbers(path: Path, count: int) -> Float[Tensor, "count"]:
 # radial, millimetres).
 
 
-def triplet_files(folder: Path) -> list[Path]:
+def find_triplets(folder: Path) -> list[Path]:
     """The NAME.json files of a folder that have a NAME_0.png."""
     return [path for path in sorted(folder.glob("*.json")) if path.with_name(f"{path.stem}_0.png").is_file()]
 
 
-def read_triplet(source: Path, convention: str | None = None) -> Collection:
+def read_triplet(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The views of a NAME.json, which has `c2w`, a list of cam2world matrices with OpenCV axes.
 
     The first and last view are the context, those between are targets.
@@ -401,32 +376,24 @@ def read_triplet(source: Path, convention: str | None = None) -> Collection:
             raise InputError(f"{source}: needed the image {image.name} for pose {i}, got no such file; add it.")
         depth = source.with_name(f"{source.stem}_{i}_depth.png")
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, pose {i}"), convention or "cam2world opencv")
-        mask = find_mask(image, source.parent)
+        mask = find_mask(image, folder)
         panoramas.append(Panorama(image.stem, image, cam2world, mask, depth if depth.is_file() else None))
     last = len(panoramas) - 1
-    return Collection(source, tuple(panoramas), (((0, last), tuple(range(1, last))),), name=source.stem)
+    return Collection(source, folder, tuple(panoramas), (((0, last), tuple(range(1, last))),), name=source.stem)
 
 
 # Sequences of frames: a 360Loc camera_pose.json (docs/official.md, section 2.2), or a KITTI or TUM trajectory.
 
 
-def is_loc360_sequence(folder: Path) -> bool:
-    """Whether the folder has a camera_pose.json."""
-    return (folder / CAMERA_POSES).is_file()
-
-
-def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collection:
+def read_loc360_sequence(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The frames of a 360Loc sequence in the order of camera_pose.json ({frame: 4x4 matrix}); images are in image/.
 
     The matrices are cam2world with OpenCV axes, as the official code reads them.
     """
-    source = folder / CAMERA_POSES
     convention = convention or "cam2world opencv"
-    content = read_json(source)
-    if not isinstance(content, dict):
-        raise InputError(
-            f"{source}: needed {{frame: 4x4 matrix, ...}}, got {type(content).__name__}; see docs/input.md."
-        )
+    content = read_json(source, dict[str, Any])
+    if not content:
+        raise InputError(f"{source}: needed {{frame: 4x4 matrix, ...}}, got none; add the poses or remove the file.")
     panoramas = []
     for frame, matrix in content.items():
         inside = locate_inside(folder, frame, f"{source}, {frame!r}").relative_to(folder)
@@ -434,12 +401,12 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
         image = next((place for place in places if place.is_file()), places[0])
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, {frame!r}"), convention)
         panoramas.append(Panorama(image.stem, image, cam2world, find_mask(image, folder)))
-    return Collection(source, tuple(panoramas), ordered=True, far=FAR_SEQUENCE)
+    return with_further(Collection(source, folder, tuple(panoramas), ordered=True, far=FAR_SEQUENCE))
 
 
-def find_trajectory(folder: Path) -> Path | None:
-    """The trajectory file of a folder (*.kitti, *.tum, poses.txt, *trajectory*.txt); an error if there are several."""
-    found = [
+def find_trajectories(folder: Path) -> list[Path]:
+    """The trajectory files of a folder: *.kitti, *.tum, poses.txt, *trajectory*.txt."""
+    return [
         path
         for path in sorted(folder.iterdir())
         if path.is_file()
@@ -448,21 +415,26 @@ def find_trajectory(folder: Path) -> Path | None:
             or (path.suffix.lower() == ".txt" and ("trajectory" in path.stem.lower() or path.stem.lower() == "poses"))
         )
     ]
-    if len(found) > 1:
+
+
+def choose_trajectory(folder: Path) -> Path:
+    """The only trajectory file of a folder."""
+    found = find_trajectories(folder)
+    if len(found) != 1:
+        advice = "keep the right one" if found else "add it"
         raise InputError(
-            f"{folder}: needed one trajectory file, got {', '.join(path.name for path in found)}; keep the right one."
+            f"{folder}: needed one trajectory file (*.kitti, *.tum, poses.txt, frame_trajectory.txt), got "
+            f"{', '.join(path.name for path in found) or 'none'}; {advice}."
         )
-    return found[0] if found else None
+    return found[0]
 
 
-def read_trajectory_folder(folder: Path, convention: str | None = None) -> Collection:
+def read_trajectory_folder(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The images of a folder, sorted by name, with the poses of its trajectory file: image i has line i.
 
     The number in scale.txt, if there is one, converts the translations to metres.
     """
-    source = find_trajectory(folder)
-    if source is None:
-        raise InputError(f"{folder}: needed a trajectory (*.kitti, *.tum, poses.txt), got none; add it.")
+    source = choose_trajectory(folder)
     expected = source.suffix.lower().lstrip(".")
     if expected == "txt":
         expected = next((kind for kind in ("kitti", "tum") if kind in source.stem.lower()), None)
@@ -481,4 +453,4 @@ def read_trajectory_folder(folder: Path, convention: str | None = None) -> Colle
         Panorama(image.stem, image, pose, find_mask(image, folder))
         for image, pose in zip(images, trajectory.poses, strict=True)
     )
-    return Collection(source, panoramas, ordered=True, far=FAR_SEQUENCE)
+    return Collection(source, folder, panoramas, ordered=True, far=FAR_SEQUENCE)

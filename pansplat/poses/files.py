@@ -271,7 +271,8 @@ def _make_pairs(
             for name, pose in world["poses"].items()
         )
         only = folder.resolve().name if len(placed) == 2 else None
-        pairs += Collection(source, placed, near=world["near"], far=world["far"], name=only).pairs(folder, near, far)
+        found = Collection(source, folder, placed, near=world["near"], far=world["far"], name=only)
+        pairs += found.pairs(near, far)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
     single = [
         replace(panorama, placement=Placement("not placed", unplaced[panorama.name], source))

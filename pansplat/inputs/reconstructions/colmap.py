@@ -45,14 +45,19 @@ _Camera = tuple[str, int, int, list[float]]  # model, width, height, parameters
 _Image = tuple[list[float], list[float], int, str]  # quaternion, translation, camera, name
 
 
-def find_colmap(folder: Path) -> Path | None:
-    """The images file of the model in a folder; None if there is none. A model needs its cameras file, too."""
+def list_files(source: Path) -> list[Path]:
+    """The files of a model, from its images file."""
+    return [source.with_stem(name) for name in ("images", "cameras", "points3D")]
+
+
+def find_colmap(folder: Path) -> list[Path]:
+    """The images file of the model in a folder, if there is one. A model needs its cameras file, too."""
     for sub in MODEL_FOLDERS:
         for suffix in (".bin", ".txt"):
-            files = [folder / sub / (name + suffix) for name in ("images", "cameras")]
-            if all(file.is_file() for file in files):
-                return files[0]
-    return None
+            images, cameras, _ = list_files(folder / sub / f"images{suffix}")
+            if images.is_file() and cameras.is_file():
+                return [images]
+    return []
 
 
 def read_colmap(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:

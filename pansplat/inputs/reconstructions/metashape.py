@@ -28,23 +28,24 @@ _MAX_BYTES = 1 << 28  # of a file
 _HEAD = 4096  # bytes that show what a file is
 
 
-def find_metashape(folder: Path) -> Path | None:
-    """The first .xml file of a folder that is an export of cameras; None if there is none."""
+def find_metashape(folder: Path) -> list[Path]:
+    """The first .xml file of a folder that is an export of cameras, if there is one."""
     for path in sorted(folder.glob("*.xml")):
         if not path.is_file():
             continue
         with open(path, "rb") as file:
             head = file.read(_HEAD)
         if b"<document" in head and b"<chunk" in head:
-            return path
-    return None
+            return [path]
+    return []
 
 
-def read_metashape(source: Path, convention: str | None = None) -> Reconstruction:
+def read_metashape(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:
     """The aligned cameras of spherical sensors; of several components, those of the largest, with a note.
 
     Args:
         source: the file.
+        folder: of the file.
         convention: of the poses; by default "cam2world opencv".
     """
     data = read_file(source, limit=_MAX_BYTES)
@@ -70,7 +71,7 @@ def read_metashape(source: Path, convention: str | None = None) -> Reconstructio
             if camera.get("component_id") != largest:
                 continue
             name = camera.get("label", "")
-            image = find_picture(source.parent, name)
+            image = find_picture(folder, name)
             if image is None:
                 missing.append(name)
                 continue
@@ -95,7 +96,7 @@ def read_metashape(source: Path, convention: str | None = None) -> Reconstructio
             "set the camera type to Spherical and align, or move the file away to estimate poses."
         )
     note_smaller(source, len(sizes) - 1)
-    return Reconstruction(source, source.parent, shots, is_metric=is_metric, missing=missing)
+    return Reconstruction(source, folder, shots, is_metric=is_metric, missing=missing)
 
 
 def _read_chunk_transform(element: ElementTree.Element) -> tuple[np.ndarray, float, bool]:

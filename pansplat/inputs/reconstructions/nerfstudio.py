@@ -54,11 +54,12 @@ _PLY_TYPES = {
 _MAX_PLY = 1 << 30  # bytes
 
 
-def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstruction:
+def read_nerfstudio(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:
     """The frames of a transforms.json.
 
     Args:
         source: the file.
+        folder: of the file.
         convention: of the matrices, such as "cam2world opencv"; by default nerfstudio's.
     """
     content = read_json(source, dict[str, Any])
@@ -70,7 +71,7 @@ def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstructi
     undo = torch.eye(4, dtype=torch.float64)
     if applied is not None:
         undo = invert_pose(rigid_matrix(applied, f"{source}, applied_transform"))
-    folder, shots, missing = source.parent, [], []
+    shots, missing = [], []
     for number, frame in enumerate(frames):
         where = f"{source}, frame {number}"
         name = read_field(frame, "file_path", str, where, "")

@@ -28,11 +28,12 @@ _Items = list[dict[str, Any]]
 _FIRST = 1 << 31  # flag of a type's number where its name is stated
 
 
-def read_openmvg(source: Path, convention: str | None = None) -> Reconstruction:
+def read_openmvg(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:
     """The spherical views of a sfm_data.json that have a pose.
 
     Args:
         source: the file.
+        folder: of the file.
         convention: of the poses; by default "world2cam opencv".
     """
     content = read_json(source, dict[str, Any])
@@ -46,7 +47,7 @@ def read_openmvg(source: Path, convention: str | None = None) -> Reconstruction:
         for view in posed:
             name = "/".join(part for part in (view.get("local_path"), view["filename"]) if part)
             where = f"{source}, {name!r}"
-            image = find_inside(source.parent, f"{root}/{name}" if root else name) or find_picture(source.parent, name)
+            image = find_inside(folder, f"{root}/{name}" if root else name) or find_picture(folder, name)
             if image is None:
                 missing.append(f"{root}/{name}" if root else name)
                 continue
@@ -69,7 +70,7 @@ def read_openmvg(source: Path, convention: str | None = None) -> Reconstruction:
             f"{describe_count(len(poses), 'pose')} and {describe_count(len(spherical), 'spherical camera')}; "
             "reconstruct with --camera_model 7, or move the file away to estimate poses."
         )
-    return Reconstruction(source, source.parent, shots, table, missing=missing)
+    return Reconstruction(source, folder, shots, table, missing=missing)
 
 
 def _find_spherical(content: dict[str, Any], source: Path) -> set[int]:

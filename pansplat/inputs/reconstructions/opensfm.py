@@ -25,11 +25,12 @@ FILE = "reconstruction.json"
 _SPHERICAL = ("spherical", "equirectangular")
 
 
-def read_opensfm(source: Path, convention: str | None = None) -> Reconstruction:
+def read_opensfm(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:
     """The spherical shots of a reconstruction.json; of several reconstructions, those of the largest, with a note.
 
     Args:
         source: the file.
+        folder: of the file.
         convention: of the poses; by default "world2cam opencv".
     """
     content = read_json(source)
@@ -41,7 +42,7 @@ def read_opensfm(source: Path, convention: str | None = None) -> Reconstruction:
         shots, missing = [], []
         for name, shot in chosen.items():
             where = f"{source}, {name!r}"
-            image = find_picture(source.parent, name)
+            image = find_picture(folder, name)
             if image is None:
                 missing.append(name)
                 continue
@@ -68,4 +69,4 @@ def read_opensfm(source: Path, convention: str | None = None) -> Reconstruction:
             '"projection_type": "equirectangular" and reconstruct again, or move the file away to estimate poses.'
         )
     note_smaller(source, others)
-    return Reconstruction(source, source.parent, shots, table, is_metric, missing)
+    return Reconstruction(source, folder, shots, table, is_metric, missing)

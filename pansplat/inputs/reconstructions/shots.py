@@ -159,6 +159,7 @@ def make_collection(found: Reconstruction) -> Collection:
     near, far = _find_range(centres, found.points * scale, found.is_metric or scale_file is not None)
     return Collection(
         found.source,
+        found.folder,
         tuple(panoramas),
         near=near,
         far=far,

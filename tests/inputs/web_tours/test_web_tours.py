@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pansplat.errors import InputError
-from pansplat.inputs.web_tours import read_web_tour
+from pansplat.inputs.folders import load_panoramas
 
 _VALUES = (
     10**400,
@@ -92,7 +92,7 @@ def test_any_value_is_read_or_refused_with_a_message(folder: Path, name: str, va
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            panoramas = read_web_tour(folder / name)
+            panoramas = load_panoramas(folder / name)
         except InputError as error:
             assert str(folder / name) in str(error)
         else:
@@ -113,6 +113,6 @@ def test_damaged_text_is_read_or_refused_with_a_message(folder: Path, name: str,
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            assert read_web_tour(folder / name)
+            assert load_panoramas(folder / name)
         except InputError as error:
             assert str(folder / name) in str(error)
