@@ -42,7 +42,8 @@ def _write(path: Path, content: Any) -> None:
 
 def state_poses(folder: Path, names: Names) -> None:
     poses = {name: move(n) for n, name in enumerate(names)}
-    _write(folder / "poses.json", {"convention": "cam2world opencv", "poses": poses})
+    world = {"near": 0.4, "far": 9.0, "unit": 1.5}
+    _write(folder / "poses.json", {"convention": "cam2world opencv", "poses": poses, "worlds": [world]})
 
 
 def _state_equal_names(folder: Path, names: Names) -> None:
@@ -162,7 +163,17 @@ def state_marzipano(folder: Path, names: Names) -> None:
             for seed, face in enumerate("frblud"):
                 write_picture(folder / "tiles" / key / "0" / face / "0" / "0.jpg", seed, (8, 8))
             (folder / name).unlink()
-    scenes = [{"id": key, "name": "Hall", "levels": [{"tileSize": 8, "size": 8}]} for key in keys]
+    scenes = [
+        {
+            "id": key,
+            "name": "Hall",
+            "levels": [{"tileSize": 8, "size": 8}],
+            "initialViewParameters": {"yaw": 0, "pitch": 0},
+            "linkHotspots": [{"yaw": 0, "pitch": 1, "target": keys[0]}],
+            "infoHotspots": [{"yaw": 0, "title": ""}],
+        }
+        for key in keys
+    ]
     _write(folder / "data.js", f"var APP_DATA = {json.dumps({'scenes': scenes})};")
     _write(folder / "index.html", "<!DOCTYPE html><script src='data.js'></script>")
 
@@ -184,6 +195,20 @@ def _state_posed_archive(folder: Path, names: Names) -> None:
 
 def _state_pannellum(folder: Path, names: Names) -> None:
     _write(folder / "tour.json", {"scenes": {Path(name).stem: {"panorama": name} for name in names}})
+
+
+def _state_tiles(folder: Path, names: Names) -> None:
+    scenes: dict[str, object] = {}
+    for name in names:
+        key = Path(name).stem
+        if (folder / name).is_file():
+            for seed, face in enumerate("frblud"):
+                write_picture(folder / key / "1" / f"{face}0_0.jpg", seed, (8, 8))
+            (folder / name).unlink()
+        scenes[key] = {"type": "cubemap", "cubeMap": [f"{key}/1/{face}0_0.jpg" for face in "frblud"]}
+    tiles = {"basePath": "b", "path": "/%l/%s%y_%x", "tileResolution": 8, "maxLevel": 1, "cubeResolution": 8}
+    scenes["b"] = {"type": "multires", "multiRes": tiles, "yaw": 3, "haov": 360, "title": "B", "hotSpots": [{"yaw": 1}]}
+    _write(folder / "tour.json", {"default": {"firstScene": "b", "basePath": "."}, "scenes": scenes})
 
 
 def _state_faces(folder: Path, names: Names) -> None:
@@ -231,6 +256,7 @@ EXAMPLES = {
     "COLMAP cameras": Example("COLMAP", _state_colmap_binary, "cameras.bin"),
     "Metashape": Example("Metashape", state_metashape, "cameras.xml"),
     "Pannellum": Example("web tour", _state_pannellum, "tour.json"),
+    "Pannellum tiles": Example("web tour", _state_tiles, "tour.json", is_joined=True),
     "Marzipano": Example("web tour", state_marzipano, "data.js", is_joined=True),
     "archive": Example("web tour", state_archive, "app-files/data.js", is_joined=True),
     "page": Example("web tour", state_archive, "app-files/data.js", "index.html", is_joined=True),

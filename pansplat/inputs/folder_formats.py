@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from msgspec import Meta
@@ -36,7 +35,14 @@ from pansplat.inputs.pairs import (
 )
 from pansplat.inputs.photographs import list_further, with_further
 from pansplat.inputs.placements import Placement, is_by_hand, judge, read_rejected, read_ties
-from pansplat.inputs.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
+from pansplat.inputs.poses import (
+    parse_convention,
+    parse_numbers,
+    read_number,
+    read_trajectory,
+    rigid_matrix,
+    to_cam2world,
+)
 from pansplat.inputs.stated_files import find_inside, locate_inside
 from pansplat.inputs.web_tours import find_web_tours, read_web_tour
 from pansplat.inputs.web_tours.entries import plain_text
@@ -342,13 +348,7 @@ def _read_numbers(path: Path, count: int) -> Float[Tensor, "count"]:
     """Exactly `count` numbers from a text file."""
     if not path.is_file():
         raise InputError(f"{path}: needed the pose of the view, got no such file; add it.")
-    try:
-        values = np.array(read_file(path, limit=1 << 20).decode().split(), dtype=np.float64)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: needed {count} numbers, got other text ({error}); correct it.") from error
-    if values.size != count:
-        raise InputError(f"{path}: needed {count} numbers, got {values.size}; correct it.")
-    return torch.from_numpy(values)
+    return parse_numbers(read_file(path, limit=1 << 20).decode(errors="replace"), count, path)
 
 
 # Triplets rendered from game maps: NAME.json with NAME_0.png, NAME_1.png, NAME_2.png and their _depth.png (uint16,
@@ -391,9 +391,9 @@ def read_loc360_sequence(source: Path, folder: Path, convention: str | None = No
     The matrices are cam2world with OpenCV axes, as the official code reads them.
     """
     convention = convention or "cam2world opencv"
-    content = read_json(source, dict[str, Any])
-    if not content:
-        raise InputError(f"{source}: needed {{frame: 4x4 matrix, ...}}, got none; add the poses or remove the file.")
+    content = read_json(source)
+    if not isinstance(content, dict) or not content:
+        raise InputError(f"{source}: needed {{frame: 4x4 matrix, ...}}, got {str(content)[:40]}; see docs/input.md.")
     panoramas = []
     for frame, matrix in content.items():
         inside = locate_inside(folder, frame, f"{source}, {frame!r}").relative_to(folder)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from pansplat.errors import InputError, InputWarning, collect_notes
 from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
 from pansplat.images.image_files import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
-from pansplat.inputs.folder_formats import PAIRS, POSES
+from pansplat.inputs.folder_formats import CAMERA_POSES, PAIRS, POSES
 from pansplat.inputs.formats import FORMATS, PHOTOGRAPHS, POSED, TRIPLETS, WEB_TOURS, Format
 from pansplat.inputs.pairs import Collection, Pair, Panorama, list_names, list_panorama_files, localize_pairs
 from pansplat.inputs.photographs import LINKS, add_links, list_unread_panoramas
@@ -247,7 +247,7 @@ def list_stated_files(folder: Path) -> list[Path]:
     except (OSError, InputError):
         found = []
     links = [place / LINKS for place in _list_link_folders(folder)]
-    return list(dict.fromkeys([folder / POSES, folder / PAIRS, *found, *links]))
+    return list(dict.fromkeys([*(folder / name for name in (POSES, PAIRS, CAMERA_POSES)), *found, *links]))
 
 
 def _list_link_folders(folder: Path) -> list[Path]:

@@ -420,5 +420,7 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
         load_pairs(tmp_path)
     for name in ("cameras", "images"):
         (model / f"{name}.bin").write_bytes(b"\x05\0\0\0\0\0\0\0\1")
-    with pytest.raises(InputError, match=r"sparse.0: needed a complete model of COLMAP, got damaged \.bin files"):
+    with pytest.raises(
+        InputError, match=r"sparse.0.cameras\.bin: needed a complete file of a model of COLMAP, got damaged"
+    ):
         load_pairs(tmp_path)
