@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
-from msgspec import Meta
+from msgspec import Meta, Struct
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
@@ -233,66 +233,64 @@ def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -
     return None
 
 
+class _Group(Struct):
+    context: list[str]
+    target: str | list[str] | None = None
+
+
+class _Groups(Struct):
+    triplets: list[_Group] = []
+    pairs: list[_Group] = []
+
+
 def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
     """Triplets, then pairs of a pairs.json, as indices into `names`.
 
     Images without a pose are left out, and pairs that need them, with a note, if a pair remains.
     """
-    content = read_json(source)
-    if not isinstance(content, dict) or not any(key in content for key in ("pairs", "triplets")):
+    content = read_json(source, _Groups)
+    stated = [
+        *((f"{source}, triplets {number}", group) for number, group in enumerate(content.triplets, start=1)),
+        *((f"{source}, pairs {number}", group) for number, group in enumerate(content.pairs, start=1)),
+    ]
+    if not stated:
         raise InputError(
-            f'{source}: needed {{"pairs": [{{"context": [a, b], "target": [m]}}]}}, got neither "pairs" nor '
-            '"triplets"; see docs/input.md.'
+            f'{source}: needed {{"pairs": [{{"context": [a, b], "target": [m]}}]}}, got none; add one or remove the '
+            "file (docs/input.md)."
         )
     groups, numbers = [], {name: number for number, name in enumerate(names)}
     unposed: dict[str, str] = {}  # image, and the first entry that names it
-    dropped = 0
-    for key in ("triplets", "pairs"):
-        entries = read_field(content, key, list, source, [])
-        for number, entry in enumerate(entries, start=1):
-            where = f"{source}, {key} {number}"
-            context, target = (entry.get("context"), entry.get("target")) if isinstance(entry, dict) else (None, None)
-            context = _as_names(context)
-            if context is None or len(set(context)) < max(2, len(context)):
-                raise InputError(
-                    f'{where}: needed two or more different images as "context", a list of names, '
-                    f"got {str(entry)[:60]}; correct it."
-                )
-            targets = _as_names([target] if isinstance(target, str) else target or [])
-            if targets is None:
-                raise InputError(f'{where}: needed an image or a list of images as "target", got {target}; correct it.')
-            if len(context) > MAX_CONTEXT:
-                raise too_many_panoramas(where, len(context))
-            unposed |= {
-                name: where
-                for name in (*context, *targets)
-                if name not in {**numbers, **unposed} and find_inside(source.parent, name) is not None
-            }
-            first, second = (
-                tuple(_find_name(name, numbers, where) for name in part if name not in unposed)
-                for part in (context, targets)
+    for where, group in stated:
+        context, targets = group.context, [group.target] if isinstance(group.target, str) else group.target or []
+        if len(set(context)) < max(2, len(context)):
+            raise InputError(
+                f'{where}: needed two or more different images as "context", a list of names, got {str(context)[:60]}; '
+                "correct it."
             )
-            if len(first) > 1:
-                groups.append((first, second))
-            else:
-                dropped += 1
+        if len(context) > MAX_CONTEXT:
+            raise too_many_panoramas(where, len(context))
+        unposed |= {
+            name: where
+            for name in (*context, *targets)
+            if name not in {**numbers, **unposed} and find_inside(source.parent, name) is not None
+        }
+        first, second = (
+            tuple(_find_name(name, numbers, where) for name in part if name not in unposed)
+            for part in (context, targets)
+        )
+        if len(first) > 1:
+            groups.append((first, second))
     if unposed and not groups:
         _find_name(*next((name, numbers, where) for name, where in unposed.items()))
     if unposed:
-        pairs = f"; pairs that need them: {dropped} of {dropped + len(groups)}" if dropped else ""
+        dropped = len(stated) - len(groups)
+        pairs = f"; pairs that need them: {dropped} of {len(stated)}" if dropped else ""
         warnings.warn(
             f"left out of {source}, without a pose in {POSES}: {list_names([Path(name) for name in unposed])}{pairs}.",
             category=InputWarning,
             stacklevel=4,
         )
-    if not groups:
-        raise InputError(f"{source}: needed at least one pair, got none; add one or remove the file.")
     return tuple(groups)
-
-
-def _as_names(value: Any) -> list[str] | None:
-    """The value if it is a list of strings, else None."""
-    return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else None
 
 
 def _find_name(name: str, names: dict[str, int], where: str) -> int:

@@ -207,17 +207,14 @@ def test_360loc_sequences_pair_consecutive_frames(tmp_path: Path) -> None:
     pairs = load_pairs(tmp_path)
     assert [_centres(pair) for pair in pairs] == [[0, 1], [1, 2]]
     assert pairs[0].far == 50
-    inverted = load_pairs(tmp_path, convention="world2cam opencv")[0].context[1].cam2world
-    assert torch.allclose(inverted, torch.linalg.inv(torch.tensor(_pose(1), dtype=torch.float64)))
 
 
 @pytest.mark.parametrize("name", ["poses.txt", "frame_trajectory.txt", "a.kitti"])
-def test_trajectory_lines_are_the_scaled_poses_of_the_sorted_images(tmp_path: Path, name: str) -> None:
+def test_trajectory_lines_are_the_poses_of_the_sorted_images(tmp_path: Path, name: str) -> None:
     _sequence(tmp_path)
     lines = [" ".join(map(str, np.array(_pose(i))[:3].ravel())) for i in range(3)]
     (tmp_path / name).write_text("\n".join(lines))
-    (tmp_path / "scale.txt").write_text("2.5\n")
-    assert [_centres(pair) for pair in load_pairs(tmp_path)] == [[0, 2.5], [2.5, 5]]
+    assert [_centres(pair) for pair in load_pairs(tmp_path)] == [[0, 1], [1, 2]]
 
 
 @pytest.mark.parametrize(

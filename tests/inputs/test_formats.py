@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from panorama_formats import (
@@ -35,7 +36,7 @@ from panorama_formats import (
 from pansplat.errors import InputError, collect_notes
 from pansplat.images.image_files import list_pictures
 from pansplat.images.rig_images import Lens, RigImage, RigView, write_rig
-from pansplat.inputs.folders import list_stated_files, load_pairs, load_panoramas
+from pansplat.inputs.folders import list_stated_files, load_collections, load_pairs, load_panoramas
 from pansplat.inputs.formats import FORMATS
 from pansplat.inputs.pairs import Note, Panorama
 from pansplat.inputs.photographs import write_notes
@@ -253,6 +254,35 @@ def test_masks_of_panoramas_are_applied_and_those_of_none_are_refused(room: Path
     write_picture(image.with_name("nobody_mask.png"))
     with pytest.raises(InputError, match=r"nobody_mask\.png: needed the name of a panorama before _mask\.png"):
         read(room)
+
+
+POSED = [name for name, e in EXAMPLES.items() if e.format not in ("web tour", "photographs")]
+
+
+@pytest.mark.parametrize("name", [name for name in POSED if name not in ("PanoGRF", "rigs")])  # whose axes are others
+def test_a_convention_overrides_that_of_the_format(room: Path, name: str) -> None:
+    EXAMPLES[name].state(room, NAMES)
+    first, second = (
+        load_collections(room, convention=f"{direction} opencv")[0].panoramas[1].cam2world
+        for direction in ("cam2world", "world2cam")
+    )
+    assert torch.allclose(first @ second, torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in POSED if EXAMPLES[n].format not in ("poses.json", "360Loc", "PanoGRF", "game maps")]
+)
+def test_a_number_in_scale_txt_is_metres_per_unit(room: Path, name: str) -> None:
+    EXAMPLES[name].state(room, NAMES)
+    places = []
+    for text in ("1", "2.5\n"):
+        (room / "scale.txt").write_text(text)
+        places.append(load_collections(room)[0].panoramas[1].cam2world[:3, 3])
+    assert torch.allclose(places[1], 2.5 * places[0]) and places[0].any()
+    for text in ("0", "-1", "nan", "inf", "x", "", "1" * 400):
+        (room / "scale.txt").write_text(text)
+        with pytest.raises(InputError, match=r"scale\.txt: needed one positive number"):
+            load_collections(room)
 
 
 # Paths that a file states

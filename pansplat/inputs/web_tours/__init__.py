@@ -43,8 +43,6 @@ def read_web_tour(source: Path, folder: Path, convention: str | None = None) -> 
     Args:
         source: data.js of an export of the Marzipano Tool, its index.html, or the configuration of Pannellum in JSON,
             HTML or JavaScript.
-        folder: in which it was found.
-        convention: without a use.
     """
     del convention
     marzipano = find_marzipano(source.parent)
