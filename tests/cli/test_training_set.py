@@ -16,7 +16,7 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
-from pansplat.errors import InputWarning
+from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
 from pansplat.inputs.folders import find_panorama_folders, load_pairs, load_panoramas
 
