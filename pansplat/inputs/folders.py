@@ -10,7 +10,6 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from pansplat.errors import InputError, InputWarning, collect_notes
 from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
@@ -187,9 +186,8 @@ def _read_folder(root: Path, convention: str | None, posed: bool) -> list[Collec
     if not root.exists():
         raise InputError(f"{root}: needed a panorama, or a folder of panoramas, got no such path; check it.")
     collections: list[Collection] = []
-    for found in _search(root, POSED) if posed else ():
-        read = (found.format.read(source, found.folder, convention) for source in found.sources)
-        collections += _link(list(read))
+    for folder, form in _search(root, POSED) if posed else ():
+        collections += _link([form.read(source, folder, convention) for source in form.find(folder)])
     if not collections:
         return _read_unposed(root)
     _note_unread_panoramas(root, collections)
@@ -215,26 +213,18 @@ def _read_unposed(folder: Path) -> list[Collection]:
     return []
 
 
-class _Found(NamedTuple):
-    """The sources of a format in a folder."""
-
-    folder: Path
-    format: Format
-    sources: list[Path]
-
-
-def _search(root: Path, wanted: Sequence[Format]) -> list[_Found]:
+def _search(root: Path, wanted: Sequence[Format]) -> list[tuple[Path, Format]]:
     """What is found at or below a folder; exports of pansplat in subfolders count only if there is nothing else."""
     found = _find(root, wanted, _MAX_DEPTH, exports=False)
     is_export = not found and all(map(is_written, list_panorama_files(root)))
     return _find(root, wanted, _MAX_DEPTH, exports=True) if is_export else found
 
 
-def _find(folder: Path, wanted: Sequence[Format], depth: int, exports: bool) -> list[_Found]:
+def _find(folder: Path, wanted: Sequence[Format], depth: int, exports: bool) -> list[tuple[Path, Format]]:
     """The first format of a folder itself, if it is wanted, or else what is found in its subfolders."""
     for form in FORMATS:
-        if (form in wanted or form is WEB_TOURS) and (sources := form.find(folder)):
-            return [_Found(folder, form, sources)] if form in wanted else []
+        if (form in wanted or form is WEB_TOURS) and form.find(folder):
+            return [(folder, form)] if form in wanted else []
     return [
         found for sub in _list_subfolders(folder, depth, exports) for found in _find(sub, wanted, depth - 1, exports)
     ]
@@ -242,12 +232,11 @@ def _find(folder: Path, wanted: Sequence[Format], depth: int, exports: bool) -> 
 
 def list_stated_files(folder: Path) -> list[Path]:
     """The files that state the panoramas of a folder, their poses, pairs and links; some need not exist."""
-    try:
-        found = [each for form in (*POSED, WEB_TOURS) for source in form.find(folder) for each in form.files(source)]
-    except (OSError, InputError):
-        found = []
-    links = [place / LINKS for place in _list_link_folders(folder)]
-    return list(dict.fromkeys([*(folder / name for name in (POSES, PAIRS, CAMERA_POSES)), *found, *links]))
+    files = [folder / name for name in (POSES, PAIRS, CAMERA_POSES, LINKS)]
+    with contextlib.suppress(OSError, InputError):
+        files += [each for form in (*POSED, WEB_TOURS) for source in form.find(folder) for each in form.files(source)]
+        files += [place / LINKS for place in _list_link_folders(folder)]
+    return list(dict.fromkeys(files))
 
 
 def _list_link_folders(folder: Path) -> list[Path]:
@@ -338,7 +327,7 @@ def find_panorama_folders(root: Path) -> list[Path]:
     Raises:
         OSError: a folder cannot be listed.
     """
-    return [found.folder for found in _search(root, FORMATS)]
+    return [folder for folder, _ in _search(root, FORMATS)]
 
 
 def _list_subfolders(folder: Path, depth: int, exports: bool = True) -> list[Path]:

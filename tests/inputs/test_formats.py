@@ -100,6 +100,10 @@ def test_a_format_is_found_first_and_its_files_open_its_panoramas(room: Path, ex
         assert all(read(file)[0].keys() == panoramas.keys() for file in opened)
 
 
+def test_a_folder_that_is_gone_has_files_to_watch(tmp_path: Path) -> None:
+    assert tmp_path / "gone" / "poses.json" in list_stated_files(tmp_path / "gone")
+
+
 def check_read_or_named(room: Path, example: Example) -> None:
     """Panoramas are read with a note about others, or the file is named."""
     panoramas, text = try_to_read(room / example.opens)

@@ -16,8 +16,8 @@ from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.inputs.pairs import Link, Note, Panorama
 from pansplat.inputs.web_tours import find_web_tours
-from pansplat.poses.edit import PoseEditor
-from pansplat.poses.files import _describe, name_pictures
+from pansplat.poses.edit import PoseEditor, name_pictures
+from pansplat.poses.files import _describe
 
 LEVELS = [
     {"tileSize": 16, "size": 16, "fallbackOnly": True},
