@@ -117,11 +117,12 @@ def load_pairs(
     """
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
-    try:
-        return folders.load_pairs(path, convention=convention, near=near, far=far, camera_height=camera_height)
-    except folders.UnposedPanoramasError as error:
+    collections = folders.load_collections(path, convention=convention)
+    if collections[0].needs_poses:
+        folder, panoramas = collections[0].folder, collections[0].unposed
         options = {"near": near, "far": far, "camera_height": camera_height}
-        return estimate_pairs(error.folder, error.panoramas, **options, progress=progress, on_unposed=on_unposed)
+        return estimate_pairs(folder, panoramas, **options, progress=progress, on_unposed=on_unposed)
+    return folders.make_pairs(collections, near, far, camera_height)
 
 
 @with_device
@@ -838,11 +839,12 @@ def _load_listed(paths: Sequence[str | Path], progress: Progress | None) -> Pair
             f"needed panoramas of one folder, got {', '.join(map(str, paths)) or 'none'}; put them into one"
         )
     folder = files[0].parent
-    try:
-        pairs = folders.load_pairs(folder)
-    except folders.UnposedPanoramasError as error:
-        listed = [panorama for panorama in error.panoramas if panorama.image.absolute() in files]
+    collections = folders.load_collections(folder)
+    if collections[0].needs_poses:
+        listed = [panorama for panorama in collections[0].unposed if panorama.image.absolute() in files]
         pairs = estimate_pairs(folder, listed, progress=progress) if len(listed) > 1 else []
+    else:
+        pairs = folders.make_pairs(collections)
     found = {view.image.absolute(): view for pair in pairs for view in (*pair.context, *pair.targets)}
     missing = [file for file in files if file not in found]
     if missing:

@@ -1,8 +1,6 @@
 """Folders of posed panoramas by format: poses.json, data sets, and sequences of frames (docs/input.md).
 
-Each format has a function that recognises a folder and one that reads it into a `Collection`. The argument `convention`
-of the readers, one of `CONVENTIONS`, overrides that of the format. Readers raise an InputError for missing or invalid
-files; the message names the file and the entry.
+`pansplat.inputs.formats` describes the functions that find and read them.
 """
 
 from __future__ import annotations
@@ -12,14 +10,13 @@ import difflib
 import os
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from msgspec import Meta
+from msgspec import Meta, Struct
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
@@ -27,7 +24,6 @@ from pansplat.inputs.pairs import (
     FAR,
     FAR_SEQUENCE,
     MAX_CONTEXT,
-    MAX_NAMES,
     NEAR,
     Collection,
     Panorama,
@@ -37,13 +33,20 @@ from pansplat.inputs.pairs import (
     list_panorama_files,
     too_many_panoramas,
 )
-from pansplat.inputs.photographs import list_further_photographs
+from pansplat.inputs.photographs import list_further, with_further
 from pansplat.inputs.placements import Placement, is_by_hand, judge, read_rejected, read_ties
-from pansplat.inputs.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
+from pansplat.inputs.poses import (
+    parse_convention,
+    parse_numbers,
+    read_number,
+    read_trajectory,
+    rigid_matrix,
+    to_cam2world,
+)
 from pansplat.inputs.stated_files import find_inside, locate_inside
-from pansplat.inputs.web_tours import find_web_tour, read_web_tour
+from pansplat.inputs.web_tours import find_web_tours, read_web_tour
 from pansplat.inputs.web_tours.entries import plain_text
-from pansplat.system.descriptions import describe_count, list_first
+from pansplat.system.descriptions import describe_count
 from pansplat.system.files import read_file
 from pansplat.system.strict_json import read_field, read_json
 
@@ -59,12 +62,11 @@ CAMERA_POSES = "camera_pose.json"  # of 360Loc
 # poses.json with an optional pairs.json: the package's own format.
 
 
-def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collection:
+def read_pose_file(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder.
 
     Warns about other panoramas of the folder, and of the folders of those in poses.json, which have no pose.
     """
-    source = folder / POSES
     content = read_json(source)
     entries = content.get("poses") if isinstance(content, dict) else None
     if not isinstance(entries, dict):
@@ -84,7 +86,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     folders = tuple(dict.fromkeys((folder, *(view.image.parent for view in panoramas))))
     reasons, known = _read_reasons(content), {view.image for view in panoramas}
     rest = [view for view in dict.fromkeys(tour.values()) if view.image not in known]
-    further = rest if tour else _list_further(source, folders, panoramas, reasons)
+    further = rest if tour else list_further(source, folders, panoramas, reasons)
     unposed = [_explain_unposed(view, reasons, source) for view in further]
     ranges = _read_ranges(content, source)
     near, far = (
@@ -99,6 +101,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
     is_single = count == 1 and (len(panoramas) > 1 or not unposed)
     return Collection(
         source,
+        folder,
         panoramas,
         groups,
         near=near,
@@ -115,9 +118,8 @@ def _read_tour_of_folder(folder: Path) -> dict[str, Panorama]:
 
     Empty without a tour, and for a faulty one, with a warning. The names are those of scenes, and files' paths.
     """
-    source = find_web_tour(folder)
     try:
-        views = [] if source is None else read_web_tour(source)
+        views = [view for source in find_web_tours(folder) for view in read_web_tour(source, folder).unposed]
     except InputError as error:
         warnings.warn(f"the web tour is left out: {error}", category=InputWarning, stacklevel=4)
         return {}
@@ -182,29 +184,6 @@ def _read_ranges(content: dict[str, Any], source: Path) -> dict[int, tuple[float
     return ranges
 
 
-def with_further(sequence: Collection) -> Collection:
-    """A sequence or reconstruction with the panoramas beside its frames that have no pose."""
-    folders = tuple(dict.fromkeys(view.image.parent for view in sequence.panoramas))
-    unposed = tuple(_list_further(sequence.source, folders, sequence.panoramas))
-    return dataclasses.replace(sequence, unposed=unposed, folders=folders)
-
-
-def _list_further(
-    source: Path, folders: Sequence[Path], panoramas: Sequence[Panorama], stated: Iterable[str] = ()
-) -> list[Panorama]:
-    """The panoramas of folders that have no pose, with a warning that names them."""
-    files = [file for view in panoramas for file in (view.image, view.mask, view.depth) if file is not None]
-    unposed = list_further_photographs(folders, files, [view.name for view in panoramas], set(stated))
-    if unposed:
-        warnings.warn(
-            f"{source} has no pose of {list_first([view.file_label for view in unposed], MAX_NAMES)}; "
-            "each is a scene of its own.",
-            category=InputWarning,
-            stacklevel=5,
-        )
-    return unposed
-
-
 def _read_pose_entry(
     folder: Path, name: str, entry: Any, convention: str, is_stated: bool, view: Panorama | None
 ) -> Panorama:
@@ -254,66 +233,64 @@ def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -
     return None
 
 
+class _Group(Struct):
+    context: list[str]
+    target: str | list[str] | None = None
+
+
+class _Groups(Struct):
+    triplets: list[_Group] = []
+    pairs: list[_Group] = []
+
+
 def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
     """Triplets, then pairs of a pairs.json, as indices into `names`.
 
     Images without a pose are left out, and pairs that need them, with a note, if a pair remains.
     """
-    content = read_json(source)
-    if not isinstance(content, dict) or not any(key in content for key in ("pairs", "triplets")):
+    content = read_json(source, _Groups)
+    stated = [
+        *((f"{source}, triplets {number}", group) for number, group in enumerate(content.triplets, start=1)),
+        *((f"{source}, pairs {number}", group) for number, group in enumerate(content.pairs, start=1)),
+    ]
+    if not stated:
         raise InputError(
-            f'{source}: needed {{"pairs": [{{"context": [a, b], "target": [m]}}]}}, got neither "pairs" nor '
-            '"triplets"; see docs/input.md.'
+            f'{source}: needed {{"pairs": [{{"context": [a, b], "target": [m]}}]}}, got none; add one or remove the '
+            "file (docs/input.md)."
         )
     groups, numbers = [], {name: number for number, name in enumerate(names)}
     unposed: dict[str, str] = {}  # image, and the first entry that names it
-    dropped = 0
-    for key in ("triplets", "pairs"):
-        entries = read_field(content, key, list, source, [])
-        for number, entry in enumerate(entries, start=1):
-            where = f"{source}, {key} {number}"
-            context, target = (entry.get("context"), entry.get("target")) if isinstance(entry, dict) else (None, None)
-            context = _as_names(context)
-            if context is None or len(set(context)) < max(2, len(context)):
-                raise InputError(
-                    f'{where}: needed two or more different images as "context", a list of names, '
-                    f"got {str(entry)[:60]}; correct it."
-                )
-            targets = _as_names([target] if isinstance(target, str) else target or [])
-            if targets is None:
-                raise InputError(f'{where}: needed an image or a list of images as "target", got {target}; correct it.')
-            if len(context) > MAX_CONTEXT:
-                raise too_many_panoramas(where, len(context))
-            unposed |= {
-                name: where
-                for name in (*context, *targets)
-                if name not in {**numbers, **unposed} and find_inside(source.parent, name) is not None
-            }
-            first, second = (
-                tuple(_find_name(name, numbers, where) for name in part if name not in unposed)
-                for part in (context, targets)
+    for where, group in stated:
+        context, targets = group.context, [group.target] if isinstance(group.target, str) else group.target or []
+        if len(set(context)) < max(2, len(context)):
+            raise InputError(
+                f'{where}: needed two or more different images as "context", a list of names, got {str(context)[:60]}; '
+                "correct it."
             )
-            if len(first) > 1:
-                groups.append((first, second))
-            else:
-                dropped += 1
+        if len(context) > MAX_CONTEXT:
+            raise too_many_panoramas(where, len(context))
+        unposed |= {
+            name: where
+            for name in (*context, *targets)
+            if name not in {**numbers, **unposed} and find_inside(source.parent, name) is not None
+        }
+        first, second = (
+            tuple(_find_name(name, numbers, where) for name in part if name not in unposed)
+            for part in (context, targets)
+        )
+        if len(first) > 1:
+            groups.append((first, second))
     if unposed and not groups:
         _find_name(*next((name, numbers, where) for name, where in unposed.items()))
     if unposed:
-        pairs = f"; pairs that need them: {dropped} of {dropped + len(groups)}" if dropped else ""
+        dropped = len(stated) - len(groups)
+        pairs = f"; pairs that need them: {dropped} of {len(stated)}" if dropped else ""
         warnings.warn(
             f"left out of {source}, without a pose in {POSES}: {list_names([Path(name) for name in unposed])}{pairs}.",
             category=InputWarning,
             stacklevel=4,
         )
-    if not groups:
-        raise InputError(f"{source}: needed at least one pair, got none; add one or remove the file.")
     return tuple(groups)
-
-
-def _as_names(value: Any) -> list[str] | None:
-    """The value if it is a list of strings, else None."""
-    return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else None
 
 
 def _find_name(name: str, names: dict[str, int], where: str) -> int:
@@ -328,26 +305,28 @@ def _find_name(name: str, names: dict[str, int], where: str) -> int:
 # (uint16, millimetres), rot.txt (3x3) and tran.txt (3), camera to world with Habitat's axes (camera and world y up).
 
 
-def is_matterport3d_scene(folder: Path) -> bool:
-    """Whether subfolders have a rot.txt or tran.txt."""
-    return bool(_view_folders(folder))
+def list_panogrf_files(folder: Path) -> list[Path]:
+    """The poses of the views of a scene folder."""
+    folders = [view for view in sorted(folder.iterdir()) if view.is_dir()]
+    return [file for view in folders for name in ("rot.txt", "tran.txt") if (file := view / name).is_file()]
 
 
-def read_matterport3d_scene(folder: Path, convention: str | None = None) -> Collection:
+def find_panogrf(folder: Path) -> list[Path]:
+    """The folder, if it is that of a scene."""
+    return [folder] if list_panogrf_files(folder) else []
+
+
+def read_panogrf_scene(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The views of a scene folder, sorted by name: the first and last are the context, those between are targets.
 
     The world is rotated to z-up, as in the official code.
     """
     convention = convention or "cam2world opengl"
-    panoramas = tuple(_read_view_folder(view, folder, convention) for view in _view_folders(folder))
+    views = dict.fromkeys(file.parent for file in list_panogrf_files(source))
+    panoramas = tuple(_read_view_folder(view, folder, convention) for view in views)
     last = len(panoramas) - 1
     groups = (((0, last), tuple(range(1, last))),) if last > 0 else None
-    return Collection(folder, panoramas, groups, name=folder.resolve().name)
-
-
-def _view_folders(folder: Path) -> list[Path]:
-    names = ("rot.txt", "tran.txt")
-    return [v for v in sorted(folder.iterdir()) if v.is_dir() and any((v / name).is_file() for name in names)]
+    return Collection(source, folder, panoramas, groups, name=folder.resolve().name)
 
 
 def _read_view_folder(view: Path, folder: Path, convention: str) -> Panorama:
@@ -367,25 +346,19 @@ def _read_numbers(path: Path, count: int) -> Float[Tensor, "count"]:
     """Exactly `count` numbers from a text file."""
     if not path.is_file():
         raise InputError(f"{path}: needed the pose of the view, got no such file; add it.")
-    try:
-        values = np.array(read_file(path, limit=1 << 20).decode().split(), dtype=np.float64)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: needed {count} numbers, got other text ({error}); correct it.") from error
-    if values.size != count:
-        raise InputError(f"{path}: needed {count} numbers, got {values.size}; correct it.")
-    return torch.from_numpy(values)
+    return parse_numbers(read_file(path, limit=1 << 20).decode(errors="replace"), count, path)
 
 
 # Triplets rendered from game maps: NAME.json with NAME_0.png, NAME_1.png, NAME_2.png and their _depth.png (uint16,
 # radial, millimetres).
 
 
-def triplet_files(folder: Path) -> list[Path]:
+def find_triplets(folder: Path) -> list[Path]:
     """The NAME.json files of a folder that have a NAME_0.png."""
     return [path for path in sorted(folder.glob("*.json")) if path.with_name(f"{path.stem}_0.png").is_file()]
 
 
-def read_triplet(source: Path, convention: str | None = None) -> Collection:
+def read_triplet(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The views of a NAME.json, which has `c2w`, a list of cam2world matrices with OpenCV axes.
 
     The first and last view are the context, those between are targets.
@@ -401,32 +374,24 @@ def read_triplet(source: Path, convention: str | None = None) -> Collection:
             raise InputError(f"{source}: needed the image {image.name} for pose {i}, got no such file; add it.")
         depth = source.with_name(f"{source.stem}_{i}_depth.png")
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, pose {i}"), convention or "cam2world opencv")
-        mask = find_mask(image, source.parent)
+        mask = find_mask(image, folder)
         panoramas.append(Panorama(image.stem, image, cam2world, mask, depth if depth.is_file() else None))
     last = len(panoramas) - 1
-    return Collection(source, tuple(panoramas), (((0, last), tuple(range(1, last))),), name=source.stem)
+    return Collection(source, folder, tuple(panoramas), (((0, last), tuple(range(1, last))),), name=source.stem)
 
 
 # Sequences of frames: a 360Loc camera_pose.json (docs/official.md, section 2.2), or a KITTI or TUM trajectory.
 
 
-def is_loc360_sequence(folder: Path) -> bool:
-    """Whether the folder has a camera_pose.json."""
-    return (folder / CAMERA_POSES).is_file()
-
-
-def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collection:
+def read_loc360_sequence(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The frames of a 360Loc sequence in the order of camera_pose.json ({frame: 4x4 matrix}); images are in image/.
 
     The matrices are cam2world with OpenCV axes, as the official code reads them.
     """
-    source = folder / CAMERA_POSES
     convention = convention or "cam2world opencv"
     content = read_json(source)
-    if not isinstance(content, dict):
-        raise InputError(
-            f"{source}: needed {{frame: 4x4 matrix, ...}}, got {type(content).__name__}; see docs/input.md."
-        )
+    if not isinstance(content, dict) or not content:
+        raise InputError(f"{source}: needed {{frame: 4x4 matrix, ...}}, got {str(content)[:40]}; see docs/input.md.")
     panoramas = []
     for frame, matrix in content.items():
         inside = locate_inside(folder, frame, f"{source}, {frame!r}").relative_to(folder)
@@ -434,12 +399,12 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
         image = next((place for place in places if place.is_file()), places[0])
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, {frame!r}"), convention)
         panoramas.append(Panorama(image.stem, image, cam2world, find_mask(image, folder)))
-    return Collection(source, tuple(panoramas), ordered=True, far=FAR_SEQUENCE)
+    return with_further(Collection(source, folder, tuple(panoramas), ordered=True, far=FAR_SEQUENCE))
 
 
-def find_trajectory(folder: Path) -> Path | None:
-    """The trajectory file of a folder (*.kitti, *.tum, poses.txt, *trajectory*.txt); an error if there are several."""
-    found = [
+def find_trajectories(folder: Path) -> list[Path]:
+    """The trajectory files of a folder: *.kitti, *.tum, poses.txt, *trajectory*.txt."""
+    return [
         path
         for path in sorted(folder.iterdir())
         if path.is_file()
@@ -448,21 +413,26 @@ def find_trajectory(folder: Path) -> Path | None:
             or (path.suffix.lower() == ".txt" and ("trajectory" in path.stem.lower() or path.stem.lower() == "poses"))
         )
     ]
-    if len(found) > 1:
+
+
+def choose_trajectory(folder: Path) -> Path:
+    """The only trajectory file of a folder."""
+    found = find_trajectories(folder)
+    if len(found) != 1:
+        advice = "keep the right one" if found else "add it"
         raise InputError(
-            f"{folder}: needed one trajectory file, got {', '.join(path.name for path in found)}; keep the right one."
+            f"{folder}: needed one trajectory file (*.kitti, *.tum, poses.txt, frame_trajectory.txt), got "
+            f"{', '.join(path.name for path in found) or 'none'}; {advice}."
         )
-    return found[0] if found else None
+    return found[0]
 
 
-def read_trajectory_folder(folder: Path, convention: str | None = None) -> Collection:
+def read_trajectory_folder(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The images of a folder, sorted by name, with the poses of its trajectory file: image i has line i.
 
     The number in scale.txt, if there is one, converts the translations to metres.
     """
-    source = find_trajectory(folder)
-    if source is None:
-        raise InputError(f"{folder}: needed a trajectory (*.kitti, *.tum, poses.txt), got none; add it.")
+    source = choose_trajectory(folder)
     expected = source.suffix.lower().lstrip(".")
     if expected == "txt":
         expected = next((kind for kind in ("kitti", "tum") if kind in source.stem.lower()), None)
@@ -481,4 +451,4 @@ def read_trajectory_folder(folder: Path, convention: str | None = None) -> Colle
         Panorama(image.stem, image, pose, find_mask(image, folder))
         for image, pose in zip(images, trajectory.poses, strict=True)
     )
-    return Collection(source, panoramas, ordered=True, far=FAR_SEQUENCE)
+    return Collection(source, folder, panoramas, ordered=True, far=FAR_SEQUENCE)

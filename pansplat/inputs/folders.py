@@ -5,46 +5,21 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
-import itertools
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from pansplat.errors import InputError, InputWarning, collect_notes
 from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
 from pansplat.images.image_files import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
-from pansplat.inputs.folder_formats import (
-    CAMERA_POSES,
-    PAIRS,
-    POSES,
-    find_trajectory,
-    is_loc360_sequence,
-    is_matterport3d_scene,
-    read_loc360_sequence,
-    read_matterport3d_scene,
-    read_pose_file_folder,
-    read_trajectory_folder,
-    read_triplet,
-    triplet_files,
-    with_further,
-)
-from pansplat.inputs.pairs import (
-    Collection,
-    Pair,
-    Panorama,
-    list_names,
-    list_panorama_files,
-    localize_pairs,
-    single_view_pairs,
-)
-from pansplat.inputs.photographs import LINKS, add_links, list_photographs, list_unread_panoramas, read_photograph
+from pansplat.inputs.folder_formats import CAMERA_POSES, PAIRS, POSES
+from pansplat.inputs.formats import FORMATS, PHOTOGRAPHS, POSED, TRIPLETS, WEB_TOURS, Format
+from pansplat.inputs.pairs import Collection, Pair, Panorama, list_names, list_panorama_files, localize_pairs
+from pansplat.inputs.photographs import LINKS, add_links, list_unread_panoramas
 from pansplat.inputs.poses import parse_convention
-from pansplat.inputs.reconstructions import find_reconstruction, read_reconstruction
-from pansplat.inputs.web_tours import find_web_tour, is_web_tour_file, read_web_tour
+from pansplat.inputs.web_tours import find_web_tours, is_web_tour_file
 from pansplat.inputs.web_tours.entries import make_panorama
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import expand_home, is_scene_file, is_written, require_text
@@ -58,7 +33,6 @@ _PICTURES = (*READABLE_SUFFIXES, ".bmp", ".gif")  # that may be masks
 _MAX_DEPTH = 4  # levels of nested folders that are searched
 
 
-@list_folders_once()
 def load_pairs(
     path: Path | str,
     *,
@@ -69,70 +43,79 @@ def load_pairs(
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
-    Poses are in a world of metres around its origin; `Panorama.frame` states where it is in the world of the files.
-
     Args:
-        path: a panorama; a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the
-            formats of docs/input.md (poses.json, nerfstudio, COLMAP, openMVG, OpenSfM, Metashape, PanoGRF, 360Loc,
-            KITTI, TUM, game-map triplets); or one of their files with poses. A folder or web tour of a single panorama
-            is a pair of one view.
-        convention: pose convention, such as "world2cam opengl"; overrides that of the files.
+        path: see `load_collections`.
+        convention: pose convention, such as "world2cam opencv"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
         camera_height: of the cameras over the floor, metres.
 
     Raises:
-        UnposedPanoramasError: the folder or web tour holds two or more panoramas, and no poses.
+        InputError: the folder or web tour holds two or more panoramas, and no poses.
+    """
+    return make_pairs(load_collections(path, convention=convention), near, far, camera_height)
+
+
+def make_pairs(
+    collections: Sequence[Collection],
+    near: float | None = None,
+    far: float | None = None,
+    camera_height: float = CAMERA_HEIGHT,
+) -> list[Pair]:
+    """The pairs of collections, of unique names, those with targets first.
+
+    Poses are in a world of metres around its origin; `Panorama.frame` states where it is in the world of the files.
+    """
+    pairs = [pair for found in collections for pair in found.pairs(near, far)]
+    return localize_pairs(make_names_unique(sorted(pairs, key=lambda pair: not pair.targets)), camera_height)
+
+
+@list_folders_once()
+def load_collections(path: Path | str, *, convention: str | None = None, posed: bool = True) -> list[Collection]:
+    """The panoramas at a path, with poses in the world of the files, or else one collection without poses.
+
+    Args:
+        path: a panorama; a pair folder, a folder of many panoramas, or a folder of such folders, in one of `FORMATS`;
+            or one of their files with poses, or the file of a web tour.
+        convention: pose convention; overrides that of the files.
+        posed: whether poses are read; else a folder is its web tour or its pictures.
     """
     root = expand_home(path)
     if not root.is_dir():
         require_text(root)
     convention = None if convention is None else parse_convention(convention, "`convention`")
     try:
-        pairs = _load_pairs(root, convention, near, far)
-    except UnposedPanoramasError as error:
-        require_known_masks(root, error.panoramas)
-        raise
-    require_known_masks(root, [view for pair in pairs for view in pair.context + pair.targets])
-    return localize_pairs(pairs, camera_height)
+        collections = _read_file(root, convention, posed) if root.is_file() else _read_folder(root, convention, posed)
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or root}: needed a readable folder, got '{error.strerror}'; check its permissions."
+        ) from error
+    require_known_masks(root, [view for found in collections for view in found.views])
+    if not collections:
+        raise _nothing_found(root)
+    return collections
 
 
 def load_panoramas(path: Path | str) -> list[Panorama]:
-    """All panoramas at a path (see `load_pairs`), with titles, links and start views, with or without poses."""
-    try:
-        pairs = load_pairs(path)
-    except UnposedPanoramasError as error:
-        return error.panoramas
-    return list({view.image: view for pair in pairs for view in pair.context + pair.targets}.values())
+    """All panoramas at a path (see `load_collections`), with titles, links and start views."""
+    return [view for found in load_collections(path) for view in found.views]
 
 
 @list_folders_once()
 def list_unposed(paths: Sequence[Path]) -> list[Panorama]:
-    """The panoramas of folders, files of web tours, and pictures, with links and titles; no poses are read.
-
-    Those of a folder are the scenes of its web tour, or else its pictures.
-    """
+    """The panoramas of folders, files of web tours, and pictures, with links and titles; no poses are read."""
     panoramas: list[Panorama] = []
     siblings: dict[Path, dict[Path, Panorama]] = {}
     for path in paths:
-        if not path.exists():
-            raise InputError(f"{path}: needed a folder of panoramas or a file, got no such path; check it.")
-        if path.is_dir() or is_web_tour_file(path):
-            found = _list_unposed(path) if path.is_dir() else _read_tour_file(path)
-            require_known_masks(path, found if path.is_dir() else ())
-        else:
-            if path.parent not in siblings:
-                siblings[path.parent] = _list_silently(path.parent)
-            found = [siblings[path.parent].get(path) or make_panorama(path.stem, path, path.parent)]
+        if path.exists() and not path.is_dir() and not is_web_tour_file(path):
+            folder = path.parent
+            if folder not in siblings:
+                with collect_notes(), contextlib.suppress(InputError):  # without notes about other files
+                    siblings[folder] = {view.image: view for found in _read_unposed(folder) for view in found.views}
+            panoramas.append(siblings.get(folder, {}).get(path) or make_panorama(path.stem, path, folder))
             require_known_masks(path)
-        panoramas += found
+        else:
+            panoramas += [view for found in load_collections(path, posed=False) for view in found.views]
     return panoramas
-
-
-def _list_silently(folder: Path) -> dict[Path, Panorama]:
-    """The panoramas of a folder by their files, without notes about other files."""
-    with collect_notes(), contextlib.suppress(InputError):
-        return {panorama.image: panorama for panorama in _list_unposed(folder)}
-    return {}
 
 
 def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
@@ -189,138 +172,115 @@ def _list_folders(folder: Path, depth: int) -> Iterator[Path]:
             yield from _list_folders(sub, depth - 1)
 
 
-def _load_pairs(root: Path, convention: str | None, near: float | None, far: float | None) -> list[Pair]:
-    if not root.exists():
-        raise InputError(f"{root}: needed a panorama, or a folder of panoramas, got no such path; check it.")
-    if root.is_file() and root.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES):
-        raise InputError(f"{root}: needed panoramas, got {_advise_on_file(root)}.")
-    try:
-        if root.suffix.lower() in READABLE_SUFFIXES and root.is_file():
-            return single_view_pairs([read_photograph(root)], root.parent, near, far)
-        if root.is_file() and root in triplet_files(root.parent):
-            collections = _link_collections([read_triplet(root, convention)], root.parent)
-        elif root.is_file() and not _is_pose_file(root) and not _is_posed_tour(root):
-            return _make_unposed_pairs(root.parent, _read_tour_file(root), near, far)
-        else:
-            root = root.parent if root.is_file() else root
-            collections = _search(root, partial(_find_collections, convention=convention))
-            if collections:
-                _note_unread_panoramas(root, *_list_files(collections))
-        unposed = [] if collections else _list_unposed(root)
-    except OSError as error:
-        raise InputError(
-            f"{error.filename or root}: needed a readable folder, got '{error.strerror}'; check its permissions."
-        ) from error
-    if unposed:
-        return _make_unposed_pairs(root, unposed, near, far)
-    if not collections:
-        require_known_masks(root)
-        raise _nothing_found(root)
-    collections = [(folder, _leave_out_damaged(collection)) for folder, collection in collections]
-    pairs = [pair for folder, collection in collections for pair in collection.pairs(folder, near, far)]
-    return make_names_unique(sorted(pairs, key=lambda pair: not pair.targets))
-
-
-def _is_pose_file(file: Path) -> bool:
-    stated = file.name in (POSES, PAIRS, CAMERA_POSES, LINKS)
-    return stated or file in (find_trajectory(file.parent), find_reconstruction(file.parent))
-
-
-def _is_posed_tour(file: Path) -> bool:
-    """Whether a file describes a web tour with a poses.json beside it."""
-    return is_web_tour_file(file) and (file.parent / POSES).exists() and find_web_tour(file.parent) is not None
-
-
-def list_stated_files(folder: Path) -> list[Path]:
-    """The files of a folder that state poses, pairs, links or a web tour; those of fixed names need not exist."""
-    files = [folder / name for name in (POSES, PAIRS, CAMERA_POSES, LINKS)]
-    try:
-        others = (
-            find_trajectory(folder), find_reconstruction(folder), find_web_tour(folder), *triplet_files(folder)
-        )  # fmt: skip
-    except (OSError, InputError):
-        return files
-    stated = [file for file in others if file is not None]
-    return list(dict.fromkeys([*files, *stated, *(place / LINKS for place in _list_link_folders(folder))]))
-
-
-def _read_tour_file(file: Path) -> list[Panorama]:
+def _read_file(file: Path, convention: str | None, posed: bool) -> list[Collection]:
+    """The panorama of a picture, those of a triplet or web tour, or those of the folder of another file with poses."""
+    if file.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES):
+        raise InputError(f"{file}: needed panoramas, got {_advise_on_file(file)}.")
+    folder = file.parent
+    if file.suffix.lower() in READABLE_SUFFIXES:
+        return [PHOTOGRAPHS.read(file, folder, convention)]
+    if file in TRIPLETS.find(folder):
+        return _link([TRIPLETS.read(file, folder, convention)])
+    is_posed_tour = is_web_tour_file(file) and (folder / POSES).exists() and bool(WEB_TOURS.find(folder))
+    stated = (each for form in POSED for source in form.find(folder) for each in form.files(source))
+    if posed and (file.name in (PAIRS, LINKS) or is_posed_tour or file in stated):
+        return _read_folder(folder, convention, posed)
     if not is_web_tour_file(file):
         raise InputError(
             f"{file}: needed a panorama, a folder of panoramas, its file of poses, or a web tour, got another file; "
             "give the folder."
         )
-    return _add_links(read_web_tour(file), file.parent)
+    return _link([WEB_TOURS.read(file, folder, convention)])
+
+
+def _read_folder(root: Path, convention: str | None, posed: bool) -> list[Collection]:
+    """The collections in a folder and those below it, or else the panoramas of the folder itself without poses."""
+    if not root.exists():
+        raise InputError(f"{root}: needed a panorama, or a folder of panoramas, got no such path; check it.")
+    collections: list[Collection] = []
+    for folder, form in _search(root, POSED) if posed else ():
+        collections += _link([form.read(source, folder, convention) for source in form.find(folder)])
+    if not collections:
+        return _read_unposed(root)
+    _note_unread_panoramas(root, collections)
+    return [_leave_out_damaged(collection) for collection in collections]
+
+
+def _read_unposed(folder: Path) -> list[Collection]:
+    """The panoramas of a web tour in a folder, or else the pictures of the folder; a faulty tour gives a warning."""
+    problems: list[InputError] = []
+    for form in (WEB_TOURS, PHOTOGRAPHS):
+        for source in form.find(folder):
+            try:
+                collections = _link([form.read(source, folder, None)])
+            except InputError as error:
+                problems.append(error)
+                continue
+            for problem in problems:
+                warnings.warn(f"the web tour is left out: {problem}", category=InputWarning, stacklevel=3)
+            _note_unread_panoramas(folder, collections, _MAX_DEPTH if form is PHOTOGRAPHS else 0)
+            return collections
+    if problems:
+        raise problems[0]
+    return []
+
+
+def _search(root: Path, wanted: Sequence[Format]) -> list[tuple[Path, Format]]:
+    """What is found at or below a folder; exports of pansplat in subfolders count only if there is nothing else."""
+    found = _find(root, wanted, _MAX_DEPTH, exports=False)
+    is_export = not found and all(map(is_written, list_panorama_files(root)))
+    return _find(root, wanted, _MAX_DEPTH, exports=True) if is_export else found
+
+
+def _find(folder: Path, wanted: Sequence[Format], depth: int, exports: bool) -> list[tuple[Path, Format]]:
+    """The first format of a folder itself, if it is wanted, or else what is found in its subfolders."""
+    for form in FORMATS:
+        if (form in wanted or form is WEB_TOURS) and form.find(folder):
+            return [(folder, form)] if form in wanted else []
+    return [
+        found for sub in _list_subfolders(folder, depth, exports) for found in _find(sub, wanted, depth - 1, exports)
+    ]
+
+
+def list_stated_files(folder: Path) -> list[Path]:
+    """The files that state the panoramas of a folder, their poses, pairs and links; some need not exist."""
+    files = [folder / name for name in (POSES, PAIRS, CAMERA_POSES, LINKS)]
+    with contextlib.suppress(OSError, InputError):
+        files += [each for form in (*POSED, WEB_TOURS) for source in form.find(folder) for each in form.files(source)]
+        files += [place / LINKS for place in _list_link_folders(folder)]
+    return list(dict.fromkeys(files))
 
 
 def _list_link_folders(folder: Path) -> list[Path]:
     """The folders whose links.json is read: a folder, and that of the data of its web tour."""
-    tour = find_web_tour(folder)
-    return list(dict.fromkeys((folder, *([] if tour is None else [tour.parent]))))
+    return list(dict.fromkeys((folder, *(source.parent for source in find_web_tours(folder)))))
 
 
-def _add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
-    """The panoramas of a folder with what each links.json of it states; the notes go to the last one."""
-    for place in _list_link_folders(folder):
-        panoramas = add_links(panoramas, place)
-    return list(panoramas)
-
-
-def _link_collections(collections: Sequence[Collection], folder: Path) -> list[tuple[Path, Collection]]:
-    """The collections of a folder with what its links.json states."""
-    linked = iter(_add_links([view for found in collections for view in (*found.panoramas, *found.unposed)], folder))
+def _link(collections: Sequence[Collection]) -> list[Collection]:
+    """The collections of one folder with what its links.json states."""
+    views = linked = [view for found in collections for view in found.views]
+    for place in _list_link_folders(collections[0].folder):
+        linked = add_links(linked, place)
+    of = dict(zip(views, linked, strict=True))
     return [
-        (
-            folder,
-            dataclasses.replace(
-                found,
-                panoramas=tuple(itertools.islice(linked, len(found.panoramas))),
-                unposed=tuple(itertools.islice(linked, len(found.unposed))),
-            ),
+        dataclasses.replace(
+            found,
+            panoramas=tuple(of[view] for view in found.panoramas),
+            unposed=tuple(of[view] for view in found.unposed),
         )
         for found in collections
     ]
 
 
-def _list_unposed(root: Path) -> list[Panorama]:
-    """The panoramas of a web tour in a folder, or else the pictures of the folder; a faulty tour gives a warning."""
-    source, problem = find_web_tour(root), None
-    if source is not None:
-        try:
-            panoramas = _add_links(read_web_tour(source), root)
-        except InputError as error:
-            problem = error
-        else:
-            _note_unread_panoramas(root, _list_pictures(panoramas), set(), depth=0)
-            return panoramas
-    try:
-        panoramas = list_photographs(root)
-    except InputError:
-        if problem is not None:
-            raise problem from None
-        raise
-    if problem is not None:
-        if not panoramas:
-            raise problem
-        warnings.warn(f"the web tour is left out: {problem}", category=InputWarning, stacklevel=3)
-    if panoramas:
-        _note_unread_panoramas(root, set(), {root})
-    return panoramas
+def _note_unread_panoramas(root: Path, collections: Sequence[Collection], depth: int = _MAX_DEPTH) -> None:
+    """Warn about the panoramas in a folder and those below it that are in no collection."""
+    views = [view for found in collections for view in found.views]
+    files = [file for view in views for file in (*list_pictures(view.image), view.mask, view.depth)]
+    known = {file.resolve() for file in files if file is not None}
+    _note_unread(root, known, {folder for found in collections for folder in found.folders}, depth)
 
 
-def _list_pictures(panoramas: Iterable[Panorama]) -> set[Path]:
-    """The files that panoramas are made from, resolved."""
-    files = [file for view in panoramas for file in (*list_pictures(view.image), view.mask, view.depth)]
-    return {file.resolve() for file in files if file is not None}
-
-
-def _list_files(collections: Sequence[tuple[Path, Collection]]) -> tuple[set[Path], set[Path]]:
-    """The files of collections, and the folders of which all panoramas are in them."""
-    files = _list_pictures(view for _, found in collections for view in (*found.panoramas, *found.unposed))
-    return files, {folder for _, found in collections for folder in found.folders}
-
-
-def _note_unread_panoramas(folder: Path, known: set[Path], read: set[Path], depth: int = _MAX_DEPTH) -> None:
+def _note_unread(folder: Path, known: set[Path], read: set[Path], depth: int) -> None:
     """Warn about the panoramas in a folder and those below it that are not read.
 
     Args:
@@ -338,54 +298,11 @@ def _note_unread_panoramas(folder: Path, known: set[Path], read: set[Path], dept
             stacklevel=3,
         )
     for sub in _list_subfolders(folder, depth):
-        tour = None if sub in read else find_web_tour(sub)
-        if tour is None:
-            _note_unread_panoramas(sub, known, read, depth - 1)
-        else:
+        tours = [] if sub in read else find_web_tours(sub)
+        if not tours:
+            _note_unread(sub, known, read, depth - 1)
+        for tour in tours:
             warnings.warn(f"left out: {tour} is another tour; open it by its own path.", InputWarning, stacklevel=3)
-
-
-def _make_unposed_pairs(folder: Path, panoramas: list[Panorama], near: float | None, far: float | None) -> list[Pair]:
-    """The pair of a single panorama; an error for more, whose poses must be estimated."""
-    if len(panoramas) > 1:
-        raise UnposedPanoramasError(folder, panoramas)
-    (pair,) = single_view_pairs(panoramas, folder, near, far)
-    return [dataclasses.replace(pair, name=folder.resolve().name)]
-
-
-def _search(root: Path, find: Callable[[Path, int, bool], list[Any]]) -> list[Any]:
-    """What is found at or below a folder; exports of pansplat in subfolders count only if there is nothing else."""
-    found = find(root, _MAX_DEPTH, False)
-    return found if found or not all(map(is_written, list_panorama_files(root))) else find(root, _MAX_DEPTH, True)
-
-
-def _find_collections(folder: Path, depth: int, exports: bool, convention: str | None) -> list[tuple[Path, Collection]]:
-    """The collections in a folder itself, or else those in its subfolders."""
-    if collections := _read_collections(folder, convention):
-        return _link_collections(collections, folder)
-    if find_web_tour(folder) is not None:
-        return []
-    find = partial(_find_collections, depth=depth - 1, exports=exports, convention=convention)
-    return [found for sub in _list_subfolders(folder, depth, exports) for found in find(sub)]
-
-
-def _read_collections(folder: Path, convention: str | None) -> list[Collection]:
-    """The collections in a folder, without its links.json."""
-    if (folder / POSES).exists():  # the reader refuses what is no file
-        return [read_pose_file_folder(folder, convention)]
-    if is_loc360_sequence(folder):
-        return [with_further(read_loc360_sequence(folder, convention))]
-    if is_matterport3d_scene(folder):
-        return [read_matterport3d_scene(folder, convention)]
-    if triplets := triplet_files(folder):
-        return [read_triplet(path, convention) for path in triplets]
-    if find_trajectory(folder) is not None:
-        return [read_trajectory_folder(folder, convention)]
-    if (source := find_reconstruction(folder)) is not None:
-        found = read_reconstruction(source, folder, convention)
-        is_joined = any(len(list_pictures(view.image)) > 1 for view in found.panoramas)
-        return [found if is_joined else with_further(found)]
-    return []
 
 
 def _leave_out_damaged(collection: Collection) -> Collection:
@@ -422,17 +339,7 @@ def find_panorama_folders(root: Path) -> list[Path]:
     Raises:
         OSError: a folder cannot be listed.
     """
-    return _search(root, _find_panorama_folders)
-
-
-def _find_panorama_folders(folder: Path, depth: int, exports: bool) -> list[Path]:
-    has_poses = (folder / POSES).exists() or is_loc360_sequence(folder) or is_matterport3d_scene(folder)
-    if has_poses or triplet_files(folder) or find_trajectory(folder) is not None or list_panorama_files(folder):
-        return [folder]
-    if find_reconstruction(folder) is not None or find_web_tour(folder) is not None:
-        return [folder]
-    find = partial(_find_panorama_folders, depth=depth - 1, exports=exports)
-    return [found for sub in _list_subfolders(folder, depth, exports) for found in find(sub)]
+    return [folder for folder, _ in _search(root, FORMATS)]
 
 
 def _list_subfolders(folder: Path, depth: int, exports: bool = True) -> list[Path]:
@@ -448,19 +355,6 @@ def _is_export(folder: Path) -> bool:
         return is_written(folder / "transforms.json")
     pictures = [] if (folder / POSES).exists() else list_panorama_files(folder)
     return bool(pictures) and all(map(is_written, pictures))
-
-
-class UnposedPanoramasError(InputError):
-    """A folder or web tour holds two or more panoramas, and no poses in a known format."""
-
-    def __init__(self, folder: Path, panoramas: list[Panorama]) -> None:
-        names = list_first([panorama.file_label for panorama in panoramas])
-        super().__init__(
-            f"{folder}: needed poses for the panoramas, got images only ({names}); run `pansplat pose {folder} -o "
-            f"{folder / POSES}`, or add a pose file (docs/input.md)."
-        )
-        self.folder = folder
-        self.panoramas = panoramas
 
 
 def _nothing_found(root: Path) -> InputError:

@@ -230,11 +230,12 @@ ViewGroup = tuple[tuple[int, ...], tuple[int, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Collection:
-    """All posed panoramas of a folder, before they are grouped into pairs.
+    """The panoramas that a format reads in a folder, before they are grouped into pairs.
 
     Attributes:
         source: file or folder that error messages name.
-        panoramas: in file order.
+        folder: of the files.
+        panoramas: in file order; none if no poses are known.
         groups: given context and target views; None to pair neighbours.
         ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
         near, far: metres.
@@ -245,7 +246,8 @@ class Collection:
     """
 
     source: Path
-    panoramas: tuple[Panorama, ...]
+    folder: Path
+    panoramas: tuple[Panorama, ...] = ()
     groups: tuple[ViewGroup, ...] | None = None
     ordered: bool = False
     near: float = NEAR
@@ -255,17 +257,34 @@ class Collection:
     unposed: tuple[Panorama, ...] = ()
     folders: tuple[Path, ...] = ()
 
-    def pairs(self, folder: Path, near: float | None = None, far: float | None = None) -> list[Pair]:
+    @property
+    def views(self) -> tuple[Panorama, ...]:
+        """All panoramas."""
+        return (*self.panoramas, *self.unposed)
+
+    @property
+    def needs_poses(self) -> bool:
+        """Whether there are panoramas for an estimate of poses, and no poses."""
+        return not self.panoramas and len(self.unposed) > 1
+
+    def pairs(self, near: float | None = None, far: float | None = None) -> list[Pair]:
         """One pair per group, those with targets first, then one of a single view for each other panorama.
 
         Warns about posed panoramas that are in no group.
 
         Args:
-            folder: of the files.
             near, far: metres; they override the collection's values.
+
+        Raises:
+            InputError: it needs poses.
         """
-        if not self.panoramas:
-            raise InputError(f"{self.source}: needed posed panoramas, got none; add them and their poses.")
+        folder = self.folder
+        if self.needs_poses:
+            names = list_first([panorama.file_label for panorama in self.unposed])
+            raise InputError(
+                f"{folder}: needed poses for the panoramas, got images only ({names}); run `pansplat pose {folder} -o "
+                f"{folder / 'poses.json'}`, or add a pose file (docs/input.md)."
+            )
         siblings = tuple(panorama.image for panorama in self.panoramas)
         pairs, groups = [], self._select_groups()
         for indices in groups:
@@ -282,9 +301,10 @@ class Collection:
                 stacklevel=4,
             )
         pairs += [Pair(view.name, folder, (view,), (), *self._range(view.world, near, far), siblings) for view in alone]
-        first_world = 1 + max(panorama.world for panorama in self.panoramas)
+        first_world = 1 + max((panorama.world for panorama in self.panoramas), default=-1)
         every = tuple(heapq.merge(self.panoramas, self.unposed, key=lambda panorama: panorama.name))
-        return pairs + single_view_pairs(self.unposed, folder, near, far, siblings=every, first_world=first_world)
+        single = single_view_pairs(self.unposed, folder, near, far, siblings=every, first_world=first_world)
+        return [replace(pair, name=self.name or pair.name) for pair in single] if not pairs else pairs + single
 
     def _range(self, world: int, near: float | None, far: float | None) -> tuple[float, float]:
         """Near and far of a world, unless they are given."""

@@ -1,4 +1,4 @@
-"""Panoramas without poses: the pictures of a folder, and the links, titles and notes of its links.json."""
+"""Panoramas without poses: pictures, and the links, titles and notes of the links.json of a folder."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 import warnings
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,9 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
 from pansplat.images.cube_faces import group_faces, read_picture
 from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
-from pansplat.images.image_files import is_two_to_one
+from pansplat.images.image_files import is_two_to_one, list_pictures
 from pansplat.images.rig_images import RIG_SUFFIX
-from pansplat.inputs.pairs import Link, Note, Panorama, list_panorama_files
+from pansplat.inputs.pairs import MAX_NAMES, Collection, Link, Note, Panorama, list_panorama_files
 from pansplat.inputs.web_tours.entries import (
     Number,
     make_note,
@@ -27,22 +27,27 @@ from pansplat.inputs.web_tours.entries import (
     resolve_links,
 )
 from pansplat.system.atomic import replacing
+from pansplat.system.descriptions import list_first
 from pansplat.system.files import is_written
 from pansplat.system.strict_json import convert, read_field, read_json
 
 LINKS = "links.json"
 
 
-def read_photograph(image: Path) -> Panorama:
-    """A 2:1 picture, or one that holds six cube faces, as a panorama at the origin of a world of its own."""
-    return make_panorama(image.stem, read_picture(image), image.parent)
+def find_photographs(folder: Path) -> list[Path]:
+    """The folder, if it has pictures."""
+    return [folder] if list_panorama_files(folder) else []
 
 
-def list_photographs(folder: Path) -> list[Panorama]:
-    """The panoramas among the pictures of a folder, sorted by name, with the links of links.json.
+def read_photographs(source: Path, folder: Path, convention: str | None = None) -> Collection:
+    """The panoramas among the pictures of a folder, sorted by name, or that of a picture, which may hold cube faces.
 
     Pictures that pansplat rendered count only if there are no other panoramas. Warns about pictures that are left out.
     """
+    del convention
+    if source != folder:
+        view = make_panorama(source.stem, read_picture(source), folder)
+        return Collection(source, folder, name=view.name, unposed=(view,))
     every = list_panorama_files(folder)
     rendered = [image for image in every if is_written(image)]
     panoramas, problems = _read_pictures([image for image in every if image not in rendered], folder)
@@ -53,40 +58,56 @@ def list_photographs(folder: Path) -> list[Panorama]:
     if problems and not panoramas:
         raise InputError("; ".join(problem.rstrip(".") for problem in problems[:3]) + ".")
     _warn_left_out(problems)
-    return add_links(panoramas, folder)
+    name = folder.resolve().name
+    return Collection(source, folder, name=name, unposed=tuple(panoramas), folders=(folder,))
 
 
-def list_further_photographs(
-    folders: Sequence[Path], known: Collection[Path], names: Collection[str], stated: Collection[str] = ()
+def with_further(found: Collection) -> Collection:
+    """A sequence or reconstruction with the panoramas beside its pictures that have no pose."""
+    if any(len(list_pictures(view.image)) > 1 for view in found.panoramas):  # joined: the others are pictures of rigs
+        return found
+    folders = tuple(dict.fromkeys(view.image.parent for view in found.panoramas))
+    unposed = tuple(list_further(found.source, folders, found.panoramas))
+    return dataclasses.replace(found, unposed=unposed, folders=folders)
+
+
+def list_further(
+    source: Path, folders: Sequence[Path], panoramas: Sequence[Panorama], stated: Container[str] = ()
 ) -> list[Panorama]:
-    """The panoramas of folders other than the known files, without links.
-
-    Pictures that pansplat rendered count only if they are stated. Warns about pictures that are no panoramas.
+    """The panoramas of folders that have no pose, with a warning that names them, and about what is no panorama.
 
     Args:
+        source: the file of the poses.
         folders: each once.
-        known: files that are no further ones.
-        names: that are taken; a panorama of such a name gets the folder's name before its own.
-        stated: names of files that are photographs.
+        panoramas: those with poses. One of such a name gets the folder's name before its own.
+        stated: names of files that are photographs, even if pansplat rendered them.
     """
-    taken = set(names)
+    known = [file for view in panoramas for file in (view.image, view.mask, view.depth) if file is not None]
+    taken = {view.name for view in panoramas}
     further: list[Panorama] = []
-    for folder in folders:
-        panoramas, problems = _read_pictures(_list_others(folder, known, stated), folder)
+    for folder in filter(Path.is_dir, folders):
+        found, problems = _read_pictures(_list_others(folder, known, stated), folder)
         _warn_left_out(problems)
-        for panorama in panoramas:
-            name = panorama.name if panorama.name not in taken else f"{folder.resolve().name}_{panorama.name}"
+        for view in found:
+            name = view.name if view.name not in taken else f"{folder.resolve().name}_{view.name}"
             taken.add(name)
-            further.append(dataclasses.replace(panorama, name=name))
+            further.append(dataclasses.replace(view, name=name))
+    if further:
+        warnings.warn(
+            f"{source} has no pose of {list_first([view.file_label for view in further], MAX_NAMES)}; "
+            "each is a scene of its own.",
+            category=InputWarning,
+            stacklevel=5,
+        )
     return further
 
 
-def list_unread_panoramas(folder: Path, known: Collection[Path]) -> list[Path]:
+def list_unread_panoramas(folder: Path, known: Iterable[Path]) -> list[Path]:
     """The 2:1 pictures of a folder other than the known files, which pansplat has not rendered; no pixels are read."""
     return [image for image in _list_others(folder, known) if is_two_to_one(image)]
 
 
-def _list_others(folder: Path, known: Collection[Path], stated: Collection[str] = ()) -> list[Path]:
+def _list_others(folder: Path, known: Iterable[Path], stated: Container[str] = ()) -> list[Path]:
     """The pictures of a folder other than the known files, which are stated, or which pansplat has not rendered."""
     read = {_identify(file) for file in known}
     others = [image for image in list_panorama_files(folder) if _identify(image) not in read]

@@ -149,6 +149,17 @@ def read_number(path: Path) -> float:
     return number
 
 
+def parse_numbers(text: str, count: int, source: object) -> Float[Tensor, "count"]:
+    """Exactly `count` numbers of a text; `source` is the file or entry that error messages name."""
+    try:
+        values = np.array(text.split(), np.float64)
+    except ValueError as error:
+        raise InputError(f"{source}: needed {count} numbers, got other text ({error}); correct it.") from error
+    if values.size != count:
+        raise InputError(f"{source}: needed {count} numbers, got {values.size}; correct it.")
+    return torch.from_numpy(values)
+
+
 def read_trajectory(
     path: Path, convention: str | None = None, expected: str | None = None, scale: float = 1.0
 ) -> Trajectory:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -20,11 +21,13 @@ from msgspec import Meta
 from numpy import ndarray as Array
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.images.image_files import list_pictures
+from pansplat.images.cube_images import CUBE_SUFFIX
+from pansplat.images.image_files import is_assembled
 from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
+from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.web_tours import is_scene_of_tour
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.placing import PlanPose, Suggestion
@@ -64,7 +67,7 @@ class PoseEditor:
         """
         self.file = folder / POSES
         self._sources = {panorama.placement.source for panorama in panoramas} - {None}
-        self._names = {panorama.image: _name_in(folder, panorama) for panorama in panoramas}
+        self._names = name_pictures(self.file, [panorama.image for panorama in panoramas])
         self._by_name = {panorama.name: panorama.image for panorama in panoramas}
         if not self._sources:
             raise InputError(f"{folder}: needed estimated poses or a {POSES} to change poses, got another format.")
@@ -321,19 +324,25 @@ def _find_scales(content: Content, file: Path, group: PoseGroup, anchors: Mappin
     return scales
 
 
-def _name_in(folder: Path, panorama: Panorama) -> str:
-    """The key of a panorama in the poses.json of a folder."""
-    image = panorama.image
-    if is_scene_of_tour(folder, image):
-        return panorama.name
-    if len(list_pictures(image)) > 1:
-        raise InputError(
-            f"{image}: needed 2:1 photographs to place them by hand, got cube faces; convert them to panoramas."
-        )
-    try:
-        return image.resolve().relative_to(folder.resolve()).as_posix()
-    except ValueError:
-        raise InputError(f"{image}: needed a photograph in {folder} to place it by hand; move it there.") from None
+def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
+    """The names of images in a poses.json, relative to its folder; an InputError for one outside of it.
+
+    Scenes of a web tour in this folder that are made from cube faces have their own names.
+    """
+    names = {}
+    for image in images:
+        if is_scene_of_tour(path.parent, image):
+            names[image] = image.name.removesuffix(CUBE_SUFFIX)
+        elif is_assembled(image):
+            raise InputError(
+                f"{path}: needed 2:1 photographs or a web tour, got the cube faces of "
+                f"{image.name.removesuffix(CUBE_SUFFIX)}, of which it holds no poses; `pansplat export --photos` makes "
+                "photographs of them."
+            )
+        else:
+            file = locate_inside(path.parent, os.path.abspath(image), path)
+            names[image] = file.relative_to(path.parent).as_posix()
+    return names
 
 
 def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, Path]) -> Content:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -23,10 +22,8 @@ from pansplat.inputs.folders import make_names_unique
 from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
 from pansplat.inputs.placements import Placement, judge, read_ties
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
-from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.views import CAMERA_HEIGHT
-from pansplat.inputs.web_tours import is_scene_of_tour
-from pansplat.poses.edit import POSES, find_kept, merge_estimate, read_pose_content, write_pose_file
+from pansplat.poses.edit import POSES, find_kept, merge_estimate, name_pictures, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses, fingerprint_estimates
 from pansplat.poses.pose_file import (
     CONVENTION,
@@ -88,27 +85,6 @@ def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) 
         lines.append(" ".join(f"{number:.9g}" for number in numbers))
     with replacing(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", "utf-8")
-
-
-def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
-    """The names of images in a poses.json, relative to its folder; an InputError for one outside of it.
-
-    Scenes of a web tour in this folder that are made from cube faces have their own names.
-    """
-    names = {}
-    for image in images:
-        if is_scene_of_tour(path.parent, image):
-            names[image] = image.name.removesuffix(CUBE_SUFFIX)
-        elif is_assembled(image):
-            raise InputError(
-                f"{path}: needed 2:1 photographs or a web tour, got the cube faces of "
-                f"{image.name.removesuffix(CUBE_SUFFIX)}, of which it holds no poses; `pansplat export --photos` makes "
-                "photographs of them."
-            )
-        else:
-            file = locate_inside(path.parent, os.path.abspath(image), path)
-            names[image] = file.relative_to(path.parent).as_posix()
-    return names
 
 
 def estimate_panoramas(
@@ -272,7 +248,8 @@ def _make_pairs(
             for name, pose in world["poses"].items()
         )
         only = folder.resolve().name if len(placed) == 2 else None
-        pairs += Collection(source, placed, near=world["near"], far=world["far"], name=only).pairs(folder, near, far)
+        found = Collection(source, folder, placed, near=world["near"], far=world["far"], name=only)
+        pairs += found.pairs(near, far)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
     single = [
         replace(panorama, placement=Placement("not placed", unplaced[panorama.name], source))

@@ -17,7 +17,7 @@ from pansplat.errors import InputError
 from pansplat.images.image_files import read_mask, resize_panorama
 from pansplat.images.masks import lift_black_surfaces
 from pansplat.images.video import VideoFile, open_video
-from pansplat.inputs.folder_formats import find_trajectory, is_loc360_sequence, read_loc360_sequence
+from pansplat.inputs.folder_formats import CAMERA_POSES, choose_trajectory, read_loc360_sequence
 from pansplat.inputs.folders import VIDEO_FILES, require_known_masks
 from pansplat.inputs.pairs import FAR_SEQUENCE, NEAR, Pair, Panorama, find_mask
 from pansplat.inputs.poses import read_number, read_trajectory
@@ -174,7 +174,7 @@ def read_loc360(root: Path | str, stage: Stage) -> list[ImageSequence]:
             folder
             for part in ("mapping", "query_360")
             for folder in sorted((root / location / part).glob("*360*"))
-            if is_loc360_sequence(folder)
+            if (folder / CAMERA_POSES).is_file()
         ]
         if not folders:
             raise InputError(
@@ -183,8 +183,8 @@ def read_loc360(root: Path | str, stage: Stage) -> list[ImageSequence]:
                 f"{', '.join(LOCATIONS[stage])}."
             )
         for folder in folders:
-            collection = read_loc360_sequence(folder)
-            require_known_masks(folder, collection.panoramas)
+            collection = read_loc360_sequence(folder / CAMERA_POSES, folder)
+            require_known_masks(folder, collection.views)
             name = f"{location}-{folder.name}"
             sequences.append(ImageSequence(name, collection.panoramas, collection.near, collection.far))
     return sequences
@@ -215,11 +215,7 @@ def read_video_folder(folder: Path) -> VideoSequence:
     if len(default or videos) != 1:
         names = ", ".join(video.name for video in videos) or "none"
         raise InputError(f"{folder}: needed one video, got {names}; name the right one video.mp4.")
-    source = find_trajectory(folder)
-    if source is None:
-        raise InputError(
-            f"{folder}: needed a trajectory for the video (*.kitti, *.tum, frame_trajectory.txt), got none; add it."
-        )
+    source = choose_trajectory(folder)
     video = open_video((default or videos)[0])
     if video.width != 2 * video.height:
         raise InputError(

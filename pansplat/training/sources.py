@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from pansplat.errors import InputError
-from pansplat.inputs.folder_formats import is_matterport3d_scene, read_matterport3d_scene, read_triplet, triplet_files
+from pansplat.inputs.folder_formats import find_panogrf, find_triplets, read_panogrf_scene, read_triplet
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Sample
 from pansplat.system.files import expand_home
@@ -89,8 +89,9 @@ class TripletSet:
     def pair(self, index: int) -> Pair:
         """Triplet `index` as a pair with a target; without detection of static content."""
         source = self.sources[index]
-        collection = read_triplet(source) if source.is_file() else read_matterport3d_scene(source)
-        (pair,) = collection.pairs(source if source.is_dir() else source.parent)
+        is_triplet = source.is_file()
+        collection = read_triplet(source, source.parent) if is_triplet else read_panogrf_scene(source, source)
+        (pair,) = collection.pairs()
         if not pair.targets:
             raise InputError(f"{source}: needed three views (two inputs and a target between), got two; add one.")
         return dataclasses.replace(pair, siblings=())
@@ -201,7 +202,7 @@ def read_panogrf(
     for name, distance in sets:
         folder = panogrf_folder(root, stage, name, distance, height)
         scenes = sorted(folder.iterdir()) if folder.is_dir() else []
-        scenes = [scene for scene in scenes if scene.is_dir() and is_matterport3d_scene(scene)]
+        scenes = [scene for scene in scenes if scene.is_dir() and find_panogrf(scene)]
         found.append(TripletSet(f"{name}_dist_{distance}", folder, tuple(scenes)))
     missing = [str(triplets.folder) for triplets in found if not triplets.sources]
     if len(missing) == len(found):
@@ -217,7 +218,7 @@ def read_panogrf(
 def read_game_maps(folder: Path | str) -> TripletSet:
     """The game-map triplets (NAME.json) of a folder."""
     folder = expand_home(folder)
-    sources = tuple(triplet_files(folder))
+    sources = tuple(find_triplets(folder))
     if not sources:
         raise InputError(
             f"{folder}: needed triplets (NAME.json with NAME_0.png next to it), got none; see docs/input.md."

@@ -14,8 +14,7 @@ from pansplat.cli import run
 from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
 from pansplat.images.video import write_video
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.photographs import list_photographs
+from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
@@ -108,9 +107,9 @@ def test_key_frames_without_poses_are_photographs_beside_others(video: Path, tmp
     estimator(fail)
     walk = tmp_path / "walk"
     assert run(["pose", str(video), "-o", str(walk), "--frames", "3"]) == 2
-    assert len(list_photographs(walk)) == 3
+    assert len(load_panoramas(walk)) == 3
     Image.fromarray(_photograph(99)).save(walk / "hall.jpg")
-    assert len(list_photographs(walk)) == 4
+    assert len(load_panoramas(walk)) == 4
 
 
 def test_key_frames_replace_no_picture_of_the_user(video: Path, tmp_path: Path, estimator, capsys) -> None:

@@ -16,10 +16,9 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
-from pansplat.errors import InputWarning
+from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
-from pansplat.inputs.folders import UnposedPanoramasError, find_panorama_folders, load_pairs
-from pansplat.inputs.photographs import list_photographs
+from pansplat.inputs.folders import find_panorama_folders, load_pairs, load_panoramas
 
 OPTIONS = ["--model", "sphere", "--refine", "0", "--predict-height", "64"]
 
@@ -62,9 +61,9 @@ def test_an_export_into_a_folder_of_photographs_does_not_hide_them(
     for name in ("poses.json", "pairs.json"):
         (room / name).unlink()
     recwarn.clear()
-    with pytest.raises(UnposedPanoramasError) as photographs:  # as of a folder of photographs without poses
+    with pytest.raises(InputError, match="needed poses"):  # as of a folder of photographs without poses
         load_pairs(room)
-    assert [panorama.image for panorama in photographs.value.panoramas] == [room / f"{n}.png" for n in "abc"]
+    assert [panorama.image for panorama in load_panoramas(room)] == [room / f"{n}.png" for n in "abc"]
     assert find_panorama_folders(tmp_path) == [room]
     for folder in (out, out.parent):
         images = [view.image for pair in load_pairs(folder) for view in pair.context]
@@ -82,7 +81,7 @@ def test_no_export_or_picture_is_a_panorama_of_the_folder(room: Path, scene: Pat
     for name in ("view.png", "view.jpg", "view.webp"):
         assert run(["render", str(scene), "-o", str(room / name), "--height", "16"]) == 0
     with pytest.warns(InputWarning, match="rendered by pansplat"):
-        assert [panorama.name for panorama in list_photographs(room)] == ["a", "b", "c"]
+        assert [panorama.name for panorama in load_panoramas(room)] == ["a", "b", "c"]
 
 
 def test_no_export_repeats_the_metadata_of_the_photographs(

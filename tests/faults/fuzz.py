@@ -3,7 +3,7 @@
 A reader may return a value or raise an InputError. Any other exception ends the program with status 1 and names the
 reader and the input; a crash of the interpreter ends it by a signal.
 
-Usage: python fuzz.py FOLDER NUMBER_OF_INPUTS
+Usage: PYTHONPATH=tests python tests/faults/fuzz.py FOLDER NUMBER_OF_INPUTS
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import faulthandler
 import json
 import random
 import shutil
-import struct
 import sys
 import time
 import traceback
@@ -28,6 +27,7 @@ import safetensors.torch
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from panorama_formats import EXAMPLES, Example, write_room
 from PIL import Image
 
 from pansplat.cache import CachedScene, _is_valid
@@ -37,7 +37,7 @@ from pansplat.gaussians.gltf import load_glb, save_glb
 from pansplat.gaussians.ply import load_ply
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.images.image_files import read_depth, read_panorama, write_image
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.model.network import build_empty_network, load_predictor
 from pansplat.model.weights import WeightsFile, load_weights, read_checkpoint
 from pansplat.pipeline import render
@@ -90,48 +90,10 @@ def draw(scene: Scene) -> None:
     assert rendering.color.isfinite().all() and rendering.depth.isfinite().all()
 
 
-def write_reconstructions(folder: Path) -> dict[str, tuple[Path, Read]]:
-    """Poses of other programs, each in a folder with two panoramas; and cube faces in nerfstudio's format."""
-    names, identity = ("a.png", "b.png"), np.eye(4).tolist()
-    image = np.random.default_rng(1).integers(0, 255, (8, 16, 3), dtype=np.uint8)
-    frames = [{"file_path": name, "transform_matrix": identity} for name in names]
-    lens = {"polymorphic_id": 1 << 31, "polymorphic_name": "spherical", "ptr_wrapper": {"data": {}}}
-    pose = {"rotation": np.eye(3).tolist(), "center": [0, 0, 1]}
-    views = [{"filename": name, "id_intrinsic": 0, "id_pose": 0} for name in names]
-    shot = {"rotation": [0, 0.1, 0], "translation": [1, 0, 0], "camera": "c"}
-    camera = '<camera sensor_id="0" label="{}"><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>'
-    files = {
-        "transforms.json": {"camera_model": "EQUIRECTANGULAR", "applied_scale": 2, "frames": frames},
-        "sfm_data.json": {
-            "views": [{"value": {"ptr_wrapper": {"data": view}}} for view in views],
-            "intrinsics": [{"key": 0, "value": lens}],
-            "extrinsics": [{"key": 0, "value": pose}],
-            "structure": [{"value": {"X": [1, 2, 3]}}],
-        },
-        "reconstruction.json": [
-            {"cameras": {"c": {"projection_type": "spherical"}}, "shots": dict.fromkeys(names, shot), "points": {}}
-        ],
-        "cameras.xml": '<document><chunk><sensor id="0" type="spherical"/><transform><scale>2</scale></transform>'
-        f"{camera.format('a')}{camera.format('b')}</chunk></document>",
-        "images.txt": "1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n",
-        "cameras.txt": "1 EQUIRECTANGULAR 16 8 16 8\n",
-        "images.bin": struct.pack("<QI7dI6sQ", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1, b"a.png", 0),
-        "cameras.bin": struct.pack("<QIiQQ2d", 1, 1, 17, 16, 8, 16, 8),
-    }
-    readers: dict[str, tuple[Path, Read]] = {}
-    for number, (name, content) in enumerate(files.items()):
-        own = folder / f"poses{number}"
-        own.mkdir()
-        for picture in names:
-            Image.fromarray(image).save(own / picture)
-        texts = {name: content}
-        if name.startswith(("images.", "cameras.")) and not name.endswith(".xml"):
-            texts |= {other: files[other] for other in (f"images{name[-4:]}", f"cameras{name[-4:]}")}
-        for file, text in texts.items():
-            data = text if isinstance(text, bytes) else (text if isinstance(text, str) else json.dumps(text)).encode()
-            (own / file).write_bytes(data)
-        readers[name] = own / name, lambda path: load_pairs(path.parent)
-    return readers
+def make_example(folder: Path, example: Example) -> tuple[Path, Read]:
+    """A file that states panoramas, and a reader of its folder; a web tour is read alone, or pictures were read."""
+    example.state(write_room(folder), ("a.png", "b.png"))
+    return folder / example.stated, lambda path: load_panoramas(path if example.format == "web tour" else folder)
 
 
 def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
@@ -187,7 +149,11 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
         "path.kitti": (folder / "path.kitti", read_poses),
         "path.tum": (folder / "path.tum", read_poses),
         "pose.json": (folder / "pose.json", read_poses),
-        **write_reconstructions(folder),
+        **{
+            f"room {name}": make_example(folder / f"room{number}", example)
+            for number, (name, example) in enumerate(EXAMPLES.items())
+            if example.format != "photographs"
+        },
         "weights": (folder / "small.safetensors", lambda path: load_weights(path)),
         "training checkpoint": (folder / "training.pt", read_training),
         "official checkpoint": (folder / "official.ckpt", lambda path: read_checkpoint(path)),

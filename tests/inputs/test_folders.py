@@ -11,7 +11,7 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
-from pansplat.inputs.folders import UnposedPanoramasError, find_panorama_folders, load_pairs
+from pansplat.inputs.folders import find_panorama_folders, load_collections, load_pairs
 from pansplat.inputs.pairs import Link
 
 OPENCV = "cam2world opencv"
@@ -207,17 +207,14 @@ def test_360loc_sequences_pair_consecutive_frames(tmp_path: Path) -> None:
     pairs = load_pairs(tmp_path)
     assert [_centres(pair) for pair in pairs] == [[0, 1], [1, 2]]
     assert pairs[0].far == 50
-    inverted = load_pairs(tmp_path, convention="world2cam opencv")[0].context[1].cam2world
-    assert torch.allclose(inverted, torch.linalg.inv(torch.tensor(_pose(1), dtype=torch.float64)))
 
 
 @pytest.mark.parametrize("name", ["poses.txt", "frame_trajectory.txt", "a.kitti"])
-def test_trajectory_lines_are_the_scaled_poses_of_the_sorted_images(tmp_path: Path, name: str) -> None:
+def test_trajectory_lines_are_the_poses_of_the_sorted_images(tmp_path: Path, name: str) -> None:
     _sequence(tmp_path)
     lines = [" ".join(map(str, np.array(_pose(i))[:3].ravel())) for i in range(3)]
     (tmp_path / name).write_text("\n".join(lines))
-    (tmp_path / "scale.txt").write_text("2.5\n")
-    assert [_centres(pair) for pair in load_pairs(tmp_path)] == [[0, 2.5], [2.5, 5]]
+    assert [_centres(pair) for pair in load_pairs(tmp_path)] == [[0, 1], [1, 2]]
 
 
 @pytest.mark.parametrize(
@@ -283,12 +280,11 @@ def test_one_panorama_is_a_pair_of_one_view(tmp_path: Path, suffix: str) -> None
 def test_panoramas_without_poses_are_listed_for_their_estimate(tmp_path: Path, write_scene) -> None:
     for number in range(3):
         write_scene(tmp_path / f"{number}.png", 8)
-    with pytest.raises(
-        UnposedPanoramasError, match=r"needed poses .* got images only \(0\.png, 1\.png, 2\.png\)"
-    ) as caught:
+    with pytest.raises(InputError, match=r"needed poses .* got images only \(0\.png, 1\.png, 2\.png\)"):
         load_pairs(tmp_path)
-    assert caught.value.folder == tmp_path
-    assert [panorama.name for panorama in caught.value.panoramas] == ["0", "1", "2"]
+    (found,) = load_collections(tmp_path)
+    assert found.needs_poses and found.folder == tmp_path
+    assert [panorama.name for panorama in found.unposed] == ["0", "1", "2"]
 
 
 def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path, write_scene) -> None:

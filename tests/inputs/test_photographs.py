@@ -8,8 +8,9 @@ import pytest
 from PIL import Image
 
 from pansplat.images.image_files import read_panorama
+from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Link, Note
-from pansplat.inputs.photographs import list_photographs, write_notes
+from pansplat.inputs.photographs import write_notes
 
 
 def test_panoramas_faces_and_strips_of_a_folder_are_listed_by_name(
@@ -20,7 +21,7 @@ def test_panoramas_faces_and_strips_of_a_folder_are_listed_by_name(
     for face in "frblud":
         Image.fromarray(color_face(face, 16)).save(tmp_path / f"attic_{face}.png")
     Image.fromarray(np.concatenate([color_face(face, 16) for face in "lfrbud"], axis=1)).save(tmp_path / "cellar.png")
-    panoramas = list_photographs(tmp_path)
+    panoramas = load_panoramas(tmp_path)
     assert [panorama.name for panorama in panoramas] == ["attic", "cellar", "hall_jpg", "hall_png"]
     for panorama in panoramas:
         check_colors(read_panorama(panorama.image, 32)[0])
@@ -36,14 +37,14 @@ def test_a_damaged_picture_is_named_and_the_others_open(tmp_path: Path, write_sc
     for content in (whole[:-30], *([flipped] if suffix == "png" else [])):
         (tmp_path / f"b.{suffix}").write_bytes(content)
         with pytest.warns(UserWarning, match=rf"left out: .*b\.{suffix}: needed a complete image"):
-            assert [panorama.name for panorama in list_photographs(tmp_path)] == ["a"]
+            assert [panorama.name for panorama in load_panoramas(tmp_path)] == ["a"]
 
 
 def test_a_picture_with_other_data_behind_it_is_whole(tmp_path: Path, write_scene) -> None:
     write_scene(tmp_path / "a.jpg", 64)
     with open(tmp_path / "a.jpg", "ab") as file:
         file.write(b"SEFT" * 9)  # as some phones do
-    assert len(list_photographs(tmp_path)) == 1
+    assert len(load_panoramas(tmp_path)) == 1
 
 
 def test_own_renderings_count_only_if_there_is_nothing_else(tmp_path: Path, write_panorama, write_scene) -> None:
@@ -51,14 +52,14 @@ def test_own_renderings_count_only_if_there_is_nothing_else(tmp_path: Path, writ
         write_panorama(tmp_path / name)
     Image.new("RGB", (20, 20)).save(tmp_path / "logo.png")
     with pytest.warns(UserWarning, match=r"logo\.png: needed a 2:1"):
-        assert [panorama.name for panorama in list_photographs(tmp_path)] == ["out", "out_2"]
+        assert [panorama.name for panorama in load_panoramas(tmp_path)] == ["out", "out_2"]
     (tmp_path / "logo.png").unlink()
     write_scene(tmp_path / "photo.jpg")
     with (
         pytest.warns(UserWarning, match=r"left out: .*out\.png: it was rendered by pansplat"),
         pytest.warns(UserWarning, match=r"out_2\.jpg: it was rendered"),
     ):
-        assert [panorama.name for panorama in list_photographs(tmp_path)] == ["photo"]
+        assert [panorama.name for panorama in load_panoramas(tmp_path)] == ["photo"]
 
 
 @pytest.fixture
@@ -70,7 +71,7 @@ def rooms(tmp_path: Path, write_scene) -> Path:
 
 def _link(folder: Path, content: object) -> list:
     (folder / "links.json").write_text(content if isinstance(content, str) else json.dumps(content))
-    return list_photographs(folder)
+    return load_panoramas(folder)
 
 
 def test_links_titles_and_start_views_are_read(rooms: Path) -> None:
@@ -98,13 +99,13 @@ def test_notes_are_read_and_written_and_all_else_stays(rooms: Path) -> None:
     assert one.notes == () and two.notes == (note,)
     write_notes(one, [note])
     write_notes(two, [*two.notes, Note(3, 0, "window")])
-    one, two = list_photographs(rooms)
+    one, two = load_panoramas(rooms)
     assert one.notes == (note,) and one.links == (Link("p02", 0.5),)
     assert two.notes == (note, Note(3, 0, "window")) and two.title == "Bad"
     write_notes(two, [])
     content = json.loads((rooms / "links.json").read_text("utf-8"))
     assert content["p02"] == {"title": "Bad", "notes": [], "colour": "blue"} and content["p01.jpg"]["links"] == links
-    assert list_photographs(rooms)[1].notes == ()
+    assert load_panoramas(rooms)[1].notes == ()
 
 
 @pytest.mark.parametrize(
@@ -134,7 +135,7 @@ def test_faulty_links_are_named_and_the_panoramas_open(rooms: Path, content: obj
 @pytest.mark.shared
 @pytest.mark.parametrize(("tour", "count", "links"), [("flat_3", 3, 1), ("flat_5", 5, None), ("empty_house", 10, None)])
 def test_real_tours_are_listed_with_their_links(shared: Path, tour: str, count: int, links: int | None) -> None:
-    panoramas = list_photographs(shared / "data" / "tours" / tour)
+    panoramas = load_panoramas(shared / "data" / "tours" / tour)
     stated = json.loads((shared / "data" / "tours" / tour / "links.json").read_text())
     assert len(panoramas) == count
     assert sum(len(p.links) for p in panoramas) == (links or sum(map(len, stated.values())))

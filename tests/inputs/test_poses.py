@@ -138,6 +138,12 @@ def test_read_trajectories_equal_written_ones(tmp_path: Path, kind: str, text, c
         ("0 1 2 3 0 0 0 0", None, "needed a unit quaternion .*got length 0"),
         ("0 1 2 3 5 0 0 1", None, "needed a unit quaternion .*check the order"),
         ("1 0 0 0 0 1 0 0 0 0 9 0", None, "line 1: needed a rigid pose"),
+        *(
+            (f"1 0 0 {x} 0 1 0 0 0 0 1 0", None, "line 1: needed a (rigid pose|position)")
+            for x in ("1e30", "1e400", "nan")
+        ),
+        ("0 1e30 0 0 0 0 0 1", None, "line 1: needed a position of at most"),
+        ("0 0 0 0 1e200 0 0 1e200", None, "needed a unit quaternion"),
     ],
 )
 def test_invalid_trajectories_are_refused(tmp_path: Path, text: str, expected: str | None, message: str) -> None:

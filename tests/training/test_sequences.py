@@ -166,7 +166,7 @@ def test_incomplete_video_folders_are_refused(tmp_path: Path, write_folder: Call
         read_insta360(tmp_path / "gone")
     folder = write_folder(tmp_path / "mine", _kitti())
     (folder / "frame_trajectory.txt").unlink()
-    with pytest.raises(InputError, match="needed a trajectory for the video"):
+    with pytest.raises(InputError, match=r"needed one trajectory file .*got none; add it"):
         read_insta360(folder)
     (folder / "video.mp4").rename(folder / "a.mp4")
     write_video(folder / "b.mp4", [np.zeros((16, 30, 3), np.uint8)], 10)

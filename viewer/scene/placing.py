@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.geometry.path import wrap_angle
-from pansplat.inputs.folders import read_pose_file_folder
+from pansplat.inputs.folder_formats import read_pose_file
 from pansplat.inputs.pairs import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import (
@@ -211,8 +211,8 @@ class Placing:
         """Take poses and placements from the poses.json, or as at first if there is none."""
         found = {panorama.image.resolve(): panorama for panorama in self._first}
         if self._editor is not None and self._editor.file.exists():
-            collection = read_pose_file_folder(self._folder)
-            found |= {view.image.resolve(): view for view in (*collection.panoramas, *collection.unposed)}
+            collection = read_pose_file(self._editor.file, self._folder)
+            found |= {view.image.resolve(): view for view in collection.views}
         self.panoramas = tuple(
             replace(
                 view,

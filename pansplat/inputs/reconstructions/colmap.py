@@ -8,10 +8,10 @@ Source: https://colmap.github.io/format.html, https://colmap.github.io/cameras.h
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,9 +22,10 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.geometry.pose import invert_pose, quats_from_rotations, rotations_from_quats
 from pansplat.images.rig_images import Lens
-from pansplat.inputs.poses import rigid_matrix, to_cam2world
-from pansplat.inputs.reconstructions.shots import Reconstruction, Shot, find_picture
+from pansplat.inputs.reconstructions.shots import Reconstruction, find_picture
 from pansplat.system.files import SOFTWARE, read_file
+
+_T = TypeVar("_T")
 
 CONVENTION = "world2cam opencv"
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -45,56 +46,55 @@ _Camera = tuple[str, int, int, list[float]]  # model, width, height, parameters
 _Image = tuple[list[float], list[float], int, str]  # quaternion, translation, camera, name
 
 
-def find_colmap(folder: Path) -> Path | None:
-    """The images file of the model in a folder; None if there is none. A model needs its cameras file, too."""
+def list_files(source: Path) -> list[Path]:
+    """The files of a model, from its images file."""
+    return [source.with_stem(name) for name in ("images", "cameras", "points3D")]
+
+
+def find_colmap(folder: Path) -> list[Path]:
+    """The images file of the model in a folder, if there is one. A model needs its cameras file, too."""
     for sub in MODEL_FOLDERS:
         for suffix in (".bin", ".txt"):
-            files = [folder / sub / (name + suffix) for name in ("images", "cameras")]
-            if all(file.is_file() for file in files):
-                return files[0]
-    return None
+            images, cameras, _ = list_files(folder / sub / f"images{suffix}")
+            if images.is_file() and cameras.is_file():
+                return [images]
+    return []
 
 
 def read_colmap(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:
-    """The pictures of a model.
-
-    Args:
-        source: its images file.
-        folder: that was searched; pictures are in it, or in its folder images.
-        convention: of the poses; by default COLMAP's.
-    """
+    """The pictures of a model."""
     read_cameras, read_images, read_points = _BINARY if source.suffix == ".bin" else _TEXT
+    images_file, cameras_file, points_file = list_files(source)
+    cameras = _parse(cameras_file, read_cameras)
+    images = _parse(images_file, lambda file: list(read_images(file)))
+    if not images:
+        raise InputError(f"{source}: needed posed pictures, got none; export the model again.")
+    project = next((place.parent for place in (source.parent, source.parent.parent) if place.name == "sparse"), folder)
+    found = Reconstruction(source, folder, convention or CONVENTION)
+    for quat, translation, camera, name in images:
+        where = f"{source}, {name!r}"
+        if camera not in cameras:
+            raise InputError(f"{where}: needed camera {camera} in {cameras_file.name}, got none; export it again.")
+        image = find_picture(folder, name, project / "images")
+        lens = None if image is None else _make_lens(cameras[camera], where)
+        rotation = rotations_from_quats(torch.tensor(quat, dtype=torch.float64)).numpy()
+        found.add(name, image, np.column_stack((rotation, translation)), lens)
+    if points_file.is_file():
+        points = _parse(points_file, lambda file: np.array(list(islice(read_points(file), _MAX_POINTS))).reshape(-1, 3))
+        found.points = points[np.isfinite(points).all(axis=1)]
+    return found
+
+
+def _parse(file: Path, read: Callable[[Path], _T]) -> _T:
+    """What a reader returns for a file of a model; an InputError names a damaged one."""
     try:
-        cameras = read_cameras(source.with_stem("cameras"))
-        images = list(read_images(source))
-        points_file = source.with_stem("points3D")
-        points = np.array(list(islice(read_points(points_file), _MAX_POINTS)) if points_file.is_file() else [])
+        return read(file)
     except (ValueError, IndexError, KeyError, OverflowError, struct.error) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{source.parent}: needed a complete model of COLMAP, got damaged {source.suffix} files ({error}); "
-            "export it again."
+            f"{file}: needed a complete file of a model of COLMAP, got damaged data ({error}); export it again."
         ) from error
-    shots, missing = [], []
-    project = next((place.parent for place in (source.parent, source.parent.parent) if place.name == "sparse"), folder)
-    for quat, translation, camera, name in images:
-        where = f"{source}, {name!r}"
-        if camera not in cameras:
-            raise InputError(f"{where}: needed a camera of the cameras file, got number {camera}; export it again.")
-        image = find_picture(folder, name, project / "images")
-        if image is None:
-            missing.append(name)
-            continue
-        matrix = torch.eye(4, dtype=torch.float64)
-        matrix[:3, :3] = rotations_from_quats(torch.tensor(quat, dtype=torch.float64))
-        matrix[:3, 3] = torch.tensor(translation, dtype=torch.float64)
-        pose = to_cam2world(rigid_matrix(matrix.tolist(), where), convention or CONVENTION)
-        shots.append(Shot(name, image, pose, _make_lens(cameras[camera], where)))
-    if not images:
-        raise InputError(f"{source}: needed posed pictures, got none; export the model again.")
-    points = points.reshape(-1, 3)
-    return Reconstruction(source, folder, shots, points[np.isfinite(points).all(axis=1)], missing=missing)
 
 
 def _make_lens(camera: _Camera, where: str) -> Lens | None:

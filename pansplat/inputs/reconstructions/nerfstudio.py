@@ -26,8 +26,8 @@ from pansplat.errors import InputError
 from pansplat.geometry.pose import invert_pose
 from pansplat.images.image_files import read_size
 from pansplat.images.rig_images import Lens
-from pansplat.inputs.poses import from_cam2world, rigid_matrix, to_cam2world
-from pansplat.inputs.reconstructions.shots import Reconstruction, Shot, find_picture
+from pansplat.inputs.poses import from_cam2world, rigid_matrix
+from pansplat.inputs.reconstructions.shots import Reconstruction, find_picture
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.system.atomic import replacing
 from pansplat.system.files import read_file
@@ -54,13 +54,8 @@ _PLY_TYPES = {
 _MAX_PLY = 1 << 30  # bytes
 
 
-def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstruction:
-    """The frames of a transforms.json.
-
-    Args:
-        source: the file.
-        convention: of the matrices, such as "cam2world opencv"; by default nerfstudio's.
-    """
+def read_nerfstudio(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:
+    """The frames of a transforms.json."""
     content = read_json(source, dict[str, Any])
     frames = read_field(content, "frames", list[dict[str, Any]], source, [])
     if not frames:
@@ -70,26 +65,20 @@ def read_nerfstudio(source: Path, convention: str | None = None) -> Reconstructi
     undo = torch.eye(4, dtype=torch.float64)
     if applied is not None:
         undo = invert_pose(rigid_matrix(applied, f"{source}, applied_transform"))
-    folder, shots, missing = source.parent, [], []
+    found = Reconstruction(source, folder, convention or CONVENTION, undo, 1 / scale)
     for number, frame in enumerate(frames):
         where = f"{source}, frame {number}"
         name = read_field(frame, "file_path", str, where, "")
         image = find_picture(folder, name)
-        if image is None:
-            missing.append(name)
-            continue
-        pose = to_cam2world(rigid_matrix(frame.get("transform_matrix"), where), convention or CONVENTION)
-        pose[:3, 3] /= scale
-        stated = read_field(frame, "mask_path", str, where)
+        stated = None if image is None else read_field(frame, "mask_path", str, where)
         mask = None if stated is None else find_picture(folder, stated)
         if stated is not None and mask is None:
             locate_inside(folder, stated, where)
             raise InputError(f'{where}: needed the mask {stated}, got no such file; correct or remove "mask_path".')
-        lens = _read_lens({**content, **frame}, image, where)
-        shots.append(Shot(name, image, undo @ pose, lens, mask))
-    points = _read_points(content, source)
-    points = (points / scale) @ undo[:3, :3].T.numpy() + undo[:3, 3].numpy()
-    return Reconstruction(source, folder, shots, points, missing=missing)
+        lens = None if image is None else _read_lens({**content, **frame}, image, where)
+        found.add(name, image, frame.get("transform_matrix"), lens, mask)
+    found.points = (_read_points(content, source) / scale) @ undo[:3, :3].T.numpy() + undo[:3, 3].numpy()
+    return found
 
 
 def _read_lens(fields: Mapping[str, Any], image: Path, where: str) -> Lens | None:

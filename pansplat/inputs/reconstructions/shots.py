@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
@@ -24,11 +25,13 @@ from pansplat.images.blur_masks import fold_name
 from pansplat.images.image_files import READABLE_SUFFIXES
 from pansplat.images.rig_images import Lens, RigImage, RigView, write_rig
 from pansplat.inputs.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
-from pansplat.inputs.poses import read_number
+from pansplat.inputs.poses import read_number, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import find_inside
 from pansplat.system.components import label_components
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import make_unique_name
+
+Vector = tuple[float, float, float]
 
 _SCALE = "scale.txt"
 _IMAGE_FOLDERS = ("images", "image", "panos", "frames", "input", ".")
@@ -60,13 +63,16 @@ class Shot:
     mask: Path | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Reconstruction:
     """What a file states.
 
     Attributes:
         source: the file that messages name.
         folder: of the pictures, in whose cache folder joined panoramas are described.
+        convention: of the poses.
+        to_world: from the world of the file to that of the shots, rigid, after `scale`.
+        scale: units of the world per unit of the file.
         shots: those whose pictures exist, in the order of the file.
         points: of the scene, the unit of the file; may be empty.
         is_metric: whether the unit of the file is the metre; otherwise nothing is known of it.
@@ -75,10 +81,25 @@ class Reconstruction:
 
     source: Path
     folder: Path
-    shots: Sequence[Shot]
+    convention: str
+    to_world: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
+    scale: float = 1.0
+    shots: list[Shot] = field(default_factory=list)
     points: Float[Array, "point 3"] = field(default_factory=lambda: np.empty((0, 3)))
     is_metric: bool = False
-    missing: Sequence[str] = ()
+    missing: list[str] = field(default_factory=list)
+
+    def add(
+        self, name: str, image: Path | None, matrix: Any, lens: Lens | None = None, mask: Path | None = None
+    ) -> None:
+        """Add a picture with its pose, 3x4 or 4x4 numbers in the convention; or note that it is missing."""
+        if image is None:
+            self.missing.append(name)
+            return
+        values = matrix.tolist() if isinstance(matrix, (Array, Tensor)) else matrix
+        pose = to_cam2world(rigid_matrix(values, f"{self.source}, {name!r}"), self.convention).clone()
+        pose[:3, 3] *= self.scale
+        self.shots.append(Shot(name, image, self.to_world @ pose, lens, mask))
 
 
 def note_smaller(source: Path, count: int) -> None:
@@ -159,6 +180,7 @@ def make_collection(found: Reconstruction) -> Collection:
     near, far = _find_range(centres, found.points * scale, found.is_metric or scale_file is not None)
     return Collection(
         found.source,
+        found.folder,
         tuple(panoramas),
         near=near,
         far=far,

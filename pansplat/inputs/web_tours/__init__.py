@@ -9,19 +9,20 @@ from pathlib import Path
 
 from pansplat.errors import InputError
 from pansplat.images.cube_images import CUBE_SUFFIX
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.pairs import Collection
 from pansplat.inputs.web_tours.entries import make_panoramas
 from pansplat.inputs.web_tours.marzipano import find_marzipano, read_marzipano
 from pansplat.inputs.web_tours.pannellum import SUFFIXES, find_pannellum, read_pannellum
 
 
-def find_web_tour(folder: Path) -> Path | None:
-    """The file that describes the tour in a folder; None if there is none. It may be faulty.
+def find_web_tours(folder: Path) -> list[Path]:
+    """The file that describes the tour in a folder, if there is one. It may be faulty.
 
     Raises:
         OSError: the folder cannot be listed.
     """
-    return find_marzipano(folder) or find_pannellum(folder)
+    source = find_marzipano(folder) or find_pannellum(folder)
+    return [] if source is None else [source]
 
 
 def is_web_tour_file(file: Path) -> bool:
@@ -31,10 +32,10 @@ def is_web_tour_file(file: Path) -> bool:
 
 def is_scene_of_tour(folder: Path, image: Path) -> bool:
     """Whether a panorama is a scene of the web tour in a folder that is made from cube faces."""
-    return image.name.endswith(CUBE_SUFFIX) and find_web_tour(folder) is not None
+    return image.name.endswith(CUBE_SUFFIX) and bool(find_web_tours(folder))
 
 
-def read_web_tour(source: Path) -> list[Panorama]:
+def read_web_tour(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The panoramas of a tour, with titles, links, notes and start views, and without poses. No pixels are read.
 
     Warns about panoramas, links and levels that cannot be used.
@@ -43,6 +44,7 @@ def read_web_tour(source: Path) -> list[Panorama]:
         source: data.js of an export of the Marzipano Tool, its index.html, or the configuration of Pannellum in JSON,
             HTML or JavaScript.
     """
+    del convention
     marzipano = find_marzipano(source.parent)
     if marzipano is not None and (marzipano == source or source.suffix.lower() in (".html", ".htm")):
         source, (title, entries) = marzipano, read_marzipano(marzipano)
@@ -50,4 +52,5 @@ def read_web_tour(source: Path) -> list[Panorama]:
         title, entries = read_pannellum(source)
     if not entries:
         raise InputError(f"{source}: needed panoramas, got none that can be used; the notes name the reasons.")
-    return make_panoramas(entries, source, title)
+    name, panoramas = folder.resolve().name, tuple(make_panoramas(entries, source, title))
+    return Collection(source, folder, name=name, unposed=panoramas)

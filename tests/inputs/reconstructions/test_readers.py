@@ -382,17 +382,6 @@ def test_scale_txt_states_the_unit(tmp_path: Path, cameras: list[Array], write_p
     np.testing.assert_allclose(panoramas[1].cam2world[:3, 3], 0.5 * cameras[1][:3, 3])
 
 
-def test_a_convention_overrides_the_format(tmp_path: Path, cameras: list[Array], write_panorama) -> None:
-    frames = []
-    for name, pose in zip(NAMES, cameras, strict=True):
-        write_panorama(tmp_path / name, pose)
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-    write_transforms(tmp_path, frames, camera_model="EQUIRECTANGULAR")
-    with pytest.warns(InputWarning, match="arbitrary"):
-        pairs = load_pairs(tmp_path, convention="cam2world opencv")
-    np.testing.assert_allclose(pairs[0].context[0].cam2world, cameras[0])
-
-
 def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
     tmp_path: Path, cameras: list[Array], write_panorama, write_view
 ) -> None:
@@ -420,5 +409,7 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
         load_pairs(tmp_path)
     for name in ("cameras", "images"):
         (model / f"{name}.bin").write_bytes(b"\x05\0\0\0\0\0\0\0\1")
-    with pytest.raises(InputError, match=r"sparse.0: needed a complete model of COLMAP, got damaged \.bin files"):
+    with pytest.raises(
+        InputError, match=r"sparse.0.cameras\.bin: needed a complete file of a model of COLMAP, got damaged"
+    ):
         load_pairs(tmp_path)

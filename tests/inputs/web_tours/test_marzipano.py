@@ -11,12 +11,13 @@ import pytest
 from PIL import Image
 
 from pansplat.cli import run
+from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.folders import UnposedPanoramasError, load_pairs, load_panoramas
+from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.inputs.pairs import Link, Note, Panorama
-from pansplat.inputs.web_tours import find_web_tour, read_web_tour
-from pansplat.poses.edit import PoseEditor
-from pansplat.poses.files import _describe, name_pictures
+from pansplat.inputs.web_tours import find_web_tours
+from pansplat.poses.edit import PoseEditor, name_pictures
+from pansplat.poses.files import _describe
 
 LEVELS = [
     {"tileSize": 16, "size": 16, "fallbackOnly": True},
@@ -72,7 +73,7 @@ def test_an_export_has_its_pictures_names_links_and_start_views(export: Export, 
     spot = {"yaw": 3.0, "pitch": 0.25, "rotation": 0, "target": "1-kitchen"}
     back = {"yaw": -0.1 - 2 * math.pi, "pitch": -0.2, "target": "0-hall"}
     folder = export(_scene("0-hall", linkHotspots=[spot]), _scene("1-kitchen", name="", linkHotspots=[back]))
-    hall, kitchen = read_web_tour(folder / "data.js")
+    hall, kitchen = load_panoramas(folder / "data.js")
     assert (hall.name, hall.label, kitchen.label) == ("0-hall", "Hall", "1-kitchen")
     assert hall.links == (Link("1-kitchen", 3.0, 0.25),)
     assert kitchen.links[0].target == "0-hall"
@@ -84,9 +85,9 @@ def test_an_export_has_its_pictures_names_links_and_start_views(export: Export, 
 
 def test_messages_name_rooms_by_their_titles(export: Export) -> None:
     folder = export(_scene("0-hall", name="Entrance"), _scene("1-kitchen"))
-    with pytest.raises(UnposedPanoramasError, match=r"got images only \(Entrance, Kitchen\)") as caught:
+    with pytest.raises(InputError, match=r"got images only \(Entrance, Kitchen\)"):
         load_pairs(folder)
-    assert [_describe(view, folder) for view in caught.value.panoramas] == [f"{folder}: Entrance", f"{folder}: Kitchen"]
+    assert [_describe(view, folder) for view in load_panoramas(folder)] == [f"{folder}: Entrance", f"{folder}: Kitchen"]
 
 
 def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Export) -> None:
@@ -156,20 +157,20 @@ def test_what_is_hidden_stays_hidden_in_the_photographs_of_a_tour(tmp_path: Path
 
 def test_the_export_is_found_from_its_folder_archive_and_page(export: Export) -> None:
     folder = export(_scene("0-hall"))
-    assert find_web_tour(folder) == folder / "data.js"
-    assert [panorama.name for panorama in read_web_tour(folder / "index.html")] == ["0-hall"]
+    assert find_web_tours(folder) == [folder / "data.js"]
+    assert [panorama.name for panorama in load_panoramas(folder / "index.html")] == ["0-hall"]
     parent = folder / "archive"
     parent.mkdir()
     for name in ("data.js", "index.html", "tiles"):
         (parent / "app-files").mkdir(exist_ok=True)
         (folder / name).rename(parent / "app-files" / name)
-    assert find_web_tour(parent) == parent / "app-files" / "data.js"
-    assert len(read_web_tour(parent / "app-files" / "data.js")) == 1
+    assert find_web_tours(parent) == [parent / "app-files" / "data.js"]
+    assert len(load_panoramas(parent / "app-files" / "data.js")) == 1
 
 
 def test_levels_without_a_preview_count_from_one(export: Export, check_colors) -> None:
     folder = export(_scene("0-hall", levels=LEVELS[1:]), first=1)
-    _check_picture(read_web_tour(folder / "data.js")[0], check_colors)
+    _check_picture(load_panoramas(folder / "data.js")[0], check_colors)
 
 
 def test_a_level_with_a_damaged_tile_gives_way_to_the_next_complete_one(export: Export, check_colors) -> None:
@@ -180,7 +181,7 @@ def test_a_level_with_a_damaged_tile_gives_way_to_the_next_complete_one(export: 
         pytest.warns(UserWarning, match="'0-hall' is read at 32 instead of 64 pixels .*2/u/1/0.jpg is damaged"),
         pytest.warns(UserWarning, match="'1-attic' is left out: needed all tiles .*1-attic/2/f/0/0.jpg is damaged"),
     ):
-        (hall,) = read_web_tour(folder / "data.js")
+        (hall,) = load_panoramas(folder / "data.js")
     _check_picture(hall, check_colors, 32)
 
 
@@ -192,7 +193,7 @@ def test_without_tiles_the_preview_is_read(export: Export, color_face, check_col
     (folder / "tiles/0-hall").mkdir(parents=True)
     preview.save(folder / "tiles/0-hall/preview.jpg", quality=97, subsampling=0)
     with pytest.warns(UserWarning, match="is read at 16 instead of 64 pixels"):
-        (hall,) = read_web_tour(folder / "data.js")
+        (hall,) = load_panoramas(folder / "data.js")
     assert read_height(hall.image) == 32
     check_colors(read_panorama(hall.image, 32)[0], tolerance=12)
 
@@ -201,7 +202,7 @@ def test_a_broken_start_view_is_dropped(export: Export) -> None:
     views = [{"yaw": {}}, None]
     folder = export(*(_scene(f"{n}-room", initialViewParameters=view) for n, view in enumerate(views)))
     with pytest.warns(UserWarning, match="the start view of 0-room is left out: direction, yaw: needed a number"):
-        panoramas = read_web_tour(folder / "data.js")
+        panoramas = load_panoramas(folder / "data.js")
     assert [panorama.start for panorama in panoramas] == [None, None]
 
 
@@ -211,7 +212,7 @@ def test_links_to_nowhere_and_to_itself_are_dropped(export: Export) -> None:
     ]
     folder = export(_scene("0-hall", linkHotspots=[*spots, None, "x"]))
     with pytest.warns(UserWarning) as caught:
-        (hall,) = read_web_tour(folder / "data.js")
+        (hall,) = load_panoramas(folder / "data.js")
     assert hall.links == ()
     messages = [str(warning.message) for warning in caught]
     assert len(messages) == 2
@@ -230,7 +231,7 @@ def test_information_is_kept_as_plain_text_with_addresses_of_web_pages(export: E
         {"yaw": "x", "title": "gone"},
     ]
     with pytest.warns(UserWarning, match="a hot spot of 0-hall is left out: direction, yaw: needed a number"):
-        (hall,) = read_web_tour(export(_scene("0-hall", infoHotspots=spots)) / "data.js")
+        (hall,) = load_panoramas(export(_scene("0-hall", infoHotspots=spots)) / "data.js")
     shown = "Floor\nOak & ash\n1 < 2\n[oven.jpg]\nmore\nonetwothree\n[a tap]"
     assert hall.notes == (Note(0.5, -0.2, shown, ("https://example.org/a?b=1&c", "http://example.org/tap.png")),)
 
@@ -240,12 +241,12 @@ def test_the_title_of_the_tour_is_that_of_the_project(export: Export, name: obje
     folder = export(_scene("0-hall"))
     data = json.loads((folder / "data.js").read_text().removeprefix("var APP_DATA = ").rstrip(";\n"))
     (folder / "data.js").write_text(f"var APP_DATA = {json.dumps(data | {'name': name})};")
-    assert [panorama.tour for panorama in read_web_tour(folder / "data.js")] == [title]
+    assert [panorama.tour for panorama in load_panoramas(folder / "data.js")] == [title]
 
 
 def test_scripts_in_names_are_plain_text(export: Export) -> None:
     name = "<script>alert('x')</script>\n\u2028\0 & more"
-    (hall,) = read_web_tour(export(_scene("0-hall", name=name)) / "data.js")
+    (hall,) = load_panoramas(export(_scene("0-hall", name=name)) / "data.js")
     assert hall.title == "<script>alert('x')</script> & more"
 
 
@@ -256,7 +257,7 @@ def test_tiles_outside_of_the_folder_are_not_read(export: Export, key: str) -> N
     data["scenes"].append(_scene(key))
     (folder / "data.js").write_text(f"var APP_DATA = {json.dumps(data)}")
     with pytest.warns(UserWarning, match="is left out: needed (a file|all tiles)"):
-        panoramas = read_web_tour(folder / "data.js")
+        panoramas = load_panoramas(folder / "data.js")
     assert [panorama.name for panorama in panoramas] == ["0-hall"]
 
 
@@ -276,7 +277,7 @@ def test_a_broken_scene_is_named_and_the_others_open(export: Export, content: di
     export(_scene("0-hall", levels=level), first=1)
     (folder / "data.js").write_text(f"APP_DATA = {json.dumps({'scenes': [_scene('0-hall', levels=level), broken, 7]})}")
     with pytest.warns(UserWarning) as caught:
-        panoramas = read_web_tour(folder / "data.js")
+        panoramas = load_panoramas(folder / "data.js")
     assert [panorama.name for panorama in panoramas] == ["0-hall"]
     assert message in str(caught[0].message)
     assert "'number 3' is left out: needed an object, got '7'" in str(caught[1].message)

@@ -12,8 +12,9 @@ from PIL import Image
 
 from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
+from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Link, Note
-from pansplat.inputs.web_tours import find_web_tour, read_web_tour
+from pansplat.inputs.web_tours import find_web_tours
 
 MULTIRES = {
     "basePath": "tiles",
@@ -56,7 +57,7 @@ def test_a_tour_of_panoramas_has_titles_links_and_start_views(tmp_path: Path, wr
             "hall": {"title": "The hall", "type": "equirectangular", "panorama": "hall.jpg", "yaw": -190},
         },
     }
-    hall, kitchen = read_web_tour(_write(tmp_path, content))
+    hall, kitchen = load_panoramas(_write(tmp_path, content))
     assert hall.tour == kitchen.tour == "Our home" and hall.notes == ()
     lamp, picture = kitchen.notes
     assert (lamp.yaw, lamp.pitch) == pytest.approx((math.pi / 2, -math.radians(10)))
@@ -73,7 +74,7 @@ def test_a_tour_of_panoramas_has_titles_links_and_start_views(tmp_path: Path, wr
 
 
 def test_tiles_of_several_levels_are_one_panorama(multires: Path, check_colors) -> None:
-    (panorama,) = read_web_tour(_write(multires, {"type": "multires", "multiRes": MULTIRES}, "config.json"))
+    (panorama,) = load_panoramas(_write(multires, {"type": "multires", "multiRes": MULTIRES}, "config.json"))
     assert read_height(panorama.image) == 80
     for height in (80, 40, 16):
         check_colors(read_panorama(panorama.image, height)[0])
@@ -84,7 +85,7 @@ def test_six_files_are_one_panorama(tmp_path: Path, color_face, check_colors) ->
     for number, face in enumerate("frblud"):
         files.append(f"examplepanocube{number}.png")
         Image.fromarray(color_face(face, 32)).save(tmp_path / files[-1])
-    (panorama,) = read_web_tour(_write(tmp_path, {"type": "cubemap", "cubeMap": files}))
+    (panorama,) = load_panoramas(_write(tmp_path, {"type": "cubemap", "cubeMap": files}))
     assert panorama.name == tmp_path.name.replace("[", "_").replace("]", "_")[:60].strip("_.")
     check_colors(read_panorama(panorama.image, 64)[0])
 
@@ -107,15 +108,15 @@ document.getElementById('x').onclick = () => { run(); };
 def test_a_configuration_in_a_page_is_read_and_not_run(tmp_path: Path, script: str, write_scene) -> None:
     write_scene(tmp_path / "hall.jpg")
     page = _write(tmp_path, HTML % script, "page.html")
-    assert find_web_tour(tmp_path) == page
-    assert [panorama.image.name for panorama in read_web_tour(page)] == ["hall.jpg"]
+    assert find_web_tours(tmp_path) == [page]
+    assert [panorama.image.name for panorama in load_panoramas(page)] == ["hall.jpg"]
 
 
 def test_an_embedded_viewer_names_its_configuration(tmp_path: Path, write_scene) -> None:
     write_scene(tmp_path / "hall.jpg")
     _write(tmp_path, {"panorama": "hall.jpg"}, "my.json")
     page = _write(tmp_path, '<iframe src="pannellum.htm#config=my.json&amp;autoLoad=true"></iframe>', "page.html")
-    assert [panorama.image.name for panorama in read_web_tour(page)] == ["hall.jpg"]
+    assert [panorama.image.name for panorama in load_panoramas(page)] == ["hall.jpg"]
 
 
 def test_damaged_pictures_are_left_out_and_damaged_tiles_give_way(multires: Path, write_scene, check_colors) -> None:
@@ -127,7 +128,7 @@ def test_damaged_pictures_are_left_out_and_damaged_tiles_give_way(multires: Path
         pytest.warns(UserWarning, match=r"d2_1\.jpg is damaged; the panorama is read at 20 pixels a face, not 40"),
         pytest.warns(UserWarning, match=r"'attic' is left out: .*attic\.jpg: needed a complete image"),
     ):
-        (panorama,) = read_web_tour(_write(multires, {"scenes": scenes}))
+        (panorama,) = load_panoramas(_write(multires, {"scenes": scenes}))
     check_colors(read_panorama(panorama.image, 40)[0])
 
 
@@ -135,7 +136,7 @@ def test_without_tiles_the_fallback_is_read(multires: Path, check_colors) -> Non
     for level in "123":
         (multires / f"tiles/{level}/f0_0.jpg").unlink()
     with pytest.warns(UserWarning, match="read at 24 pixels"):
-        (panorama,) = read_web_tour(_write(multires, {"type": "multires", "multiRes": MULTIRES}))
+        (panorama,) = load_panoramas(_write(multires, {"type": "multires", "multiRes": MULTIRES}))
     check_colors(read_panorama(panorama.image, 48)[0])
 
 
@@ -144,7 +145,7 @@ def test_the_same_picture_in_two_scenes_is_one_panorama(tmp_path: Path, write_sc
         write_scene(tmp_path / f"{name}.jpg")
     link = {"hotSpots": [{"sceneId": "day", "yaw": 0, "pitch": 0}]}
     scenes = {"night": {"panorama": "a.jpg"}, "day": {"panorama": "a.jpg"}, "hall": {"panorama": "b.jpg", **link}}
-    night, hall = read_web_tour(_write(tmp_path, {"scenes": scenes}))
+    night, hall = load_panoramas(_write(tmp_path, {"scenes": scenes}))
     assert (night.name, hall.links) == ("night", (Link("night", 0.0, 0.0),))
     assert str(hall.links[0].pitch) == "0.0", "not -0.0, which would be in links.json"
 
@@ -154,7 +155,7 @@ def test_names_are_file_safe_and_unique(tmp_path: Path, write_scene) -> None:
     for number in range(len(keys)):
         write_scene(tmp_path / f"{number}.jpg")
     scenes = {key: {"panorama": f"{number}.jpg"} for number, key in enumerate(keys)}
-    names = [panorama.name for panorama in read_web_tour(_write(tmp_path, {"scenes": scenes}))]
+    names = [panorama.name for panorama in load_panoramas(_write(tmp_path, {"scenes": scenes}))]
     assert names == ["a_b", "a_b_2", "A_B_3", "scene_4", "\u00e9t\u00e9"]
 
 
@@ -200,7 +201,7 @@ def test_a_broken_scene_is_named_and_the_others_open(tmp_path: Path, scene: obje
     (tmp_path / "text.jpg").write_text("hello")
     scenes = {"attic": scene, "hall": {"panorama": "hall.jpg"}}
     with pytest.warns(UserWarning) as caught:
-        panoramas = read_web_tour(_write(tmp_path, {"scenes": scenes}))
+        panoramas = load_panoramas(_write(tmp_path, {"scenes": scenes}))
     assert [panorama.name for panorama in panoramas] == ["hall"]
     assert "scene 'attic' is left out" in str(caught[0].message) and message in str(caught[0].message)
 
@@ -213,7 +214,7 @@ def test_json_files_of_other_kinds_are_no_tours(tmp_path: Path) -> None:
         ("c.html", "<p>"),
     ):
         _write(tmp_path, text, name)
-    assert find_web_tour(tmp_path) is None
+    assert find_web_tours(tmp_path) == []
 
 
 HOSTILE_PAGES = {  # file, repetitions, text of n repetitions
@@ -241,7 +242,7 @@ def test_the_time_of_a_page_grows_in_proportion_to_its_size(tmp_path: Path, case
         for _ in range(3):
             start = time.process_time()  # of this process only: other programs do not count
             with contextlib.suppress(InputError):
-                read_web_tour(tmp_path / name)
+                load_panoramas(tmp_path / name)
             seconds.append(time.process_time() - start)
         return min(seconds)
 
