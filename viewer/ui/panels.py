@@ -14,7 +14,6 @@ from imgui_bundle import imgui
 
 from pansplat.system.descriptions import describe_count
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.key_frames import KeyFrame
 from pansplat_viewer.scene.settings import Display, Preset
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
@@ -24,6 +23,7 @@ from pansplat_viewer.scene.state import (
     fly_to,
     go_home,
     jump_to_view,
+    make_key_frame,
     show_path,
     toggle_play,
 )
@@ -427,7 +427,7 @@ class Panels:
                 show_path(state, frame.seconds)
             imgui.same_line()
             if self.widgets.button(f"Replace##{index}"):
-                state.path = state.path.add(KeyFrame.of_camera(state.camera, frame.seconds))
+                state.path = state.path.add(make_key_frame(state.camera, frame.seconds))
             imgui.same_line()
             if self.widgets.button(f"Delete##{index}"):
                 state.path = state.path.remove(index)
