@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pansplat.tours.camera_path import CameraPath
     from pansplat_viewer.draw.stereo import ImageFormat
 
-_WRITTEN = "view_*.png", "panorama_*.png", "[0-9]*_*.png", "floor_plan.png", "flythrough.mp4", "tour.mp4"  # offscreen
+_WRITTEN = "view_*.png", "panorama_*.png", "[0-9]*_*.png", "flythrough.mp4", "tour.mp4"  # offscreen
 _WINDOW_SIZE = 1280, 720  # pixels
 _PREDICTION_PART = 0.6  # of the work of a film; the rest is drawing
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset

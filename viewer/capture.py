@@ -17,7 +17,6 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import write_image
 from pansplat.predictor import Progress
-from pansplat.tours.floor import paint_floor_plan
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.route import FADE_SECONDS, NEAR_OF_FAR, Route
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
@@ -147,17 +146,16 @@ def write_tour(
     progress: Progress,
     show_file: Callable[[Path], None],
 ) -> None:
-    """Write the film of a route through a tour (`tour.mp4`), a still at each panorama (`01_NAME.png`), and its floor
-    plan; see `write_flight`."""
+    """Write the film of a route through a tour (`tour.mp4`) and a still at each panorama (`01_NAME.png`).
+
+    See `write_flight`.
+    """
     shots = list_flight(route, fps, FIELD_OF_VIEW, seconds)
     stills = {
         frame: [f"{node + 1:02d}_{make_file_name(scenes.tour.panoramas[node].label)}" for node in nodes]
         for frame, nodes in find_nearest_frames(scenes.tour, route, shots).items()
     }
     _write(film, shots, stills, folder / "tour.mp4", fps, progress, show_file)
-    plan = paint_floor_plan(scenes.tour, scenes.outlines, route=route)
-    write_image(folder / "floor_plan.png", plan.astype(np.float32) / 255)
-    show_file(folder / "floor_plan.png")
 
 
 def _write(

@@ -251,16 +251,10 @@ def test_the_mesh_of_a_panorama_without_a_pose_is_a_file_of_its_own(
     assert run(command) == 0 and not (tmp_path / "home_2.glb").exists(), "a mesh of before"
 
 
-def test_a_floor_plan_needs_a_floor(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
-    message = refusal("export", scene, "-o", tmp_path / "plan.png", "--min-opacity", "0.95")
-    assert "needed a floor below at least one of 2 input cameras" in message
-    assert "--points is for a .ply" in refusal("export", scene, "-o", tmp_path / "plan.png", "--points")
-
-
-def test_a_drawn_plan_needs_walls_and_all_that_each_panorama_shows(
+def test_a_plan_needs_walls_and_all_that_each_panorama_shows(
     scene: Path, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
-    message = refusal("export", scene, "-o", tmp_path / "plan.svg", "--min-opacity", "0.95")
+    message = refusal("export", scene, "-o", tmp_path / "plan.png", "--min-opacity", "0.95")
     assert "needed a floor, and walls around at least one of 2 input cameras" in message
     assert run(["export", str(scene), "-o", str(tmp_path / "joint.ply")]) == 0
     assert "exported with --layers" in refusal("export", tmp_path / "joint.ply", "-o", tmp_path / "plan.dxf")

@@ -337,7 +337,7 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
 
     write_tour(open_tour_film(scenes, load), scenes, route, tmp_path, 12, None, lambda task, done: None, show_file)
     names = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
-    assert written == [*names, "tour.mp4", "floor_plan.png"] and complete == [False] * 4 + [True] * 2
+    assert written == [*names, "tour.mp4"] and complete == [False] * 4 + [True]
     frames = read_film(tmp_path / "tour.mp4")
     with Image.open(tmp_path / names[0]) as still:
         assert np.abs(np.asarray(still).astype(float) - frames[0]).mean() < 6, "the still of the first panorama"
@@ -346,8 +346,6 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
     steps = np.abs(np.diff(frames, axis=0)).mean((1, 2, 3))
     change = np.abs(frames[0].mean((0, 1)) - frames[-1].mean((0, 1))).mean()
     assert change > 30 and steps.max() < 0.3 * change, "scenes of different colours fade"
-    with Image.open(tmp_path / "floor_plan.png") as plan:
-        assert max(plan.size) == 1024
 
 
 def test_a_change_of_scenes_changes_the_picture_no_more_than_a_flight_along_an_edge(house, load_house, open_tour_film):
@@ -387,8 +385,8 @@ def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house,
     arguments = ["--offscreen", str(tmp_path), "--size", "64x32", "--seconds", "0.5", "--renderer", "cpu"]
     assert run([str(house.folder), *arguments]) == 0
     stills = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [*stills, "floor_plan.png", "tour.mp4"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*stills, "tour.mp4"]
     assert len(read_film(tmp_path / "tour.mp4")) == 12
     lines = capsys.readouterr().out.splitlines()[1:]  # without the note on several scenes
-    assert [Path(line).name for line in lines if "Gaussians" not in line] == [*stills, "tour.mp4", "floor_plan.png"]
+    assert [Path(line).name for line in lines if "Gaussians" not in line] == [*stills, "tour.mp4"]
     assert lines[0].endswith(" Gaussians"), "before the first still"
