@@ -17,6 +17,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import write_image
 from pansplat.predictor import Progress
+from pansplat.rendering.image_planes import Layout
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.route import FADE_SECONDS, NEAR_OF_FAR, Route
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
@@ -93,10 +94,10 @@ def open_film(
         assert shown is not None
         return shown.scene, scenes.part
 
-    layout = "equirect" if image_format.projection == "equirect" else "pinhole"
+    layout: Layout = "equirect" if image_format.projection == "equirect" else "pinhole"
     chosen = choose if scenes is not None else lambda shot: (loaded.scene, 0)
     try:
-        yield Film(chosen, draw, layout, size[::-1], photographs)
+        yield Film(chosen, draw, layout, (size[1], size[0]), photographs)
     finally:
         for renderer in renderers:
             renderer.release()

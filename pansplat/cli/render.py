@@ -198,12 +198,12 @@ class Render(Writer):
 
         @torch.no_grad()
         def draw(slot: int, shown: Scene, shot: Shot) -> tuple[np.ndarray, np.ndarray | None]:
-            fov = {"vertical_fov_degrees": shot.vertical_fov_degrees} if is_perspective else {}
+            fov: dict[str, Any] = {"vertical_fov_degrees": shot.vertical_fov_degrees} if is_perspective else {}
             image = pipeline.render(shown, shot.pose, near=near, **options | fov)
             return image.color.permute(1, 2, 0).cpu().numpy(), image.depth.cpu().numpy() if with_depth else None
 
-        is_plain = source is not None and self.blend is None and not self.stereo and not with_depth
-        photographs = FilmPhotographs.open(source, scene) if is_plain else None
+        is_plain = self.blend is None and not self.stereo and not with_depth
+        photographs = FilmPhotographs.open(source, scene) if source is not None and is_plain else None
         choose = (lambda shot: (scene, 0)) if isinstance(options["blend"], int) else choose_scenes(scene)
         return Film(choose, draw, "pinhole" if is_perspective else "equirect", options["size"], photographs)
 

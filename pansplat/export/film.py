@@ -51,7 +51,7 @@ class FilmPhotographs:
         self,
         photographs: Sequence[Pair],
         cam2world: Float[Tensor, "photograph 4 4"],
-        gains: Sequence[tuple[float, float, float]] = (),
+        gains: Sequence[tuple[float, ...]] = (),
     ) -> None:
         """Read nothing yet.
 
@@ -219,7 +219,8 @@ class Film:
             size: (height, width) of the image of one eye, pixels.
             photographs: that are shown at panoramas; none with depth.
         """
-        self._choose, self._draw, self._layout, self._size = choose, draw, layout, size
+        self._choose, self._draw, self._size = choose, draw, size
+        self._layout: Layout = layout
         self._photographs = photographs or FilmPhotographs((), torch.zeros(0, 4, 4))
         self._fade = CrossFade()
 
