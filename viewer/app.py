@@ -270,8 +270,7 @@ def _write_film(
     Names of scenes and files are printed as soon as they are there.
     """
     from pansplat.export.film import follow_path, write_film
-    from pansplat.tours.route import plan_route
-    from pansplat_viewer.capture import open_film, write_flight, write_tour
+    from pansplat_viewer.capture import open_film, write_flight
     from pansplat_viewer.draw.cpu_renderer import create_renderer
     from pansplat_viewer.scene.state import fit_settings
     from pansplat_viewer.scene.tour import TourScenes
@@ -316,12 +315,9 @@ def _write_film(
                     options_of_file = {"projection": projection, "stereo": format_.stereo, "unit": scene.frame.unit}
                     for file in write_film(out, film, shots, fps, **options_of_file, progress=show_progress):
                         show_file(file)
-                elif scenes is not None:
-                    route = plan_route(scenes.tour, scenes.tour.plan_walk())
-                    write_tour(film, scenes, route, folder, fps, options.seconds, show_progress, show_file)
                 else:
-                    at = 0.5 if options.at is None else options.at
-                    write_flight(film, scene, folder, fps, options.seconds, at, settings, show_progress, show_file)
+                    at, show = 0.5 if options.at is None else options.at, (show_progress, show_file)
+                    write_flight(film, scene, scenes, folder, fps, options.seconds, at, settings, *show)
         finally:
             if ctx is not None:
                 ctx.release()

@@ -19,7 +19,7 @@ from pansplat.images.image_files import write_image
 from pansplat.predictor import Progress
 from pansplat.rendering.image_planes import Layout
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.route import FADE_SECONDS, NEAR_OF_FAR, Route
+from pansplat.tours.route import FADE_SECONDS, NEAR_OF_FAR, Route, plan_route
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.stereo import ImageFormat, render_image
 from pansplat_viewer.scene import camera as cameras
@@ -106,6 +106,7 @@ def open_film(
 def write_flight(
     film: Film,
     scene: Scene,
+    scenes: TourScenes | None,
     folder: Path,
     fps: float,
     seconds: float | None,
@@ -114,11 +115,15 @@ def write_flight(
     progress: Progress,
     show_file: Callable[[Path], None],
 ) -> None:
-    """Write the film of a scene's flight (`flythrough.mp4`), stills of it, and a panorama.
+    """Write the film of a flight, and frames of it as stills before the film is complete.
+
+    For a scene these are `flythrough.mp4`, `view_000.png` and so on, and a panorama; for a tour `tour.mp4` and a still
+    at each panorama (`01_NAME.png`).
 
     Args:
-        film: of the scene.
-        scene: the scene.
+        film: of the scene or tour.
+        scene: the scene, or the first one of the tour.
+        scenes: of the tour; None for another scene.
         folder: created if it does not exist.
         fps, seconds: see `list_flight`.
         at: fraction of the flight at which the panorama is rendered.
@@ -126,59 +131,31 @@ def write_flight(
         progress: called with the task and the fraction done.
         show_file: called with each file that is written.
     """
-    shots = list_flight(partial(compute_flight_pose, scene), fps, FIELD_OF_VIEW, seconds)
+    folder.mkdir(parents=True, exist_ok=True)
     stills: dict[int, list[str]] = {}
-    for still in STILLS:
-        stills.setdefault(round(still * (len(shots) - 1)), []).append(f"view_{round(100 * still):03d}")
-    _write(film, shots, stills, folder / "flythrough.mp4", fps, progress, show_file)
-    file = folder / f"panorama_{round(100 * at):03d}.png"
-    blend = settings.view if settings.mode == "view" else settings.mode
-    write_image(file, pipeline.render(scene, compute_flight_pose(scene, at), blend=blend).color)
-    show_file(file)
-
-
-def write_tour(
-    film: Film,
-    scenes: TourScenes,
-    route: Route,
-    folder: Path,
-    fps: float,
-    seconds: float | None,
-    progress: Progress,
-    show_file: Callable[[Path], None],
-) -> None:
-    """Write the film of a route through a tour (`tour.mp4`) and a still at each panorama (`01_NAME.png`).
-
-    See `write_flight`.
-    """
-    shots = list_flight(route, fps, FIELD_OF_VIEW, seconds)
-    stills = {
-        frame: [f"{node + 1:02d}_{make_file_name(scenes.tour.panoramas[node].label)}" for node in nodes]
-        for frame, nodes in find_nearest_frames(scenes.tour, route, shots).items()
-    }
-    _write(film, shots, stills, folder / "tour.mp4", fps, progress, show_file)
-
-
-def _write(
-    film: Film,
-    shots: Sequence[Shot],
-    stills: dict[int, list[str]],
-    file: Path,
-    fps: float,
-    progress: Progress,
-    show_file: Callable[[Path], None],
-) -> None:
-    """Write a film, and frames of it as stills before the film is complete."""
-    file.parent.mkdir(parents=True, exist_ok=True)
+    if scenes is None:
+        shots = list_flight(partial(compute_flight_pose, scene), fps, FIELD_OF_VIEW, seconds)
+        for still in STILLS:
+            stills.setdefault(round(still * (len(shots) - 1)), []).append(f"view_{round(100 * still):03d}.png")
+    else:
+        tour, route = scenes.tour, plan_route(scenes.tour, scenes.tour.plan_walk())
+        shots = list_flight(route, fps, FIELD_OF_VIEW, seconds)
+        for frame, nodes in find_nearest_frames(tour, route, shots).items():
+            stills[frame] = [f"{node + 1:02d}_{make_file_name(tour.panoramas[node].label)}.png" for node in nodes]
 
     def show(number: int, color: np.ndarray) -> None:
         for name in stills.get(number, ()):
-            still = file.with_name(f"{name}.png")
-            write_image(still, color)
-            show_file(still)
+            write_image(folder / name, color)
+            show_file(folder / name)
 
-    write_film(file, film, shots, fps, progress=progress, show=show)
-    show_file(file)
+    name = "flythrough.mp4" if scenes is None else "tour.mp4"
+    for file in write_film(folder / name, film, shots, fps, progress=progress, show=show):
+        show_file(file)
+    if scenes is None:
+        file = folder / f"panorama_{round(100 * at):03d}.png"
+        blend = settings.view if settings.mode == "view" else settings.mode
+        write_image(file, pipeline.render(scene, compute_flight_pose(scene, at), blend=blend).color)
+        show_file(file)
 
 
 def find_nearest_frames(tour: TourGraph, route: Route, shots: Sequence[Shot]) -> dict[int, list[int]]:

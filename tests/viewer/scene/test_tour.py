@@ -17,7 +17,7 @@ from pansplat.inputs.pairs import Link
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.route import FADE_SECONDS, plan_route
 from pansplat_viewer import run
-from pansplat_viewer.capture import find_nearest_frames, open_film, write_tour
+from pansplat_viewer.capture import find_nearest_frames, open_film, write_flight
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.stereo import ImageFormat
 from pansplat_viewer.scene.camera import Camera
@@ -335,7 +335,8 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
         written.append(file.name)
         complete.append((tmp_path / "tour.mp4").exists())
 
-    write_tour(open_tour_film(scenes, load), scenes, route, tmp_path, 12, None, lambda task, done: None, show_file)
+    film, show = open_tour_film(scenes, load), (lambda task, done: None, show_file)
+    write_flight(film, scenes.get((0, 1)).scene, scenes, tmp_path, 12, None, 0.5, DrawSettings(), *show)
     names = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
     assert written == [*names, "tour.mp4"] and complete == [False] * 4 + [True]
     frames = read_film(tmp_path / "tour.mp4")
