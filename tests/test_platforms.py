@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.bench import harness
 from pansplat.errors import InputError
 from pansplat.gaussians import formats
 from pansplat.inputs.folders import load_pairs
@@ -84,13 +83,6 @@ def test_a_crash_without_a_message_is_described(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(formats, "_CODER", "import os; os._exit(5)")
     with pytest.raises(formats._CoderError, match="gaussforge stopped, 0x5"):
         formats._convert(b"", "ply", "spz")
-
-
-def test_without_a_handle_of_all_libraries_there_is_no_peak_memory(
-    windows: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(harness.ctypes, "CDLL", lambda _: pytest.fail("Windows raises a TypeError"))
-    assert harness.measure_peak_memory(lambda: 3, torch.device("cpu")) == ({}, 3)
 
 
 # Consoles

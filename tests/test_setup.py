@@ -38,8 +38,7 @@ def run_setup(folder: Path, **answers: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["bash", folder / "setup.sh"], env=environment, capture_output=True, text=True)
 
 
-@pytest.mark.parametrize("can_sudo", ["", "yes"], ids=["no sudo", "sudo without apt-get"])
-@pytest.mark.parametrize("has_ensurepip", ["yes", ""], ids=["venv", "no venv package"])
+@pytest.mark.parametrize(("can_sudo", "has_ensurepip"), [("", "yes"), ("yes", "")])  # with sudo, but without apt-get
 def test_without_permission_the_packages_are_listed_and_the_rest_is_installed(
     tmp_path: Path, can_sudo: str, has_ensurepip: str
 ) -> None:
@@ -65,3 +64,12 @@ def test_no_package_is_missing_where_those_of_the_dockerfile_are_installed(tmp_p
     done = run_setup(tmp_path, CAN_SUDO="", HAS_ENSUREPIP="yes", INSTALLED=" ".join(packages.split()))
     assert done.returncode == 0 and "setup: ready:" in done.stdout
     assert "apt-get" not in done.stdout, done.stdout
+
+
+def test_setup_has_help_and_refuses_unknown_options() -> None:
+    done, refused = (
+        subprocess.run(["bash", ROOT / "setup.sh", option], capture_output=True, text=True)
+        for option in ("--help", "--dve")
+    )
+    assert done.returncode == 0 and "--dev" in done.stdout
+    assert refused.returncode == 1 and "unknown option --dve" in refused.stderr

@@ -111,8 +111,3 @@ def test_a_truncated_checkpoint_is_refused(conversion: tuple[Path, Path, str], t
     message = refusal("convert", tmp_path / "short.ckpt", "-o", tmp_path / "m.safetensors")
     assert "got a damaged one; download" in message
     assert not (tmp_path / "m.safetensors").exists()
-
-
-def test_other_outputs_are_refused(conversion: tuple[Path, Path, str], tmp_path: Path, refusal) -> None:
-    assert "--out must end in .safetensors" in refusal("convert", conversion[0], "-o", tmp_path / "m.ckpt")
-    assert "existing folder" in refusal("convert", conversion[0], "-o", tmp_path / "no" / "m.safetensors")

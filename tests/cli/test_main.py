@@ -1,4 +1,4 @@
-"""Help, errors, warnings, interruptions and exit statuses of all commands."""
+"""What all commands share: help, version, completion, refused arguments, notes, interruptions and exit statuses."""
 
 import json
 import os
@@ -17,39 +17,37 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.system.console import own_warnings
 
 
+def run_program(program: str) -> str:
+    """The output of a Python program, which prints no error."""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def test_help_does_not_import_torch() -> None:
+    names = ["predict", "render", "refine", "export", "pose", "batch", "evaluate", "check", "info", "convert"]
+    names += [f"bench {name}" for name in ("raster", "model", "refine", "flights", "viewer", "pose")]
     program = (
-        "import sys\nfrom pansplat.cli import run\n"
-        "commands = ['predict', 'render', 'evaluate', 'check', 'info', 'convert', 'bench']\n"
-        "benches = [['bench', name] for name in ('raster', 'model', 'memory', 'pose')]\n"
-        "for arguments in ([], *([name] for name in commands), *benches):\n"
-        "    try: run([*arguments, '--help'])\n    except SystemExit as stop: assert stop.code == 0, stop.code\n"
+        f"import sys\nfrom pansplat.cli import run\nfor name in ['', 'bench', *{names}]:\n"
+        "    try: run([*name.split(), '--help'])\n    except SystemExit as stop: assert stop.code == 0, stop.code\n"
         "heavy = {'torch', 'numpy', 'scipy', 'cv2', 'numba', 'matplotlib'} & set(sys.modules)\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    for command in ("predict", "render", "evaluate", "check", "info", "convert", "bench raster", "bench pose"):
-        assert f"usage: pansplat {command} " in done.stdout
+    printed = run_program(program)
+    assert all(f"usage: pansplat {name} " in printed for name in names)
 
 
-@pytest.mark.parametrize("arguments", [["predict"], ["render", "x", "-o", "y.png", "--heigth", "3"]])
-def test_missing_or_misspelt_arguments_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        run(arguments)
-    err = capsys.readouterr().err
-    assert stop.value.code == 2 and "Traceback" not in err
-    assert {"predict": "--out", "render": "--height"}[arguments[0]] in err
-
-
-@pytest.mark.parametrize("module", ["pansplat.cli", "pansplat_viewer", "pansplat.training.__main__"])
-def test_the_version_is_printed_without_torch(module: str) -> None:
-    program = f"import sys\nfrom {module} import run\ntry: run(['--version'])\nexcept SystemExit as stop:\n"
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [("cli", "pansplat"), ("viewer", "pansplat-view"), ("training", "pansplat-train")],
+)
+def test_the_version_is_printed_without_torch_by_an_installed_command(module: str, name: str) -> None:
+    package = {"cli": "pansplat.cli", "viewer": "pansplat_viewer", "training": "pansplat.training.__main__"}[module]
+    program = f"import sys\nfrom {package} import run\ntry: run(['--version'])\nexcept SystemExit as stop:\n"
     program += "    assert stop.code == 0 and 'torch' not in sys.modules\nelse: sys.exit('no exit')"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    name = {"pansplat.cli": "pansplat", "pansplat_viewer": "pansplat-view"}.get(module, "pansplat-train")
-    assert done.stdout == f"{name} {pansplat.__version__}\n"
+    assert run_program(program) == f"{name} {pansplat.__version__}\n"
+    (found,) = entry_points(group="console_scripts", name=name)
+    assert callable(found.load())
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
@@ -76,6 +74,102 @@ def test_the_completion_script_completes_in_bash(words: str, expected: set[str],
     assert set(done.stdout.split()) == expected, "and no words of descriptions"
 
 
+@pytest.mark.parametrize("command", ["render", "export", "predict", "check", "evaluate"])
+def test_help_ends_in_a_narrow_terminal_and_has_plain_headings(command: str, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "2")
+    with pytest.raises(SystemExit):
+        run([command, "--help"])
+    headings = [line for line in capsys.readouterr().out.splitlines() if line.rstrip().endswith(" options")]
+    assert os.environ["COLUMNS"] == "2" and len(headings) > 1
+    assert not any("." in line or "options options" in line for line in headings)
+
+
+# Commands (`room`: a folder of panoramas, `scene.ply`: a scene), and what their message has.
+MISSPELT = {"predict": "--out", "render x -o y.png --heigth 3": "--height"}  # by the parser
+REFUSED = {
+    "exprot x": "needed a command, got 'exprot' (did you mean export?); the commands are predict, ",
+    "zzz x": "got 'zzz'; the commands are predict, ",
+    "info gone.ply": "got no such file; check the path",
+    "info gone.spz": "got no such file; check the path",
+    "render gone.ply -o x.png": "got no such file; check the path",
+    "predict room -o scene.obj": "--out must end in .compressed.ply, .spz, .splat, .sog, .glb, .ply",
+    "predict room -o no/x.ply": "existing folder",
+    "predict room -o x.ply --model magic": "must be one of default, sphere, sweep",
+    "predict room -o x.ply --near 9 --far 3": "0 < near < far",
+    "predict room -o x.ply --convention sideways": "needed a known pose convention",
+    "predict room -o x.ply --model sphere --precision bfloat16": "`precision` is for networks, and sphere is not one",
+    "refine room -o x.ply --seconds 1 --steps 3": "--seconds and --steps both",
+    "refine room -o x.ply --photographs elsewhere": "--photographs is for a scene file",
+    "refine room -o x.ply --report report.txt": "--report must end in .json",
+    "refine room -o x.ply --model sphere --poses": "add --layers",
+    "refine scene.ply -o x.ply": "give the folder of its pair with --photographs",
+    "refine scene.ply -o x.png --photographs room": ".splat, .sog, .glb, .ply",
+    "render scene.ply -o x.tiff": "--out must end in",
+    "render scene.ply -o no/x.png": "needed an existing folder",
+    "render scene.ply -o x.png --at 0.5 --pose path.txt": "give one of them",
+    "render scene.ply -o x.mp4 --pose path.txt --path walk.json": "--pose and --path set the camera",
+    "render scene.ply -o x.png --depth --path walk.json": "write the film of --path as .exr",
+    "render scene.ply -o x.jpg --path walk.json": "--out must end in .mp4, .webm, .png, .exr",
+    "render scene.ply -o x.png --pose path.txt": "holds 2 poses",
+    "render scene.ply -o x.mp4 --at 0.5": "--at is one position",
+    "render room -o x.png --at 1.5": "--at: needed a number <= 1.0, got 1.5",
+    "render scene.ply -o x.jpg --depth": "--depth writes a .png",
+    "render scene.ply -o x.png --blend mixed": "--blend must be",
+    "render scene.ply -o x.png --blend view7": "from 0 to 1, got 7",
+    "render scene.ply -o x.png --stereo --layout cubemap": "--stereo is for panoramas of --layout equirect",
+    "render room -o x.png --model sphere --precision bfloat16": "`precision` is for networks",
+    "export scene.ply -o x.ply --split": "--split is for an .html page, got x.ply",
+    "export scene.ply -o x.ply --photo-height 1024": "--photo-height is for an .html page, got x.ply",
+    "export scene.ply -o x.ply --embed https://example.com": "--embed is for an .html page, got x.ply",
+    "export none -o x.html --embed example.com": "got 'example.com'",  # before anything is loaded
+    "export scene.ply -o x.stl": ".sog, .glb, .ply",
+    "export scene.ply -o x.spz --points": "--points is for a .ply",
+    "export scene.ply -o x.png --points": "--points is for a .ply",
+    "export scene.ply -o x.obj --points": "--points is for a .ply",
+    "export room -o x --training-set --points": "--points is for a .ply",
+    "export room -o x.ply --up z": "--up is for a scene file",
+    "export scene.ply -o x.ply --mesh": "--mesh is for a mesh (.obj, or .glb with --mesh)",
+    "export scene.ply -o x.glb --triangles 9": "--triangles is for a mesh",
+    "export scene.ply -o x.obj --triangles 9": "needs 512 triangles or more",
+    "export scene.ply -o x.ply --crop a 0 0 1 1 1": "--crop",
+    "export scene.ply -o x.ply --layers --crop 50 50 50 60 60 60": "scene.ply: needed a box with Gaussians, got (50.00",
+    "export scene.ply -o x.ply --layers --rooms attic": "got 'attic'; choose from a, b",
+    "export scene.ply -o x.png --min-opacity 0.95": "needed a floor, and walls around at least one of 2 input cameras",
+    "export scene.ply -o x.svg --min-opacity 0.95": "needed a floor, and walls around at least one of 2 input cameras",
+    "export scene.ply -o x --training-set": "needed the folder of the panoramas to write their cube faces",
+    "export room -o room --training-set": "needed a new or empty folder, got one with files",
+    "export room -o x --training-set --crop 0 0 0 1 1 1": "--remove-floaters are not for a folder to train from",
+    "evaluate -o x": "at least one folder",
+    "evaluate -o x --protocol m3d": "--protocol needs --data",
+    "evaluate room -o x --protocol m3d --data room": "as well; leave it out",
+    "evaluate -o x --protocol m3d --data room --near 1": "--near is set by the protocol",
+    "evaluate -o x --protocol m3d --data room --blend view0": "--blend must be joint or deferred with --protocol",
+    "evaluate -o x --protocol m3d --data room --model sphere --models sphere": "must have distinct names",
+    "evaluate -o x --protocol replica --data room --model sphere --lpips vgg": "LPIPS with vgg needed vgg16-397923af",
+    "evaluate -o x --protocol 360loc --data room --model sphere": "360Loc: needed",
+    "convert path.txt -o x.ckpt": "--out must end in .safetensors",
+    "convert path.txt -o no/x.safetensors": "existing folder",
+}
+
+
+def test_refused_arguments_are_one_line_with_status_2_and_write_nothing(
+    room: Path, scene: Path, tmp_path: Path, refusal, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PANSPLAT_LPIPS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    Path("path.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    for line, message in MISSPELT.items():
+        with pytest.raises(SystemExit) as stop:
+            run(line.split())
+        error = capsys.readouterr().err
+        assert stop.value.code == 2 and message in error and "Traceback" not in error, line
+    for line, message in REFUSED.items():
+        options = ["--refine", "0"] if line.startswith("export room") else []
+        assert message in refusal(*line.split(), *options), line
+        assert not list(tmp_path.glob("x*")), line
+
+
 def test_a_warning_of_pansplat_is_one_note(room: Path, predict, tmp_path: Path, capsys) -> None:
     content = json.loads((room / "poses.json").read_text())
     content["poses"]["b.png"] = content["poses"]["a.png"]  # coincident cameras
@@ -86,67 +180,50 @@ def test_a_warning_of_pansplat_is_one_note(room: Path, predict, tmp_path: Path, 
     assert (tmp_path / "scene.ply").exists()
 
 
-@pytest.fixture
-def fail(monkeypatch: pytest.MonkeyPatch, sphere_model: type):
-    """A function that makes the predictor raise an error."""
-
-    def set_error(error: BaseException) -> None:
-        def predict(*_: object, **__: object) -> None:
-            raise error
-
-        monkeypatch.setattr(sphere_model, "__call__", predict)
-
-    return set_error
-
-
-def test_interrupting_exits_with_130_and_leaves_no_file(room: Path, predict, fail, tmp_path: Path, capsys) -> None:
-    fail(KeyboardInterrupt())
-    before = sorted(os.listdir(tmp_path))
-    assert predict() == 130
-    assert capsys.readouterr().err.startswith("interrupted")
-    assert sorted(os.listdir(tmp_path)) == before
-
-
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: ...")])
-def test_too_little_memory_is_one_line(predict, fail, tmp_path: Path, capsys, error: Exception) -> None:
-    fail(error)
-    assert predict() == 2
-    message = capsys.readouterr().err
-    assert "error: out of memory" in message and len(message.splitlines()) == 1
-    assert not list(tmp_path.glob("*.ply"))
-
-
-def test_a_defect_is_one_line_with_a_log_of_its_traceback(
-    predict, fail, capsys, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    fail(RuntimeError("a defect"))
-    assert predict() == 70
-    message = capsys.readouterr().err
-    assert message.startswith("error: internal error (RuntimeError: a defect), please report it with the log /")
-    assert message.count("\n") == 1
-    log = Path(message.split("the log ")[1].split(";")[0])
-    assert "RuntimeError: a defect" in log.read_text() and "Traceback" in log.read_text()
-
-
-def test_debugging_shows_the_traceback(predict, fail, capsys, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("PANSPLAT_DEBUG", "1")
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    fail(RuntimeError("a defect"))
-    assert predict() == 70
-    assert "Traceback" in capsys.readouterr().err
-
-
-def test_warning_filters_are_restored_after_a_command(scene: Path) -> None:
+def test_equal_notes_are_printed_once_and_warning_filters_are_restored(scene: Path, capsys) -> None:
     shown, filters = warnings.showwarning, list(warnings.filters)
+    with own_warnings():
+        for text in ("first", "second", "first"):
+            warnings.warn(text, InputWarning, stacklevel=2)
+    assert capsys.readouterr().err.splitlines() == ["note: first", "note: second"]
     run(["info", str(scene)])
     assert warnings.showwarning is shown and list(warnings.filters) == filters
 
 
-@pytest.mark.parametrize("entry", ["pansplat", "pansplat-train"])
-def test_entry_points_are_installed(entry: str) -> None:
-    (found,) = entry_points(group="console_scripts", name=entry)
-    assert callable(found.load())
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (MemoryError(), 2, "error: out of memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: ..."), 2, "error: out of memory"),
+        (
+            RuntimeError("a defect"),
+            70,
+            "error: internal error (RuntimeError: a defect), please report it with the log /",
+        ),
+    ],
+)
+@pytest.mark.parametrize("debug", ["0", "1"])
+def test_what_ends_a_command_is_one_line_without_a_file_and_a_traceback_is_shown_for_debugging(
+    predict, sphere_model: type, capsys, monkeypatch, tmp_path: Path, error: Exception, status: int, message: str, debug
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(sphere_model, "__call__", fail)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("PANSPLAT_DEBUG", debug)
+    before = sorted(os.listdir(tmp_path))
+    assert predict() == status
+    printed = capsys.readouterr().err
+    assert ("Traceback" in printed) == (debug == "1")
+    line = printed.splitlines()[-1]
+    assert line.startswith(message) and (debug == "1" or printed.count("\n") == 1)
+    if status == 70:
+        log = Path(line.split("the log ")[1].split(";")[0])
+        assert "RuntimeError: a defect" in log.read_text() and "Traceback" in log.read_text()
+        log.unlink()
+    assert sorted(os.listdir(tmp_path)) == before
 
 
 def test_main_exits_with_the_status_of_the_command_after_the_registered_functions() -> None:
@@ -158,47 +235,7 @@ pansplat.cli.main([])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (3, "functions at the exit ran\n", "")
-
-
-def test_input_errors_are_value_errors() -> None:
     assert issubclass(InputError, ValueError)
-
-
-def test_equal_notes_are_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
-    with own_warnings():
-        for text in ("first", "second", "first"):
-            warnings.warn(text, InputWarning, stacklevel=2)
-    assert capsys.readouterr().err.splitlines() == ["note: first", "note: second"]
-
-
-@pytest.mark.parametrize(
-    ("word", "near"), [("exprot", " (did you mean export?)"), ("predikt", " (did you mean predict?)"), ("zzz", "")]
-)
-def test_an_unknown_command_is_named_with_the_nearest_one(word: str, near: str, capsys) -> None:
-    assert run([word, "x"]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith(f"error: needed a command, got '{word}'{near}; the commands are predict, ")
-    assert err.count("\n") == 1
-
-
-@pytest.mark.parametrize("command", ["render", "export", "predict", "check", "evaluate"])
-def test_help_ends_in_a_narrow_terminal_and_has_plain_headings(command: str, monkeypatch, capsys) -> None:
-    monkeypatch.setenv("COLUMNS", "2")
-    with pytest.raises(SystemExit):
-        run([command, "--help"])
-    text = capsys.readouterr().out
-    headings = [line for line in text.splitlines() if line.rstrip().endswith(" options")]
-    assert os.environ["COLUMNS"] == "2" and len(headings) > 1
-    assert not any("." in line or "options options" in line for line in headings)
-
-
-@pytest.mark.parametrize(
-    "arguments", [["info", "gone.ply"], ["render", "gone.ply", "-o", "x.png"], ["info", "gone.spz"]]
-)
-def test_a_missing_file_is_said_to_be_missing(arguments: list[str], tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(arguments) == 2
-    assert "got no such file; check the path" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs file names of any bytes")

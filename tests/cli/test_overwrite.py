@@ -25,10 +25,7 @@ COMMANDS = {
     "again.ply": ["refine", "{room}", "--model", "sphere", "--height", "64", "--steps", "1"],
     "view.png": ["render", "{scene}", "--height", "16"],
     "view.jpg": ["render", "{scene}", "--height", "16", "--layout", "perspective"],
-    "view.webp": ["render", "{scene}", "--height", "16", "--layout", "perspective"],
-    "view.exr": ["render", "{scene}", "--height", "16"],
     "film.mp4": ["render", "{scene}", "--height", "16", "--seconds", "0.1"],
-    "film.webm": ["render", "{scene}", "--height", "16", "--seconds", "0.1"],
     "scene.glb": [*EXPORT, "{room}"],
     "scene.spz": [*EXPORT, "{room}"],
     "scene.sog": [*EXPORT, "{room}"],
@@ -82,17 +79,6 @@ def test_files_beside_a_mesh_are_checked_before_the_first_is_written(
     assert run([*EXPORT, str(room), *COARSE, "-o", str(out)]) == 0
 
 
-def test_the_folder_of_a_split_page_keeps_files_of_the_user(scene: Path, tmp_path: Path) -> None:
-    out = tmp_path / "page.html"
-    own = write_own(tmp_path / "page_files" / "0123456789abcdef.js")
-    for count in ("100", "50"):
-        assert run(["export", str(scene), "-o", str(out), "--split", "--gaussians", count]) == 0
-    others = [file for file in own.parent.iterdir() if file != own]
-    assert own.read_bytes() == OWN and len(others) == 2 and all(map(is_written, others)), (
-        "parts of the first page are removed"
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "command"),
     [
@@ -123,14 +109,6 @@ def test_more_files_than_the_named_one_need_overwrite(room: Path, tmp_path: Path
     assert f"got {own}, which pansplat did not write" in refusal(*command)
     command = ["convert", tmp_path / "official.ckpt", "-o", write_own(tmp_path / "model.safetensors")]
     assert "--overwrite" in refusal(*command)
-
-
-def test_the_results_of_a_run_are_replaced_by_those_of_the_next(room: Path, tmp_path: Path) -> None:
-    command = ["evaluate", str(room), "--model", "sphere", "--height", "64", "-o", str(tmp_path / "out")]
-    for _ in range(2):
-        assert run(command) == 0
-    files = [file for file in (tmp_path / "out").rglob("*") if file.is_file()]
-    assert len(files) == 4 and all(map(is_written, files))
 
 
 def test_reports_and_pictures_of_all_kinds_are_marked(tmp_path: Path) -> None:

@@ -50,40 +50,29 @@ def estimator(monkeypatch):
     return lambda function: monkeypatch.setattr("pansplat.poses.files.estimate_poses", function)
 
 
-def test_measured_poses_of_all_panoramas_are_an_error_before_the_estimate(folder: Path, estimator, capsys) -> None:
-    file = folder / "poses.json"
-    poses = {f"{name}.png": np.eye(4).tolist() for name in "ab"}
+@pytest.mark.parametrize("name", ["poses.json", "walk.tum", "walk.kitti"])
+def test_measured_poses_are_an_error_before_the_estimate_and_replaced_with_overwrite(
+    folder: Path, estimator, capsys, name: str
+) -> None:
+    file = folder / name
+    poses = {f"{each}.png": np.eye(4).tolist() for each in "ab"}
     file.write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
     before = file.read_bytes()
     estimator(_refuse)
     assert run(["pose", str(folder), "-o", str(file)]) == 2
     error = capsys.readouterr().err
-    assert "poses.json" in error and "--overwrite" in error
-    assert file.read_bytes() == before
+    assert name in error and "--overwrite" in error and file.read_bytes() == before
     estimator(_place_two)
     assert run(["pose", str(folder), "-o", str(file), "--overwrite"]) == 0
-    assert json.loads(file.read_text())["poses"]["b.png"][0][3] == 1
-    assert (folder / "poses.json.bak").read_bytes() == before
-
-
-def test_a_faulty_file_of_poses_is_an_error_before_the_estimate(folder: Path, estimator, capsys) -> None:
-    (folder / "poses.json").write_text("[")
-    estimator(_refuse)
-    assert run(["pose", str(folder), "-o", str(folder / "poses.json"), "--overwrite"]) == 2
-    assert "poses.json: needed JSON" in capsys.readouterr().err
-    assert (folder / "poses.json").read_text() == "["
-
-
-@pytest.mark.parametrize("suffix", ["tum", "kitti"])
-def test_a_trajectory_is_replaced_with_overwrite_only(folder: Path, estimator, capsys, suffix: str) -> None:
-    file = folder / f"walk.{suffix}"
-    file.write_text("measured")
-    estimator(_refuse)
-    assert run(["pose", str(folder), "-o", str(file)]) == 2
-    assert "--overwrite" in capsys.readouterr().err and file.read_text() == "measured"
-    estimator(_place_two)
-    assert run(["pose", str(folder), "-o", str(file), "--overwrite"]) == 0
-    assert len(file.read_text().splitlines()) == 2
+    if name == "poses.json":
+        assert json.loads(file.read_text())["poses"]["b.png"][0][3] == 1
+        assert (folder / "poses.json.bak").read_bytes() == before
+        file.write_text("[")
+        estimator(_refuse)
+        assert run(["pose", str(folder), "-o", str(file), "--overwrite"]) == 2
+        assert "poses.json: needed JSON" in capsys.readouterr().err and file.read_text() == "["
+    else:
+        assert len(file.read_text().splitlines()) == 2
 
 
 def test_renderings_beside_photographs_are_given_no_poses(folder: Path, estimator, capsys) -> None:

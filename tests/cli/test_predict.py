@@ -21,25 +21,6 @@ def test_predict_writes_the_format_of_the_suffix(room: Path, tmp_path: Path) -> 
     assert (tmp_path / "scene.splat").stat().st_size == 32 * 2 * 2 * 16**2
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["-o", "scene.obj"], "--out must end in .compressed.ply, .spz, .splat, .sog, .glb, .ply"),
-        (["-o", "no/scene.ply"], "existing folder"),
-        (["--model", "magic"], "must be one of default, sphere, sweep"),
-        (["--near", "9", "--far", "3"], "0 < near < far"),
-        (["--convention", "sideways"], "needed a known pose convention"),
-        (["--precision", "bfloat16"], "`precision` is for networks, and sphere is not one"),
-    ],
-)
-def test_invalid_arguments_are_refused_before_the_prediction(
-    room: Path, tmp_path: Path, refusal, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert message in refusal("predict", room, "-o", "scene.ply", "--model", "sphere", *arguments)
-    assert not list(tmp_path.glob("*.ply"))
-
-
 def test_the_named_pair_of_a_folder_is_predicted_or_the_first(tmp_path: Path, write_room, refusal, capsys) -> None:
     for name in ("hall", "kitchen"):
         write_room(tmp_path / "pairs" / name)

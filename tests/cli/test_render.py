@@ -44,11 +44,6 @@ def test_the_height_sets_the_size_of_each_layout(
     assert render(scene, tmp_path / "x.png", "--layout", layout, "--height", 20).shape == shape
 
 
-def test_blend_modes_differ(scene: Path, tmp_path: Path) -> None:
-    modes = ("deferred", "joint", "view0", "view1")
-    assert len({render(scene, tmp_path / "x.png", "--blend", mode).tobytes() for mode in modes}) == 4
-
-
 def test_an_exr_holds_depth(scene: Path, tmp_path: Path) -> None:
     assert run(["render", str(scene), "--at", "0", "-o", str(tmp_path / "x.exr"), "--blend", "view0"]) == 0
     depth = read_depth(tmp_path / "x.exr", HEIGHT)
@@ -149,26 +144,3 @@ def test_stereo_panoramas_have_the_left_eye_above_the_right(scene: Path, tmp_pat
         frame = next(video.decode(video=0))
     assert frame.to_ndarray(format="rgb24").shape == (36, 36, 3)
     assert {"SPHERICAL", "STEREO3D"} <= {data.type.name for data in frame.side_data}
-
-
-def test_invalid_arguments_are_refused(scene: Path, room: Path, tmp_path: Path, refusal, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("path.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
-    for path, out, arguments, message in (
-        (scene, "x.tiff", [], "--out must end in"),
-        (scene, "no/x.png", [], "needed an existing folder"),
-        (scene, "x.png", ["--at", 0.5, "--pose", "path.txt"], "give one of them"),
-        (scene, "x.mp4", ["--pose", "path.txt", "--path", "walk.json"], "--pose and --path set the camera"),
-        (scene, "x.png", ["--depth", "--path", "walk.json"], "write the film of --path as .exr"),
-        (scene, "x.jpg", ["--path", "walk.json"], "--out must end in .mp4, .webm, .png, .exr"),
-        (scene, "x.png", ["--pose", "path.txt"], "holds 2 poses"),
-        (scene, "x.mp4", ["--at", 0.5], "--at is one position"),
-        (room, "x.png", ["--at", 1.5], "--at: needed a number <= 1.0, got 1.5"),
-        (scene, "x.jpg", ["--depth"], "--depth writes a .png"),
-        (scene, "x.png", ["--blend", "mixed"], "--blend must be"),
-        (scene, "x.png", ["--blend", "view7"], "from 0 to 1, got 7"),
-        (scene, "x.png", ["--stereo", "--layout", "cubemap"], "--stereo is for panoramas of --layout equirect"),
-        (room, "x.png", ["--model", "sphere", "--precision", "bfloat16"], "`precision` is for networks"),
-    ):
-        assert message in refusal("render", path, "-o", out, *arguments)
-    assert not list(tmp_path.glob("x.*"))

@@ -84,24 +84,11 @@ def test_equals_the_lpips_package_with_trained_weights(shared: Path) -> None:
     assert float(metric(*pair())) == pytest.approx(TRAINED_VALUE, rel=TOLERANCE)
 
 
-def test_the_distance_is_symmetric_and_zero_for_equal_images(squeeze: Lpips) -> None:
+def test_the_distance_is_symmetric_zero_for_equal_images_and_that_of_each_of_a_batch(squeeze: Lpips) -> None:
     a, b = pair()
-    assert float(squeeze(a, a)) == 0
-    assert float(squeeze(a, b)) == pytest.approx(float(squeeze(b, a)), rel=1e-12)
-    assert float(squeeze(a, b)) > 0
-
-
-def test_a_batch_equals_its_items(squeeze: Lpips) -> None:
-    a, b = pair()
-    both = squeeze(torch.cat((a, b)), torch.cat((b, b)))
-    assert both.tolist() == pytest.approx([float(squeeze(a, b)), 0.0], abs=1e-12)
-
-
-def test_equal_weights_change_nothing(squeeze: Lpips) -> None:
-    a, b = pair()
-    assert float(squeeze(a, b, torch.full((1, 66, 100), 0.3).double())) == pytest.approx(
-        float(squeeze(a, b)), rel=1e-12
-    )
+    both, swapped = squeeze(torch.cat((a, b)), torch.cat((b, b))), float(squeeze(b, a))
+    assert both.tolist() == pytest.approx([swapped, 0.0], abs=1e-12) and swapped > 0
+    assert float(squeeze(a, b, torch.full((1, 66, 100), 0.3).double())) == pytest.approx(swapped, rel=1e-12)
 
 
 def test_pixels_of_weight_zero_have_no_effect(squeeze: Lpips) -> None:
@@ -117,17 +104,6 @@ def test_pixels_of_weight_zero_have_no_effect(squeeze: Lpips) -> None:
     assert float(squeeze(a, b, torch.zeros_like(weights))) == 0
 
 
-def test_gradients_equal_finite_differences(squeeze: Lpips) -> None:
-    a, b = pair()
-    a = a.requires_grad_()
-    (gradient,) = torch.autograd.grad(squeeze(a, b).sum(), a)
-    direction = torch.sin(torch.arange(a.numel()).double()).reshape(a.shape)
-    step = 1e-6
-    with torch.no_grad():
-        derivative = float(squeeze(a + step * direction, b) - squeeze(a - step * direction, b)) / (2 * step)
-    assert float((gradient * direction).sum()) == pytest.approx(derivative, rel=1e-4)
-
-
 def test_zero_activations_have_zero_distance_and_gradient() -> None:
     metric = Lpips("squeeze")
     for parameter in metric.features.parameters():
@@ -140,11 +116,6 @@ def test_zero_activations_have_zero_distance_and_gradient() -> None:
     assert distance.item() == 0 and not gradient.any()
 
 
-def test_weights_are_not_trained(squeeze: Lpips) -> None:
-    assert not any(parameter.requires_grad for parameter in squeeze.parameters())
-    assert not squeeze.train().training
-
-
 def test_small_images_are_refused(squeeze: Lpips) -> None:
     small = torch.zeros(1, 3, 16, 32, dtype=torch.float64)
     with pytest.raises(InputError, match="32 pixels or more along each side, got 16x32"):
@@ -152,24 +123,13 @@ def test_small_images_are_refused(squeeze: Lpips) -> None:
 
 
 def test_missing_files_are_named_with_their_source_and_folders(empty_hub: Path, tmp_path: Path) -> None:
+    write_heads(tmp_path / "vgg.pth", "vgg")
     with pytest.raises(InputError) as error:
         load_lpips("vgg", tmp_path)
-    for part in (
-        "vgg16-397923af.pth (from https://download.pytorch.org/models/vgg16-397923af.pth)",
-        "vgg.pth (from https://github.com/richzhang/PerceptualSimilarity",
-        str(tmp_path),
-        str(empty_hub),
-        FOLDER_VARIABLE,
-    ):
+    source = "vgg16-397923af.pth (from https://download.pytorch.org/models/vgg16-397923af.pth)"
+    for part in (source, str(tmp_path), str(empty_hub), FOLDER_VARIABLE):
         assert part in str(error.value)
-    assert find_backbone(tmp_path) is None
-
-
-def test_only_missing_files_are_named(empty_hub: Path, tmp_path: Path) -> None:
-    write_heads(tmp_path / "alex.pth", "alex")
-    with pytest.raises(InputError) as error:
-        load_lpips("alex", tmp_path)
-    assert "alexnet-owt" in str(error.value) and "alex.pth (from" not in str(error.value)
+    assert "vgg.pth (from" not in str(error.value) and find_backbone(tmp_path) is None
 
 
 @pytest.mark.parametrize("place", ["folder", "variable", "hub"])
@@ -222,7 +182,7 @@ def measure_distances(metric: Lpips, size: tuple[int, int], weighted: bool) -> t
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "pixels", "weighted"),
-    [((64, 48), 1000, False), ((67, 33), 300, True), ((35, 32), 1, True)],
+    [((64, 48), 1000, False), ((35, 32), 1, True)],
 )
 def test_bands_change_neither_distances_nor_gradients(
     size: tuple[int, int], pixels: int, weighted: bool, vgg: Lpips, monkeypatch: pytest.MonkeyPatch
@@ -234,23 +194,3 @@ def test_bands_change_neither_distances_nor_gradients(
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-9, atol=1e-9 * float(expected_gradient.abs().max()))
     assert float(expected.min()) > 0.01
-
-
-def test_bands_limit_the_activations_in_memory(vgg: Lpips, monkeypatch: pytest.MonkeyPatch) -> None:
-    def largest() -> int:
-        """Number of values saved for the backward pass."""
-        kept: dict[int, int] = {}
-
-        def keep(tensor: torch.Tensor) -> torch.Tensor:
-            kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes() // 8
-            return tensor
-
-        a = torch.rand(1, 3, 128, 64, dtype=torch.float64, requires_grad=True)
-        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-            vgg(a, a.detach().flip(2))
-        return sum(kept.values())
-
-    whole = largest()
-    monkeypatch.setattr(lpips, "_MAX_WHOLE_PIXELS", 0)
-    monkeypatch.setattr(lpips, "_BAND_PIXELS", 16 * 64)
-    assert largest() < whole / 3

@@ -13,10 +13,9 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
-from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
-from pansplat.evaluation.report import ERROR_SCALE, error_image, evaluate, results_table
+from pansplat.evaluation.report import evaluate, results_table
 from pansplat.evaluation.results import Row
 from pansplat.inputs.folders import load_pairs
 
@@ -73,11 +72,6 @@ def test_metrics_are_those_of_the_written_images(folder: Path, case: Row) -> Non
     assert case.get("cross_fade_ws_psnr") == pytest.approx(ws_psnr(sum(inputs) / 2, target), abs=0.01)
 
 
-def test_the_drawing_changes_the_images(folder: Path, case: Row, tmp_path: Path, sphere_predictor: type) -> None:
-    (official,) = evaluate(load_pairs(folder / "room"), sphere_predictor(), tmp_path, height=HEIGHT, drawing="original")
-    assert official.get("psnr") != case.get("psnr") and abs(official.get("psnr") - case.get("psnr")) < 3
-
-
 def test_an_evaluation_does_not_use_the_prediction_cache(
     tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
 ) -> None:
@@ -101,26 +95,6 @@ def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(
     assert f"{cases[0].get('ws_psnr'):.2f}" in mean
     below = lines[-2].replace("│", " ").split()
     assert below[:2] == ["cross-fade", f"{cases[0].get('cross_fade_ws_psnr'):.2f}"]
-
-
-@pytest.mark.filterwarnings("ignore:.*in no pair of pairs")
-def test_pairs_without_target_are_skipped(
-    tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
-) -> None:
-    alone = load_pairs(write_triplet(tmp_path / "alone", target=False))  # a pair and a single view
-    with_target = load_pairs(write_triplet(tmp_path / "room"))
-    assert len(evaluate([*alone, *with_target], sphere_predictor(), tmp_path / "out", height=HEIGHT)) == 1
-    with pytest.raises(InputError, match="none of the pairs has a target view"):
-        evaluate(alone, sphere_predictor(), tmp_path / "nothing", height=HEIGHT)
-    assert not (tmp_path / "nothing").exists()
-
-
-def test_a_file_at_the_output_folders_path_is_an_input_error(
-    folder: Path, tmp_path: Path, sphere_predictor: type
-) -> None:
-    (tmp_path / "out").write_text("")
-    with pytest.raises(InputError, match=r"cannot make .*choose another"):
-        evaluate(load_pairs(folder / "room"), sphere_predictor(), tmp_path / "out", height=HEIGHT)
 
 
 def test_a_masked_target_has_second_values_of_the_scene_and_of_the_cross_fade(
@@ -154,16 +128,6 @@ def test_lpips_is_optional(folder: Path, tmp_path: Path, sphere_predictor: type)
     context = pairs[0].load_context(32)
     assert case.get("cross_fade_lpips") == pytest.approx(metric.distance(context.images.mean(0), target), abs=1e-3)
     assert "LPIPS" in [str(column.header) for column in results_table([case]).columns]
-
-
-def test_error_images_are_brighter_for_larger_errors() -> None:
-    target = torch.full((3, 4, 8), 0.5)
-    prediction = target.clone()
-    prediction[:, 0] += 10 * ERROR_SCALE
-    prediction[:, 1] += ERROR_SCALE / 2
-    brightness = error_image(prediction, target).mean(dim=(0, 2))
-    assert float(brightness[2]) < 0.02
-    assert float(brightness[2]) < float(brightness[1]) < float(brightness[0])
 
 
 @pytest.mark.usefixtures("refinement_clock")

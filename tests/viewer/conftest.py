@@ -198,15 +198,20 @@ def assert_matches() -> Callable[..., None]:
 
 @pytest.fixture
 def assert_reference(make_renderer, reference, assert_matches) -> Callable[..., None]:
-    """Checks that OpenGL and the processor render a scene as the reference does."""
+    """Checks that OpenGL and the processor render a scene as the reference does, perhaps another one, `drawn`.
 
-    def check(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
-        expected = reference(scene, cam2world, size, settings)
-        assert_matches(make_renderer(scene), cam2world, settings, expected)
-        if not settings.is_exact:
-            return
-        expected = reference(scene, cam2world, size, settings, "equirect")  # the processor draws panoramas directly
-        assert_matches(make_renderer(scene, "cpu"), cam2world, settings, expected)
+    The processor draws panoramas directly, and the preset exact only.
+    """
+
+    def check(
+        scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings, drawn: Scene | None = None
+    ) -> None:
+        for name, panorama in (("gl", "cubemap"), ("cpu", "equirect"))[: 2 if settings.is_exact else 1]:
+            renderer = make_renderer(scene, name)
+            assert_matches(
+                renderer, cam2world, settings, reference(drawn or scene, cam2world, size, settings, panorama)
+            )
+            assert renderer.stats.total + renderer.stats.dropped == len(scene.gaussians)
 
     return check
 

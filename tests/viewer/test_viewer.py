@@ -24,8 +24,9 @@ from pansplat.tours.camera_path import CameraPath
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, load_entry
 from pansplat_viewer.scene.settings import FrameStats
+from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.viewer import Viewer
-from pansplat_viewer.window.input import Input
+from pansplat_viewer.window.input import FAST, FLY_SPEED, KEYS, SLOW, Input
 
 SIZE = (560, 900)
 CENTER = (0.5, 0.5)
@@ -67,7 +68,7 @@ class NoRenderer:
         return Mock()
 
     def read_color(self) -> np.ndarray:
-        return np.zeros((2, 2, 4), np.float32)
+        return np.zeros((*SIZE[::-1], 4), np.float32)
 
     def read_depth(self) -> np.ndarray:
         return np.full(SIZE[::-1], 3.0, np.float32)
@@ -195,6 +196,101 @@ class Gate:
         self.event.set()
 
 
+# --- what a user does, and the state after it ---
+
+STEP = FLY_SPEED / 30  # of a frame
+ROWS = [  # at the first of two panoramas, which are 0.5 m apart
+    *[(f"hold {key}", "camera.position == approx((0, 0, STEP))") for key in ("w", "up")],
+    *[(f"hold {key}", "camera.position == approx((0, 0, -STEP))") for key in ("s", "down")],
+    *[(f"hold {key}", "camera.position == approx((STEP, 0, 0))") for key in ("d", "right")],
+    *[(f"hold {key}", "camera.position == approx((-STEP, 0, 0))") for key in ("a", "left")],
+    *[(f"hold {key}", f"camera.position == approx((0, {sign}STEP, 0))") for key, sign in (("e", "-"), ("q", ""))],
+    ("hold w shift", "camera.position[2] == approx(FAST * STEP)"),
+    ("hold w alt", "camera.position[2] == approx(SLOW * STEP)"),
+    ("hold w s a d q e", "camera == home"),
+    ("drag 40 0", "camera.yaw_radians < 0 and camera.position == home.position"),
+    ("pan 30 0", "camera.position[0] < 0 and camera.position[2] == approx(0)"),
+    ("scroll 1", "camera.vertical_fov_degrees < home.vertical_fov_degrees"),
+    ("press v", "state.orbiting and camera == home"),
+    ("press v; press v", "not state.orbiting"),
+    ("press v; scroll 1", "camera.distance < home.distance"),
+    ("press v; scroll 1", "camera.vertical_fov_degrees == home.vertical_fov_degrees"),
+    *[
+        (f"press v; {turn}", "camera != home and camera.orbit_center == approx(home.orbit_center)")
+        for turn in ("drag 80 10", "scroll 1", *(f"hold {key}" for key in "wasdqe"))
+    ],
+    ("press f", "state.orbiting and camera.orbit_center == approx((0, 0, 3))"),
+    ("press 2", "camera.position == approx((0, 0, 0.5)) and state.flight == 1"),
+    ("press 2; press 1", "camera.position == approx((0, 0, 0)) and state.flight == 0"),
+    ("press 2; press 3", "camera.position == approx((0, 0, 0.5))"),
+    ("press page down", "camera.position == approx((0, 0, 0.5))"),
+    ("press page down; press page down", "camera.position == approx((0, 0, 0))"),
+    ("press page up", "camera.position == approx((0, 0, 0.5))"),
+    ("press space", "state.playing"),
+    ("press space; wait 10", "not state.playing and state.flight == 1 and camera.position == approx((0, 0, 0.5))"),
+    ("press space; wait 10; press space", "state.playing and state.flight < 0.1"),
+    ("press space; wait 1; press space; wait 1", "not state.playing and 0.1 < state.flight < 0.3"),
+    ("press space; scroll 1", "state.playing"),
+    ("press space; hold w", "not state.playing"),
+    ("press ,", "state.flight == 0"),
+    (12 * "press .; ", "state.flight == approx(0.5) and camera.position == approx((0, 0, 0.25))"),
+    (30 * "press .; ", "state.flight == 1"),
+    ("press tab", "not state.overlay"),
+    ("press tab; press tab", "state.overlay"),
+    ("press h", "state.help"),
+    ("press h; press escape", "not state.help and not state.quit"),
+    ("press escape", "state.quit"),
+    ("press q", "not state.quit"),
+    ("press q ctrl", "state.quit and camera == home"),
+    ("press c", "state.comparing and viewer.right_name == 'photograph a.png'"),
+    ("press k", "len(state.path) == 1"),
+    ("press p", "viewer.screenshots.files[-1].suffix == '.png'"),
+    ("press p shift", "viewer.screenshots.files[-1].suffix == '.exr'"),
+    ("click 0.5 0.5", "len(state.points) == 1 and 1 < state.points[0].depth < 5"),
+    ("click 0.5 0.5; click 0.6 0.5; click 0.7 0.5", "len(state.points) == 2"),
+    ("click 0.5 0.5; press r", "state.points == []"),
+    ("hold w d; drag 40 10; scroll 2; press r", "camera == home"),
+]  # fmt: skip
+
+
+def act(app: App, text: str) -> None:
+    """Do what a user does: `press KEY HELD`, `hold KEYS`, `wait SECONDS`, or another event with its numbers."""
+    for step in filter(str.strip, text.split(";")):
+        kind, *words = step.replace("page ", "page-").split()
+        keys = [word.replace("-", " ") for word in words]
+        if kind == "press":
+            app.press(keys[0], held=" ".join(keys[1:]))
+        elif kind == "hold":
+            app.frame(held=frozenset(keys))
+        elif kind == "wait":
+            app.frames(round(10 * float(words[0])), 0.1)
+        else:
+            numbers = tuple(map(float, words))
+            app.frame(**{kind: numbers[0] if kind == "scroll" else numbers})
+
+
+RESET = ("orbiting", "playing", "flight", "overlay", "help", "quit", "comparing", "path", "points")
+
+
+def test_the_state_of_the_window_after_what_a_user_does(app):
+    state, start, failed = app.state, ViewerState(), []
+    names = {"state": state, "viewer": app.viewer, "approx": pytest.approx, "STEP": STEP, "FAST": FAST, "SLOW": SLOW}
+    for actions, expected in ROWS:
+        for name in RESET:
+            setattr(state, name, getattr(start, name))
+        state.camera = state.home
+        app.settle()
+        act(app, actions)
+        if not eval(expected, names | {"camera": state.camera, "home": state.home}):
+            failed.append((actions, expected, state.camera))
+    assert not failed
+
+
+def test_each_key_has_one_action():
+    keys = [key for row in KEYS for key in row.actions]
+    assert len(set(keys)) == len(keys)
+
+
 # --- scenes ---
 
 
@@ -213,17 +309,6 @@ def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
     assert app.viewer.stage.slot.scene is small_scene
     app.viewer.dismiss_error()
     assert app.viewer.error is None
-
-
-def test_a_path_is_remembered_and_an_entry_is_chosen_by_its_name(app, pair):
-    app.find = lambda path, progress, show: [SceneEntry(name, pair=pair) for name in ("a", "b")]
-    app.viewer.open(Path("kitchen"), "b")
-    app.settle()
-    assert app.library.current == 1 and app.library.path == Path("kitchen")
-    assert app.viewer.preferences.recent == (str(Path("kitchen").absolute()),)
-    app.viewer.scenes.choose(0)
-    app.settle()
-    assert app.viewer.loaded.entry.name == "a"
 
 
 def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_house, house):
@@ -250,18 +335,6 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
     app.frames(2)
     assert app.viewer.loaded is shown and app.library.names == ["placed"]
     gate.open()
-
-
-def test_progress_is_shown_and_input_accepted_while_a_scene_is_loaded(app, small_scene):
-    app.load = gate = Gate(lambda entry: LoadedScene(entry, small_scene), "searching depth", 0.5)
-    app.viewer.show([SceneEntry("slow")], 0)
-    app.until(lambda: app.viewer.scenes.loading == ("slow", "searching depth", 0.5), "progress")
-    app.frame(held=frozenset("w"))
-    assert app.state.camera.position[2] > 0
-    gate.open()
-    app.settle()
-    assert app.viewer.scenes.loading is None and app.viewer.loaded.entry.name == "slow"
-    assert app.library.loader.poll() is app.library.loader.progress is None, "the result is handed over once"
 
 
 def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
@@ -374,21 +447,6 @@ def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(app, monkeypatch
         app.state.camera = replace(app.state.camera, position=(0.0, 0.0, 0.01 + 0.01 * len(scales)))
         app.frame()
     assert scales == [1.0, 0.75, 0.5, 0.75, 1.0] and recorded[-4:] == scales[:-1]
-
-
-def test_a_changed_file_is_announced_and_read_again(app, room):
-    app.show(SceneEntry("room", file=room))
-    app.frame(3.0)
-    assert not app.library.watch.changed
-    room.write_bytes(room.read_bytes() + b"0")
-    app.frames(2, 3.0)
-    assert app.library.watch.changed
-    app.viewer.scenes.reload()
-    app.settle()
-    assert not app.library.watch.changed
-    room.unlink()
-    app.frames(2, 3.0)
-    assert app.library.watch.changed, "a missing file has changed, too"
 
 
 def test_a_folder_that_changes_is_announced_and_searched_again(app, pair, tmp_path):

@@ -34,6 +34,7 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import path_poses
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.pairs import Note, Pair
+from pansplat.notebook import _bundle_scene
 from pansplat.tours.doll_house import find_fronts, find_rooms
 from pansplat.tours.graph import make_graph, select_views
 
@@ -595,21 +596,6 @@ def test_the_page_loads_without_network_or_messages(page: OpenPage, folder: Path
     page.wait("document.getElementById('cover').hidden")
 
 
-@pytest.mark.slow
-def test_keys_walk_and_jump(home: OpenPage) -> None:
-    keyboard, start = home.page.keyboard, home.camera
-    keyboard.down("KeyW")
-    home.wait(f"Math.hypot(...pansplat.camera.position.map((x, i) => x - {start['position']}[i])) > 0.02")
-    keyboard.up("KeyW")
-    level = np.array(home.run("HEADER.level"))
-    moved = level.T @ (np.array(home.camera["position"]) - start["position"])
-    assert moved[2] > 0.02 and abs(moved[0]) < 1e-6 and abs(moved[1]) < 1e-6
-    keyboard.press("3")
-    home.wait("pansplat.camera.position.every((x, i) => x === HEADER.spots[2].position[i])")
-    keyboard.press("KeyR")
-    assert home.camera == start
-
-
 def test_the_scene_follows_the_mouse(home: OpenPage) -> None:
     mouse, start = home.page.mouse, home.camera
     mouse.move(200, 100)
@@ -684,12 +670,6 @@ def test_two_fingers_walk_and_one_turns(chromium: Any, folder: Path) -> None:
         assert (before["pitch"], after["pitch"]) == pytest.approx((0, math.radians(20)), abs=1e-9)
         assert after["roll"] == pytest.approx(0, abs=1e-9)
         assert page.messages == []
-
-
-def test_a_lost_context_is_restored(home: OpenPage) -> None:
-    before = home.draw()
-    home.run(LOSE_AND_RESTORE)
-    assert psnr(home.draw(), before) > 60
 
 
 def test_a_context_that_is_lost_while_the_page_loads_is_restored(chromium: Any, folder: Path) -> None:
@@ -885,14 +865,10 @@ def read_failure(chromium: Any, path: Path) -> str:
     return message
 
 
-def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) -> None:
+def test_missing_parts_and_data_that_cannot_be_read_are_named(chromium: Any, folder: Path, tmp_path: Path) -> None:
     shutil.copy(folder / "split.html", tmp_path)
+    (tmp_path / "bad.html").write_text((folder / "tour.html").read_text().replace(">H4s", ">AAA", 1))
     assert "Copy the whole folder" in read_failure(chromium, tmp_path / "split.html")
-
-
-def test_data_that_cannot_be_read_is_reported(chromium: Any, folder: Path, tmp_path: Path) -> None:
-    text = (folder / "tour.html").read_text()
-    (tmp_path / "bad.html").write_text(text.replace(">H4s", ">AAA", 1))
     assert "cannot be read" in read_failure(chromium, tmp_path / "bad.html")
 
 
@@ -1658,6 +1634,11 @@ def test_controllers_and_hands_select_rings(chromium: Any, folder: Path, iwer: s
         page.run("HEADER.speed *= 100")  # a flight takes 0.6 s
         fly = "step = 50; walked().then(walked).then(walked)"
         right = "device.controllers.right"
+        page.run(f"{right}.connected = true")  # it points straight ahead, at no ring
+        before = page.camera
+        page.run(f"{right}.updateButtonValue('trigger', 1), walked()")
+        page.run(f"{right}.updateButtonValue('trigger', 0), walked()")
+        assert page.camera == before
         page.run(f"pointAt({right}, 1)")
         rings = see(page, (0.1, 1.6, -0.2), 0.2, -0.7)
         assert (rings[:, :200].min(axis=2) > 0.98).sum() > 40, "the ring that is pointed at is white"
@@ -1690,15 +1671,6 @@ def test_controllers_and_hands_select_rings(chromium: Any, folder: Path, iwer: s
         page.run("pointAt(device.hands.right, 1); device.hands.right.updatePinchValue(1)")
         page.run(fly)
         assert above(page, 1) == pytest.approx(0, abs=1e-5)
-
-
-def test_a_ring_that_is_not_pointed_at_is_not_selected(chromium: Any, folder: Path, iwer: str) -> None:
-    with in_headset(chromium, folder / "tour.html", iwer) as page:
-        page.run("device.controllers.right.connected = true")  # it points straight ahead
-        before = page.camera
-        page.run("device.controllers.right.updateButtonValue('trigger', 1)")
-        page.run("walked()")
-        assert page.camera == before
 
 
 @pytest.mark.slow
@@ -1811,26 +1783,20 @@ SCALED = """
 
 
 @pytest.mark.slow
-def test_perfect_frames_of_a_headset_that_states_no_rate_keep_the_resolution(
-    chromium: Any, folder: Path, iwer: str
+@pytest.mark.parametrize(("milliseconds", "scale"), [(1000 / 60, 1), (33, 0.4)])
+def test_the_resolution_of_a_headset_that_states_no_rate_follows_its_first_frames(
+    chromium: Any, folder: Path, iwer: str, milliseconds: float, scale: float
 ) -> None:
-    unstated = "Object.defineProperty(XRSession.prototype, 'frameRate', { value: undefined }); step = 1000 / 60;"
+    unstated = (
+        f"Object.defineProperty(XRSession.prototype, 'frameRate', {{ value: undefined }}); step = {milliseconds};"
+    )
     with in_headset(chromium, folder / "tour.html", iwer, SCALED + unstated) as page:
-        page.wait("frames > 240")
-        assert page.run("scale") == 1
-        page.run("step = 25")
-        page.wait("scale < 1")
-        page.run("step = 1000 / 60")
-        page.wait("scale === 1")
-
-
-@pytest.mark.slow
-def test_a_headset_that_states_no_rate_and_is_late_from_the_first_frame_lowers_the_resolution(
-    chromium: Any, folder: Path, iwer: str
-) -> None:
-    unstated = "Object.defineProperty(XRSession.prototype, 'frameRate', { value: undefined }); step = 33;"
-    with in_headset(chromium, folder / "tour.html", iwer, SCALED + unstated) as page:
-        page.wait("scale === 0.4")
+        page.wait(f"frames > 240 && scale === {scale}")
+        if scale == 1:
+            page.run("step = 25")
+            page.wait("scale < 1")
+            page.run("step = 1000 / 60")
+            page.wait("scale === 1")
 
 
 @pytest.mark.slow
@@ -1847,42 +1813,25 @@ def test_the_resolution_follows_the_time_between_frames(chromium: Any, folder: P
 
 
 @pytest.mark.slow
-def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(
+def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it_and_saves_pictures(
     chromium: Any, plain_scene: Scene, tmp_path: Path
 ) -> None:
-    from pansplat.notebook import _bundle_scene
-
     file = tmp_path / "cell.html"
     file.write_text(f"<!doctype html><meta charset=utf-8>{_bundle_scene(plain_scene)['text/html']}")
-    page = new_context(chromium, viewport={"width": 640, "height": 560}).new_page()
-    messages: list[str] = []
-    page.on("console", lambda message: messages.append(message.text))
-    page.on("pageerror", lambda error: messages.append(str(error)))
-    page.goto(file.as_uri())
-    (frame,) = page.main_frame.child_frames
+    page = OpenPage(new_context(chromium, viewport={"width": 640, "height": 560}).new_page())
+    page.page.goto(file.as_uri())
+    (frame,) = page.page.main_frame.child_frames
     frame.wait_for_selector("#cover", state="hidden")
     frame.wait_for_selector("#buttons", state="visible")
     wait_until(frame, "pansplat.isSettled()")
     assert frame.evaluate("origin") == "null"
     assert frame.evaluate("document.getElementById('name').innerText") in plain_scene.names
-    assert messages == []
-    page.context.close()
-
-
-def test_a_picture_is_saved_from_the_frame_of_a_notebook(chromium: Any, plain_scene: Scene, tmp_path: Path) -> None:
-    from pansplat.notebook import _bundle_scene
-
-    file = tmp_path / "cell.html"
-    file.write_text(f"<!doctype html><meta charset=utf-8>{_bundle_scene(plain_scene)['text/html']}")
-    page = new_context(chromium, viewport={"width": 640, "height": 560}).new_page()
-    page.goto(file.as_uri())
-    (frame,) = page.main_frame.child_frames
-    assert frame.evaluate("pansplat.ready.then(() => 'ready', String)") == "ready"
-    with page.expect_download() as download:
+    assert page.messages == []
+    with page.page.expect_download() as download:
         frame.click("#more")
         frame.click("#picture")
     assert download.value.suggested_filename == "scene.png"
     assert "if the page around this frame allows" in frame.inner_text("#status")
     with Image.open(download.value.path()) as image:
         assert np.asarray(image.convert("RGB")).std() > 10
-    page.context.close()
+    page.page.context.close()

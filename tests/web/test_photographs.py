@@ -24,7 +24,7 @@ from pansplat.export.photographs import PackedPhotograph, pack_photographs, read
 from pansplat.gaussians.scene import Scene
 from pansplat.images.cube_images import equirect_from_faces
 from pansplat.images.image_files import read_panorama
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.pairs import Pair
 
 PURPLE = (200, 0, 200)  # of what masks hide; nothing else has so little green
 
@@ -126,8 +126,7 @@ def test_the_tiles_of_the_largest_level_are_the_photograph(
         assert np.allclose(packed.rotation, scene.cam2world[view, :3, :3])
 
 
-@pytest.mark.parametrize("kind", ["mask", "blur"])
-@pytest.mark.parametrize("split", [False, True])
+@pytest.mark.parametrize(("kind", "split"), [("mask", False), ("blur", True)])
 def test_what_masks_hide_is_in_no_file_of_a_page(
     grey: Scene, tmp_path: Path, take_photographs: Callable[..., list[Pair]], kind: str, split: bool
 ) -> None:
@@ -188,9 +187,3 @@ def test_a_new_page_removes_the_tiles_of_the_old_one(
     assert len(first.files) == 1 + 2 + 2 * 6 and all(file.is_file() for file in first.files)
     second = write_page(plain_scene, tmp_path / "index.html", split=True)
     assert second.photo_height == 0 and set((tmp_path / "index_files").iterdir()) == set(second.files[1:])
-
-
-def test_a_panorama_of_a_pair_is_a_pair_of_its_own(scene: Scene, tmp_path: Path) -> None:
-    panoramas = tuple(Panorama(f"{k}", tmp_path / f"{k}.png", pose) for k, pose in enumerate(scene.cam2world))
-    pair = Pair("room", tmp_path, panoramas, (), 0.5, 10.0)
-    assert [each.context for each in module.list_photographs(pair, [2, 0])] == [panoramas[2:], panoramas[:1]]

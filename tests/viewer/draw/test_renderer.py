@@ -21,7 +21,6 @@ pytestmark = pytest.mark.gl
 SIZE = (64, 48)
 SETTINGS = DrawSettings(background=(0.1, 0.4, 0.7))
 RENDERERS = pytest.mark.parametrize("renderer_name", ["gl", "cpu"])
-PRESETS = pytest.mark.parametrize("preset", ["exact", "3dgs"])
 
 
 def select(scene, mask):
@@ -32,70 +31,74 @@ def select_view(scene, view):
     return select(scene, scene.gaussians.views == view)
 
 
-@PRESETS
-def test_pinhole_image_equals_the_reference(random_scene, pose, assert_reference, preset):
-    settings = replace(SETTINGS, preset=preset, vertical_fov_degrees=65)
-    assert_reference(random_scene(), pose, (97, 64), settings)
+def change(scene, **fields):
+    return replace(scene, gaussians=replace(scene.gaussians, **fields))
 
 
-@PRESETS
-def test_each_of_six_faces_equals_the_reference(random_scene, pose, assert_reference, preset):
-    for face in face_poses(torch.from_numpy(pose)).numpy():
-        assert_reference(random_scene(seed=1), face, (48, 48), replace(SETTINGS, preset=preset))
+def make_cases(name, random_scene, pose):
+    """Scene, pose, size and settings of images of a hard case, and perhaps the scene that the reference draws."""
+    scene, opacities = random_scene(), random_scene().gaussians.opacities
+    if name == "pinhole":
+        yield scene, pose, (97, 64), {"vertical_fov_degrees": 65}
+    elif name == "six faces":
+        for face in face_poses(torch.from_numpy(pose)).numpy():
+            yield scene, face, (48, 48), {}
+    elif name == "panorama":
+        yield scene, pose, (96, 48), {"layout": "equirect"}
+    elif name == "among large Gaussians":
+        yield random_scene(150, size=0.5, seed=3), pose, SIZE, {"vertical_fov_degrees": 110}
+    elif name == "smaller than a pixel, needles and discs":
+        scales = scene.gaussians.scales.clone()
+        scales[:100] *= 0.01
+        scales[100:200, 0] *= 30
+        scales[200:, 1] = 0
+        yield change(scene, scales=scales), pose, (80, 60), {}
+    elif name == "colours of any degree follow the position":
+        for degree, shift in ((0, 0.0), (2, 0.5), (4, 0.5)):
+            moved = pose.copy()
+            moved[0, 3] += shift
+            yield random_scene(degree=degree, seed=5), moved, SIZE, {}
+    elif name == "ties are drawn in the order of indices":
+        tied = random_scene(60, degree=0, size=0.15, seed=6)  # six of different colour at each position
+        yield change(tied, means=tied.gaussians.means[torch.arange(60) // 6 * 6]), pose, SIZE, {}
+    elif name == "near, odd sizes and unusual opacities":
+        yield from ((scene, pose, SIZE, {"near": near, "background": (0.0, 0.0, 0.0)}) for near in (1.5, 2.5))
+        yield from ((scene, pose, size, {}) for size in ((1, 1), (2, 1), (31, 7), (7, 31)))
+        unusual = opacities * 4 - 1
+        unusual[::7] = 0.99 / 255
+        yield change(scene, opacities=unusual), pose, SIZE, {}
+    elif name == "the Gaussians of a view, of levels and of a least opacity":
+        for view in (0, 1):
+            yield scene, pose, SIZE, {"mode": "view", "view": view}, select_view(scene, view)
+        yield scene, pose, SIZE, {"opacity_threshold": 0.6}, select(scene, opacities >= 0.6)
+        for levels in ((), (0,), (1, 3)):
+            mask = torch.isin(scene.gaussians.levels, torch.tensor(levels, dtype=torch.int64))
+            yield scene, pose, SIZE, {"levels": frozenset(levels)}, select(scene, mask)
+    elif name == "values that are not finite are dropped":
+        fields = ("means", "scales", "quats", "opacities", "harmonics")
+        broken = {each: getattr(scene.gaussians, each).clone() for each in fields}
+        for row, (each, value) in enumerate(
+            zip(fields, (math.nan, math.inf, math.nan, math.nan, -math.inf), strict=True)
+        ):
+            broken[each][row].flatten()[-1] = value
+        yield change(scene, **broken), pose, SIZE, {}, select(scene, torch.arange(300) >= 5)
+    else:
+        raise AssertionError(name)
 
 
-@PRESETS
-def test_panorama_equals_the_reference(random_scene, pose, assert_reference, preset):
-    settings = replace(SETTINGS, preset=preset, layout="equirect")
-    assert_reference(random_scene(seed=2), pose, (96, 48), settings)
-
-
-@PRESETS
-def test_camera_among_large_gaussians_equals_the_reference(random_scene, pose, assert_reference, preset):
-    settings = replace(SETTINGS, preset=preset, vertical_fov_degrees=110)
-    assert_reference(random_scene(150, size=0.5, seed=3), pose, SIZE, settings)
-
-
-@PRESETS
-def test_subpixel_needle_and_disc_gaussians_equal_the_reference(random_scene, pose, assert_reference, preset):
-    scene = random_scene(400, seed=4)
-    scales = scene.gaussians.scales.clone()
-    scales[:100] *= 0.01
-    scales[100:200, 0] *= 30
-    scales[200:300, 1] = 0
-    scene = replace(scene, gaussians=replace(scene.gaussians, scales=scales))
-    assert_reference(scene, pose, (80, 60), replace(SETTINGS, preset=preset))
-
-
-@RENDERERS
-@pytest.mark.parametrize("degree", [0, 2, 4])
-def test_colors_of_any_degree_follow_the_position(
-    make_renderer, random_scene, pose, reference, assert_matches, degree, renderer_name
-):
-    scene = random_scene(degree=degree, seed=5)
-    renderer = make_renderer(scene, renderer_name)
-    for shift in (0.0, 0.5):
-        pose[0, 3] += shift
-        assert_matches(renderer, pose, SETTINGS, reference(scene, pose, SIZE, SETTINGS))
-
-
-@PRESETS
-def test_ties_are_drawn_in_the_order_of_indices(random_scene, pose, assert_reference, preset):
-    scene = random_scene(60, degree=0, size=0.15, seed=6)
-    means = scene.gaussians.means[torch.arange(60) // 6 * 6]  # six of different colour at each position
-    scene = replace(scene, gaussians=replace(scene.gaussians, means=means))
-    assert_reference(scene, pose, SIZE, replace(SETTINGS, preset=preset))
-
-
-def test_near_unusual_opacities_and_odd_sizes_equal_the_reference(random_scene, pose, assert_reference):
-    scene = random_scene(seed=9)
-    for near in (1.5, 2.5):
-        assert_reference(scene, pose, SIZE, DrawSettings(near=near))
-    for size in ((1, 1), (2, 1), (31, 7), (7, 31)):
-        assert_reference(scene, pose, size, SETTINGS)
-    opacities = scene.gaussians.opacities * 4 - 1
-    opacities[::7] = 0.99 / 255
-    assert_reference(replace(scene, gaussians=replace(scene.gaussians, opacities=opacities)), pose, SIZE, SETTINGS)
+@pytest.mark.parametrize("preset", ["exact", "3dgs"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("pinhole", "six faces", "panorama", "among large Gaussians", "smaller than a pixel, needles and discs"),
+        *("colours of any degree follow the position", "ties are drawn in the order of indices"),
+        *("near, odd sizes and unusual opacities", "the Gaussians of a view, of levels and of a least opacity"),
+        "values that are not finite are dropped",
+    ],
+)
+def test_opengl_and_the_processor_draw_the_reference(name, preset, random_scene, pose, assert_reference):
+    for scene, camera, size, changes, *drawn in make_cases(name, random_scene, pose):
+        assert_reference(scene, camera, size, replace(SETTINGS, preset=preset, **changes), *drawn)
 
 
 @RENDERERS
@@ -133,18 +136,6 @@ def test_panorama_error_at_seams_is_not_larger_than_inside_faces(make_renderer, 
 
 
 @RENDERERS
-@pytest.mark.parametrize("view", [0, 1])
-def test_mode_view_draws_the_gaussians_of_the_view(
-    make_renderer, random_scene, pose, reference, assert_matches, view, renderer_name
-):
-    scene = random_scene()
-    renderer = make_renderer(scene, renderer_name)
-    expected = reference(select_view(scene, view), pose, SIZE, SETTINGS)
-    assert_matches(renderer, pose, replace(SETTINGS, mode="view", view=view), expected)
-    assert renderer.stats.visible <= int((scene.gaussians.views == view).sum())
-
-
-@RENDERERS
 @pytest.mark.parametrize("layout", ["pinhole", "equirect"])
 @pytest.mark.parametrize("position", ["between", "at view 1", "elsewhere"])
 def test_deferred_blending_equals_the_reference(
@@ -165,21 +156,6 @@ def test_deferred_blending_equals_the_reference(
 
 
 @RENDERERS
-def test_levels_and_opacity_threshold_select_gaussians(
-    make_renderer, random_scene, pose, reference, assert_matches, renderer_name
-):
-    scene = random_scene()
-    renderer = make_renderer(scene, renderer_name)
-    cases = [({"opacity_threshold": 0.6}, scene.gaussians.opacities >= 0.6)]
-    for levels in ((), (0,), (1, 3)):
-        mask = torch.isin(scene.gaussians.levels, torch.tensor(levels, dtype=torch.int64))
-        cases.append(({"levels": frozenset(levels)}, mask))
-    for change, mask in cases:
-        expected = reference(select(scene, mask), pose, SIZE, SETTINGS)
-        assert_matches(renderer, pose, replace(SETTINGS, **change), expected)
-
-
-@RENDERERS
 def test_empty_scene_is_the_background(make_renderer, random_scene, pose, renderer_name):
     scene = random_scene()
     renderer = make_renderer(select(scene, torch.zeros(len(scene.gaussians), dtype=torch.bool)), renderer_name)
@@ -187,25 +163,6 @@ def test_empty_scene_is_the_background(make_renderer, random_scene, pose, render
         renderer.render(pose, SIZE, settings)
         assert np.allclose(renderer.read_color(), (*SETTINGS.background, 0), atol=1e-6)
         assert not renderer.read_depth().any()
-
-
-@RENDERERS
-def test_gaussians_with_non_finite_values_are_dropped_and_counted(
-    make_renderer, random_scene, pose, reference, assert_matches, renderer_name
-):
-    scene = random_scene()
-    names = ("means", "scales", "quats", "opacities", "harmonics")
-    fields = {name: getattr(scene.gaussians, name).clone() for name in names}
-    fields["means"][0, 1] = float("nan")
-    fields["scales"][1, 0] = float("inf")
-    fields["quats"][2, 3] = float("nan")
-    fields["opacities"][3] = float("nan")
-    fields["harmonics"][4, 2, 0] = float("-inf")
-    renderer = make_renderer(replace(scene, gaussians=replace(scene.gaussians, **fields)), renderer_name)
-    finite = select(scene, torch.arange(len(scene.gaussians)) >= 5)
-    assert_matches(renderer, pose, SETTINGS, reference(finite, pose, SIZE, SETTINGS))
-    assert renderer.stats.dropped == 5
-    assert renderer.stats.total == len(scene.gaussians) - 5
 
 
 def test_half_float_targets_are_close(make_renderer, random_scene, pose):
@@ -263,19 +220,6 @@ def test_culling_does_not_change_the_image(make_renderer, random_scene, pose, mo
         assert np.array_equal(whole.read_color(), image)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"preset": "surfel"}, "`preset` must be one of exact, 3dgs, got 'surfel'"),
-        ({"vertical_fov_degrees": 180}, "between 0 and 180, got 180"),
-        ({"near": 0.0}, "`near` must be a positive distance"),
-    ],
-)
-def test_invalid_settings_are_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        DrawSettings(**change)
-
-
 @RENDERERS
 def test_settings_poses_and_sizes_that_do_not_fit_are_refused(make_renderer, random_scene, pose, renderer_name):
     scene = random_scene()
@@ -294,7 +238,14 @@ def test_settings_poses_and_sizes_that_do_not_fit_are_refused(make_renderer, ran
         renderer.render(pose, SIZE, replace(SETTINGS, mode="deferred"))
 
 
-def test_renderer_without_a_scene_refuses_to_draw(ctx, pose):
+def test_renderer_without_a_scene_and_invalid_settings_are_refused(ctx, pose):
+    for change, message in (
+        ({"preset": "surfel"}, "`preset` must be one of exact, 3dgs, got 'surfel'"),
+        ({"vertical_fov_degrees": 180}, "between 0 and 180, got 180"),
+        ({"near": 0.0}, "`near` must be a positive distance"),
+    ):
+        with pytest.raises(InputError, match=message):
+            DrawSettings(**change)
     with pytest.raises(InputError, match="color_bits"):
         SplatRenderer(ctx, color_bits=8)
     empty = SplatRenderer(ctx)
@@ -306,7 +257,7 @@ def test_renderer_without_a_scene_refuses_to_draw(ctx, pose):
     empty.release()
 
 
-@pytest.mark.parametrize("renderer_name", ["gl", "cpu"])
+@RENDERERS
 def test_a_failed_upload_keeps_the_scene_before(make_renderer, random_scene, pose, renderer_name, monkeypatch):
     renderer, compile_splat, failures = make_renderer(random_scene(), renderer_name), Programs.splat, [True]
     renderer.render(pose, SIZE, SETTINGS)

@@ -62,6 +62,9 @@ def test_swapping_the_sign_of_the_distance_exchanges_the_eyes(renderer, pose):
         )
         left, right = np.split(first, 2, axis=1)
         assert np.array_equal(second, np.hstack((right, left)))
+        image_format = ImageFormat(projection, "side-by-side")
+        color, depth = render_image(renderer, pose, size, DrawSettings(), image_format, with_depth=True)
+        assert depth.shape == color.shape[:2] == first.shape[:2] and depth.min() >= 0 and 0.5 < depth.max() < 20
 
 
 def test_the_faces_of_a_cubemap_are_where_players_read_them(renderer, pose):
@@ -83,20 +86,11 @@ def test_the_faces_of_a_cubemap_are_where_players_read_them(renderer, pose):
             assert error.mean() < 0.02
 
 
-def test_the_depth_of_both_eyes_is_arranged_as_the_colours_are(renderer, pose):
-    for projection, size, stereo, shape in (
-        ("equirect", SIZE, "top-bottom", (48, 48)),
-        ("cubemap", (24, 16), "side-by-side", (16, 48)),
-        ("perspective", SIZE, "side-by-side", (24, 96)),
-        ("cubemap", (24, 16), "mono", (16, 24)),
-    ):
-        image_format = ImageFormat(projection, stereo)
-        color, depth = render_image(renderer, pose, size, DrawSettings(), image_format, with_depth=True)
-        assert depth is not None and depth.shape == shape == color.shape[:2]
-        assert depth.min() >= 0 and 0.5 < depth.max() < 20
-
-
-def test_omnidirectional_stereo_needs_the_exact_preset(renderer, pose):
+@pytest.mark.gl
+def test_omnidirectional_stereo_needs_the_exact_preset_and_the_processor(make_renderer, random_scene, pose):
+    settings = DrawSettings(layout="equirect", eye_offset=0.03)
+    with pytest.raises(InputError, match="use `CpuRenderer`"):
+        make_renderer(random_scene(), "gl").render(pose, (32, 16), settings)
     with pytest.raises(InputError, match="needs preset exact, got 3dgs"):
         ImageFormat("equirect", "top-bottom").check((64, 32), "3dgs")
     with pytest.raises(InputError, match="needs layout equirect and preset exact"):
@@ -104,13 +98,6 @@ def test_omnidirectional_stereo_needs_the_exact_preset(renderer, pose):
     with pytest.raises(InputError, match="`eye_offset` must be a distance"):
         DrawSettings(layout="equirect", eye_offset=float("nan"))
     assert arrange_eyes([np.zeros((2, 3, 1))], "mono").shape == (2, 3, 1)
-
-
-@pytest.mark.gl
-def test_opengl_refuses_omnidirectional_stereo(make_renderer, random_scene, pose):
-    settings = replace(DrawSettings(layout="equirect"), eye_offset=0.03)
-    with pytest.raises(InputError, match="use `CpuRenderer`"):
-        make_renderer(random_scene(), "gl").render(pose, (32, 16), settings)
 
 
 def test_films_of_stereo_panoramas_state_their_layout(room, tmp_path, monkeypatch):

@@ -44,12 +44,8 @@ def test_paths_without_scenes_are_refused(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             find_entries(path, LoadOptions())
-
-
-def test_a_damaged_scene_is_refused_when_loaded(tmp_path):
-    file = tmp_path / "scene.ply"
-    file.write_bytes(b"ply\nnot really")
-    (entry,) = find_entries(file, LoadOptions())
+    (tmp_path / "scene.ply").write_bytes(b"ply\nnot really")
+    (entry,) = find_entries(tmp_path / "scene.ply", LoadOptions())
     with pytest.raises(InputError, match=r"scene\.ply"):
         load_entry(entry, LoadOptions(), ignore)
 
@@ -180,27 +176,6 @@ def test_panoramas_are_shown_before_their_poses_are_estimated_but_not_if_these_a
     assert len(set(early.tour.parts)) == 2
 
 
-def test_a_search_hands_over_panoramas_before_its_result(wait_until):
-    go, early, found = threading.Event(), [SceneEntry("early")], [SceneEntry("found")]
-
-    def find(path, progress, show):
-        show(early)
-        assert go.wait(300)
-        return found
-
-    loader = SceneLoader(work_forever)
-    loader.search(Path("tour"), find)
-    loader.wait_for_entries()
-    assert loader.poll() is early and loader.is_searching and loader.poll() is None
-    go.set()
-    loader.wait_for_entries()
-    assert wait_until(loader.poll, "entries") is found and not loader.is_searching
-    loader.search(Path("tour"), lambda path, progress, show: show(early) or found)
-    loader._searching.future.result(300)
-    assert wait_until(loader.poll, "entries") is found and not loader.is_searching, "a finished search has its result"
-    loader.close()
-
-
 @pytest.mark.parametrize(
     ("name", "folder"), [("a/b c", "a_b_c"), ("../x", "x"), ("...", "scene"), ("Küche 1", "Küche_1")]
 )
@@ -216,44 +191,28 @@ def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
     loader.request(SceneEntry("first"))
     loader.request(SceneEntry("second"))
     assert wait_until(loader.poll, "result").entry.name == "second"
+    loader.request(SceneEntry("first"))
     loader.close()
-    assert not list_loader_threads()
+    assert not list_loader_threads(), "the end cancels the request and joins its thread"
 
 
-def test_close_cancels_the_request_and_joins_its_thread():
-    loader = SceneLoader(work_forever)
-    loader.request(SceneEntry("endless"))
-    loader.close()
-    assert not list_loader_threads()
-
-
-def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene):
-    arguments = {}
-
+def test_a_prediction_has_the_arguments_of_the_options_and_is_shown_before_the_refined_scene(monkeypatch, small_scene):
     def predict(pair, **options):
-        arguments.update(options)
+        assert (options["model"], options["height"], options["cache"], options["refine_seconds"]) == (
+            "sweep",
+            256,
+            False,
+            3.0,
+        )
         options["progress"]("predicting", 0.5)
-        return small_scene
-
-    monkeypatch.setattr("pansplat.pipeline.predict", predict)
-    tasks = []
-    entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
-    options = LoadOptions(prediction=PredictOptions("sweep", height=256, cache=False))
-    loaded = load_entry(entry, options, lambda task, done: tasks.append(task))
-    assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)
-    assert loaded.scene is small_scene and tasks[0] == "predicting"
-
-
-def test_an_entry_shows_its_prediction_before_the_refined_scene(monkeypatch, small_scene):
-    def predict(pair, **options):
-        assert options["refine_seconds"] == 3.0
         options["on_predicted"](small_scene)
         return small_scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     shown = []
     entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
-    final = load_entry(entry, LoadOptions(prediction=PredictOptions(refine_seconds=3.0)), ignore, shown.append)
+    prediction = PredictOptions("sweep", height=256, cache=False, refine_seconds=3.0)
+    final = load_entry(entry, LoadOptions(prediction=prediction), ignore, shown.append)
     assert [loaded.is_final for loaded in (*shown, final)] == [False, True]
 
 

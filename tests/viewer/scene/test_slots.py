@@ -1,4 +1,4 @@
-"""Conversion of scenes in a worker thread."""
+"""Conversion of scenes in a worker thread; tests/viewer/test_viewer.py has that of a scene that is shown."""
 
 import threading
 
@@ -11,25 +11,6 @@ from pansplat_viewer.scene.slots import ScenePreparer
 @pytest.fixture(autouse=True)
 def all_scenes_are_large(monkeypatch):
     monkeypatch.setattr(slots, "_SMALL_SCENE", 0)
-
-
-def test_a_scene_is_converted_once_and_its_progress_is_reported(random_scene, wait_until):
-    go, reported = threading.Event(), threading.Event()
-
-    def prepare(scene, report):
-        report(0.5)
-        reported.set()
-        assert go.wait(300)
-        return len(scene.gaussians)
-
-    preparer, scene = ScenePreparer(prepare), random_scene(20)
-    assert not preparer.is_ready(scene) and reported.wait(300)
-    assert preparer.progress == 0.5 and not preparer.is_ready(scene)
-    go.set()
-    wait_until(lambda: preparer.is_ready(scene), "conversion")
-    assert preparer.progress is None and preparer.take(scene) == 20
-    assert preparer.take(scene) is None, "not kept"
-    preparer.close()
 
 
 def test_another_scene_ends_the_conversion_and_errors_are_raised_when_it_is_taken(random_scene, wait_until):
@@ -52,11 +33,4 @@ def test_another_scene_ends_the_conversion_and_errors_are_raised_when_it_is_take
     wait_until(lambda: preparer.is_ready(scene), "end")
     with pytest.raises(MemoryError):
         preparer.take(scene)
-    preparer.close()
-
-
-def test_small_scenes_are_not_converted_in_a_thread(random_scene, monkeypatch):
-    monkeypatch.setattr(slots, "_SMALL_SCENE", 20)
-    preparer = ScenePreparer(lambda scene, report: 1)
-    assert preparer.is_ready(random_scene(20)) and preparer.take(random_scene(20)) is None
     preparer.close()

@@ -45,12 +45,6 @@ def test_the_least_recently_used_scene_is_dropped_when_the_memory_is_exceeded(ho
     assert set(scenes.outlines) == {0, 1, 2, 3}, "outlines are kept"
 
 
-def test_the_camera_needs_the_nearest_edge_and_keeps_it_near_a_panorama(scenes):
-    for z, views in ((0.4, (0, 1)), (0.9, (0, 1)), (1.2, (1, 2)), (0.7, (1, 2)), (0.3, (0, 1))):
-        scenes.move(np.array((0.0, 0.0, z)))
-        assert scenes.views == views, z
-
-
 def test_missing_scenes_are_requested_first_then_refinements(house, load_house, scenes):
     wanted = [(0, 1), (1, 2)]
     request = scenes.choose_request(wanted, None)
@@ -122,13 +116,10 @@ def test_after_a_cut_a_photograph_fades_from_the_one_before_and_not_from_the_sce
     assert np.diff(weights[:10]).min() > 0.05
     stop.update(None, 4.0)
     assert (stop.index, stop.before) == (5, None) and stop.weight < 1, "into the scene"
-
-
-def test_a_cut_to_a_photograph_that_is_left_at_once_ends_in_the_scene():
     stop = StopFade()
     for time, index in ((0.0, 3), (1.0, 3), (1.5, 3), (2.0, 5), (2.1, None), (3.0, None), (4.0, None)):
         stop.update(index, time)
-    assert (stop.before, stop.weight) == (None, 0)
+    assert (stop.before, stop.weight) == (None, 0), "a cut to a photograph that is left at once"
 
 
 def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(house, load_house):
@@ -162,6 +153,9 @@ def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_h
 
 
 def test_a_scene_is_good_along_its_edges_and_near_its_panoramas(scenes):
+    for z, views in ((0.4, (0, 1)), (0.9, (0, 1)), (1.2, (1, 2)), (0.7, (1, 2)), (0.3, (0, 1))):
+        scenes.move(np.array((0.0, 0.0, z)))
+        assert scenes.views == views, "the edge is kept near a panorama"
     for z, inside in ((0.4, True), (1.0, True), (1.15, False), (1.6, False)):
         scenes.edge = (0, 1) if z < 0.8 else (1, 2)
         assert scenes.is_inside(np.array((0.0, 0.0, z)), (0, 1)) == inside, z
@@ -183,15 +177,11 @@ def test_predictions_go_on_to_the_last_scene_and_what_was_dropped_is_read_when_i
     assert scenes.choose_request(scenes.list_next(None, 0.0), None).views == scenes.views
 
 
-def test_the_way_to_a_panorama_starts_at_the_camera(scenes):
-    camera = Camera(position=(0.1, 0.0, 0.5), yaw_radians=0.4, pitch_radians=0.2)
-    route = scenes.plan_way(camera.cam2world, 3)
-    assert np.allclose(route.pose(0), camera.cam2world, atol=1e-3)
+def test_a_way_begins_at_the_camera_and_after_a_jump_at_its_edge(scenes):
+    looking = Camera(position=(0.1, 0.0, 0.5), yaw_radians=0.4, pitch_radians=0.2)
+    route = scenes.plan_way(looking.cam2world, 3)
+    assert np.allclose(route.pose(0), looking.cam2world, atol=1e-3)
     assert route.walk == (1, 2, 3), "it does not go back to the first panorama"
-    assert np.allclose(route.pose(1)[:3, 3], scenes.tour.positions[3])
-
-
-def test_a_way_begins_at_the_edge_of_the_camera_after_a_jump(scenes):
     camera = Camera(position=(0.5, 0.0, 1.6)).cam2world
     assert scenes.edge == (0, 1), "the edge before the jump"
     assert scenes.plan_way(camera, 0).walk == (2, 1, 0)

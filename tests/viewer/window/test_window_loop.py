@@ -28,12 +28,15 @@ def make_viewer() -> Mock:
     return viewer
 
 
-def test_a_dropped_path_is_opened():
-    window, viewer = make_window(), make_viewer()
+def test_a_dropped_path_is_opened_another_resolution_changes_the_scale_and_waiting_input_is_not_delayed():
+    window, viewer = make_window(scale_changed=True, dpi_scale=2.0), make_viewer()
+    viewer.moving, viewer.gui.has_input = False, True
     Window._drop(window, None, ["/somewhere/a pair"])
     _run_loop(window, viewer)
     viewer.open.assert_called_once_with(Path("/somewhere/a pair"))
-    assert window.dropped == []
+    viewer.gui.set_scale.assert_called_once_with(2.0)
+    window.wait.assert_called_once_with(0.0)
+    assert window.dropped == [] and window.scale_changed is False
 
 
 def test_a_minimised_window_waits_and_draws_nothing():
@@ -59,13 +62,6 @@ def test_an_image_drawn_in_the_background_wakes_the_window_when_it_is_finished()
     window.wake.assert_called_once_with()
 
 
-def test_input_that_waits_for_the_next_frame_is_not_delayed():
-    window, viewer = make_window(), make_viewer()
-    viewer.moving, viewer.gui.has_input = False, True
-    _run_loop(window, viewer)
-    window.wait.assert_called_once_with(0.0)
-
-
 def test_a_window_without_pixels_or_minimised_is_not_visible():
     for size, iconified, visible in (((640, 480), 0, True), ((640, 0), 0, False), ((640, 480), 1, False)):
         library = SimpleNamespace(
@@ -76,13 +72,6 @@ def test_a_window_without_pixels_or_minimised_is_not_visible():
         window = Window.__new__(Window)
         window._glfw, window._handle = library, None
         assert window.is_visible == visible
-
-
-def test_another_resolution_of_the_screen_changes_the_scale_once():
-    window, viewer = make_window(scale_changed=True, dpi_scale=2.0), make_viewer()
-    _run_loop(window, viewer)
-    viewer.gui.set_scale.assert_called_once_with(2.0)
-    assert window.scale_changed is False
 
 
 def test_a_reset_of_the_graphics_card_is_reported_after_the_frame():

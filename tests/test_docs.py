@@ -1,0 +1,101 @@
+"""The documents: commands, calls, links and pose files of the README work; the notebook runs; every module is named."""
+
+import base64
+import io
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import nbformat
+import numpy as np
+import pytest
+from PIL import Image
+
+import pansplat
+from pansplat.cli import parse
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text("utf-8")
+BLOCKS = "\n".join(re.findall(r"^```\w*\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE))
+COMMANDS = re.findall(r"^(?:\.venv/bin/)?pansplat (.+?)(?:\s+#.*)?$", BLOCKS, flags=re.MULTILINE)
+NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
+
+
+def test_commands_of_the_readme_are_valid_and_all() -> None:
+    for command in COMMANDS:
+        assert type(parse(shlex.split(command))).__name__.lower() == command.split()[0]
+    commands = "predict refine render export batch evaluate check info convert bench pose"
+    assert {command.split()[0] for command in COMMANDS} == set(commands.split())
+
+
+def test_calls_of_the_readme_exist() -> None:
+    calls = set(re.findall(r"pansplat\.(\w+)\(", README))
+    assert calls >= {"predict", "render", "load_model", "rasterize", "save", "load"} and calls <= set(pansplat.__all__)
+    assert all(callable(getattr(pansplat, name)) for name in pansplat.__all__)
+
+
+def test_links_of_the_readme_exist_and_lead_to_every_document() -> None:
+    targets = re.findall(r"\]\(([^)#]+)\)", README) + re.findall(r'src="([^"]+)"', README)
+    local = {target for target in targets if not target.startswith("http")}
+    assert not [target for target in local if not (ROOT / target).exists()]
+    assert {f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md")} <= local
+
+
+def test_pose_files_of_the_readme_are_read(tmp_path: Path) -> None:
+    (poses,) = re.findall(r"```json\n(.+?)```", README, flags=re.DOTALL)
+    (tmp_path / "poses.json").write_text(poses)
+    for name in ("left.jpg", "right.jpg"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((8, 16, 3), np.uint8))
+    (pair,) = pansplat.load_pairs(tmp_path)
+    assert [panorama.image.name for panorama in pair.context] == ["left.jpg", "right.jpg"]
+    assert (pair.near, pair.far) == (0.45, 10.0)
+
+
+def test_the_two_commands_are_those_of_ci_and_setup() -> None:
+    assert "bash setup.sh && .venv/bin/pansplat-view assets/living_room" in README
+    assert "bash setup.sh --dev && .venv/bin/pytest" in README
+    ci = (ROOT / ".ci" / "run").read_text()
+    assert "bash setup.sh --dev" in ci and ".venv/bin/pytest" in ci
+    assert "assets/living_room" in (ROOT / "setup.sh").read_text()
+
+
+def test_the_architecture_names_every_module() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    rows = {names: row for row in text.splitlines() for names in re.findall(r"^\| `([a-z_/]+)/`", row)}
+    missing = []
+    for source in (*(ROOT / "pansplat").rglob("*.py"), *(ROOT / "viewer").rglob("*.py")):
+        folder = source.relative_to(ROOT).parent.as_posix().removeprefix("pansplat/")
+        parts = [row for name, row in rows.items() if folder == name or folder.startswith(f"{name}/")]
+        described = "".join(parts) or (text if folder == "pansplat" else "")
+        if source.name != "__init__.py" and not re.search(rf"\b{source.stem}\b", described):
+            missing.append(source.relative_to(ROOT).as_posix())
+    assert not missing
+
+
+@pytest.mark.slow
+def test_all_cells_of_the_notebook_run_and_show_the_stored_pictures(tmp_path: Path) -> None:
+    out = tmp_path / "notebook.ipynb"
+    command = [sys.executable, str(ROOT / "tests" / "run_notebook.py"), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    ran, stored = (
+        [
+            (cell.source, [set(output.get("data", {output.output_type: None})) for output in cell.outputs])
+            for cell in nbformat.read(path, as_version=4).cells
+            if cell.cell_type == "code"
+        ]
+        for path in (out, NOTEBOOK)
+    )
+    assert ran == stored, f"run {' '.join(command[:2])} to store new outputs"
+    assert NOTEBOOK.stat().st_size < 1_000_000 and "tensor(" not in NOTEBOOK.read_text("utf-8")
+    cells = nbformat.read(NOTEBOOK, as_version=4).cells
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    assert not [output for output in outputs if output.get("name") == "stderr"]
+    pictures = [output.data["image/jpeg"] for output in outputs if "image/jpeg" in output.get("data", {})]
+    assert len(pictures) >= 5
+    for picture in pictures:
+        with Image.open(io.BytesIO(base64.b64decode(picture))) as image:
+            assert image.width >= 512 and image.convert("L").getextrema()[1] > 128
