@@ -26,3 +26,6 @@ MIN_EWA_VARIANCE = 1e-12  # pixel^2; the determinant of a needle can round to ze
 
 FRONT_COSINE = -0.4
 """Least cosine between the rays of two cameras that see the same side of a Gaussian (docs/rendering.md, section 10)."""
+
+MIN_FOV_DEGREES, MAX_FOV_DEGREES = 15.0, 130.0
+"""Vertical fields of view of cameras that a user moves."""

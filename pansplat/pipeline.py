@@ -764,8 +764,10 @@ def render(
     return blend_renderings(renderings, weights[torch.tensor(shown, device=pose.device)])
 
 
-def make_renderer(scene: Scene, work: str, count: int, **options: Any) -> Callable[[Tensor], Rendering]:
-    """A function from poses to images: on the device for their number, out of a card's memory on the processor.
+def make_renderer(scene: Scene, work: str, count: int, **options: Any) -> Callable[..., Rendering]:
+    """A function from a pose to its image: on the device for their number, out of a card's memory on the processor.
+
+    Keywords of the function replace those of all images.
 
     Args:
         scene: in main memory, as the images are.
@@ -776,14 +778,14 @@ def make_renderer(scene: Scene, work: str, count: int, **options: Any) -> Callab
     device = choose_device(work, count * math.prod(options["size"]) * _PIXEL_SECONDS, kernels=True)
     placed = replace(scene, gaussians=scene.gaussians.to(device=device))
 
-    def draw(cam2world: Tensor) -> Rendering:
+    def draw(cam2world: Tensor | np.ndarray, **changed: Any) -> Rendering:
         nonlocal placed
         try:
-            image = render(placed, cam2world, **options)
+            image = render(placed, cam2world, **options | changed)
         except torch.cuda.OutOfMemoryError:
             note_full_card(work)
             placed = scene
-            return draw(cam2world)
+            return draw(cam2world, **changed)
         return replace(image, color=image.color.cpu(), alpha=image.alpha.cpu(), depth=image.depth.cpu())
 
     return draw

@@ -32,10 +32,10 @@ from pansplat.inputs.folders import load_pairs
 from pansplat.model.network import build_empty_network
 from pansplat.model.weights import WeightsFile
 from pansplat.system.options import check_numbers
+from pansplat.tours.camera_path import read_path
 from pansplat.training.checkpoint import extract_weights, load_checkpoint
 from pansplat.training.config import TrainConfig
 from pansplat_viewer.app import Options
-from pansplat_viewer.scene.key_frames import read_path
 
 VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 7, 0.5, 1e300, 10**400, math.nan, "", "x", "../x", [], {}, [[1, 2], [3]], {"a": 1}, [None],

@@ -1,9 +1,9 @@
 """The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
-import glob
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +14,7 @@ from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import own_warnings, parse_arguments, progress_bar
 from pansplat.system.devices import Device, use_device
-from pansplat.system.files import expand_home, require_output_file, require_output_folder, require_replaceable
+from pansplat.system.files import expand_home, require_output_folder, require_replaceable
 from pansplat.system.options import EYE_DISTANCE, EyeDistance, check_numbers
 from pansplat_viewer.scene.loader import (
     LoadedScene,
@@ -32,10 +32,10 @@ from pansplat_viewer.scene.settings import DrawSettings, Mode, Preset, Projectio
 if TYPE_CHECKING:
     import moderngl
 
+    from pansplat.tours.camera_path import CameraPath
     from pansplat_viewer.draw.stereo import ImageFormat
-    from pansplat_viewer.scene.key_frames import CameraPath
 
-_WRITTEN = "view_*.png", "panorama_*.png", "[0-9]*_*.png", "floor_plan.png", "flythrough.mp4", "tour.mp4"  # offscreen
+_WRITTEN = "view_*.png", "panorama_*.png", "[0-9]*_*.png", "flythrough.mp4", "tour.mp4"  # offscreen
 _WINDOW_SIZE = 1280, 720  # pixels
 _PREDICTION_PART = 0.6  # of the work of a film; the rest is drawing
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
@@ -148,14 +148,11 @@ def _run(options: Options) -> int:
         raise InputError("--projection, and --stereo without a window, need --out; give --path and --out FILE")
     if options.offscreen is not None:
         require_output_folder("--offscreen", options.offscreen)
-    from pansplat.images.video import VIDEO_SUFFIXES
-    from pansplat_viewer.scene.key_frames import read_path
+    from pansplat.export.film import require_film_file
+    from pansplat.tours.camera_path import read_path
 
     if options.out is not None:
-        require_output_file("--out", options.out, (*VIDEO_SUFFIXES, ".png", ".exr"))
-        suffix = options.out.suffix.lower()
-        sequence = options.out.parent.glob(f"{glob.escape(options.out.stem)}_[0-9]*{suffix}")
-        require_replaceable("--out", [options.out] if suffix in VIDEO_SUFFIXES else sequence, options.overwrite)
+        require_film_file("--out", options.out, options.overwrite)
         if options.path_file is None or options.offscreen is not None or options.pair == "all":
             raise InputError("--out needs --path, one scene and no --offscreen; give the file of a camera path")
     path = None if options.path_file is None else read_path(expand_home(options.path_file))
@@ -197,7 +194,7 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
         if options.renderer == "cpu":
             raise InputError("--stereo in a window needs OpenGL, got --renderer cpu; use --renderer gl")
         options = replace(options, renderer="gl")
-    from pansplat_viewer.scene.key_frames import CameraPath
+    from pansplat.tours.camera_path import CameraPath
     from pansplat_viewer.scene.state import ViewerState
 
     try:
@@ -273,14 +270,14 @@ def _write_film(
 
     Names of scenes and files are printed as soon as they are there.
     """
-    from pansplat.tours.route import plan_route
-    from pansplat_viewer.capture import Film, TourFrames, open_frames, write_flythrough, write_path_film, write_tour
+    from pansplat.export.film import follow_path, write_film
+    from pansplat_viewer.capture import open_film, write_flight
     from pansplat_viewer.draw.cpu_renderer import create_renderer
-    from pansplat_viewer.scene.state import create_level_camera, fit_settings
+    from pansplat_viewer.scene.state import fit_settings
     from pansplat_viewer.scene.tour import TourScenes
 
-    film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
-    choice = "cpu" if options.image_format.is_omnidirectional else options.renderer
+    out, format_, fps = options.out, options.image_format, options.fps
+    choice = "cpu" if format_.is_omnidirectional else options.renderer
     ctx = _create_context(choice)  # before the prediction, so that missing OpenGL is reported early
     predicted = 0.0  # fraction of the panoramas
     with progress_bar() as progress:
@@ -301,31 +298,27 @@ def _write_film(
             return loaded
 
         def show_progress(task: str, done: float) -> None:
-            stage = "film" if task in ("film", "done") else f"film: {task}"
-            progress(stage, _PREDICTION_PART * predicted + (1 - _PREDICTION_PART) * done)
+            progress(f"film: {task}", _PREDICTION_PART * predicted + (1 - _PREDICTION_PART) * done)
 
         def show_file(file: Path) -> None:
             print(file, flush=True)
 
         loaded = load(entry)
-        tour, settings = loaded.entry.tour, fit_settings(options.settings, loaded.scene)
+        scene, tour, settings = loaded.scene, loaded.entry.tour, fit_settings(options.settings, loaded.scene)
         scenes = None if tour is None else TourScenes.start(loaded, options.memory)
-        format_, create = options.image_format, lambda: create_renderer(ctx, choice, color_bits=32)
+        create = partial(create_renderer, ctx, choice, color_bits=32)
+        with_depth = out is not None and out.suffix.lower() == ".exr"
         try:
-            with open_frames(create, loaded.scene, loaded.entry, scenes, load, pixels, settings, format_) as frames:
-                if path is not None:
-                    assert options.out is not None
-                    level, frame = create_level_camera(loaded.scene, tour), loaded.scene.frame
-                    for file in write_path_film(
-                        frames, path.map_places(frame.localize_places), level, options.out, options.fps, show_progress
-                    ):
+            with open_film(create, loaded, scenes, load, pixels, settings, format_, with_depth=with_depth) as film:
+                if path is not None and out is not None:
+                    shots = follow_path(path, fps, scene, tour)
+                    projection = None if format_.projection == "perspective" else format_.projection
+                    options_of_file = {"projection": projection, "stereo": format_.stereo, "unit": scene.frame.unit}
+                    for file in write_film(out, film, shots, fps, **options_of_file, progress=show_progress):
                         show_file(file)
-                elif isinstance(frames, TourFrames):
-                    assert scenes is not None
-                    route = plan_route(scenes.tour, scenes.tour.plan_walk())
-                    write_tour(frames, scenes, route, folder, film, show_progress, show_file)
                 else:
-                    write_flythrough(frames, loaded.scene, folder, film, show_progress, show_file)
+                    at, show = 0.5 if options.at is None else options.at, (show_progress, show_file)
+                    write_flight(film, scene, scenes, folder, fps, options.seconds, at, settings, *show)
         finally:
             if ctx is not None:
                 ctx.release()

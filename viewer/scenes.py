@@ -378,7 +378,7 @@ class Scenes:
         if tour is None:
             return
         route = state.route if state.playing else None
-        tour.move(np.asarray(state.camera.position), route, state.flight)
+        tour.move(np.asarray(state.camera.position), None if route is None else route.edge(state.flight))
         state.tour = tour.tour  # poor edges and walls are found later
         self._show_place(tour)
         self._stage.fade.move(state.camera.cam2world, tour.part)

@@ -26,9 +26,9 @@ from pansplat.geometry.path import find_direction
 from pansplat.inputs.photographs import write_notes
 from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable
+from pansplat.tours.camera_path import read_path, write_path
 from pansplat.tours.route import find_angles
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.key_frames import read_path, write_path
 from pansplat_viewer.scene.library import Library
 from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
@@ -325,7 +325,7 @@ class Viewer:
             if self.loaded is not None:
                 require_replaceable("the camera path", [file])
                 write_path(self.state.path.map_places(self.loaded.scene.frame.globalize_places), file)
-                self.state.show_message(f"wrote {text}; pansplat-view SCENE --path {text} --out film.mp4 draws it")
+                self.state.show_message(f"wrote {text}; pansplat render SCENE --path {text} -o film.mp4 draws it")
 
     def open_path(self, text: str) -> None:
         """Read the key frames of a camera path."""

@@ -79,12 +79,10 @@ class _FloorPlan:
 
     def write(self, export: Export) -> None:
         """Write the plan and print its rooms."""
-        from pansplat.export.plan_files import describe_plan, write_picture, write_plan
+        from pansplat.export.plan_files import describe_plan, write_plan
 
         scene, changes, _ = export.open()
-        plan = (write_picture if export.out.suffix.lower() == ".png" else write_plan)(scene, export.out)
-        floors = [f"the floors of {describe_count(len(scene.cam2world), 'panorama')}"]
-        print(f"{export.out}: {'; '.join(floors if plan is None else describe_plan(plan))}")
+        print(f"{export.out}: {'; '.join(describe_plan(write_plan(scene, export.out)))}")
         _print_changes(changes)
 
 

@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from msgspec import Meta
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from pansplat.cli.inputs import Computation, Out, ScenePrediction, parse_blend
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count
-from pansplat.system.files import read_file, require_output_file
+from pansplat.system.files import expand_home, read_file, require_output_file
 from pansplat.system.options import EYE_DISTANCE, EyeDistance, ImageHeight
 
 if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
-    from pansplat.export.film import FilmPhotographs
+    from pansplat.export.film import Film, Shot
     from pansplat.gaussians.scene import Scene
-    from pansplat.predictor import Progress
+    from pansplat.inputs.pairs import Pair
     from pansplat.rendering import Rendering
+    from pansplat.tours.camera_path import CameraPath
     from pansplat.tours.route import Route
-
-    Renderer = Callable[[Tensor], Rendering]
-    Frame = list[tuple[Tensor, float]]  # poses whose images are mixed, and their weights
 
 _VIDEO_SUFFIXES = (".mp4", ".webm")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
@@ -52,6 +49,8 @@ class Render(Computation):
     pose: Path | None = None
     """File with the camera pose: a JSON matrix (cam2world, OpenCV axes, metres), 16 numbers, or a KITTI or TUM
     trajectory, which a video follows."""
+    path_file: Annotated[Path | None, arg(name="path")] = None
+    """File of a camera path (docs/viewer.md), which the film follows; a .png or .exr becomes a numbered sequence."""
     layout: Literal["equirect", "cubemap", "perspective"] | None = None
     """Panorama with one exact ray per pixel, panorama stitched from six cube faces, or perspective image.
     By default equirect, for a video perspective."""
@@ -80,34 +79,33 @@ class Render(Computation):
         import torch
 
         from pansplat import pipeline
-        from pansplat.export.film import FilmPhotographs
-        from pansplat.export.photographs import list_photographs
+        from pansplat.export.film import write_film
         from pansplat.images.image_files import write_depth, write_image
-        from pansplat.images.video import write_video
+        from pansplat.tours.camera_path import read_path
 
         self._refuse_invalid_arguments()
         poses = None if self.pose is None else read_poses(self.pose)
-        if poses is not None and len(poses) > 1 and not self._is_video:
+        path = None if self.path_file is None else read_path(expand_home(self.path_file))
+        if poses is not None and len(poses) > 1 and not self._is_film:
             raise InputError(
                 f"{self.pose} holds {len(poses)} poses; write an .mp4 or .webm, or keep one pose in the file"
             )
         scene, source = self.prediction.open(self.path)
         poses = None if poses is None else [scene.frame.localize(pose) for pose in poses]
-        layout = self.layout or ("perspective" if self._is_video and not self.stereo else "equirect")
+        layout = self.layout or ("perspective" if self._is_film and not self.stereo else "equirect")
         options = self._render_options(layout, self.height or self._choose_height(layout, scene))
         size = f"{options['size'][1]}x{options['size'][0] * (2 if self.stereo else 1)}"
-        stereo = "top-bottom" if self.stereo else "mono"
-        if self._is_video:
-            path = self._path_between_cameras(scene) if poses is None else [[(pose, 1.0)] for pose in poses]
-            shows_photographs = source is not None and self.blend is None and not self.stereo
-            photographs = list_photographs(source, range(len(scene.cam2world))) if shows_photographs else ()
-            stops = FilmPhotographs(photographs, scene.cam2world, scene.gains if scene.joint else ())
+        if self._is_film:
+            shots = self._list_shots(scene, poses, path)
+            film = self._make_film(scene, source, options, len(shots))
+            marks = {
+                "projection": None if layout == "perspective" else "equirect",
+                "stereo": "top-bottom" if self.stereo else "mono",
+                "unit": scene.frame.unit,
+            }
             with progress_bar() as progress:
-                count = 0 if self.stereo else len(path)  # a card has no kernels of stereo
-                draw = pipeline.make_renderer(scene, "film", count, **options)
-                frames = self._render_frames(draw, path, options, stops, progress)
-                count = write_video(self.out, frames, self.fps, panorama=layout != "perspective", stereo=stereo)
-            print(f"{self.out}: {describe_count(count, 'frame')} of {size}, {layout}")
+                write_film(self.out, film, shots, self.fps, **marks, progress=progress)
+            print(f"{self.out}: {describe_count(len(shots), 'frame')} of {size}, {layout}")
             return 0
         pose = self._pose_between_cameras(scene) if poses is None else poses[0]
         with torch.no_grad():
@@ -123,22 +121,31 @@ class Render(Computation):
         return 0
 
     @property
-    def _is_video(self) -> bool:
-        return self.out.suffix.lower() in _VIDEO_SUFFIXES
+    def _is_film(self) -> bool:
+        return self.out.suffix.lower() in _VIDEO_SUFFIXES or self.path_file is not None
 
     def _choose_height(self, layout: str, scene: Scene) -> int:
-        if not self._is_video:
+        if not self._is_film:
             return scene.height
         return _VIDEO_HEIGHT if layout == "perspective" else _PANORAMA_VIDEO_HEIGHT
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, *_VIDEO_SUFFIXES), overwrite=self.overwrite)
+        if self.path_file is None:
+            require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, *_VIDEO_SUFFIXES), overwrite=self.overwrite)
+        else:
+            from pansplat.export.film import require_film_file
+
+            require_film_file("--out", self.out, self.overwrite)
         if self.depth and self.out.suffix.lower() != ".png":
             raise InputError(f"--depth writes a .png, got {self.out}; an .exr holds the depth without it")
-        if self.at is not None and self.pose is not None:
-            raise InputError("--at and --pose both set the camera; give one of them")
-        if self.at is not None and self._is_video:
+        cameras = {"--at": self.at, "--pose": self.pose, "--path": self.path_file}
+        given = [name for name, value in cameras.items() if value is not None]
+        if len(given) > 1:
+            raise InputError(f"{' and '.join(given)} set the camera; give one of them")
+        if self.depth and self.path_file is not None:
+            raise InputError("--depth writes one image; write the film of --path as .exr, which holds depth")
+        if self.at is not None and self._is_film:
             raise InputError("--at is one position, a video moves through all; write a .png, or leave out --at")
         if self.stereo and self.layout not in (None, "equirect"):
             raise InputError(f"--stereo is for panoramas of --layout equirect, got {self.layout}; leave out --layout")
@@ -165,41 +172,50 @@ class Render(Computation):
         fraction, route = 0.5 if self.at is None else self.at, _plan_flight(scene)
         return scene.pose_between(fraction) if route is None else torch.from_numpy(route.pose(fraction))
 
-    def _path_between_cameras(self, scene: Scene) -> list[Frame]:
-        """A frame for each time, through all input cameras."""
-        import torch
+    def _list_shots(self, scene: Scene, poses: list[Tensor] | None, path: CameraPath | None) -> list[Shot]:
+        """The frames of a film: of a path, of poses, or of the flight through all input cameras."""
+        from pansplat.export.film import Shot, follow_path, list_flight
+        from pansplat.geometry.path import fly_pose
+        from pansplat.tours.graph import make_graph
 
-        from pansplat.geometry.path import fly_path
-
+        if path is not None:
+            return follow_path(path, self.fps, scene, make_graph(scene) if scene.overlaps else None)
+        if poses is not None:
+            return [Shot(pose.numpy(), self.fov, number / self.fps) for number, pose in enumerate(poses)]
         if not len(scene.cam2world):
             raise InputError(f"{self.path} has no input cameras to fly between; give a trajectory with --pose")
-        route = _plan_flight(scene)
-        count = max(2, round((self.seconds or (4.0 if route is None else route.seconds)) * self.fps))
-        fractions = [i / (count - 1) for i in range(count)]
-        if route is None:
-            return [[(pose, 1.0)] for pose in fly_path(scene.cam2world, fractions)]
-        return [[(torch.from_numpy(pose), weight) for pose, weight in route.fade(at)] for at in fractions]
+        flight = _plan_flight(scene) or (lambda fraction: fly_pose(scene.cam2world, fraction).numpy())
+        return list_flight(flight, self.fps, self.fov, self.seconds)
 
-    def _render_frames(
-        self, render: Renderer, frames: list[Frame], options: dict[str, Any], stops: FilmPhotographs, progress: Progress
-    ) -> Iterator[np.ndarray]:
-        """8-bit RGB images of the frames."""
-        import numpy as np
+    def _make_film(self, scene: Scene, source: Pair | None, options: dict[str, Any], count: int) -> Film:
+        """Draws the scene, and photographs that no option replaces; `count` is the number of frames."""
+        import functools
+
         import torch
 
-        from pansplat.rendering.image_planes import image_planes
+        from pansplat import pipeline
+        from pansplat.constants import NEAR
+        from pansplat.export.film import Film, FilmPhotographs, choose_scenes
+        from pansplat.tours.route import NEAR_OF_FAR
 
-        layout = "equirect" if options["layout"] == "cubemap" else options["layout"]  # the same directions
-        (plane,) = image_planes(layout, options["size"], vertical_fov_degrees=self.fov)
+        with_depth, is_perspective = self.out.suffix.lower() == ".exr", options["layout"] == "pinhole"
+        near = NEAR_OF_FAR * scene.far if scene.overlaps else NEAR
+
+        @functools.lru_cache(maxsize=2)
+        def renderer(shown: Scene) -> Callable[..., Rendering]:
+            work = 0 if self.stereo else count  # a card has no kernels of stereo
+            return pipeline.make_renderer(shown, "film", work, near=near, **options)
 
         @torch.no_grad()
-        def draw(pose: Tensor) -> np.ndarray:
-            return render(pose).color.permute(1, 2, 0).numpy()
+        def draw(slot: int, shown: Scene, shot: Shot) -> tuple[np.ndarray, np.ndarray | None]:
+            fov: dict[str, Any] = {"vertical_fov_degrees": shot.vertical_fov_degrees} if is_perspective else {}
+            image = renderer(shown)(shot.pose, **fov)
+            return image.color.permute(1, 2, 0).numpy(), image.depth.numpy() if with_depth else None
 
-        for index, frame in enumerate(frames):
-            progress(f"frame {index + 1} of {len(frames)}", index / len(frames))
-            drawn = [(pose.cpu().numpy(), weight, partial(draw, pose)) for pose, weight in frame]
-            yield (stops.mix(drawn, plane, index / self.fps).clip(0, 1) * 255).round().astype(np.uint8)
+        is_plain = self.blend is None and not self.stereo and not with_depth
+        photographs = FilmPhotographs.open(source, scene) if source is not None and is_plain else None
+        choose = (lambda shot: (scene, 0)) if isinstance(options["blend"], int) else choose_scenes(scene)
+        return Film(choose, draw, "pinhole" if is_perspective else "equirect", options["size"], photographs)
 
 
 def _plan_flight(scene: Scene) -> Route | None:

@@ -1,9 +1,15 @@
-"""The photographs in films: they replace the image while the camera stands at a panorama."""
+"""Films: their frames along flights and camera paths, and the one loop that draws and writes them.
+
+The photographs replace the image while the camera stands at a panorama.
+"""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+import glob
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,15 +17,27 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.export.photographs import load_photograph
+from pansplat.export.photographs import list_photographs, load_photograph
+from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
+from pansplat.geometry.path import level_axes
+from pansplat.images.image_files import write_image
+from pansplat.images.panorama_metadata import Projection, Stereo
+from pansplat.images.video import VIDEO_SUFFIXES, write_video
 from pansplat.inputs.pairs import Pair
-from pansplat.rendering.image_planes import ImagePlane
-from pansplat.tours.route import STOP_REACH, STOP_SECONDS
+from pansplat.predictor import Progress, part_of
+from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
+from pansplat.system.files import require_output_file, require_replaceable
+from pansplat.tours.camera_path import CameraPath
+from pansplat.tours.cross_fade import CrossFade
+from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
+from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Route
 
+FLIGHT_SECONDS = 4.0  # of the film of a pair
 _HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
 
 Image = Float[np.ndarray, "height width 3"]
+Depth = Float[np.ndarray, "height width"]
 DrawnPose = tuple[Float[np.ndarray, "4 4"], float, Callable[[], Image]]  # a pose, its weight, and what draws it
 
 
@@ -33,7 +51,7 @@ class FilmPhotographs:
         self,
         photographs: Sequence[Pair],
         cam2world: Float[Tensor, "photograph 4 4"],
-        gains: Sequence[tuple[float, float, float]] = (),
+        gains: Sequence[tuple[float, ...]] = (),
     ) -> None:
         """Read nothing yet.
 
@@ -54,6 +72,14 @@ class FilmPhotographs:
             return torch.cat((image.clamp(0, 1), shown[None]))
 
         self._load = load
+
+    @staticmethod
+    def open(source: Pair | TourGraph, scene: Scene) -> FilmPhotographs:
+        """The photographs that a scene, or all scenes of a tour, are predicted from."""
+        panoramas = source.context if isinstance(source, Pair) else source.panoramas
+        poses = torch.stack([panorama.cam2world for panorama in panoramas])
+        gains = scene.gains if scene.joint and len(scene.cam2world) == len(panoramas) else ()
+        return FilmPhotographs(list_photographs(source, range(len(panoramas))), poses, gains)
 
     def mix(self, frame: Sequence[DrawnPose], plane: ImagePlane, seconds: float) -> Image:
         """The image of a frame, with the photographs of the panoramas at which its poses stand.
@@ -94,3 +120,190 @@ class FilmPhotographs:
         uv = uv_from_directions(plane.directions() @ rotation.T)
         drawn = sample_equirect(self._load(index, height), uv.float()).permute(1, 2, 0).numpy()
         return drawn[..., :3], drawn[..., 3:]
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A frame of a film.
+
+    Attributes:
+        pose: of the camera (cam2world), in the world of the scene.
+        vertical_fov_degrees: of a perspective image.
+        seconds: time of the frame in the fades.
+        edge: of a tour that is flown; None is the one that the camera is at.
+    """
+
+    pose: Float[np.ndarray, "4 4"]
+    vertical_fov_degrees: float
+    seconds: float
+    edge: Edge | None = None
+
+
+def list_flight(
+    flight: Route | Callable[[float], Float[np.ndarray, "4 4"]],
+    fps: float,
+    vertical_fov_degrees: float,
+    seconds: float | None = None,
+) -> list[Shot]:
+    """The frames of a flight, two or more.
+
+    Args:
+        flight: the pose at a fraction of the flight, or the route through a tour.
+        fps: frames per second.
+        vertical_fov_degrees: of each frame.
+        seconds: duration, 4 by default; that of a route changes the speed of the camera and of the fades.
+    """
+    route = flight if isinstance(flight, Route) else None
+    count = max(round((seconds or (FLIGHT_SECONDS if route is None else route.seconds)) * fps), 2)
+    shots = []
+    for number in range(count):
+        at = number / (count - 1)
+        if isinstance(flight, Route):
+            shots.append(Shot(flight.pose(at), vertical_fov_degrees, at * flight.seconds, flight.edge(at)))
+        else:
+            shots.append(Shot(flight(at), vertical_fov_degrees, number / fps))
+    return shots
+
+
+def follow_path(path: CameraPath, fps: float, scene: Scene, tour: TourGraph | None) -> list[Shot]:
+    """The frames of a camera path in the user's world; frame i shows the path at i / fps seconds.
+
+    Args:
+        path: key frames.
+        fps: frames per second.
+        scene: that is shown.
+        tour: that the scene is of.
+    """
+    local = path.map_places(scene.frame.localize_places)
+    level = level_axes(scene.cam2world) if tour is None else tour.level_axes
+    times = [number / fps for number in range(path.count_frames(fps))]
+    return [Shot(*local.interpolate(time, level, tour), time) for time in times]
+
+
+def choose_scenes(scene: Scene) -> Callable[[Shot], tuple[Scene, int]]:
+    """What the frames of a film show of a scene, and its part: all, or of a tour the scene of the camera's edge."""
+    if not scene.overlaps:
+        return lambda shot: (scene, 0)
+    tour, edge = make_graph(scene), None
+    select = functools.lru_cache(maxsize=4)(functools.partial(select_views, scene))
+
+    def choose(shot: Shot) -> tuple[Scene, int]:
+        nonlocal edge
+        place = shot.pose[:3, 3]
+        followed = tour.find_nearest_edge(place)[0] if edge is None else tour.follow_edge(place, edge)
+        edge = shot.edge or followed
+        part = tour.parts[edge[0]]
+        return select(tour.list_parts()[part] if scene.joint else tour.choose_scene_views()[edge]), part
+
+    return choose
+
+
+class Film:
+    """Draws the frames of a film: of one scene, or of the scenes of a tour, which fade into each other."""
+
+    def __init__(
+        self,
+        choose: Callable[[Shot], tuple[Scene, int]],
+        draw: Callable[[int, Scene, Shot], tuple[Image, Depth | None]],
+        layout: Layout,
+        size: tuple[int, int],
+        photographs: FilmPhotographs | None = None,
+    ) -> None:
+        """Draw nothing yet.
+
+        Args:
+            choose: the scene of a frame, and its part of the tour (`choose_scenes`).
+            draw: draws a scene, with depth or without; the number is 0 or 1, and another one for the scene that fades
+                out.
+            layout: of the frames.
+            size: (height, width) of the image of one eye, pixels.
+            photographs: that are shown at panoramas; none with depth.
+        """
+        self._choose, self._draw, self._size = choose, draw, size
+        self._layout: Layout = layout
+        self._photographs = photographs or FilmPhotographs((), torch.zeros(0, 4, 4))
+        self._fade = CrossFade()
+
+    def draw(self, shot: Shot) -> tuple[Image, Depth | None]:
+        """Colour of a frame, and the depth that `draw` returns of the scene that is shown or fades in."""
+        scene, part = self._choose(shot)
+        fade, depth = self._fade, None
+        fade.compute_weight(shot.seconds)
+        slot = fade.choose_slot(scene)
+        if slot is not None:
+            fade.show(slot, scene, shot.seconds, part)
+        fade.move(shot.pose, part)
+        weight = fade.compute_weight(shot.seconds)
+
+        def draw(slot: int, scene: Scene, pose: np.ndarray) -> Image:
+            nonlocal depth
+            color, found = self._draw(slot, scene, replace(shot, pose=pose))
+            depth = found if slot == fade.front else depth
+            return color
+
+        drawn = [
+            (pose, share, functools.partial(draw, slot, scene, pose))
+            for slot, share in ((1 - fade.front, 1 - weight), (fade.front, weight))
+            if isinstance(scene := fade.contents[slot], Scene) and (pose := fade.poses[slot]) is not None
+            if share > 0 or slot == fade.front
+        ]
+        (plane,) = image_planes(self._layout, self._size, vertical_fov_degrees=shot.vertical_fov_degrees)
+        return self._photographs.mix(drawn, plane, shot.seconds), depth
+
+
+def write_film(
+    file: Path,
+    film: Film,
+    shots: Sequence[Shot],
+    fps: float,
+    *,
+    projection: Projection | None = None,
+    stereo: Stereo = "mono",
+    unit: float = 1.0,
+    progress: Progress | None = None,
+    show: Callable[[int, Image], None] = lambda number, color: None,
+) -> list[Path]:
+    """Write a film, or the files of its frames, each completely or not at all; returns the files.
+
+    Args:
+        file: a film (.mp4 or .webm), or the name of a sequence: `walk.png` and `walk.exr` are written as
+            `walk_0000.png` or `walk_0000.exr`, and so on.
+        film: draws the frames.
+        shots: the frames.
+        fps: frames per second.
+        projection: of frames of all directions.
+        stereo: arrangement of the eyes.
+        unit: of depth, see `pansplat.geometry.world.WorldFrame`.
+        progress: called with the frame and the fraction done.
+        show: called with the number and the colours of each frame.
+    """
+
+    def draw() -> Iterator[tuple[Image, Depth | None]]:
+        for number, shot in enumerate(shots):
+            part_of(progress)(f"frame {number + 1} of {len(shots)}", number / len(shots))
+            color, depth = film.draw(shot)
+            show(number, color)
+            yield color, depth
+
+    if file.suffix.lower() in VIDEO_SUFFIXES:
+        images = ((color.clip(0, 1) * 255 + 0.5).astype(np.uint8) for color, _ in draw())
+        write_video(file, images, fps, panorama=projection or False, stereo=stereo)
+        return [file]
+    files = [name_frame(file, number) for number in range(len(shots))]
+    is_panorama = (projection, stereo) == ("equirect", "mono")
+    for path, (color, depth) in zip(files, draw(), strict=True):
+        write_image(path, color, depth=None if depth is None else depth * unit, panorama=is_panorama)
+    return files
+
+
+def name_frame(file: Path, number: int) -> Path:
+    """The file of one frame of a sequence, such as `walk_0012.png` of `walk.png`."""
+    return file.with_name(f"{file.stem}_{number:04d}{file.suffix.lower()}")
+
+
+def require_film_file(option: str, file: Path, overwrite: bool) -> None:
+    """Check that `write_film` can write a film, or the files of its frames; see `require_output_file`."""
+    suffix = file.suffix.lower()
+    require_output_file(option, file, (*VIDEO_SUFFIXES, ".png", ".exr"))
+    sequence = file.parent.glob(f"{glob.escape(file.stem)}_[0-9]*{suffix}")
+    require_replaceable(option, [file] if suffix in VIDEO_SUFFIXES else sequence, overwrite)

@@ -727,7 +727,6 @@ def _write_files(
         title=html.escape(title),
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
-        count=f"{count:,}",
         header=_to_script(msgspec.to_builtins(msgspec.convert(header | {"folder": folder_address}, PageHeader))),
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         worker=_to_script("".join(map(_read, _WORKER))),

@@ -26,7 +26,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import SOFTWARE
-from pansplat.tours.floor import assign_storeys, write_floor_plan
+from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import make_graph
 from pansplat.tours.layout import arrange_in_rows
 from pansplat.tours.plan import Plan, Room, make_plan
@@ -70,49 +70,21 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
             f"cannot write {path}: needed all that each panorama shows, got a scene with each surface once; give the "
             "folder of the panoramas, or a scene that was exported with --layers"
         )
-    plan = _find_rooms(scene)
-    if plan is None:
+    tour = make_graph(scene)
+    plan = make_plan(scene, tour) if len(tour) else None
+    if plan is None or not plan.rooms:
         raise InputError(
             f"cannot write {path}: needed a floor, and walls around at least one of "
             f"{describe_count(len(scene.cam2world), 'input camera')}, got none; "
             "export a folder of upright panoramas of rooms"
         )
-    _write(plan, Path(path))
-    return plan
-
-
-def write_picture(scene: Scene, path: str | Path) -> Plan | None:
-    """Write the floor plan as an image: the drawing of `write_plan`, or only the floors where no walls are known.
-
-    Args:
-        scene: with input cameras.
-        path: a .png.
-
-    Returns:
-        The plan; None if only the floors are shown, as in a scene with each surface once.
-    """
-    plan = None if scene.joint else _find_rooms(scene)
-    if plan is None:
-        write_floor_plan(scene, path)
-    else:
-        _write(plan, Path(path))
-    return plan
-
-
-def _write(plan: Plan, path: Path) -> None:
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
+    path = Path(path)
+    if (suffix := path.suffix.lower()) not in SUFFIXES:
         raise InputError(f"cannot write {path}: needed a name ending in {', '.join(SUFFIXES)}; rename it")
     drawing = _Drawing(plan)
     with replacing(path) as partial:
         partial.write_bytes(_draw_dxf(drawing) if suffix == ".dxf" else _draw_figure(drawing, suffix[1:]))
-
-
-def _find_rooms(scene: Scene) -> Plan | None:
-    """The plan of a scene; None if it has no rooms."""
-    tour = make_graph(scene)
-    plan = make_plan(scene, tour) if len(tour) else None
-    return plan if plan is not None and plan.rooms else None
+    return plan
 
 
 def describe_plan(plan: Plan) -> list[str]:

@@ -7,6 +7,7 @@ direction of the cameras.
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -64,6 +65,12 @@ def level_pose(cam2world: Float[Tensor, "4 4"], up: Float[Tensor, "3"]) -> Float
     return look_pose(pose[:3, 3], flat, up)
 
 
+def turn_axes(level: Float[np.ndarray, "3 3"], yaw_radians: float, pitch_radians: float) -> Float[np.ndarray, "3 3"]:
+    """Axes of a camera (columns right, down, forward) that is turned right and up from level axes, without roll."""
+    cy, sy, cp, sp = math.cos(yaw_radians), math.sin(yaw_radians), math.cos(pitch_radians), math.sin(pitch_radians)
+    return level @ np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
+
+
 def turn_pose(pose: Float[Tensor, "4 4"], yaw_radians: float, up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
     """The pose rotated about `up`; positive yaw turns the view to the right."""
     axis = -up.double() / up.double().norm()  # down: with y down, right turns z towards x
@@ -108,6 +115,14 @@ def path_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"
         else:
             poses.append(look_pose(pose[:3, 3], flat, up))
     return torch.stack(poses) if poses else torch.zeros((0, 4, 4), dtype=torch.float64)
+
+
+def level_axes(cam2world: Float[Tensor, "view 4 4"]) -> Float[np.ndarray, "3 3"]:
+    """Axes of a level camera at the first of the cameras, in the direction of the path; without cameras those of +z."""
+    if len(cam2world):
+        return path_poses(cam2world)[0, :3, :3].numpy()
+    forward = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
+    return look_pose(torch.zeros(3), forward, up_direction(cam2world))[:3, :3].numpy()
 
 
 def fly_pose(

@@ -1,29 +1,21 @@
-"""The floor under the cameras of a tour, its outlines, and the floor plan."""
+"""The floor under the cameras of a tour, its outlines, and storeys."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 
-from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
-from pansplat.images.image_files import write_image
-from pansplat.system.descriptions import describe_count
-from pansplat.tours.graph import TourGraph, ViewNumbers, make_graph
-from pansplat.tours.route import Route
+from pansplat.tours.graph import TourGraph, ViewNumbers
 from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
 
-_PLAN_SIZE = 1024  # of the longer side of a floor plan as a file, pixels
 _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
 _AZIMUTHS = 180  # of a floor outline
 _STOREY_GAP, _STOREY_REACH = 1.2, 0.4  # metres: least distance of the cameras of two storeys; from a storey's level
-_PLAN_MARGIN = 0.5  # around the panoramas and outlines of a floor plan, metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,25 +150,6 @@ def find_storeys(heights: Float[np.ndarray, "n"]) -> list[list[int]]:
     return [storey for storey in storeys if len(storey) > 1 or heights[storey[0]] in ends]
 
 
-@dataclass(frozen=True, eq=False)
-class FloorPlan:
-    """An image of the floor from above, and its place.
-
-    Attributes:
-        image: RGBA; transparent where no floor is known.
-        origin: plan coordinates of the upper left corner, metres.
-        pixels_per_metre: scale.
-    """
-
-    image: UInt8[np.ndarray, "height width 4"]
-    origin: Float[np.ndarray, "2"]
-    pixels_per_metre: float
-
-    def to_pixels(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixel coordinates (right, down) of plan coordinates (right, forward)."""
-        return (places - self.origin) * (self.pixels_per_metre, -self.pixels_per_metre)
-
-
 def find_other_storeys(tour: TourGraph, position: Float[np.ndarray, "3"]) -> frozenset[int]:
     """The panoramas of the world around a position that are in another storey, each in the one of the nearest level."""
     nearest = int(np.linalg.norm(tour.positions - position, axis=1).argmin())
@@ -207,102 +180,7 @@ def _find_levels(tour: TourGraph, world: int) -> tuple[list[int], Float[np.ndarr
     return members, np.sort([float(np.median(heights[storey])) for storey in find_storeys(heights)])
 
 
-def draw_floor_plan(
-    tour: TourGraph, outlines: Sequence[FloorOutline], *, faint: Sequence[FloorOutline] = (), size: int = 256
-) -> FloorPlan:
-    """The floors that the outlines enclose, with walls where they end.
-
-    Args:
-        tour: all its panoramas fit into the image.
-        outlines: of any of the panoramas.
-        faint: of other storeys, drawn below.
-        size: longer side of the image, pixels.
-    """
-    corners = [outline.corners for outline in (*outlines, *faint)]
-    places = np.concatenate([tour.positions @ tour.level_axes[:, (0, 2)], *corners])
-    low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
-    scale = size / float((high - low).max())
-    width, height = np.maximum(np.ceil((high - low) * scale).astype(int), 1)
-    plan = FloorPlan(np.zeros((height, width, 4), np.uint8), np.array((low[0], high[1])), scale)
-    for shown, alpha in ((faint, 90), (outlines, 255)):
-        floor = np.zeros((height, width), np.uint8)
-        for outline in shown:
-            cv2.fillPoly(floor, [plan.to_pixels(outline.corners).round().astype(np.int32)], 255)
-        # A wall is the border of all floors together: an outline that ends in another view's floor draws no wall.
-        wall = cv2.morphologyEx(floor, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
-        plan.image[floor > 0] = (96, 104, 116, alpha)
-        plan.image[wall > 0] = (228, 230, 235, alpha)
-    return plan
-
-
 def find_floor_outlines(tour: TourGraph, scene: Scene, views: ViewNumbers) -> dict[int, FloorOutline]:
     """The floor outlines of a scene's views that show a floor, by panorama."""
     outlines = {node: find_floor_outline(scene, view, tour.level_axes) for view, node in enumerate(views)}
     return {node: outline for node, outline in outlines.items() if outline is not None}
-
-
-def write_floor_plan(scene: Scene, path: str | Path) -> None:
-    """Write the floor plan of a scene as an image, with the edges of its tour.
-
-    Args:
-        scene: with input cameras.
-        path: the file, such as a .png.
-    """
-    tour = make_graph(scene)
-    outlines = find_floor_outlines(tour, scene, tuple(range(len(tour)))) if len(tour) else {}
-    if not outlines:
-        raise InputError(
-            f"cannot write {path}: needed a floor below at least one of {describe_count(len(tour), 'input camera')}, "
-            "got none; "
-            "export a folder of upright panoramas"
-        )
-    write_image(path, paint_floor_plan(tour, outlines).astype(np.float32) / 255)
-
-
-def paint_floor_plan(
-    tour: TourGraph, outlines: Mapping[int, FloorOutline], *, route: Route | None = None
-) -> UInt8[np.ndarray, "height width 3"]:
-    """The floor plan over dark grey with the names of the panoramas, the edges between them, and a route.
-
-    Panoramas without a known place are squares, those that are only probably placed are rings. Storeys are next to each
-    other, the lowest on the left; each shows the floors of the others faintly.
-
-    Args:
-        tour: the graph.
-        outlines: by panorama.
-        route: drawn instead of the edges.
-    """
-    storeys = np.array(assign_storeys(tour))
-    panels = [_paint_storey(tour, outlines, storeys == storey, route) for storey in range(storeys.max(initial=0) + 1)]
-    return np.concatenate(panels, axis=1)
-
-
-def _paint_storey(
-    tour: TourGraph, outlines: Mapping[int, FloorOutline], inside: Bool[np.ndarray, "n"], route: Route | None
-) -> UInt8[np.ndarray, "height width 3"]:
-    """The plan of one storey; `inside` are its panoramas."""
-    own, faint = ([o for node, o in outlines.items() if inside[node] == shown] for shown in (True, False))
-    plan = draw_floor_plan(tour, own, faint=faint, size=_PLAN_SIZE)
-    alpha = plan.image[..., 3:] / 255.0
-    image = np.ascontiguousarray((plan.image[..., :3] * alpha + 24 * (1 - alpha)).astype(np.uint8))
-    axes = tour.level_axes[:, (0, 2)]
-    centers = plan.to_pixels(tour.positions @ axes).round().astype(np.int32)
-    if route is not None:
-        line = plan.to_pixels(route.positions @ axes).round().astype(np.int32)
-        nearest = np.linalg.norm(route.positions[:, None] - tour.positions, axis=2).argmin(axis=1)
-        for part in np.split(np.arange(len(line)), route.jumps + 1):
-            runs = np.split(part, np.flatnonzero(np.diff(inside[nearest[part]])) + 1)
-            shown = [line[run] for run in runs if inside[nearest[run[0]]]]
-            cv2.polylines(image, shown, False, (255, 204, 51), 2, cv2.LINE_AA)
-    else:
-        for edge in (edge for edge in tour.overlaps if inside[list(edge)].any()):
-            cv2.polylines(image, [centers[list(edge)]], False, (170, 180, 190), 1, cv2.LINE_AA)
-    for node in np.flatnonzero(inside).tolist():
-        panorama, (x, y) = tour.panoramas[node], centers[node].tolist()
-        if not tour.is_placed(node):
-            cv2.rectangle(image, (x - 5, y - 5), (x + 5, y + 5), (90, 204, 255), -1)
-        else:
-            is_probable = panorama.placement.state == "probable"
-            cv2.circle(image, (x, y), 6, (90, 204, 255), 2 if is_probable else -1, cv2.LINE_AA)
-        cv2.putText(image, panorama.label, (x + 9, y + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-    return image

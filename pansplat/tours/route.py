@@ -11,11 +11,13 @@ from functools import cached_property, partial
 import numpy as np
 from jaxtyping import Float, Int
 
+from pansplat.geometry.path import turn_axes
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.links import find_way_along_link
 from pansplat.tours.outlook import choose_arrival
 
 FADE_SECONDS = 1.0
+NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
 STOP_SECONDS = 0.2  # of the fade between scene and photograph
 _FLY_SPEED = 1.0  # metres per second
@@ -73,26 +75,10 @@ class Route:
             at = round(at)
         steps = np.arange(len(self.yaws))
         yaw, pitch = (np.interp(at, steps, values) for values in (self.yaws, self.pitches))
-        cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
         pose = np.eye(4)
-        turn = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
-        pose[:3, :3] = self.level @ turn
+        pose[:3, :3] = turn_axes(self.level, float(yaw), float(pitch))
         pose[:3, 3] = [np.interp(at, steps, column) for column in self.positions.T]
         return pose
-
-    def fade(self, fraction: float) -> list[tuple[Float[np.ndarray, "4 4"], float]]:
-        """The poses from which a fraction of the duration is drawn, with their weights.
-
-        They are the pose there, and in the `FADE_SECONDS` after a jump the last pose before it.
-        """
-        steps = len(self.legs) - 1
-        at = min(max(fraction, 0.0), 1.0) * steps
-        passed = self.jumps[self.jumps < round(at)]
-        done = (at - passed[-1]) / (FADE_SECONDS * _SAMPLES_PER_SECOND) if len(passed) else 1.0
-        if done >= 1:
-            return [(self.pose(fraction), 1.0)]
-        weight = done * done * (3 - 2 * done)
-        return [(self.pose(passed[-1] / steps), 1 - weight), (self.pose(fraction), weight)]
 
     def edge(self, fraction: float) -> Edge | None:
         """The edge that is flown at a fraction of the duration; None before the first panorama."""

@@ -1,21 +1,17 @@
 """The floor under cameras, and floor plans."""
 
 import dataclasses
-import math
 from pathlib import Path
 
 import numpy as np
-import PIL.Image
 import pytest
 import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
-from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.inputs.pairs import Panorama
-from pansplat.inputs.placements import Placement
 from pansplat.tours import floor
-from pansplat.tours.floor import draw_floor_plan, find_floor_outline
+from pansplat.tours.floor import find_floor_outline
 from pansplat.tours.graph import TourGraph, make_graph
 
 
@@ -41,52 +37,6 @@ def test_the_floor_of_a_room_ends_at_its_walls(room_scene):
     assert floor.find_camera_height(room_scene, 0, level) == outline.camera_height
     assert floor.choose_camera_height((1.0, None, 1.4, 1.6), 10.0) == 1.4
     assert floor.choose_camera_height((None,), 10.0) == 1.5
-
-
-def test_the_plan_shows_the_floor_and_its_walls(room_scene):
-    panoramas = (Panorama("a", Path("a"), room_scene.cam2world[0]),)
-    tour = TourGraph("", Path(), panoramas, 0.45, 10.0)
-    outline = find_floor_outline(room_scene, 0, tour.level_axes)
-    plan = draw_floor_plan(tour, [outline], size=200)
-    assert max(plan.image.shape[:2]) in (200, 201)
-
-    def alpha(x: float, y: float) -> int:
-        column, row = plan.to_pixels(np.array((x, y))).round().astype(int)
-        return int(plan.image[row, column, 3])
-
-    assert alpha(0.5, 0) == alpha(2.8, 3.8) == alpha(-0.8, -1.8) == 255
-    assert alpha(3.3, 0) == alpha(0.5, 4.3) == alpha(-1.3, -2.3) == 0
-    walls = (plan.image[..., 0] > 200).sum() / plan.pixels_per_metre
-    assert 20 < walls / 2 < 26, "a line of 2 pixels around 20 m"
-    empty = draw_floor_plan(tour, [])
-    assert empty.image.max() == 0
-    assert math.isfinite(empty.pixels_per_metre)
-
-
-def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):
-    floor.write_floor_plan(room_scene, tmp_path / "plan.png")
-    with PIL.Image.open(tmp_path / "plan.png") as image:
-        colors = np.asarray(image.convert("RGB")).astype(int)
-    assert max(colors.shape[:2]) in (1024, 1025)
-    assert (np.abs(colors - (90, 204, 255)).max(axis=2) < 12).sum() > 60, "the dot of the panorama"
-    empty = dataclasses.replace(room_scene, gaussians=room_scene.gaussians.select(torch.arange(20)))
-    for scene in (empty, dataclasses.replace(empty, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64))):
-        with pytest.raises(InputError, match="needed a floor below"):
-            floor.write_floor_plan(scene, tmp_path / "none.png")
-    assert not (tmp_path / "none.png").exists()
-
-
-def test_a_panorama_that_is_probably_placed_is_a_ring(room_scene):
-    pose = room_scene.cam2world[0]
-    views = [Panorama(state, Path(state), pose, placement=Placement(state)) for state in ("placed", "probable")]
-    colors = []
-    for view in views:
-        tour = TourGraph("", Path(), (view, view), 0.45, 10.0, overlaps={(0, 1): 0.5})
-        outline = find_floor_outline(room_scene, 0, pose[:3, :3].numpy())
-        image, plan = floor.paint_floor_plan(tour, {0: outline}), draw_floor_plan(tour, [outline], size=1024)
-        x, y = plan.to_pixels(np.array((0.5, 0.0))).round().astype(int)
-        colors.append((image[y, x].tolist(), image[y, x + 6].tolist()))
-    assert colors[0][0] == [90, 204, 255] != colors[1][0] and colors[1][1] == [90, 204, 255]
 
 
 def test_storeys_are_levels_of_cameras_and_stairs_are_in_none():
@@ -128,28 +78,3 @@ def test_panoramas_that_are_not_placed_neither_add_nor_merge_storeys(room_scene)
     assert floor.assign_storeys(tour) == [0, 0, 0, 1, 1, 1, 0, 0, 0, 0, 0]
     assert floor.find_other_storeys(tour, tour.positions[0]) == {3, 4, 5}
     assert floor.find_other_storeys(tour, tour.positions[8]) == frozenset(), "it has no storey"
-
-
-def test_storeys_of_a_plan_are_next_to_each_other(room_scene):
-    tour = _make_two_storeys(room_scene)
-    outline = find_floor_outline(room_scene, 0, tour.level_axes)
-    image = floor.paint_floor_plan(tour, {0: outline})
-    plan = draw_floor_plan(tour, [outline], size=1024)
-    height, width = plan.image.shape[:2]
-    assert image.shape == (height, 2 * width, 3)
-    for node, panel in ((0, 0), (4, 1), (5, 0)):
-        x, y = plan.to_pixels(tour.positions[node] @ tour.level_axes[:, (0, 2)]).round().astype(int)
-        marked = [image[y, x + shift].tolist() == [90, 204, 255] for shift in (0, width)]
-        assert marked == [panel == 0, panel == 1], "a panorama is marked in its own storey only"
-    corner = plan.to_pixels(np.array(((2.8, 3.8),))).round().astype(int)[0]
-    lower, upper = image[corner[1], corner[0]], image[corner[1], corner[0] + width]
-    assert lower.sum() > upper.sum() > 3 * 24, "the lower floor is faint in the plan of the upper storey"
-
-
-def test_the_floor_of_another_storey_is_faint_below_the_others(room_scene):
-    tour = _make_two_storeys(room_scene)
-    outline = find_floor_outline(room_scene, 0, tour.level_axes)
-    part = dataclasses.replace(outline, corners=outline.center + 0.5 * (outline.corners - outline.center))
-    plan = draw_floor_plan(tour, [part], faint=[outline], size=200)
-    column, row = plan.to_pixels(np.array(((0.5, 0.0), (2.8, 3.8)))).round().astype(int).T
-    assert plan.image[row, column, 3].tolist() == [255, 90]

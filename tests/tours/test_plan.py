@@ -16,7 +16,7 @@ from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
 from pansplat.export.cleanup import crop_to_rooms
-from pansplat.export.plan_files import _Drawing, describe_plan, write_picture, write_plan
+from pansplat.export.plan_files import _Drawing, describe_plan, write_plan
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
@@ -247,13 +247,11 @@ def test_storeys_are_next_to_each_other_in_metres_with_names_and_areas(tmp_path:
         assert any(line.startswith(expected) for line in text.split("\n")), expected
 
 
-def test_the_picture_is_the_drawing_and_without_walls_the_floors(tmp_path: Path) -> None:
-    scene = _make_house(WALLS, CAMERAS)
-    assert write_picture(scene, tmp_path / "plan.png") is not None and is_written(tmp_path / "plan.png")
+def test_the_picture_is_the_drawing(tmp_path: Path) -> None:
+    write_plan(_make_house(WALLS, CAMERAS), tmp_path / "plan.png")
     image = cv2.imread(str(tmp_path / "plan.png"))
-    assert (image[:3] == 255).all() and np.abs(image[..., ::-1].astype(int) - (242, 240, 234)).sum(axis=2).min() == 0
-    assert write_picture(dataclasses.replace(scene, joint=True), tmp_path / "floors.png") is None
-    assert not (cv2.imread(str(tmp_path / "floors.png"))[:3] == 255).all()
+    assert is_written(tmp_path / "plan.png") and (image[:3] == 255).all()
+    assert np.abs(image[..., ::-1].astype(int) - (242, 240, 234)).sum(axis=2).min() == 0
 
 
 @pytest.mark.parametrize(("unit", "wall", "area"), [(1e3, "4000", "15"), (1e-3, "0.00400", "0.00001")])

@@ -97,20 +97,6 @@ def test_a_route_goes_along_a_link_then_jumps_and_looks_away_from_the_link_back(
     assert [edge for edge, _ in itertools.groupby(seen)] == [(1, 2), (3, 3), (6, 6)]
 
 
-def test_the_last_view_of_a_part_fades_out_for_a_second_after_a_jump(home):
-    route = plan_route(home, [1, 2, 3])
-    (jump,) = route.jumps
-    steps = len(route.legs) - 1
-    before, after = ([route.fade((jump + k) / steps) for k in range(*span)] for span in ((-9, 1), (1, 70)))
-    assert all(len(frame) == 1 for frame in before) and len(after[-1]) == 1
-    weights = [frame[-1][1] for frame in after[:60]]
-    assert np.all(np.diff(weights) > 0) and weights[0] < 0.01 and weights[-1] == 1
-    for k, frame in enumerate(after, start=1):
-        assert sum(weight for _, weight in frame) == pytest.approx(1)
-        assert np.array_equal(frame[-1][0], route.pose((jump + k) / steps))
-        assert len(frame) == 1 or np.allclose(frame[0][0], route.pose(jump / steps))
-
-
 def test_a_fade_without_a_link_begins_at_once_and_ends_in_the_start_view_or_the_heading(home):
     start = home.cam2world[3].numpy().copy()
     start[:3, 3] += 0.3

@@ -20,8 +20,8 @@ from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.tours.camera_path import CameraPath
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.scene.key_frames import CameraPath
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, load_entry
 from pansplat_viewer.scene.settings import FrameStats
 from pansplat_viewer.scene.state import ViewerState

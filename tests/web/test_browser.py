@@ -1791,12 +1791,12 @@ def test_a_page_from_disk_or_http_says_how_to_enter_vr(chromium: Any, folder: Pa
     with opened(chromium, folder / "tour.html", script=without) as page:
         assert page.page.is_hidden("#vr")
         page.page.click("#help")
-        assert "--serve" in page.page.inner_text("#no-vr")
+        assert "https" in page.page.inner_text("#no-vr")
     insecure = f"{without} Object.defineProperty(window, 'isSecureContext', {{ value: false }});"
     with opened(chromium, folder / "tour.html", script=insecure) as page:
         page.page.click("#vr")
         page.page.wait_for_selector("#notice[open]")
-        assert "--serve" in page.page.inner_text("#notice")
+        assert "https" in page.page.inner_text("#notice")
 
 
 def test_a_served_page_may_use_webxr(chromium: Any, folder: Path) -> None:

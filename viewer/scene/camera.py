@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from pansplat.constants import MAX_FOV_DEGREES, MIN_FOV_DEGREES
 from pansplat.geometry.cubemap import face_rotations
+from pansplat.geometry.path import turn_axes
 
 MAX_PITCH_RADIANS = math.radians(89.9)
-MIN_FOV_DEGREES, MAX_FOV_DEGREES = 15.0, 130.0
 MIN_DISTANCE = 0.05  # metres, from the orbit centre
 
 
@@ -37,11 +38,7 @@ class Camera:
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """The camera axes in the world (columns right, down, forward), without roll."""
-        cy, sy = math.cos(self.yaw_radians), math.sin(self.yaw_radians)
-        cp, sp = math.cos(self.pitch_radians), math.sin(self.pitch_radians)
-        yaw = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy)))
-        pitch = np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
-        return np.asarray(self.level) @ yaw @ pitch
+        return turn_axes(np.asarray(self.level), self.yaw_radians, self.pitch_radians)
 
     @property
     def cam2world(self) -> Float[np.ndarray, "4 4"]:

@@ -1,4 +1,4 @@
-"""The point of a scene under the pointer: its distance, and the Gaussian that contributes most to the pixel."""
+"""The point of a scene under the pointer, and its distance."""
 
 import math
 from dataclasses import dataclass
@@ -18,35 +18,10 @@ _MIN_RELATIVE_SCALE = 1e-6  # of the distance; thinner Gaussians are this thick
 
 @dataclass(frozen=True)
 class PickedPoint:
-    """A point on the surface that one pixel shows.
-
-    Attributes:
-        level, view: its labels.
-    """
+    """A point on the surface that one pixel shows."""
 
     position: tuple[float, float, float]  # in the world, metres
     depth: float  # radial distance from the camera, metres: the mean of the Gaussians on the ray, by weight
-    alpha: float  # opacity of the pixel
-    count: int  # Gaussians that contribute to the pixel
-    gaussian: int  # index of the one that contributes most, and its parameters:
-    level: int
-    view: int
-    opacity: float  # its peak opacity
-    scales: tuple[float, float, float]  # its standard deviations, metres
-    mean: tuple[float, float, float]  # its centre in the world, metres
-    quat: tuple[float, float, float, float]  # its rotation, wxyz
-
-    def describe(self) -> list[str]:
-        """Lines of text for the panel."""
-        x, y, z = self.position
-        return [
-            f"depth {self.depth:.3f} m   opacity {self.alpha:.2f}   {self.count} Gaussians",
-            f"x {x:.3f}  y {y:.3f}  z {z:.3f} m",
-            f"Gaussian {self.gaussian:,}: level {self.level}, view {self.view}, opacity {self.opacity:.2f}",
-            "scales " + " ".join(f"{1000 * scale:.1f}" for scale in self.scales) + " mm",
-            "mean " + " ".join(f"{x:.3f}" for x in self.mean) + " m",
-            "rotation (wxyz) " + " ".join(f"{x:.3f}" for x in self.quat),
-        ]
 
 
 def compute_pixel_ray(
@@ -99,22 +74,8 @@ def pick_point(
     indices, alphas = indices[order], alphas[order]
     weights = alphas * np.concatenate((np.ones(1), np.cumprod(1 - alphas)[:-1]))
     depth = float((weights * distances[indices]).sum() / weights.sum())
-    best = int(indices[weights.argmax()])
-    point, scales = origin + depth * direction, gaussians.scales[best].tolist()
-    mean, quat = gaussians.means[best].tolist(), gaussians.quats[best].tolist()
-    return PickedPoint(
-        position=(float(point[0]), float(point[1]), float(point[2])),
-        depth=depth,
-        alpha=float(weights.sum()),
-        count=len(indices),
-        gaussian=best,
-        level=int(gaussians.levels[best]),
-        view=int(gaussians.views[best]),
-        opacity=float(gaussians.opacities[best]),
-        scales=(scales[0], scales[1], scales[2]),
-        mean=(mean[0], mean[1], mean[2]),
-        quat=(quat[0], quat[1], quat[2], quat[3]),
-    )
+    x, y, z = (origin + depth * direction).tolist()
+    return PickedPoint((x, y, z), depth)
 
 
 def _select(scene: Scene, settings: DrawSettings) -> Bool[np.ndarray, "n"]:

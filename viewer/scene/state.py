@@ -11,21 +11,19 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import (
     find_direction,
     fly_pose,
+    level_axes,
     level_pose,
-    look_pose,
-    path_poses,
     up_direction,
 )
+from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.route import Route
+from pansplat.tours.route import NEAR_OF_FAR, Route
 from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
-from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.scene.picking import PickedPoint
 from pansplat_viewer.scene.settings import Display, DrawSettings
 
 FLIGHT_SECONDS = 6.0
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
-NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
 _MAX_SAMPLES = 100_000  # Gaussians that percentiles are measured on
 
@@ -97,8 +95,8 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     state.context = scene.cam2world.double().numpy()
     state.tour = state.route = state.target = None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
-    level = create_level_camera(scene).level
-    camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
+    level = _level_camera(state.camera, level_axes(scene.cam2world))
+    camera = move_to_pose(level, _choose_start_pose(scene, state.flight))
     if state.flight == 0 and scene.starts and scene.starts[0] is not None:
         forward = find_direction(scene.cam2world[0], *scene.starts[0]).numpy()
         camera = focus_on_point(camera, np.asarray(camera.position) + forward)
@@ -116,8 +114,8 @@ def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, 
     state.settings = replace(state.settings, near=NEAR_OF_FAR * tour.far)
     state.tour, state.context = tour, tour.cam2world.numpy()
     state.route, state.flight = route, min(max(at, 0.0), 1.0)
-    level = create_level_camera(scene, tour).level
-    state.camera = state.home = move_to_pose(replace(state.camera, level=level), route.pose(state.flight))
+    level = _level_camera(state.camera, tour.level_axes)
+    state.camera = state.home = move_to_pose(level, route.pose(state.flight))
     state.camera = before or state.camera
 
 
@@ -126,10 +124,8 @@ def _are_same(first: Float[np.ndarray, "a 4 4"], second: Float[np.ndarray, "b 4 
     return len(first) == len(second) > 0 and np.allclose(first, second, atol=1e-5)
 
 
-def create_level_camera(scene: Scene, tour: TourGraph | None = None) -> Camera:
-    """A camera with the level axes of a scene, or of the tour that it is of."""
-    axes = _compute_level_axes(scene) if tour is None else tour.level_axes
-    return Camera(level=tuple(tuple(float(x) for x in row) for row in axes))
+def _level_camera(camera: Camera, axes: Float[np.ndarray, "3 3"]) -> Camera:
+    return replace(camera, level=tuple(tuple(float(x) for x in row) for row in axes))
 
 
 def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True) -> None:
@@ -215,15 +211,21 @@ def add_key_frame(state: ViewerState) -> None:
     seconds = state.path_seconds
     if any(abs(frame.seconds - seconds) < 1e-3 for frame in state.path.key_frames):
         seconds = state.path.seconds + KEY_SECONDS
-    state.path = state.path.add(KeyFrame.of_camera(state.camera, seconds))
+    state.path = state.path.add(make_key_frame(state.camera, seconds))
     state.path_seconds, state.path_playing = seconds, False
+
+
+def make_key_frame(camera: Camera, seconds: float) -> KeyFrame:
+    """The camera as a key frame."""
+    return KeyFrame.of_pose(camera.cam2world, seconds, camera.vertical_fov_degrees)
 
 
 def show_path(state: ViewerState, seconds: float) -> None:
     """Move the camera to a time of the path."""
     state.playing, state.path_seconds = False, max(seconds, 0.0)
     if len(state.path):
-        state.camera = state.path.interpolate(state.path_seconds, state.camera, state.tour)
+        pose, fov = state.path.interpolate(state.path_seconds, np.asarray(state.camera.level), state.tour)
+        state.camera = replace(move_to_pose(state.camera, pose), vertical_fov_degrees=fov)
 
 
 def advance_path(state: ViewerState, seconds: float) -> None:
@@ -233,20 +235,12 @@ def advance_path(state: ViewerState, seconds: float) -> None:
         state.path_playing = state.path_seconds < state.path.seconds
 
 
-def _compute_level_axes(scene: Scene) -> Float[np.ndarray, "3 3"]:
-    """Return right, down, forward of a level camera in the direction of flight (columns, world axes)."""
-    if len(scene.cam2world):
-        return path_poses(scene.cam2world)[0, :3, :3].numpy()
-    forward = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
-    return look_pose(torch.zeros(3), forward, up_direction(scene.cam2world))[:3, :3].numpy()
-
-
 def _choose_start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
     """Return the pose at a fraction of the flight; in a scene without cameras, a pose that sees it from outside."""
     if len(scene.cam2world):
         return fly_pose(scene.cam2world, fraction).numpy()
     matrix = np.eye(4)
-    matrix[:3, :3] = _compute_level_axes(scene)
+    matrix[:3, :3] = level_axes(scene.cam2world)
     means = _sample_means(scene)
     if len(means):
         middle = np.median(means, axis=0)

@@ -7,13 +7,14 @@ the camera are faint.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
-import moderngl
 import numpy as np
 from imgui_bundle import imgui
+from jaxtyping import Float
 
 from pansplat.system.descriptions import describe_count
-from pansplat.tours.floor import FloorPlan, draw_floor_plan, find_other_storeys
+from pansplat.tours.floor import find_other_storeys
 from pansplat.tours.graph import TourGraph
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.tour import TourScenes
@@ -22,7 +23,12 @@ from pansplat_viewer.ui.overlays import FADE_COLOR
 SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1
 _CLICK_PIXELS = 12.0
 _VIEW_LENGTH = 1.0  # metres, of the camera's field of view
+_PLAN_MARGIN = 0.5  # metres, around the panoramas and floors
 
+Color = tuple[float, float, float, float]
+
+_FLOORS: tuple[Color, Color] = (0.9, 0.9, 0.92, 1.0), (0.38, 0.41, 0.45, 1.0)  # walls, and floors
+_FAINT_FLOORS: tuple[Color, Color] = (0.35, 0.36, 0.37, 1.0), (0.18, 0.19, 0.21, 1.0)
 # Colours of panoramas, of those whose scene is loaded, of edges, of the camera, of links to other parts, and of
 # panoramas of other storeys.
 _COLORS = (
@@ -62,30 +68,35 @@ def is_probable(tour: TourGraph, node: int) -> bool:
 
 
 class Minimap:
-    """Draws the plan of a tour; keeps the texture of the floors.
+    """Draws the plan of a tour.
 
     Attributes:
         nodes: pixel of each panorama in the last frame; for tests that click.
     """
 
-    def __init__(self, ctx: moderngl.Context) -> None:
-        """No texture is made before the first frame."""
-        self._ctx = ctx
-        self._texture: moderngl.Texture | None = None
-        self._plan: FloorPlan | None = None
-        self._key: tuple[object, ...] = ()
+    def __init__(self) -> None:
         self.nodes: list[tuple[float, float]] = []
 
     def draw(self, scenes: TourScenes, camera: Camera) -> int | None:
         """Draw the plan into the current imgui window; returns the panorama that was clicked."""
-        scale = imgui.get_style().font_scale_dpi
-        others = find_other_storeys(scenes.tour, np.asarray(camera.position))
-        plan = self._update(scenes, others, round(SIZE * scale))
-        assert self._texture is not None
-        corner = imgui.get_cursor_screen_pos()
-        imgui.image(imgui.ImTextureRef(self._texture.glo), self._texture.size)
+        scale, tour = imgui.get_style().font_scale_dpi, scenes.tour
+        others = find_other_storeys(tour, np.asarray(camera.position))
+        corners = [outline.corners for outline in scenes.outlines.values()]
+        places = np.concatenate([tour.positions @ tour.level_axes[:, (0, 2)], *corners])
+        low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
+        factor, corner = SIZE * scale / float((high - low).max()), imgui.get_cursor_screen_pos()
+
+        def to_pixels(places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+            """Pixels of places to the right and forward, metres."""
+            return (places - (low[0], high[1])) * (factor, -factor) + (corner.x, corner.y)
+
+        width, height = ((high - low) * factor).tolist()
+        imgui.dummy((width, height))
         hovered = imgui.is_item_hovered()
-        self._draw_marks(scenes, others, camera, plan, (corner.x, corner.y), scale)
+        for is_other, colors in ((True, _FAINT_FLOORS), (False, _FLOORS)):
+            shown = [outline.corners for node, outline in scenes.outlines.items() if (node in others) == is_other]
+            _draw_floors([to_pixels(corners) for corners in shown], colors, scale)
+        self._draw_marks(scenes, others, camera, to_pixels, scale)
         if not hovered:
             return None
         mouse = imgui.get_mouse_pos()
@@ -94,43 +105,21 @@ class Minimap:
         if not near:
             return None
         nearest = min(near, key=lambda node: (node in others, distances[node]))
-        reason = scenes.tour.panoramas[nearest].placement.reason
-        imgui.set_tooltip("\n".join(filter(None, (describe_panorama(scenes.tour, nearest), reason))))
+        reason = tour.panoramas[nearest].placement.reason
+        imgui.set_tooltip("\n".join(filter(None, (describe_panorama(tour, nearest), reason))))
         return nearest if imgui.is_mouse_clicked(0) else None
-
-    def release(self) -> None:
-        """Free the texture."""
-        if self._texture is not None:
-            self._texture.release()
-        self._texture, self._key = None, ()
-
-    def _update(self, scenes: TourScenes, others: frozenset[int], size: int) -> FloorPlan:
-        """The plan; its texture is written again after a scene was loaded, and in another storey."""
-        key = (scenes.tour, others, size, *map(id, scenes.outlines.values()))
-        if self._plan is None or key != self._key:
-            self.release()
-            here, faint = (
-                [outline for node, outline in scenes.outlines.items() if (node in others) == is_other]
-                for is_other in (False, True)
-            )
-            self._plan = draw_floor_plan(scenes.tour, here, faint=faint, size=size)
-            height, width = self._plan.image.shape[:2]
-            self._texture = self._ctx.texture((width, height), 4, self._plan.image.tobytes())
-            self._key = key
-        return self._plan
 
     def _draw_marks(
         self,
         scenes: TourScenes,
         others: frozenset[int],
         camera: Camera,
-        plan: FloorPlan,
-        corner: tuple[float, float],
+        to_pixels: Callable[[Float[np.ndarray, "*batch 2"]], Float[np.ndarray, "*batch 2"]],
         scale: float,
     ) -> None:
         tour, canvas = scenes.tour, imgui.get_window_draw_list()
         axes = tour.level_axes[:, (0, 2)]
-        self.nodes = [tuple(pixel) for pixel in (plan.to_pixels(tour.positions @ axes) + corner).tolist()]
+        self.nodes = [tuple(pixel) for pixel in to_pixels(tour.positions @ axes).tolist()]
         colors = [imgui.color_convert_float4_to_u32(color) for color in _COLORS]
         for a, b in tour.overlaps:
             canvas.add_line(self.nodes[a], self.nodes[b], colors[2], scale)
@@ -150,8 +139,19 @@ class Minimap:
         heading = rotation[:, 2] @ axes
         heading = heading / max(float(np.linalg.norm(heading)), 1e-6)
         side = np.array((heading[1], -heading[0])) * math.tan(math.radians(min(camera.vertical_fov_degrees, 120)) / 2)
-        ends = [plan.to_pixels(place + _VIEW_LENGTH * (heading + sign * side)) + corner for sign in (-1, 1)]
-        at = plan.to_pixels(place) + corner
+        ends = [to_pixels(place + _VIEW_LENGTH * (heading + sign * side)) for sign in (-1, 1)]
+        at = to_pixels(place)
         for end in ends:
             canvas.add_line(tuple(at.tolist()), tuple(end.tolist()), colors[3], 1.5 * scale)
         canvas.add_circle_filled(tuple(at.tolist()), 4.5 * scale, colors[3])
+
+
+def _draw_floors(floors: list[Float[np.ndarray, "corner 2"]], colors: tuple[Color, Color], scale: float) -> None:
+    """Draw walls around all floors together: an outline that ends in another one's floor has no wall there."""
+    canvas = imgui.get_window_draw_list()
+    wall, floor = map(imgui.color_convert_float4_to_u32, colors)
+    shapes = [[imgui.ImVec2(x, y) for x, y in corners.tolist()] for corners in floors]
+    for shape in shapes:
+        canvas.add_polyline(shape, wall, thickness=3.0 * scale, flags=imgui.ImDrawFlags_.closed.value)
+    for shape in shapes:
+        canvas.add_concave_poly_filled(shape, floor)

@@ -61,5 +61,5 @@ class NotesSection:
             viewer.queue(viewer.put_note, self._text)
             self._text = ""
         imgui.same_line()
-        if self._widgets.button("Remove at the middle"):
+        if self._widgets.button("Remove"):
             viewer.queue(viewer.put_note, "")

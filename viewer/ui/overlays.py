@@ -33,9 +33,7 @@ FADE_COLOR = (1.0, 0.75, 0.3)  # of panoramas of other parts of a tour
 UNITS = {"depth": " m"}  # of displays whose range can be changed
 
 
-def draw_stats(
-    state: ViewerState, stats: FrameStats, frame_ms: float, image_size: tuple[int, int], right_name: str | None
-) -> None:
+def draw_stats(state: ViewerState, stats: FrameStats, frame_ms: float, image_size: tuple[int, int]) -> None:
     """Draw times, counts and the camera's position at the top right.
 
     Args:
@@ -43,7 +41,6 @@ def draw_stats(
         stats: of the last image.
         frame_ms: time of a whole frame.
         image_size: (width, height), pixels.
-        right_name: of what is right of the divider; None if there is nothing.
     """
     size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
     if size.x > 2.2 * PANEL_WIDTH * scale:
@@ -57,31 +54,26 @@ def draw_stats(
         f"{image_size[0]} x {image_size[1]}   {stats.renderer}" + ("   cached" if stats.cached else ""),
         f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
     ]
-    if right_name is not None:
-        lines.append(f"right: {right_name}")
     _draw_label("##stats", lines, alpha=0.6)
 
 
 def draw_points(state: ViewerState) -> None:
-    """Draw markers at the picked points, and what is known of them at the bottom right."""
+    """Draw markers at the picked points: with one its distance from the camera, with two that between both."""
     size = imgui.get_io().display_size
     color = imgui.color_convert_float4_to_u32((1.0, 0.85, 0.2, 1.0))
     canvas = imgui.get_background_draw_list()
-    pixels = [project_point(state.camera, point.position, (int(size.x), int(size.y))) for point in state.points]
-    for pixel in pixels:
-        if pixel is not None:
-            canvas.add_circle(pixel, 5.0 * imgui.get_style().font_scale_dpi, color, 0, 2.0)
-    lines = state.points[-1].describe()
-    if len(pixels) == 2:
-        if pixels[0] is not None and pixels[1] is not None:
-            canvas.add_line(pixels[0], pixels[1], color, 2.0)
-        distance = f"{math.dist(state.points[0].position, state.points[1].position):.3f} m"
-        lines.append(f"{distance} from the point before")
-        if pixels[0] is not None and pixels[1] is not None:
-            middle = ((pixels[0][0] + pixels[1][0]) / 2 + 8, (pixels[0][1] + pixels[1][1]) / 2 - 22)
-            _draw_outlined(canvas, middle, color, distance)
-    imgui.set_next_window_pos((size.x - MARGIN, size.y - MARGIN), 0, (1.0, 1.0))
-    _draw_label("##point", lines, alpha=0.6)
+    places = [point.position for point in state.points]
+    pixels = [project_point(state.camera, place, (int(size.x), int(size.y))) for place in places]
+    shown = [pixel for pixel in pixels if pixel is not None]
+    for pixel in shown:
+        canvas.add_circle(pixel, 5.0 * imgui.get_style().font_scale_dpi, color, 0, 2.0)
+    if len(shown) < len(places):
+        return
+    if len(shown) == 2:
+        canvas.add_line(*shown, color, 2.0)
+    middle = sum(x for x, _ in shown) / len(shown) + 8, sum(y for _, y in shown) / len(shown) - 22
+    distance = math.dist(places[0], places[1] if len(places) == 2 else state.camera.position)
+    _draw_outlined(canvas, middle, color, f"{distance:.2f} m" + ("" if len(places) == 2 else " away"))
 
 
 def draw_hotspots(hotspots: list[Hotspot]) -> None:

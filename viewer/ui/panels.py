@@ -1,6 +1,6 @@
-"""The panels over the image: scene, display, Gaussians, camera, comparison, screenshots, camera path and window.
+"""The panel over the image: photographs, plan, notes and film, and what only experts need.
 
-They read the viewer and change its state at once; other actions are queued.
+It reads the viewer and changes its state at once; other actions are queued.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from imgui_bundle import imgui
 
 from pansplat.system.descriptions import describe_count
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.key_frames import KeyFrame
 from pansplat_viewer.scene.settings import Display, Preset
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
@@ -24,11 +23,12 @@ from pansplat_viewer.scene.state import (
     fly_to,
     go_home,
     jump_to_view,
+    make_key_frame,
     show_path,
     toggle_play,
 )
 from pansplat_viewer.scene.tour import TourScenes
-from pansplat_viewer.ui.minimap import SIZE, Minimap, describe_panorama, describe_panoramas, is_probable
+from pansplat_viewer.ui.minimap import Minimap, describe_panorama, describe_panoramas, is_probable
 from pansplat_viewer.ui.notes import NotesSection, draw_notes
 from pansplat_viewer.ui.overlays import (
     FIXED,
@@ -59,7 +59,6 @@ _HANDLE = (
     | imgui.WindowFlags_.no_bring_to_front_on_focus.value
     | imgui.WindowFlags_.no_nav.value
 )
-_OPENED_NOTES = 3  # at most, at first
 
 
 class Panels:
@@ -70,25 +69,24 @@ class Panels:
         path, path_file: texts of the fields of scenes and of the camera path.
         minimap: the plan of a tour.
         placing: the window in which a photograph is placed.
-        notes: the section "Notes in the picture".
+        notes: the field and buttons of notes.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.widgets = Widgets()
-        self.minimap, self.placing = Minimap(ctx), PlacingWindow(ctx, self.widgets)
+        self.minimap, self.placing = Minimap(), PlacingWindow(ctx, self.widgets)
         self.notes = NotesSection(self.widgets)
         self.path, self.path_file = "", "path.json"
-        self._is_reset = False  # whether the default layout was chosen in this frame
+        self._is_expert = False  # whether the group "Expert" is open
 
     def draw(self, viewer: Viewer) -> None:
         """Draw the panels that are shown."""
         self.widgets.items.clear()
-        self._is_reset = False
         state, stats, placing = viewer.state, viewer.stage.renderer.stats, viewer.placing
         if state.overlay:
             self._draw_main_panel(viewer)
-            if stats.total:
-                draw_stats(state, stats, viewer.frame_ms, viewer.stage.image_size, viewer.right_name)
+            if stats.total and self._is_expert:
+                draw_stats(state, stats, viewer.frame_ms, viewer.stage.image_size)
         if viewer.right_name is not None:
             self._draw_divider(state)
         if stats.total:
@@ -98,8 +96,6 @@ class Panels:
         if state.overlay and state.hotspots:
             draw_hotspots(viewer.hotspots)
             draw_notes(viewer)
-        if state.overlay and viewer.tour is not None:
-            self._draw_tour(viewer, viewer.tour)
         if state.overlay and placing is not None and placing.node is not None and self.placing.draw(placing):
             viewer.queue(viewer.scenes.reload)
         if state.help:
@@ -113,20 +109,53 @@ class Panels:
 
     def release(self) -> None:
         """Free the GL objects."""
-        self.minimap.release()
         self.placing.release()
 
-    def _draw_tour(self, viewer: Viewer, tour: TourScenes) -> None:
-        """Draw the plan and the progress of the tour at the right border, below the statistics."""
-        state, size, scale = viewer.state, imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-        first = (imgui.Cond_.always if self._is_reset else imgui.Cond_.first_use_ever).value
-        imgui.set_next_window_dock_id(0, first)
-        imgui.set_next_window_pos((size.x - MARGIN, 120 * scale), first, (1.0, 0.0))
-        imgui.set_next_window_size(((SIZE + 18) * scale, (SIZE + 136) * scale), first)
-        imgui.begin("Tour")
-        place, width = imgui.get_window_pos(), imgui.get_window_width()
-        if place.x + width > size.x:  # the window was larger when the layout was remembered
-            imgui.set_window_pos((max(size.x - width, 0.0), place.y))
+    def _draw_main_panel(self, viewer: Viewer) -> None:
+        scale, height = imgui.get_style().font_scale_dpi, imgui.get_io().display_size.y
+        imgui.set_next_window_size((PANEL_WIDTH * scale, 0.8 * height), imgui.Cond_.first_use_ever.value)
+        opened, _ = imgui.begin("pansplat")
+        if opened:
+            imgui.push_item_width(-110 * scale)
+            self._draw_sections(viewer)
+            imgui.pop_item_width()
+        imgui.end()
+
+    def _draw_sections(self, viewer: Viewer) -> None:
+        """Draw what everybody needs, open, and the rest, closed."""
+        section = self.widgets.section
+        self._draw_scene(viewer)
+        if viewer.state.context.size:
+            section("Photographs", partial(self._draw_photographs, viewer))
+        if viewer.tour is not None:
+            section("Plan", partial(self._draw_plan, viewer, viewer.tour))
+        if viewer.library.notes or len(viewer.stage.comparer.photographs):
+            section("Notes", partial(self._draw_notes, viewer))
+        section("Film", partial(self._draw_film, viewer))
+        self._is_expert = section("Expert", partial(self._draw_expert, viewer), opened=False)
+
+    def _draw_photographs(self, viewer: Viewer) -> None:
+        """Draw where the camera can go, the comparison, and the states of estimated poses."""
+        state, placing = viewer.state, viewer.placing
+        if state.tour is None:  # whose plan has a list
+            self._draw_panoramas(state, viewer.panoramas)
+        if self.widgets.button("Stop" if state.playing else "Fly"):
+            toggle_play(state)
+        imgui.same_line()
+        imgui.set_next_item_width(-1)
+        flight = self.widgets.slider("##flight", state.flight, 0.0, 1.0, "%.2f of the way")
+        if flight != state.flight:
+            state.playing = False
+            fly_to(state, flight)
+        if len(viewer.stage.comparer.photographs):
+            self._draw_comparison(viewer)
+        if placing is not None and placing.is_listed:
+            opened = any(view.placement.state != "placed" for view in placing.panoramas)
+            self.widgets.section("Poses", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
+
+    def _draw_plan(self, viewer: Viewer, tour: TourScenes) -> None:
+        """Draw the floor plan and the list of panoramas, and the progress of the prediction."""
+        state = viewer.state
         state.minimap = self.widgets.check("floor plan", state.minimap)
         imgui.same_line()
         state.hotspots = self.widgets.check("hotspots", state.hotspots)
@@ -144,44 +173,38 @@ class Panels:
             imgui.end_combo()
         else:
             self.widgets.record("visit")
-        imgui.text_unformatted(f"{len(tour.loaded)} of {describe_count(tour.num_scenes, 'scene')} in memory")
         if viewer.scenes.background is not None:
             task, fraction = viewer.scenes.background
             draw_wrapped(task)
             imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
-        imgui.end()
 
-    def _draw_main_panel(self, viewer: Viewer) -> None:
-        scale, height = imgui.get_style().font_scale_dpi, imgui.get_io().display_size.y
-        imgui.set_next_window_size((PANEL_WIDTH * scale, 0.8 * height), imgui.Cond_.first_use_ever.value)
-        opened, _ = imgui.begin("pansplat")
-        if opened:
-            imgui.push_item_width(-110 * scale)
-            self._draw_sections(viewer)
-            imgui.pop_item_width()
-        imgui.end()
+    def _draw_notes(self, viewer: Viewer) -> None:
+        """Draw the note at the middle of the image, and what was not used of the folder."""
+        if len(viewer.stage.comparer.photographs):
+            self.notes.draw(viewer)
+        for note in viewer.library.notes:
+            draw_wrapped(note, is_disabled=True)
 
-    def _draw_sections(self, viewer: Viewer) -> None:
-        section, notes, placing = self.widgets.section, viewer.library.notes, viewer.placing
-        section("Scene", partial(self._draw_scene, viewer))
-        if notes:
-            section("Notes", lambda: draw_wrapped("\n".join(notes)), opened=len(notes) <= _OPENED_NOTES)
-        if placing is not None and placing.is_listed:
-            opened = any(view.placement.state != "placed" for view in placing.panoramas)
-            section("Photographs", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
-        has_photographs = len(viewer.stage.comparer.photographs) > 0
-        if has_photographs:
-            section("Notes in the picture", partial(self.notes.draw, viewer), opened=False)
+    def _draw_film(self, viewer: Viewer) -> None:
+        """Draw the buttons of pictures and the editor of the camera path."""
+        self._draw_screenshot(viewer)
+        self._draw_path(viewer)
+
+    def _draw_expert(self, viewer: Viewer) -> None:
+        """Draw how the camera moves, what is drawn of the Gaussians, and the look of the window."""
+        imgui.separator_text("Camera")
+        self._draw_camera(viewer)
         if viewer.stage.renderer.stats.total:
-            section("Gaussians", partial(self._draw_gaussians, viewer.state))
-        section("Display", partial(self._draw_display, viewer.state))
-        if has_photographs:
-            section("Compare", partial(self._draw_comparison, viewer))
-        section("Camera", partial(self._draw_camera, viewer))
-        section("Screenshot", partial(self._draw_screenshot, viewer))
-        section("Drawing", partial(self._draw_settings, viewer), opened=False)
-        section("Camera path", partial(self._draw_path, viewer), opened=False)
-        section("Window", partial(self._draw_window, viewer), opened=False)
+            imgui.separator_text("Gaussians")
+            self._draw_gaussians(viewer.state)
+        if viewer.tour is not None:
+            loaded, count = len(viewer.tour.loaded), describe_count(viewer.tour.num_scenes, "scene")
+            imgui.text_unformatted(f"{loaded} of {count} in memory")
+        imgui.separator_text("Display")
+        self._draw_display(viewer.state)
+        self._draw_settings(viewer)
+        imgui.separator_text("Window")
+        self._draw_window(viewer)
 
     def _draw_scene(self, viewer: Viewer) -> None:
         library, recent, width = viewer.library, viewer.preferences.recent, -60 * imgui.get_style().font_scale_dpi
@@ -299,18 +322,6 @@ class Panels:
         if chosen != fov:
             state.camera = replace(state.camera, vertical_fov_degrees=chosen)
         state.speed = self.widgets.slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
-        if not len(state.context):
-            return
-        if state.tour is None:  # which has a list of its own
-            self._draw_panoramas(state, viewer.panoramas)
-        if self.widgets.button("Stop" if state.playing else "Fly"):
-            toggle_play(state)
-        imgui.same_line()
-        imgui.set_next_item_width(-1)
-        flight = self.widgets.slider("##flight", state.flight, 0.0, 1.0, "%.2f of the way")
-        if flight != state.flight:
-            state.playing = False
-            fly_to(state, flight)
 
     def _draw_panoramas(self, state: ViewerState, names: list[str]) -> None:
         """Draw a button for each panorama, in rows."""
@@ -358,8 +369,7 @@ class Panels:
             if self.widgets.radio(theme, viewer.preferences.theme == theme):
                 viewer.queue(viewer.set_theme, theme)
             imgui.same_line()
-        self._is_reset = self.widgets.button("Default layout")
-        if self._is_reset:
+        if self.widgets.button("Default layout"):
             viewer.queue(viewer.gui.reset_layout)
 
     def _draw_divider(self, state: ViewerState) -> None:
@@ -396,6 +406,8 @@ class Panels:
         imgui.end()
 
     def _draw_screenshot(self, viewer: Viewer) -> None:
+        _draw_row_label("picture")
+        imgui.same_line()
         if self.widgets.button("PNG"):
             viewer.queue(viewer.write_screenshot, "png")
         imgui.same_line()
@@ -427,7 +439,7 @@ class Panels:
                 show_path(state, frame.seconds)
             imgui.same_line()
             if self.widgets.button(f"Replace##{index}"):
-                state.path = state.path.add(KeyFrame.of_camera(state.camera, frame.seconds))
+                state.path = state.path.add(make_key_frame(state.camera, frame.seconds))
             imgui.same_line()
             if self.widgets.button(f"Delete##{index}"):
                 state.path = state.path.remove(index)

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
+from pansplat.tours.cross_fade import CrossFade
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
 from pansplat_viewer.draw.window_renderer import WindowRenderer, create_window_renderer, get_eye_size
 from pansplat_viewer.scene import camera as cameras
@@ -20,7 +21,7 @@ from pansplat_viewer.scene.loader import LoadedScene
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
 from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot
 from pansplat_viewer.scene.state import ViewerState, adapt_settings, fit_settings
-from pansplat_viewer.scene.tour import CrossFade, StopFade
+from pansplat_viewer.scene.tour import StopFade
 from pansplat_viewer.ui.compare import Comparer
 from pansplat_viewer.ui.presenter import PhotographLayer, Presenter
 

@@ -53,13 +53,13 @@ class Widgets:
         return chosen if changed else value  # imgui returns an unchanged value rounded to float32
 
     def text_field(self, label: str, text: str) -> str:
-        """A field for a text; returns its new text."""
-        _, text = imgui.input_text(f"##{label}", text)
+        """A field for a text, which shows its label while it is empty; returns its new text."""
+        _, text = imgui.input_text_with_hint(f"##{label}", label, text)
         self.record(label)
         return text
 
-    def section(self, label: str, draw: Callable[[], None], *, opened: bool = True) -> None:
-        """A header that opens and closes what `draw` draws."""
+    def section(self, label: str, draw: Callable[[], None], *, opened: bool = True) -> bool:
+        """A header that opens and closes what `draw` draws; returns whether it is open."""
         flags = imgui.TreeNodeFlags_.default_open if opened else imgui.TreeNodeFlags_.none
         shown = imgui.collapsing_header(label, flags.value)
         self.record(label)
@@ -67,6 +67,7 @@ class Widgets:
             imgui.push_id(label)
             draw()
             imgui.pop_id()
+        return shown
 
 
 def draw_wrapped(text: str, *, is_disabled: bool = False) -> None:

@@ -1,6 +1,8 @@
 """The scenes of a tour are chosen, requested, kept and faded; hotspots are found; the film has no jumps."""
 
+import contextlib
 import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,15 +12,18 @@ import pytest
 import torch
 from PIL import Image
 
+from pansplat.export.film import Film, Shot, list_flight
 from pansplat.inputs.pairs import Link
+from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.route import FADE_SECONDS, plan_route
 from pansplat_viewer import run
-from pansplat_viewer.capture import Film, TourFrames, _find_nearest_frames, write_tour
+from pansplat_viewer.capture import find_nearest_frames, open_film, write_flight
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.stereo import ImageFormat
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import SceneEntry
 from pansplat_viewer.scene.settings import DrawSettings
-from pansplat_viewer.scene.tour import CrossFade, StopFade, TourScenes, find_clicked, find_hotspots, measure_bytes
+from pansplat_viewer.scene.tour import StopFade, TourScenes, find_clicked, find_hotspots, measure_bytes
 from pansplat_viewer.ui.minimap import describe_panoramas
 
 
@@ -227,7 +232,7 @@ def test_scenes_of_other_parts_are_loaded_next_those_of_links_first(parted_house
     scenes.add(load_house(scenes.make_entry((3,))))
     assert scenes.list_next(route, 0.0) == [(3,), (1, 2), (0, 1)], "those of the route"
     assert scenes.camera_height == 1.0
-    scenes.move(route.pose(1.0)[:3, 3], route, 1.0)
+    scenes.move(route.pose(1.0)[:3, 3], route.edge(1.0))
     assert scenes.views == (0, 1)
 
 
@@ -261,39 +266,44 @@ def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(scenes):
     assert find_hotspots(scenes, replace(camera, yaw_radians=np.pi), (200, 200)) == []
 
 
-def test_the_film_of_a_fade_between_parts_mixes_both_last_views(parted_house, load_house):
-    scenes = TourScenes(parted_house)
-    renderers = [CpuRenderer(None), CpuRenderer(None)]
-    settings = DrawSettings(mode="deferred")
-    frames = TourFrames(renderers, scenes, lambda entry: load_house(entry), (64, 36), settings)
+@pytest.fixture
+def open_tour_film(load_house) -> Iterator[Callable[..., Film]]:
+    """Opens the film of a tour's scenes, without photographs."""
+    with contextlib.ExitStack() as stack:
+
+        def open_one(scenes: TourScenes, load: Callable = load_house, size: tuple[int, int] = (64, 36)) -> Film:
+            first, settings = load_house(scenes.make_entry(scenes.views)), DrawSettings(mode="deferred")
+            options = scenes, load, size, settings, ImageFormat()
+            return stack.enter_context(open_film(lambda: CpuRenderer(None), first, *options, with_depth=True))
+
+        yield open_one
+
+
+def test_the_film_of_a_fade_between_parts_mixes_both_last_views(parted_house, open_tour_film):
+    film = open_tour_film(TourScenes(parted_house))
     route = plan_route(parted_house, [2, 3])
     (jump,) = route.jumps
 
     def draw(sample: int, seconds: float) -> np.ndarray:
-        pose = route.pose(sample / (len(route.legs) - 1))
-        scenes.move(pose[:3, 3], route, sample / (len(route.legs) - 1))
-        return frames.draw_scene(pose, 75.0, seconds)[0]
+        at = sample / (len(route.legs) - 1)
+        return film.draw(Shot(route.pose(at), 75.0, seconds, route.edge(at)))[0]
 
     before = draw(jump, 0.0)
     assert np.abs(draw(jump + 1, 1.0) - before).max() < 1e-6, "the fade begins with the last view"
     middle = draw(jump + 1, 1.0 + FADE_SECONDS / 2)
     after = draw(jump + 1, 1.0 + FADE_SECONDS)
     assert np.abs(after - before).mean() > 0.1 and np.abs(middle - (before + after) / 2).max() < 1e-6
-    for renderer in renderers:
-        renderer.release()
 
 
 def test_the_still_of_a_panorama_is_a_frame_in_which_the_last_part_has_faded_out(parted_house):
     route = plan_route(parted_house, [2, 3])
-    fractions = np.linspace(0, 1, 200)
-    nodes = {
-        node: frame for frame, nodes in _find_nearest_frames(parted_house, route, fractions).items() for node in nodes
-    }
-    faded = route.jumps[0] / (len(route.yaws) - 1) + FADE_SECONDS / route.seconds
-    assert fractions[nodes[2]] < faded - FADE_SECONDS / route.seconds and fractions[nodes[3]] >= faded
+    shots = list_flight(route, 24.0, 75.0, 200 / 24)
+    frames = find_nearest_frames(parted_house, route, shots)
+    nodes = {node: shots[frame] for frame, nodes in frames.items() for node in nodes}
+    jump = route.jumps[0] / (len(route.yaws) - 1) * route.seconds
+    assert nodes[2].seconds < jump and nodes[3].seconds >= jump + FADE_SECONDS
     for node in (2, 3):
-        position = route.pose(fractions[nodes[node]])[:3, 3]
-        assert np.linalg.norm(position - parted_house.positions[node]) < 0.1
+        assert np.linalg.norm(nodes[node].pose[:3, 3] - parted_house.positions[node]) < 0.1
 
 
 def read_film(path) -> np.ndarray:
@@ -301,7 +311,7 @@ def read_film(path) -> np.ndarray:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]).astype(float)
 
 
-def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scenes, tmp_path):
+def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scenes, open_tour_film, tmp_path):
     loaded = []
 
     def load(entry):
@@ -309,20 +319,16 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
         return load_house(entry)
 
     route = plan_route(house, house.plan_walk(0))
-    renderers = [CpuRenderer(None), CpuRenderer(None)]
-    film = Film((64, 36), fps=12)
-    frames = TourFrames(renderers, scenes, load, film.size, DrawSettings(mode="deferred"))
     written, complete = [], []
 
     def show_file(file):
         written.append(file.name)
         complete.append((tmp_path / "tour.mp4").exists())
 
-    write_tour(frames, scenes, route, tmp_path, film, lambda task, done: None, show_file)
-    for renderer in renderers:
-        renderer.release()
+    film, show = open_tour_film(scenes, load), (lambda task, done: None, show_file)
+    write_flight(film, scenes.get((0, 1)).scene, scenes, tmp_path, 12, None, 0.5, DrawSettings(), *show)
     names = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
-    assert written == [*names, "tour.mp4", "floor_plan.png"] and complete == [False] * 4 + [True] * 2
+    assert written == [*names, "tour.mp4"] and complete == [False] * 4 + [True]
     frames = read_film(tmp_path / "tour.mp4")
     with Image.open(tmp_path / names[0]) as still:
         assert np.abs(np.asarray(still).astype(float) - frames[0]).mean() < 6, "the still of the first panorama"
@@ -331,28 +337,22 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
     steps = np.abs(np.diff(frames, axis=0)).mean((1, 2, 3))
     change = np.abs(frames[0].mean((0, 1)) - frames[-1].mean((0, 1))).mean()
     assert change > 30 and steps.max() < 0.3 * change, "scenes of different colours fade"
-    with Image.open(tmp_path / "floor_plan.png") as plan:
-        assert max(plan.size) == 1024
 
 
-def test_a_change_of_scenes_changes_the_picture_no_more_than_a_flight_along_an_edge(house, load_house):
+def test_a_change_of_scenes_changes_the_picture_no_more_than_a_flight_along_an_edge(house, load_house, open_tour_film):
     scenes = TourScenes(house, max_views=64)
     loaded = load_house(scenes.make_entry((0, 1, 2, 3)))
     brightness = torch.tensor((1.0, 0.3, 0.8, 0.1))[loaded.scene.gaussians.views]
     gaussians = replace(loaded.scene.gaussians, harmonics=loaded.scene.gaussians.harmonics * brightness[:, None, None])
     scenes.add(replace(loaded, scene=replace(loaded.scene, gaussians=gaussians)))
-    renderers = [CpuRenderer(None), CpuRenderer(None)]
-    frames = TourFrames(renderers, scenes, pytest.fail, (48, 27), DrawSettings(mode="deferred"))
+    film = open_tour_film(scenes, pytest.fail, (48, 27))
     route = plan_route(house, [0, 1, 2, 3])
     times = np.arange(0, route.seconds, 1 / 20)  # steps of 5 cm at most
     shown, edges = [], []
     for seconds in times:
-        pose = route.pose(seconds / route.seconds)
-        scenes.move(pose[:3, 3], route, seconds / route.seconds)
-        shown.append(frames.draw_scene(pose, 75.0, seconds)[0])
+        at = seconds / route.seconds
+        shown.append(film.draw(Shot(route.pose(at), 75.0, seconds, route.edge(at)))[0])
         edges.append(scenes.edge)
-    for renderer in renderers:
-        renderer.release()
     steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3))
     changes = [k for k, (a, b) in enumerate(itertools.pairwise(edges)) if a != b]
     is_fading = np.any([(times[:-1] >= times[k]) & (times[:-1] < times[k] + FADE_SECONDS) for k in changes], axis=0)
@@ -376,8 +376,8 @@ def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house,
     arguments = ["--offscreen", str(tmp_path), "--size", "64x32", "--seconds", "0.5", "--renderer", "cpu"]
     assert run([str(house.folder), *arguments]) == 0
     stills = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [*stills, "floor_plan.png", "tour.mp4"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*stills, "tour.mp4"]
     assert len(read_film(tmp_path / "tour.mp4")) == 12
     lines = capsys.readouterr().out.splitlines()[1:]  # without the note on several scenes
-    assert [Path(line).name for line in lines if "Gaussians" not in line] == [*stills, "tour.mp4", "floor_plan.png"]
+    assert [Path(line).name for line in lines if "Gaussians" not in line] == [*stills, "tour.mp4"]
     assert lines[0].endswith(" Gaussians"), "before the first still"

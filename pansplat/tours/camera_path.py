@@ -21,14 +21,17 @@ from typing import Annotated
 import numpy as np
 import scipy
 import torch
+from jaxtyping import Float
 from msgspec import Meta, Struct
 from torch import Tensor
 
+from pansplat.constants import MAX_FOV_DEGREES, MIN_FOV_DEGREES
 from pansplat.errors import InputError
+from pansplat.geometry.path import turn_axes
 from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import read_json
 from pansplat.tours.graph import TourGraph
-from pansplat_viewer.scene.camera import MAX_FOV_DEGREES, MIN_FOV_DEGREES, Camera, move_to_pose
+from pansplat.tours.route import find_angles
 
 MAX_SECONDS = 3600.0
 _FIELDS = ("seconds", "position", "direction", "vertical_fov_degrees")
@@ -47,10 +50,10 @@ class KeyFrame:
     vertical_fov_degrees: float = _DEFAULT_FOV  # vertical field of view
 
     @staticmethod
-    def of_camera(camera: Camera, seconds: float) -> KeyFrame:
-        """The key frame of the interactive camera."""
-        x, y, z = camera.rotation[:, 2].tolist()
-        return KeyFrame(seconds, camera.position, (x, y, z), camera.vertical_fov_degrees)
+    def of_pose(pose: Float[np.ndarray, "4 4"], seconds: float, vertical_fov_degrees: float) -> KeyFrame:
+        """The key frame of a camera."""
+        (px, py, pz), (dx, dy, dz) = pose[:3, 3].tolist(), pose[:3, 2].tolist()
+        return KeyFrame(seconds, (px, py, pz), (dx, dy, dz), vertical_fov_degrees)
 
 
 @dataclass(frozen=True)
@@ -76,28 +79,27 @@ class CameraPath:
         """Number of frames of a film: from time 0 to the last key frame, both included."""
         return math.floor(self.seconds * fps + 1e-6) + 1
 
-    def interpolate(self, seconds: float, level: Camera, tour: TourGraph | None = None) -> Camera:
-        """The camera at a time; before the first and after the last key frame it stands still.
+    def interpolate(
+        self, seconds: float, level: Float[np.ndarray, "3 3"], tour: TourGraph | None = None
+    ) -> tuple[Float[np.ndarray, "4 4"], float]:
+        """Pose and vertical field of view, degrees, at a time; before the first and after the last key frame the camera
+        stands still.
 
         Args:
             seconds: time.
-            level: a camera with the scene's level axes.
+            level: axes of a level camera (columns right, down, forward).
             tour: that the path is in.
         """
         frames = self.key_frames if tour is None else self._select_part(seconds, tour)
         times = np.array([frame.seconds for frame in frames])
-        cameras = [_place(frame, level) for frame in frames]
-        yaws = np.unwrap([camera.yaw_radians for camera in cameras])
-        values = np.array(
-            [
-                (*frame.position, yaw, camera.pitch_radians, frame.vertical_fov_degrees)
-                for frame, camera, yaw in zip(frames, cameras, yaws, strict=True)
-            ]
-        )
+        yaws, pitches = zip(*(_find_angles(frame, level) for frame in frames), strict=True)
+        places, fovs = [frame.position for frame in frames], [frame.vertical_fov_degrees for frame in frames]
+        values = np.column_stack((places, np.unwrap(yaws), pitches, fovs))
         at = min(max(seconds, times[0]), times[-1])
         value = values[0] if len(frames) == 1 else scipy.interpolate.PchipInterpolator(times, values)(at)
-        x, y, z, yaw, pitch, fov = value.tolist()
-        return replace(level, position=(x, y, z), yaw_radians=yaw, pitch_radians=pitch, vertical_fov_degrees=fov)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn_axes(level, float(value[3]), float(value[4])), value[:3]
+        return pose, float(value[5])
 
     def _select_part(self, seconds: float, tour: TourGraph) -> tuple[KeyFrame, ...]:
         """The key frames in a row of one part of a tour, among which is the last one at a time."""
@@ -122,16 +124,10 @@ class CameraPath:
         return CameraPath(self.key_frames[:index] + self.key_frames[index + 1 :])
 
 
-def _place(frame: KeyFrame, level: Camera) -> Camera:
-    """The level camera, moved to the position and direction of a key frame."""
-    direction = np.array(frame.direction) / np.linalg.norm(frame.direction)
-    axes = np.asarray(level.level)
-    right = np.cross(axes[:, 1], direction)
-    if np.linalg.norm(right) < 1e-9:
-        right = axes[:, 0]
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 2], pose[:3, 3] = right / np.linalg.norm(right), direction, frame.position
-    return move_to_pose(level, pose)
+def _find_angles(frame: KeyFrame, level: Float[np.ndarray, "3 3"]) -> tuple[float, float]:
+    """Yaw and pitch of the direction of a key frame; the yaw of a vertical one is 0."""
+    direction = level.T @ np.array(frame.direction) / np.linalg.norm(frame.direction)
+    return find_angles(np.round(direction, 12) + 0.0)
 
 
 _Coordinate = Annotated[float, Meta(ge=-1e9, le=1e9)]
