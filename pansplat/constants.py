@@ -24,8 +24,5 @@ MIN_EIGENVALUE_RATIO = -1e-3  # of a covariance, smallest to largest: bfloat16's
 MIN_COMPENSATION = 1e-12  # of det B / det B': keeps its root differentiable; below it alpha is always cut
 MIN_EWA_VARIANCE = 1e-12  # pixel^2; the determinant of a needle can round to zero or less
 
-FRONT_COSINE = -0.4
-"""Least cosine between the rays of two cameras that see the same side of a Gaussian (docs/rendering.md, section 10)."""
-
 MIN_FOV_DEGREES, MAX_FOV_DEGREES = 15.0, 130.0
 """Vertical fields of view of cameras that a user moves."""

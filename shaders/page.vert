@@ -5,7 +5,7 @@
 uniform usampler2D geometry;    // the file's bits (docs/web.md): x and opacity; y, z, each with a byte of the third scale; quaternion
 uniform usampler2D scales;      // the first two, 16 bits each
 uniform sampler2D colors;
-uniform usampler2D order;       // indices of the Gaussians, view by view, farthest first; the view in the bits from 22 on
+uniform usampler2D order;       // indices of the Gaussians, view by view, farthest first
 uniform ivec2 segment;          // of the order: first place and count
 uniform vec2 color_range;       // the colours of the bytes 0 and 255
 uniform vec3 sides[4];          // inward unit normals of the view frustum, camera axes
@@ -66,8 +66,7 @@ void main() {
     if (place >= segment.y) return;
     place += segment.x;
     int width = textureSize(colors, 0).x;
-    uint word = texelFetch(order, ivec2(place % width, place / width), 0).r;
-    int index = int(word & 0x3fffffu);
+    int index = int(texelFetch(order, ivec2(place % width, place / width), 0).r);
     ivec2 texel = ivec2(index % width, index / width);
     uvec4 words = texelFetch(geometry, texel, 0);
     uint pair = texelFetch(scales, texel, 0).r;
@@ -75,7 +74,7 @@ void main() {
     vec3 scale = uintBitsToFloat(uvec3(pair & 0xffff0000u, pair << 16, (words.y & 255u) << 24 | (words.z & 255u) << 16));
     float opacity = float(words.x & 255u) / 255.0;
     if (is_ball_outside(mean, opacity, scale)) return;
-    Gaussian gaussian = Gaussian(mean, opacity, unpack_quat(words.w), scale, int(word >> 22));
+    Gaussian gaussian = Gaussian(mean, opacity, unpack_quat(words.w), scale);
     Footprint f;
     if (!project_gaussian(gaussian, f) || is_cone_outside(gaussian, f)) return;
     vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0;

@@ -14,7 +14,7 @@ out vec4 row_l;         // l, peak (0: not visible)
 out vec4 color;         // RGB, 0
 
 void main() {
-    Gaussian gaussian = Gaussian(in_mean_opacity.xyz, in_mean_opacity.w, in_quat, in_scale.xyz, 0);
+    Gaussian gaussian = Gaussian(in_mean_opacity.xyz, in_mean_opacity.w, in_quat, in_scale.xyz);
     Footprint f;
     bool visible = project_gaussian(gaussian, f);
     quad_1 = visible ? vec4(f.center, f.half_axis_1) : vec4(0.0);

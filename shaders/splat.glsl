@@ -8,15 +8,12 @@ uniform bool exact;              // the exact response, order and filter, or tho
 uniform float filter_variance;   // e^2 of section 2; of 3DGS, added to the diagonal of the projected covariance
 uniform vec2 half_size;          // half the image; of one off the optical axis, half the smallest one around both
 uniform float margin;            // added to the quad, for the rounding of the rasteriser
-uniform bool outside;            // do not draw Gaussians that show their back: docs/rendering.md, section 10
-uniform sampler2D cameras;       // centre of the camera of each view, in the moved frame of the means
 
 struct Gaussian {
     vec3 mean;
     float opacity;
     vec4 quat;                   // wxyz, any length
     vec3 scale;
-    int view;
 };
 
 // A projected Gaussian. The rows a, b, l give its response on a ray d, with D = d.xy - base:
@@ -143,19 +140,9 @@ bool set_footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2)
     return true;
 }
 
-// Whether the camera sees a Gaussian from the other side than the camera of its view: find_fronts of pansplat.tours.doll_house.
-bool is_back(Gaussian gaussian, vec3 offset) {
-    vec3 seen = gaussian.mean - texelFetch(cameras, ivec2(gaussian.view, 0), 0).xyz, scale = abs(gaussian.scale);
-    if (dot(offset, seen) < FRONT_COSINE * length(offset) * length(seen)) return true;
-    mat3 axes = rotation_from_quat(gaussian.quat);
-    vec3 normal = scale.x <= min(scale.y, scale.z) ? axes[0] : scale.y <= scale.z ? axes[1] : axes[2];
-    return dot(offset, normal) * dot(seen, normal) < 0.0;
-}
-
 // Returns whether the Gaussian can be visible.
 bool project_gaussian(Gaussian gaussian, out Footprint f) {
     vec3 offset = gaussian.mean - position;
-    if (outside && is_back(gaussian, offset)) return false;
     f.distance = length(offset);
     if (!(f.distance >= near && f.distance > 0.0)) return false;
     vec3 n = world_to_camera * (offset / f.distance);

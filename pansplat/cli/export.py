@@ -216,12 +216,9 @@ class Page:
                 "one more photograph between two such panoramas would help",
                 file=sys.stderr,
             )
-        if page.num_rough:
-            views = describe_count(page.num_rough, "panorama")
-            print(
-                f"note: {out}: without doll's house and distances of {views}, whose surfaces are too rough",
-                file=sys.stderr,
-            )
+        if page.num_outside:
+            views, why = describe_count(page.num_outside, "panorama"), "fewer than half of the rooms there have walls"
+            print(f"note: {out}: without doll's house of {views}, because {why} on the floor plan", file=sys.stderr)
         if photographs and not shows_all:
             print(f"note: {out}: without photographs, which would show what is left out", file=sys.stderr)
         panoramas = max(len(scene.cam2world), 1)

@@ -34,6 +34,7 @@ from torch import Tensor
 
 from pansplat import constants, pipeline
 from pansplat.errors import InputError, InputWarning
+from pansplat.export.doll_house import DollHouse, make_house
 from pansplat.export.film import FilmPhotographs
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, PageHeader, count_bytes, pack_gaussians
 from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, pack_photographs
@@ -49,7 +50,7 @@ from pansplat.shaders import load_shader
 from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import is_written
-from pansplat.tours.doll_house import Rooms, find_rooms, measure_box
+from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.edges import find_poor_edges
 from pansplat.tours.floor import assign_storeys, choose_camera_height, find_camera_height, find_floor_outline
 from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, make_graph, select_views
@@ -85,10 +86,9 @@ _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 _BATCH = 256  # quads that are drawn together
-_MAX_CAMERAS = 1024  # of a doll's house; their number has 10 bits (page.vert)
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
-_SHADERS |= {"photograph": ("screen.vert", "photograph.frag")}
+_SHADERS |= {"photograph": ("screen.vert", "photograph.frag"), "house": ("house.vert", "house.frag")}
 
 _ORIGIN = re.compile(r"(https?)://([a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::([0-9]{1,5}))?/?")
 _DEFAULT_PORTS = {"http": 80, "https": 443}
@@ -112,7 +112,7 @@ class PageFiles:
         photo_height: of its photographs, pixels; 0 without photographs.
         num_flights: number of edges along which it flies.
         fades: labels of the two panoramas of each edge along which it fades.
-        num_rough: panoramas without doll's house and distances, because their surfaces are too rough.
+        num_outside: panoramas without doll's house.
     """
 
     files: tuple[Path, ...]
@@ -123,7 +123,7 @@ class PageFiles:
     photo_height: int = 0
     num_flights: int = 0
     fades: tuple[tuple[str, str], ...] = ()
-    num_rough: int = 0
+    num_outside: int = 0
 
 
 @with_progress_bar
@@ -171,13 +171,15 @@ def write_page(
     tour, has_cameras = make_graph(scene), len(scene.cam2world) > 0
     if not scene.joint and tour.overlaps:
         tour = dataclasses.replace(tour, poor=find_poor_edges(scene, range(len(tour)), tour.overlaps))
-    rooms = find_rooms(scene) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
-    if rooms is not None and not rooms.plan.num_heights:
-        rooms = None  # without a floor the doll's house is a heap
-    floors = _outline_floors(scene, tour, () if rooms is None else rooms.plan.rooms)
+    rooms = find_rooms(scene) if has_cameras else None
+    plan = None if rooms is None or not rooms.plan.num_heights else rooms.plan
+    floors = _outline_floors(scene, tour, () if plan is None else plan.rooms)
     scene = _prepare(scene)
     flights = _plan_flights(scene, tour)
-    has_pictures = len(photographs) > 0 and photo_height != 0
+    house, has_pictures = DollHouse((), b""), len(photographs) > 0 and photo_height != 0
+    if rooms is not None:
+        report("building the doll's house", 0.0)
+        house = make_house(scene, rooms, flights.level, photographs if has_pictures else ())
     heights = [min(each.image_height, photo_height or MAX_HEIGHT) for each in photographs if has_pictures and not split]
     shares = _share_gaussians(flights, tour.poor, gaussians, heights)
     kept = round(gaussians * sum(shares[part] for part in flights.parts) / len(flights.parts))
@@ -187,13 +189,12 @@ def write_page(
     report("compressing", 0.6)
     degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if has_pictures and not split else 1))
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
-    cameras = None if rooms is None else _find_cameras(scene, rooms)
-    packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree, cameras)
+    packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree)
     report("drawing the poster", 0.7)
     poster = _draw_poster(scene, flights.start, photographs if has_pictures else ())
     pictures: list[PackedPhotograph] = []
     if has_pictures:
-        left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - sum(map(len, packed.contents)) - len(poster)
+        left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - sum(map(len, packed.contents)) - len(poster + house.atlas)
         pictures = pack_photographs(
             scene,
             photographs,
@@ -203,9 +204,8 @@ def write_page(
         )
     report("writing", 0.95)
     header = _describe_scene(scene, packed, origin, flights, tour)
-    header |= {"embed": embed, "doll": None, "photographs": [picture.describe() for picture in pictures]}
-    header["rough"] = [] if rooms is None else [view for view, clear in enumerate(rooms.is_clear) if not clear]
-    header["plan"] = _describe_plan(None if rooms is None else rooms.plan, floors, tour, origin, flights.level)
+    header |= {"embed": embed, "doll": [], "photographs": [picture.describe() for picture in pictures]}
+    header["plan"] = _describe_plan(plan, floors, tour, origin, flights.level)
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
         spot["notes"] = [
             {
@@ -215,10 +215,11 @@ def write_page(
             }
             for note in photograph.context[0].notes
         ]
-    if rooms is not None and cameras is not None:
-        header["doll"] = _describe_rooms(scene, packed, cameras, rooms.storeys, origin, flights.level)
-    files = _write_files(path, header, packed.contents, pictures, poster, split, title or path.stem)
-    return dataclasses.replace(files, num_rough=len(header["rough"]))
+    for nodes, corners in zip(() if rooms is None else rooms.houses, house.corners, strict=True):
+        header["doll"].append({"nodes": nodes, "corners": (corners - [*origin, 0, 0]).round(5).tolist()})
+    files = _write_files(path, header, packed.contents, pictures, poster, house.atlas, split, title or path.stem)
+    inside = sum(len(each["nodes"]) for each in header["doll"])
+    return dataclasses.replace(files, num_outside=len(scene.cam2world) - inside if has_cameras else 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -580,39 +581,6 @@ def _describe_plan(
     return {"worlds": worlds, "turns": _round(np.array(turns)), "rooms": rooms, "doors": doors}
 
 
-def _find_cameras(scene: Scene, rooms: Rooms) -> Int[np.ndarray, "n"]:
-    """The camera that saw each Gaussian in a room, -1 for those outside and on storeys that are not clear.
-
-    In a joint scene, which has no labels, it is the nearest camera.
-
-    Args:
-        scene: of `_prepare`.
-        rooms: in its unit.
-    """
-    gaussians = scene.gaussians
-    cameras = gaussians.views.long()
-    if len(scene.cam2world) > 1 and not cameras.any():
-        cameras = torch.cdist(gaussians.means.double(), scene.cam2world[:, :3, 3]).argmin(dim=1)
-    inside = rooms.find_inside(dataclasses.replace(gaussians, views=cameras)) & torch.tensor(rooms.is_clear)[cameras]
-    return torch.where(inside, cameras, -1).numpy()
-
-
-def _describe_rooms(
-    scene: Scene,
-    packed: PackedGaussians,
-    cameras: Int[np.ndarray, "n"],
-    storeys: tuple[int, ...],
-    origin: Float[np.ndarray, "3"],
-    level: Float[np.ndarray, "3 3"],
-) -> dict[str, Any] | None:
-    """The doll's house: ranges of its Gaussians, and the storeys and boxes of the views; None without Gaussians."""
-    boxes: list[list[list[float]] | None] = [None] * len(scene.cam2world)
-    for camera in np.unique(cameras[cameras >= 0]).tolist():
-        means = scene.gaussians.means[torch.from_numpy(cameras == camera)].double() - torch.from_numpy(origin)
-        boxes[camera] = [_round(corner) for corner in measure_box(means, level)]
-    return {"ranges": packed.rooms, "storeys": storeys, "boxes": boxes} if any(boxes) else None
-
-
 def _describe_links(
     tour: TourGraph,
     spots: Sequence[dict[str, Any]],
@@ -686,6 +654,7 @@ def _write_files(
     contents: Sequence[bytes],
     pictures: Sequence[PackedPhotograph],
     poster: bytes,
+    atlas: bytes,
     split: bool,
     title: str,
 ) -> PageFiles:
@@ -693,6 +662,7 @@ def _write_files(
 
     Args:
         contents: of the Gaussians of each view.
+        atlas: of the doll's house.
     """
     count = header["count"]
     parts: dict[str, bytes] = {}
@@ -722,6 +692,10 @@ def _write_files(
         elements = [*shown[first][:1], *tags[first], *shown[first][1:]]
         for kind in (tags, shown):
             elements += [element for view in others for element in kind[view]]
+    if atlas:
+        elements.append(
+            f'<img id="atlas" alt="" hidden src="data:image/webp;base64,{base64.b64encode(atlas).decode()}">'
+        )
     page = _fill_template(
         connections="'self'" if split else "'none'",
         title=html.escape(title),

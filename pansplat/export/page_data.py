@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
@@ -127,12 +127,12 @@ class PagePlan(_Record):
     doors: tuple[PageDoor, ...]
 
 
-class PageDoll(_Record):
-    """The doll's house: (view, first, count) of its Gaussians, and the storey and the box of each view."""
+class PageHouse(_Record):
+    """A doll's house: its panoramas, and corners of triangles, clockwise in front: x, y, z, and u, v in the atlas;
+    of tops of walls 2 + the normal of the wall, to the right and forward."""
 
-    ranges: tuple[tuple[int, int, int], ...]
-    storeys: tuple[int, ...]
-    boxes: tuple[tuple[Vector, Vector] | None, ...]
+    nodes: tuple[int, ...]
+    corners: tuple[tuple[float, float, float, float, float], ...]
 
 
 class PageHeader(_Record):
@@ -148,7 +148,6 @@ class PageHeader(_Record):
         unit: of a metre in the page.
         speed: of a walk, a second.
         limits: how far the camera may go in each part.
-        rough: panoramas whose surfaces are too rough for distances.
         folder: address of the folder with the files; None of a page in one file.
     """
 
@@ -180,9 +179,8 @@ class PageHeader(_Record):
     speed: float
     limits: tuple[float, ...]
     embed: tuple[str, ...]
-    doll: PageDoll | None
+    doll: tuple[PageHouse, ...]
     photographs: tuple[PagePhotograph, ...]
-    rough: tuple[int, ...]
     plan: PagePlan
     folder: str | None
 
@@ -199,7 +197,6 @@ class PackedGaussians:
         degree: of the harmonics.
         color_range: colours of the bytes 0 and 255.
         harmonics_scale: coefficient of the byte 127.
-        rooms: (camera, index of the first Gaussian, count) of the Gaussians that the doll's house view draws.
     """
 
     contents: tuple[bytes, ...]
@@ -209,7 +206,6 @@ class PackedGaussians:
     degree: int
     color_range: tuple[float, float]
     harmonics_scale: float
-    rooms: tuple[tuple[int, int, int], ...]
 
 
 def count_bytes(count: int, degree: int) -> int:
@@ -222,7 +218,6 @@ def pack_gaussians(
     origin: Float[np.ndarray, "3"],
     order: Sequence[int],
     degree: int,
-    cameras: Int[np.ndarray, "n"] | None = None,
 ) -> PackedGaussians:
     """Quantise and compress Gaussians.
 
@@ -231,14 +226,12 @@ def pack_gaussians(
         origin: subtracted from the means.
         order: all views, in which a page needs them.
         degree: highest degree of harmonics that is kept, at most MAX_DEGREE.
-        cameras: that saw each Gaussian; negative for those that the doll's house view leaves out. By default of all.
     """
     degree = min(degree, gaussians.degree, MAX_DEGREE)
     ranks = np.argsort(order)[gaussians.views.cpu().numpy()]
     means = (gaussians.means.double().cpu().numpy() - origin).astype(np.float32)
     # Neighbours in the file are neighbours in space, so that equal upper bytes follow each other.
-    cameras = np.full(len(means), -1) if cameras is None else cameras
-    chosen = np.lexsort((_morton_codes(means), -cameras, ranks))
+    chosen = np.lexsort((_morton_codes(means), ranks))
     means, scales = means[chosen], np.abs(gaussians.scales.float().cpu().numpy()[chosen])
     harmonics = gaussians.harmonics.float().cpu().numpy()[chosen]
     colors = 0.5 + SH_0 * harmonics[:, 0]
@@ -262,8 +255,7 @@ def pack_gaussians(
     ]
     contents = tuple(_compress(blocks[rank]) for rank in np.argsort(order))
     starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
-    rooms = _list_runs(ranks[chosen], cameras[chosen])
-    return PackedGaussians(contents, tuple(order), starts, counts, degree, (low, high), scale, rooms)
+    return PackedGaussians(contents, tuple(order), starts, counts, degree, (low, high), scale)
 
 
 def _compress(block: bytes) -> bytes:
@@ -272,14 +264,6 @@ def _compress(block: bytes) -> bytes:
         with gzip.GzipFile(SOFTWARE, "wb", 9, file, mtime=0) as stream:
             stream.write(block)
         return file.getvalue()
-
-
-def _list_runs(ranks: Int[np.ndarray, "n"], cameras: Int[np.ndarray, "n"]) -> tuple[tuple[int, int, int], ...]:
-    """(camera, first, count) of each run of one view and one camera, without negative cameras."""
-    starts = np.flatnonzero(np.diff(ranks, prepend=-1) | np.diff(cameras, prepend=-2))
-    counts = np.diff([*starts, len(ranks)])
-    runs = zip(cameras[starts].tolist(), starts.tolist(), counts.tolist(), strict=True)
-    return tuple(run for run in runs if run[0] >= 0)
 
 
 def _morton_codes(points: Float[np.ndarray, "n 3"]) -> np.ndarray:

@@ -106,7 +106,6 @@ function groupWeights(group, position) {
 // The views of the edge at the camera, and for a second after a change also those of the edge before. A view fades in
 // when it has arrived.
 export function blendWeights(position) {
-  if (state.doll.isOn) return null;
   const { fade } = state, weights = groupWeights(state.group, position), old = fade ? groupWeights(fade.group, position) : weights;
   const done = fade ? fade.done : 1;
   return weights.map((weight, view) => shown[view] * (done * weight + (1 - done) * old[view]));

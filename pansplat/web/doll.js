@@ -1,8 +1,8 @@
-// The doll's house view: the camera turns around the rooms from outside, and nothing is drawn that shows its back. docs/web.md
-// describes it. The rooms are those of the part and the storey of the panorama that the camera leaves.
+// The doll's house view: the camera turns around the rooms from outside, and no wall is drawn that shows its back. docs/web.md
+// describes it.
 
 import { tangentOf, turned } from "./camera.js";
-import { clamp, column, DEGREE, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
+import { clamp, column, cross, DEGREE, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
 import { camera, changed, state } from "./state.js";
 
 const DOLL_FOV = 45;                               // degrees, vertical, of a landscape picture
@@ -11,40 +11,32 @@ const LOWEST = -8 * Math.PI / 180;                 // pitch of a camera that loo
 const DOLL_ZOOM = [0.15, 2];                       // of the first distance
 const DOLL_TURN = Math.PI / 2;                     // radians a second, by keys
 
-// Whether a panorama is among the rooms that are shown.
-export function isInDoll(node) {
-  const { parts, doll: { storeys } } = HEADER, { doll } = state;
-  return parts[node] === parts[doll.node] && storeys[node] === storeys[doll.node];
-}
+// The house of the panorama that the camera leaves: corners of triangles (x, y, z, and u, v in the atlas).
+export const findHouse = () => HEADER.doll.find(({ nodes }) => nodes.includes(state.doll.node));
 
-// The boxes of the rooms, in level axes.
-export const listBoxes = () => HEADER.doll === null ? [] : HEADER.doll.boxes.filter((box, view) => box && isInDoll(view));
-
-// The Gaussians in the rooms, as [view, first, count].
-export const listRanges = () => state.doll.isOn ? HEADER.doll.ranges.filter(([view]) => isInDoll(view)) : null;
+// Whether a panorama is in the house that is shown.
+export const isInDoll = (node) => findHouse().nodes.includes(node);
 
 // The first camera outside, from which all rooms are in a picture of a size.
 export function frameDoll(size) {
-  const boxes = listBoxes();
-  const box = [0, 1].map((end) => [0, 1, 2].map((k) => Math[end ? "max" : "min"](...boxes.map((each) => each[end][k]))));
+  const places = findHouse().corners.map((place) => [0, 1, 2].map((k) => dot(column(HEADER.level, k), place)));
+  const box = ["min", "max"].map((end) => [0, 1, 2].map((k) => places.reduce((found, place) => Math[end](found, place[k]), places[0][k])));
   const yaws = [camera.yaw, camera.yaw + 0.5 * Math.PI];  // the one that is nearer to the rooms
-  const distances = yaws.map((yaw) => fitBox(box, yaw, DOLL_PITCH, size)), best = Number(distances[1] < 0.95 * distances[0]);
-  const center = HEADER.level.map((row) => dot(row, scaled(plus(...box), 0.5)));
+  const middle = scaled(plus(...box), 0.5), offsets = places.map((place) => minus(place, middle));
+  const distances = yaws.map((yaw) => fit(offsets, yaw, DOLL_PITCH, size)), best = Number(distances[1] < 0.95 * distances[0]);
+  const center = HEADER.level.map((row) => dot(row, middle));
   Object.assign(state.doll, { center, first: distances[best], distance: distances[best] });
   return { position: placeOutside(yaws[best], DOLL_PITCH), yaw: yaws[best], pitch: DOLL_PITCH, fov: DOLL_FOV };
 }
 
-// The distance from which a box fits into the picture.
-function fitBox(box, yaw, pitch, [width, height]) {
-  const rotation = turned(yaw, pitch), middle = scaled(plus(...box), 0.5);
-  const tall = tangentOf(width, height, DOLL_FOV), wide = tall * width / height;
-  let distance = 0;
-  for (let corner = 0; corner < 8; corner++) {
-    const offset = minus([0, 1, 2].map((k) => box[corner >> k & 1][k]), middle);
+// The distance from which places around the middle are in the picture.
+function fit(offsets, yaw, pitch, [width, height]) {
+  const rotation = turned(yaw, pitch), tall = tangentOf(width, height, DOLL_FOV), wide = tall * width / height;
+  const needed = offsets.map((offset) => {
     const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
-    distance = Math.max(distance, Math.abs(x) / wide - z, Math.abs(y) / tall - z);
-  }
-  return 1.05 * distance;
+    return Math.max(Math.abs(x) / wide - z, Math.abs(y) / tall - z);
+  });
+  return 1.05 * needed.reduce((most, each) => Math.max(most, each));
 }
 
 // Where a camera with these angles sees the rooms.
@@ -78,3 +70,17 @@ export function orbitByKeys([right, up, forward], seconds) {
 export const nearestInDoll = (point) => {
   return indexOfLeast(HEADER.spots.map(({ position }, node) => isInDoll(node) ? distanceOf(position, point) : Infinity));
 };
+
+// The distance to the first front of the house along a ray; null without one. Corners are clockwise in front.
+export function meetHouse(origin, ray) {
+  const { corners } = findHouse();
+  let nearest = null;
+  for (let first = 0; first < corners.length; first += 3) {
+    const [a, b, c] = corners.slice(first, first + 3), normal = cross(minus(b, a), minus(c, a)), toward = dot(normal, ray);
+    if (toward <= 0 || Math.max(a[3], a[4]) > 1) continue;  // from behind, and the tops of walls
+    const distance = dot(normal, minus(a, origin)) / toward, place = plus(origin, scaled(ray, distance));
+    const isInside = [[a, b], [b, c], [c, a]].every(([from, to]) => dot(cross(minus(to, from), minus(place, from)), normal) >= 0);
+    if (isInside && distance > 0 && (nearest === null || distance < nearest)) nearest = distance;
+  }
+  return nearest;
+}

@@ -3,14 +3,14 @@
 
 import { cameraFor, DOLLY_MS, FADE_MS, nearestNode, nodeHere, rotationOf, settleAt, turn } from "./camera.js";
 import { chooseArrival, findLink } from "./choices.js";
-import { frameDoll, isInDoll, listBoxes, nearestInDoll } from "./doll.js";
+import { findHouse, frameDoll, isInDoll, nearestInDoll } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import {
   clamp, column, distanceOf, dot, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
 } from "./graph.js";
 import { photographs } from "./photographs.js";
 import { drawAt, measureAt, rayOf } from "./picture.js";
-import { camera, changed, currentPart, edges, GRAPH, isComplete, isSortedAs, makeStart, parts, state } from "./state.js";
+import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, parts, state } from "./state.js";
 
 const DOLL_SECONDS = 1.6;            // of a flight out of the rooms, or into one
 const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
@@ -53,10 +53,11 @@ function enterDoll() {
   if (state.headset.session || !state.sorted) return;
   setTouring(false);
   doll.node = nearestNode(camera.position);
-  if (!listBoxes().length) {
+  if (!findHouse()) {
     say(byId("no-doll").textContent);
     return;
   }
+  if (!byId("atlas")?.complete) return;
   takeStill();
   setDoll(true);
   camera.roll = 0;
@@ -299,7 +300,7 @@ export function updateStill(now) {
   if (!state.still) return;
   state.still.taken ??= now;
   state.still.position = state.still.position || [...camera.position];
-  const isSorted = isSortedAs() && distanceOf(state.sorted.position, state.still.position) < NEAR;
+  const isSorted = state.doll.isOn || state.sorted.part === currentPart() && distanceOf(state.sorted.position, state.still.position) < NEAR;
   const isThere = state.still.zoom === null || !photographs.isExpected || now - state.still.taken > PHOTO_WAIT_MS;
   if (state.still.began === null && isSorted && isThere && isSeen()) state.still.began = now;
   if (state.still.began !== null) {

@@ -12,6 +12,7 @@ export const minus = (a, b) => a.map((value, i) => value - b[i]);
 export const plus = (a, b) => a.map((value, i) => value + b[i]);
 export const scaled = (a, factor) => a.map((value) => value * factor);
 export const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+export const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
 export const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, value, i) => sum + value * b[i][k], 0)));
 export const column = (matrix, k) => matrix.map((row) => row[k]);
 export const distanceOf = (a, b) => Math.hypot(...minus(a, b));

@@ -183,7 +183,7 @@ export function listen() {
   byId("list").onclick = (event) => { if (event.target === byId("list")) byId("list").close(); };  // beside it
   byId("map").onclick = () => plan.toggle();
   byId("doll").onclick = toggleDoll;
-  byId("doll").hidden = HEADER.doll === null;
+  byId("doll").hidden = !HEADER.doll.length;
   byId("no-doll").hidden = HEADER.doll !== null;
   byId("more").onclick = () => showMore(byId("menu").hidden);
   for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", savePicture], ["link", copyLink]]) {

@@ -2,7 +2,6 @@
 // has all views; one with a folder loads those that the camera needs.
 
 import { nodeHere } from "./camera.js";
-import { listRanges } from "./doll.js";
 import { byId, canvas } from "./dom.js";
 import { camera, currentPart, edges, isSortedFor, parts, refresh, state } from "./state.js";
 
@@ -46,8 +45,7 @@ export async function fetchFile(name) {
 
 const countChunks = () => [...state.asked].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
 
-// Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all of the part for the
-// doll's house, and all without edges.
+// Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all without edges.
 export function loadAround() {
   if (state.asked.size === HEADER.loading.length) return;
   const nodes = [nodeHere(), ...(state.flight ? [state.flight.spot] : [])];
@@ -55,7 +53,7 @@ export function loadAround() {
   const near = new Set([...groups, state.group].flatMap((each) => HEADER.groups[each]));
   const isAll = HEADER.folder === null || !edges.length;
   for (const view of HEADER.loading) {
-    if (state.asked.has(view) || !(isAll || near.has(view) || state.doll.isOn && parts[view] === currentPart())) continue;
+    if (state.asked.has(view) || !(isAll || near.has(view))) continue;
     state.asked.add(view);
     canvas.ariaBusy = true;
     if (HEADER.folder === null) continue;
@@ -69,7 +67,7 @@ export function loadAround() {
 export function requestSort(tolerance) {
   if (state.isSorting || isSortedFor(camera.position, currentPart(), tolerance)) return;
   state.isSorting = true;
-  worker.postMessage({ position: [...camera.position], part: currentPart(), ranges: listRanges() });
+  worker.postMessage({ position: [...camera.position], part: currentPart() });
 }
 
 function onSorted(data) {
@@ -96,7 +94,7 @@ export function load(onView) {
     };
     worker.onerror = (event) => fails(new Error(`The worker failed: ${event.message}`));
     const { count, degree, views, loading, harmonicsScale, colorRange } = HEADER;
-    const first = { position: [...camera.position], part: currentPart(), ranges: null };
+    const first = { position: [...camera.position], part: currentPart() };
     worker.postMessage({ header: { count, degree, views, loading, parts, harmonicsScale, colorRange, first } });
     if (HEADER.folder !== null) return;
     loadAround();

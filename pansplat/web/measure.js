@@ -22,10 +22,6 @@ class Measure {
   }
 
   toggle(value = !this.isOn) {
-    if (value && HEADER.rough.includes(state.here)) {
-      say("There are no distances here, because the surfaces that were found are too rough");
-      return;
-    }
     this.isOn = value;
     this.points = [];
     byId("measure").setAttribute("aria-pressed", value);

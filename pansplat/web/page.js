@@ -52,7 +52,7 @@ async function main() {
     if (isComplete()) canvas.ariaBusy = false;
   });
   loading.catch(() => {});  // of an error that comes before it is awaited
-  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
+  const gl = canvas.getContext("webgl2", { alpha: false, powerPreference: "high-performance" });
   if (!gl) throw lack("WebGL 2");
   headset.gl = gl;
   const makeRenderer = () => {

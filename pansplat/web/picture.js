@@ -1,8 +1,10 @@
 // Pictures of the camera, and what a point of the window shows.
 
 import { blendWeights, rotationOf, tangentOf } from "./camera.js";
+import { meetHouse } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
 import { dot, scaled } from "./graph.js";
+import { drawHouse } from "./house.js";
 import { photographs } from "./photographs.js";
 import { camera, changed, state } from "./state.js";
 
@@ -10,7 +12,8 @@ export function drawAt(width, height) {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
   const rotation = rotationOf(camera), tangent = tangentOf(width, height), half = [tangent * width / height, tangent];
   const seen = { position: camera.position, rotation, center: [0, 0], half };
-  if (!photographs.isOpaque) state.renderer.draw(seen, blendWeights(camera.position), null, [0, 0, width, height]);
+  if (state.doll.isOn) drawHouse(seen, width, height);
+  else if (!photographs.isOpaque) state.renderer.draw(seen, blendWeights(camera.position), null, [0, 0, width, height]);
   photographs.draw(seen, width, height);
   return rotation;
 }
@@ -29,6 +32,7 @@ export function rayOf(left, top) {
 // The distance from the camera to what a point of the window shows, or null.
 export function measureAt(left, top) {
   if (!state.renderer || !state.sorted) return null;
+  if (state.doll.isOn) return meetHouse(camera.position, rayOf(left, top));
   const [width, height] = fullSize(), tangent = tangentOf(width, height), half = [tangent / height, tangent / height];
   const seen = { position: camera.position, rotation: rotationOf(camera), center: planeOf(left, top), half };
   return state.renderer.measure(seen, blendWeights(camera.position));

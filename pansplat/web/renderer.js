@@ -22,10 +22,6 @@ export class Renderer {
     this.scales = this.makeTexture(width, height, gl.R32UI);
     this.colors = this.makeTexture(width, height, gl.RGBA8);
     this.order = this.makeTexture(width, height, gl.R32UI);
-    this.cameras = this.makeTexture(HEADER.spots.length, 1, gl.RGBA32F);
-    const centers = Float32Array.from(HEADER.spots.flatMap(({ position }) => [...position, 0]));
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, HEADER.spots.length, 1, gl.RGBA, gl.FLOAT, centers);
-    this.together = 0;  // number of Gaussians in an order of all views together
     this.ready = new Set();  // views that have an order
     this.splats = gl.createVertexArray();
     this.screen = gl.createVertexArray();
@@ -87,10 +83,9 @@ export class Renderer {
     this.write(this.colors, colors, 4, start, gl.RGBA, gl.UNSIGNED_BYTE);
   }
 
-  // Replaces the drawing order, and the colours if they depend on the position. `count`: of an order of all views together.
-  setSorted({ views, order, colors, count }) {
+  // Replaces the drawing order, and the colours if they depend on the position.
+  setSorted({ views, order, colors }) {
     const gl = this.gl;
-    this.together = count;
     this.write(this.order, order, 1, 0, gl.RED_INTEGER, gl.UNSIGNED_INT);
     if (colors) this.write(this.colors, colors, 4, 0, gl.RGBA, gl.UNSIGNED_BYTE);
     views.forEach((view) => this.ready.add(view));
@@ -128,7 +123,7 @@ export class Renderer {
     this.targets = this.makeTargets(...this.size, false);
   }
 
-  // Adds up the layers of the views in targets of `makeTargets`; without weights, the one layer of the doll's house view.
+  // Adds up the layers of the views in targets of `makeTargets`.
   addLayers(camera, weights, [layer, sum], width, height) {
     const gl = this.gl;
     gl.viewport(0, 0, width, height);
@@ -137,16 +132,13 @@ export class Renderer {
     this.setCamera(camera, width, height);
     let isFirst = true;
     const isReady = (view) => weights[view] && HEADER.views[view].count && this.ready.has(view);
-    const views = weights === null ? [] : [...HEADER.views.keys()].filter(isReady);
-    const layers = views.map((view) => ({ ...HEADER.views[view], weight: weights[view] }));
-    if (weights === null && this.together) layers.push({ start: 0, count: this.together, weight: 1 });
-    gl.uniform1i(this.splat.places.outside, weights === null);
-    layers.forEach(({ start, count, weight }) => {
+    [...HEADER.views.keys()].filter(isReady).forEach((view) => {
+      const { start, count } = HEADER.views[view];
       gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
       layer.textures.forEach((_, buffer) => gl.clearBufferfv(gl.COLOR, buffer, [0, 0, 0, 0]));
       this.drawLayer(start, count);
       gl.bindFramebuffer(gl.FRAMEBUFFER, sum.framebuffer);
-      this.addLayer(layer.textures, weight, isFirst);
+      this.addLayer(layer.textures, weights[view], isFirst);
       isFirst = false;
     });
     if (!isFirst) return;
@@ -211,7 +203,6 @@ export class Renderer {
     gl.uniform1i(places.colors, 1);
     gl.uniform1i(places.order, 2);
     gl.uniform1i(places.scales, 3);
-    gl.uniform1i(places.cameras, 4);
   }
 
   bind(textures) {
@@ -224,7 +215,7 @@ export class Renderer {
   drawLayer(start, count) {
     const gl = this.gl;
     gl.useProgram(this.splat.program);
-    this.bind([this.geometry, this.colors, this.order, this.scales, this.cameras]);
+    this.bind([this.geometry, this.colors, this.order, this.scales]);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.splats);

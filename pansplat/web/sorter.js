@@ -1,35 +1,23 @@
 "use strict";
 // The worker of unpack.js: the drawing order and the colours of one camera position, of the views of one part. Neither depends on the
-// camera's rotation. What belongs to other parts, and to views that have not arrived, is unchanged, but by an order of ranges.
+// camera's rotation. What belongs to other parts, and to views that have not arrived, is unchanged.
 
-const VIEW_SHIFT = 22;  // of the view in a word of the order; the lower bits are the index
-
-// `ranges`: [view, first, count] of Gaussians that are sorted together, and drawn as one layer: the doll's house view.
-function sort({ position, part, ranges }) {
+function sort({ position, part }) {
   const { parts, views: all, order, colors } = scene, views = arrived.filter((view) => parts[view] === part);
-  const isThere = (place) => arrived.some((view) => all[view].start <= place && place < all[view].start + all[view].count);
-  const together = ranges && ranges.filter(([, start]) => isThere(start));
-  if (together) sortRanges(together, position, 0);
   for (const view of views) {
-    if (!together) sortRanges([[0, all[view].start, all[view].count]], position, all[view].start);
+    sortView(all[view], position);
     if (colors) evaluateColors(all[view], position);
   }
-  const count = together && together.reduce((sum, range) => sum + range[2], 0);
-  postMessage({ position, part, ranges, count, views, arrived: arrived.length, order, colors: colors && new Uint8Array(colors.buffer) });
+  postMessage({ position, part, views, arrived: arrived.length, order, colors: colors && new Uint8Array(colors.buffer) });
 }
 
-// Writes the Gaussians of some ranges from a place of the order on, farthest first: a stable radix sort of the bits of the squared
-// distances, which are in the order of the numbers. The upper bits of a word are those of the view (shaders/page.vert).
-function sortRanges(ranges, [x, y, z], target) {
-  const { means, order } = scene, count = ranges.reduce((sum, range) => sum + range[2], 0);
-  const squared = new Float32Array(count), words = new Uint32Array(count);
-  let place = 0;
-  for (const [view, start, length] of ranges) {
-    for (let i = start; i < start + length; i++, place++) {
-      const dx = means[3 * i] - x, dy = means[3 * i + 1] - y, dz = means[3 * i + 2] - z;
-      squared[place] = dx * dx + dy * dy + dz * dz;
-      words[place] = (view << VIEW_SHIFT | i) >>> 0;
-    }
+// Writes the Gaussians of a view to the order, farthest first: a stable radix sort of the bits of the squared distances, which are
+// in the order of the numbers.
+function sortView({ start, count }, [x, y, z]) {
+  const { means, order } = scene, squared = new Float32Array(count);
+  for (let i = start, place = 0; place < count; i++, place++) {
+    const dx = means[3 * i] - x, dy = means[3 * i + 1] - y, dz = means[3 * i + 2] - z;
+    squared[place] = dx * dx + dy * dy + dz * dz;
   }
   const bits = new Uint32Array(squared.buffer);
   let from = new Uint32Array(count), to = new Uint32Array(count);
@@ -41,7 +29,7 @@ function sortRanges(ranges, [x, y, z], target) {
     for (let i = 0; i < count; i++) to[ends[(bits[from[i]] >>> shift) & 65535]++] = from[i];
     [from, to] = [to, from];
   }
-  for (let i = 0; i < count; i++) order[target + i] = words[from[count - 1 - i]];
+  for (let i = 0; i < count; i++) order[start + i] = start + from[count - 1 - i];
 }
 
 // RGB and a padding byte of a view's Gaussians: base colour plus harmonics of degree 1 to 3 (docs/conventions.md).

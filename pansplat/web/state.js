@@ -45,10 +45,8 @@ export const currentPart = () => edges.length ? partOfEdge(GRAPH, state.edge) : 
 export const endsOfEdge = () => edges.length ? edges[state.edge].slice(0, 2) : [];
 export const isComplete = () => [...state.asked].every((view) => state.got.has(view));
 
-// Whether the order is that of the part, and of the doll's house view or of panoramas, as the page shows it.
-export const isSortedAs = (part = currentPart()) => state.sorted.part === part && (state.sorted.ranges !== null) === state.doll.isOn;
-
+// Whether the order is that of a camera; the doll's house needs none.
 export const isSortedFor = (position, part, tolerance = 0) => {
-  const { sorted, got } = state;
-  return sorted !== null && isSortedAs(part) && sorted.arrived === got.size && distanceOf(sorted.position, position) <= tolerance;
+  const { sorted, got, doll } = state;
+  return sorted !== null && (doll.isOn || sorted.part === part && sorted.arrived === got.size && distanceOf(sorted.position, position) <= tolerance);
 };

@@ -105,10 +105,18 @@ def run(node: str, folder: Path, header: dict[str, Any], program: str, *values: 
     return json.loads(done.stdout)
 
 
+def make_house(nodes: list[int]) -> dict[str, Any]:
+    """A floor 1.5 m below the origin and a wall at its far end, which is seen from the near side, with its top."""
+    floor = [(-1, 1.5, 5), (1, 1.5, 5), (1, 1.5, -1), (-1, 1.5, 5), (1, 1.5, -1), (-1, 1.5, -1)]
+    wall = [(-1, -1, 5), (1, -1, 5), (1, 1.5, 5), (-1, -1, 5), (1, 1.5, 5), (-1, 1.5, 5)]
+    top = [(-1, -1, 5.2), (1, -1, 5.2), (1, -1, 5)]
+    corners = [(*place, 0.5, 0.5) for place in (*floor, *wall)] + [(*place, 2.0, 1.0) for place in top]
+    return {"nodes": nodes, "corners": corners}
+
+
 def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]], parts: list[int]) -> dict[str, Any]:
     """What the modules read of a header of level panoramas; each edge blends its two views."""
     spots = [{"position": place, "mark": [place[0], place[1] + 1.5, place[2]], "name": ""} for place in positions]
-    boxes = [[[place[k] - 1 for k in range(3)], [place[k] + 1 for k in range(3)]] for place in positions]
     return {
         "spots": spots,
         "views": [{"position": place, "count": 1, "start": view} for view, place in enumerate(positions)],
@@ -123,12 +131,12 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
         "poor": [],
         "next": [],
         "tallest": 1.5,
-        "doll": {"boxes": boxes, "storeys": [0] * len(positions), "ranges": [(k, k, 1) for k in range(len(positions))]},
+        "doll": [make_house([node for node, part in enumerate(parts) if part == 0])],
     }
 
 
 ROW = [(0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, 4.0), (30.0, 0.0, 0.0)]
-SORTED = "state.sorted = { position: [0, 0, 0], part: 0, ranges: null, views: [0, 1], arrived: 0 };"
+SORTED = "state.sorted = { position: [0, 0, 0], part: 0, views: [0, 1], arrived: 0 };"
 
 
 def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) -> None:
@@ -342,29 +350,39 @@ def test_the_views_of_the_edge_are_blended_and_those_of_the_edge_before_fade_out
     assert all(sum(row) == pytest.approx(1) for row in weights)
 
 
-def test_all_rooms_of_the_dolls_house_are_in_the_picture_from_every_side(node: str, tmp_path: Path) -> None:
-    """The rooms of the part and storey only; a zoom has limits."""
+def test_the_dolls_house_is_in_the_picture_and_a_zoom_has_limits(node: str, tmp_path: Path) -> None:
     program = """(size) => {
-        const look = () => listBoxes().flatMap((box) => [0, 1, 2, 3, 4, 5, 6, 7].map((corner) => {
-            const point = minus([0, 1, 2].map((k) => box[corner >> k & 1][k]), camera.position);
-            const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), point));
+        Object.assign(camera, frameDoll(size));
+        const seen = findHouse().corners.map((place) => {
+            const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), minus(place, camera.position)));
             const tangent = tangentOf(...size);
             return [Math.abs(x) / z / tangent * size[1] / size[0], Math.abs(y) / z / tangent, z];
-        }));
-        Object.assign(camera, frameDoll(size));
-        const first = [look(), listBoxes().length];
+        });
         zoomDoll(100);
         const far = state.doll.distance / state.doll.first;
         orbit(1, 9);
-        state.doll.isOn = true;
-        return [...first, far, camera.pitch, listRanges()];
+        return [seen, far, camera.pitch, HEADER.spots.map((_, node) => isInDoll(node))];
     }"""
     for size in ((1280, 720), (390, 844)):
         header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
-        corners, count, far, pitch, ranges = run(node, tmp_path, header, program, size)
+        corners, far, pitch, inside = run(node, tmp_path, header, program, size)
         x, y, z = np.array(corners).T
-        assert count == 3 and max(x.max(), y.max()) <= 1 and max(x.max(), y.max()) > 0.8 and z.min() > 0
-        assert far == 2 and pitch == pytest.approx(-np.pi * 8 / 180) and [row[0] for row in ranges] == [0, 1, 2]
+        assert 0.8 < max(x.max(), y.max()) <= 1 and z.min() > 0
+        assert far == 2 and pitch == pytest.approx(-np.pi * 8 / 180) and inside == [True, True, True, False]
+
+
+def test_a_ray_meets_the_nearest_front_of_the_dolls_house(node: str, tmp_path: Path) -> None:
+    rays = {
+        "the floor": ((0, -8, 2), (0, 1, 0), 9.5),
+        "the wall": ((0, 0, -9), (0, 0, 1), 14),
+        "the back of the wall": ((0, 0, 9), (0, 0, -1), None),
+        "the top of the wall": ((0.5, -8, 5.15), (0, 1, 0), None),
+        "above the wall": ((0, -2, -9), (0, 0, 1), None),
+        "behind": ((0, -8, 2), (0, -1, 0), None),
+    }
+    program = "(rays) => rays.map(([origin, ray]) => meetHouse(origin, ray))"
+    found = run(node, tmp_path, make_header(ROW, [(0, 1)], [0, 0, 0, 1]), program, [ray[:2] for ray in rays.values()])
+    assert dict(zip(rays, found, strict=True)) == {name: distance for name, (*_, distance) in rays.items()}
 
 
 def test_a_pose_is_moved_to_within_the_limits_and_must_be_finite(node: str, tmp_path: Path) -> None:

@@ -29,8 +29,7 @@ from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.inputs.pairs import Pair
 from pansplat.refinement.budget import merge_to
-from pansplat.tours import doll_house, edges
-from pansplat.tours.doll_house import find_rooms
+from pansplat.tours import edges
 from pansplat.tours.floor import find_camera_height
 from pansplat.tours.graph import make_graph, select_views
 from pansplat.tours.outlook import find_bin, measure_outlook
@@ -78,6 +77,16 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     outline = np.array(drawn["outline"]) + level[:, (0, 2)].T @ middle
     assert shapely.Polygon(outline).symmetric_difference(shapely.Polygon(expected.outline @ turn.T)).area < 0.05
     assert shapely.Polygon(outline).contains(shapely.Point(np.array(drawn["label"][:2]) + level[:, (0, 2)].T @ middle))
+    (house,) = header["doll"]
+    corners = np.array(house["corners"])
+    top = corners[:, 3:].max(axis=1) > 1
+    places, normals = (corners[:, :3] @ level)[:, (0, 2)] + level[:, (0, 2)].T @ middle, corners[top, 3:] - 2
+    to_wall = shapely.distance(shapely.Polygon(expected.outline @ turn.T).exterior, shapely.points(places[~top]))
+    assert house["nodes"] == [0, 1] and to_wall.max() < 1e-3, "all corners of floor and walls are on the outline"
+    inward, outward = (
+        shapely.contains_xy(shapely.Polygon(outline), *(places[top] + step * normals).T).mean() for step in (0.3, -0.3)
+    )
+    assert inward > outward + 0.4, "normals are in the page's axes"
     # What hides the mark of the other panorama is a wall between them.
     assert [spot["hidden"] for spot in header["spots"]] == [[], []]
     gaussians = room.gaussians
@@ -111,9 +120,11 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
     centers = scene.cam2world[scene.gaussians.views.long(), :3, 3].float()
     above = scene.gaussians.select(scene.gaussians.means[:, 1] < centers[:, 1])
     write_page(scene, tmp_path / "floor.html")
-    write_page(dataclasses.replace(scene, gaussians=above), tmp_path / "none.html")
+    page = write_page(dataclasses.replace(scene, gaussians=above), tmp_path / "none.html")
     headers = [read_header(tmp_path / f"{name}.html") for name in ("floor", "none")]
-    assert headers[0]["doll"] and headers[1]["doll"] is None
+    assert (
+        headers[1]["doll"] == [] and page.num_outside == 3 and 'id="atlas"' not in (tmp_path / "none.html").read_text()
+    )
     assert not any(room["hasWalls"] for room in headers[1]["plan"]["rooms"])
     assert headers[1]["plan"]["worlds"] == [0, 0, 0]
 
@@ -146,22 +157,6 @@ def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Pat
         if 3 in (link["from"], link["to"]):
             right, _, ahead = level.T @ (places[link["to"]] - places[link["from"]])
             assert math.cos(link["yaw"] - math.atan2(right, ahead)) == pytest.approx(1, abs=1e-6) and link["mark"]
-
-
-def test_a_rough_storey_has_no_dolls_house(flat: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    views = torch.unique(flat.gaussians.views).tolist()
-    monkeypatch.setattr(doll_house, "_is_clear", lambda inside, views: 2 not in views)
-    page = write_page(flat, tmp_path / "page.html")
-    header = read_header(page.files[0])
-    doll = header["doll"]
-    assert (
-        page.num_rough == 1
-        and header["rough"] == [2]
-        and doll["boxes"][2] is None
-        and all(doll["boxes"][view] for view in {*views} - {2})
-    )
-    monkeypatch.setattr(doll_house, "_is_clear", lambda inside, views: False)
-    assert write_page(flat, page.files[0]).num_rough == 4 and read_header(page.files[0])["doll"] is None
 
 
 def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,10 +194,6 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     header = read_header(tmp_path / "tour.html")
     assert header["parts"] == [0, 0, 1, 2] and header["edges"] == [[0, 1, 0], [2, 2, 1], [3, 3, 2]]
     assert header["groups"] == [[0, 1], [2], [3]]
-    doll, views = header["doll"], header["views"]
-    assert [view for view, *_ in doll["ranges"]] == header["loading"] and len(doll["boxes"]) == 4
-    assert all(start == views[view]["start"] for view, start, _ in doll["ranges"]), "those in rooms come first"
-    assert all(100 < count < views[view]["count"] for view, _, count in doll["ranges"]), "others have ceilings"
     start, spots, level = header["start"], header["spots"], np.array(header["level"])
     assert start["position"] == pytest.approx(spots[0]["position"], abs=1e-5)
     assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
@@ -223,15 +214,6 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     assert distances.min(axis=0).max() < 0.2, "it passes all panoramas"
     steps = np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1)
     assert len(jumps) == 3 and steps[jumps].min() > 10 and np.delete(steps, jumps).max() < 1.05 / header["routeRate"]
-
-
-def test_the_dolls_house_of_a_scene_without_views_has_the_nearest_cameras(scene: Scene) -> None:
-    views = torch.zeros_like(scene.gaussians.views)
-    merged = dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, views=views), joint=True)
-    cameras = page_module._find_cameras(merged, find_rooms(scene))
-    distances = torch.cdist(scene.gaussians.means.double(), scene.cam2world[:, :3, 3]).numpy()
-    inside = cameras >= 0
-    assert 0.2 < inside.mean() < 0.95 and (cameras == distances.argmin(axis=1))[inside].all()
 
 
 @pytest.mark.parametrize(("size", "limit"), [(1.0, 1.0), (0.5, 0.62)])

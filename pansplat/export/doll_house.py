@@ -1,0 +1,339 @@
+"""The doll's house of a page: floors and walls of the rooms as triangles, with the photographs projected on them.
+
+All is flat: a floor is the outline of a room, a wall is a side of it up to the ceiling, with gaps where doors lead to
+other rooms. Each place has the colour that the nearest camera sees there, and places that none sees have the colours
+around them.
+
+Places are in level axes (right, down, forward), in the unit of the scene.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import io
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import shapely
+import torch
+from jaxtyping import Float, Int
+from PIL import Image
+from shapely.geometry import LineString, Polygon, box
+from torch import Tensor
+
+from pansplat import pipeline
+from pansplat.export.photographs import read_photograph
+from pansplat.gaussians.scene import Scene
+from pansplat.geometry.equirect import sample_equirect, uv_from_directions
+from pansplat.inputs.pairs import Pair
+from pansplat.refinement.fusion import BACKGROUND_LEVEL, are_seen, measure_reach
+from pansplat.tours.doll_house import Rooms
+
+# Lengths are fractions of the height of the cameras over the floor, about 1.5 m.
+_TOP = 0.94  # of the ceiling's height over the cameras: height of the walls
+_DOOR, _PARALLEL = 0.6, 0.9  # of the same: height of doors, below the band of walls; cosine between a door and its wall
+_BEHIND = 0.4  # farthest room behind a door, and distance of the two sides of a wall
+_THICK = 0.07  # of the walls, seen from above
+_STEP = 0.06  # between two places where cameras are compared
+_SOFT, _WIDE = 1.0, 4.0  # of these places: where one camera replaces another; over which hidden ones are averaged
+_TRIPOD, _AWAY = 0.3, 3.0  # radius of the floor around a camera, which another camera shows, if it is not farther
+_GRAZING, _ASIDE = 0.02, 0.05  # least cosine between a ray and the normal of a surface; from a wall to where it is seen
+_THROUGH, _OPEN = 1.3, 0.6  # of the distance of a wall that a camera sees through; share of its places
+_HIDDEN = 4.0  # factor of the distance of a camera whose surfaces are in front
+_ATLAS, _MARGIN = 2048, 4  # side of the atlas, and space around each texture, texels
+_FINEST = 150.0  # texels along a camera's height
+_REACH_ROWS, _PHOTO_ROWS = 256, 1024  # of the surfaces and the photographs
+_QUALITY, _KEPT = 80, 16  # of WebP; photographs in memory
+
+Gap = tuple[int, Polygon, Float[np.ndarray, "2"], float]
+"""A room with a gap to another one, the ground between them, the direction of the wall, and the upper edge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A flat part of the house.
+
+    Attributes:
+        corner: upper left, as its room shows it; a floor is seen from above.
+        right, down: unit vectors.
+        shape: in lengths along these.
+        house, room: their numbers.
+        facing: of the top of a wall, which has no texture: normal of the wall, to the right and forward.
+    """
+
+    corner: Float[np.ndarray, "3"]
+    right: Float[np.ndarray, "3"]
+    down: Float[np.ndarray, "3"]
+    shape: shapely.Geometry
+    house: int
+    room: int
+    facing: Float[np.ndarray, "2"] | None = None
+
+    def locate(self, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
+        """Places in space of places in the plane."""
+        return self.corner + places[..., :1] * self.right + places[..., 1:] * self.down
+
+
+@dataclass(frozen=True, eq=False)
+class DollHouse:
+    """Triangles with a texture.
+
+    Attributes:
+        corners: of the triangles of each house, clockwise as their room shows them: place in the world, and u and v in
+            the atlas, 0 to 1, v down; of tops of walls 2 + the normal of the wall, to the right and forward.
+        atlas: WebP; empty without houses.
+    """
+
+    corners: tuple[Float[np.ndarray, "corner 5"], ...]
+    atlas: bytes
+
+
+def build_panels(rooms: Rooms, is_open: Callable[[int, np.ndarray, float], bool]) -> list[Panel]:
+    """The floors, the walls and their tops of all houses.
+
+    Args:
+        rooms: all rooms.
+        is_open: whether the cameras of a room see through a wall of it that is on the floor at a height (downwards).
+    """
+    panels: list[Panel] = []
+    down = rooms.positions @ rooms.level[:, 1]
+    for house, views in enumerate(rooms.houses):
+        shapes = {number: shape for number, (nodes, shape) in enumerate(rooms.outlines) if nodes[0] in views}
+        chosen = list(views)
+        unit, ceiling = float(np.median(rooms.floors[chosen])), float(np.median(rooms.ceilings[chosen]))
+        eye, floor = float(np.median(down[chosen])), float(np.median((down + rooms.floors)[chosen]))
+        top, every = eye - _TOP * ceiling, shapely.union_all(list(shapes.values()))
+        doors = [(door.rooms[0], door.ends, eye - _DOOR * ceiling) for door in rooms.plan.doors]
+        walls = [(room, np.array(wall)) for room, shape in shapes.items() for wall in pairwise(shape.exterior.coords)]
+        doors += [(room, wall, top) for room, wall in walls if is_open(room, wall, floor)]
+        gaps: list[Gap] = []
+        for room, (start, end), height in doors:
+            step = (end - start) / np.linalg.norm(end - start)
+            ground = LineString((start, end)).buffer(_BEHIND * unit, cap_style="flat")
+            if room in shapes and any(ground.intersects(shapes[other]) for other in shapes if other != room):
+                gaps.append((room, ground, step, height))
+        closed = every.buffer(_BEHIND / 2 * unit, join_style="mitre").buffer(-_BEHIND / 2 * unit, join_style="mitre")
+        for room, shape in shapes.items():
+            sills = [ground.intersection(closed).difference(every) for owner, ground, _, _ in gaps if owner == room]
+            shape_with_sills = shapely.union_all([shape, *sills]).buffer(0)
+            every = every.union(shape_with_sills)
+            panels.append(_lay_floor(shape_with_sills, floor, house, room))
+            panels += _raise_walls(shape, gaps, (top, floor, _THICK * unit), house, room)
+    return panels
+
+
+def _lay_floor(shape: shapely.Geometry, height: float, house: int, room: int) -> Panel:
+    """A horizontal panel that is seen from above, along the longest side of a shape in the plan."""
+    corners = np.concatenate([np.array(piece.exterior.coords) for piece in shapely.get_parts(shape)])
+    sides = np.diff(corners, axis=0)
+    along = sides[np.linalg.norm(sides, axis=1).argmax()]
+    along = along / np.linalg.norm(along)
+    axes = np.stack((along, (along[1], -along[0])), axis=1)  # to the right, and down in the picture
+    low = (corners @ axes).min(axis=0)
+    flat = shapely.transform(shape, lambda places: places @ axes - low)
+    right, down, origin = (np.array((x, 0.0, z)) for x, z in (*axes.T, axes @ low))
+    return Panel(origin + height * np.array((0, 1, 0)), right, down, flat, house, room)
+
+
+def _raise_walls(
+    shape: Polygon, gaps: Sequence[Gap], sizes: tuple[float, float, float], house: int, room: int
+) -> Iterator[Panel]:
+    """The walls of a room without gaps, and their tops. Sizes: heights of tops and floor (downwards), thickness."""
+    top, floor, thickness = sizes
+    walls = list(pairwise(np.array(shape.exterior.coords)))
+    steps = np.array([(end - start) / np.linalg.norm(end - start) for start, end in walls])
+    normals = np.stack((-steps[:, 1], steps[:, 0]), axis=1)  # into the room
+    before = np.roll(normals, 1, axis=0)
+    away = -thickness * (normals + before) / np.maximum(1 + (normals * before).sum(axis=1), 0.3)[:, None]
+    ends = away, np.roll(away, -1, axis=0)
+    for (start, end), step, normal, first, last in zip(walls, steps, normals, *ends, strict=True):
+        wall: shapely.Geometry = box(0, 0, np.linalg.norm(end - start), floor - top)
+        cover: shapely.Geometry = Polygon([start, end, end + last, start + first])
+        for _, ground, along, height in gaps:
+            cut = ground.intersection(LineString((start, end)))
+            if abs(step @ along) > _PARALLEL and cut.length > 0:
+                left, right = np.sort((end - np.array(cut.coords)) @ step)
+                wall = wall.difference(box(left, height - top, right, floor - top + 1))
+                cover = cover.difference(ground) if height == top else cover
+        if wall.area > thickness * (floor - top):
+            corner, axes = np.array((end[0], top, end[1])), np.array(((-step[0], 0, -step[1]), (0, 1, 0)))
+            yield Panel(corner, *axes, wall, house, room)
+            if cover.area > 0:
+                yield dataclasses.replace(_lay_floor(cover.buffer(0), top, house, room), facing=normal)
+
+
+@torch.no_grad()
+def make_house(
+    scene: Scene, rooms: Rooms, level: Float[np.ndarray, "3 3"], photographs: Sequence[Pair] = ()
+) -> DollHouse:
+    """The doll's houses of a scene.
+
+    Args:
+        scene: with input cameras.
+        rooms: of the scene.
+        level: right, down and forward (columns) of normals.
+        photographs: of each view; without them the images of the Gaussians.
+    """
+    if not rooms.houses:
+        return DollHouse((), b"")
+    painter = _Painter(scene, rooms, photographs)
+    panels = build_panels(rooms, painter.is_open)
+    density, places = _pack(panels, _FINEST / float(np.median(rooms.floors)))
+    atlas = np.zeros((_ATLAS, _ATLAS, 3), np.uint8)
+    corners: list[list[np.ndarray]] = [[] for _ in rooms.houses]
+    turn, textures = rooms.level[:, (0, 2)].T @ level[:, (0, 2)], []
+    for panel, place in zip(panels, places, strict=True):
+        flat = _triangulate(panel.shape)
+        if panel.facing is None:
+            textures.append((panel, place, *painter.paint(panel, density)))
+            uv = (place + _MARGIN + density * flat) / _ATLAS
+        else:
+            uv = np.broadcast_to(2 + panel.facing @ turn, flat.shape)
+        corners[panel.house].append(np.concatenate((panel.locate(flat) @ rooms.level.T, uv), axis=1))
+    for panel, place, color, seen in textures:
+        beside = [other for other in textures if other[0].room == panel.room and other[0].down[1] == panel.down[1]]
+        known = max(sum(float(other[3].sum()) for other in beside), 1.0)
+        mean = sum(other[2].sum(axis=(0, 1)) for other in beside) / known
+        texture = (255 * _fill(color, seen, mean)).round().clip(0, 255).astype(np.uint8)
+        padded, (left, upper) = cv2.copyMakeBorder(texture, *[_MARGIN] * 4, cv2.BORDER_REPLICATE), place
+        atlas[upper : upper + padded.shape[0], left : left + padded.shape[1]] = padded
+    with io.BytesIO() as file:
+        Image.fromarray(atlas).save(file, "WEBP", quality=_QUALITY, method=6)
+        return DollHouse(tuple(np.concatenate(each) for each in corners), file.getvalue())
+
+
+def _triangulate(shape: shapely.Geometry) -> Float[np.ndarray, "corner 2"]:
+    """Corners of triangles of a shape, clockwise in a picture with the second axis down."""
+    shape = shapely.set_precision(shape, 1e-4 * max(shape.bounds[2:]))  # without the slivers of differences
+    pieces = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(shape)))
+    return shapely.get_coordinates(pieces).reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
+
+
+def _measure(panel: Panel, density: float) -> tuple[int, int]:
+    """Width and height of the texture of a panel, texels, with margins."""
+    if panel.facing is not None:
+        return 0, 0
+    width, height = (math.ceil(density * length) + 2 * _MARGIN for length in panel.shape.bounds[2:])
+    return width, height
+
+
+def _pack(panels: Sequence[Panel], density: float) -> tuple[float, Int[np.ndarray, "panel 2"]]:
+    """The largest density, texels a length, with which all textures fit, and their left upper corners."""
+    while True:
+        sizes = [_measure(panel, density) for panel in panels]
+        places, left, upper, row = np.zeros((len(panels), 2), int), 0, 0, 0
+        for number in sorted(range(len(panels)), key=lambda k: -sizes[k][1]):
+            width, height = sizes[number]
+            if left + width > _ATLAS:
+                left, upper, row = 0, upper + row, 0
+            places[number] = left, upper
+            left, row = left + width, max(row, height)
+        if upper + row <= _ATLAS and max(width for width, _ in sizes) <= _ATLAS:
+            return density, places
+        density *= 0.95
+
+
+class _Painter:
+    """Projects photographs on panels."""
+
+    def __init__(self, scene: Scene, rooms: Rooms, photographs: Sequence[Pair]) -> None:
+        self.rooms, self.poses, self.level = rooms, scene.cam2world.double().cpu(), torch.from_numpy(rooms.level)
+
+        @functools.lru_cache(maxsize=_KEPT)
+        def read(view: int) -> Float[Tensor, "3 height width"]:
+            if photographs:
+                return read_photograph(scene, view, photographs[view], _PHOTO_ROWS)
+            rows, blend = min(scene.height, _PHOTO_ROWS), "joint" if scene.joint else view
+            return pipeline.render(scene, scene.cam2world[view], blend=blend, size=(rows, 2 * rows)).color.clamp(0, 1)
+
+        self.read = read
+        self.reaches = []
+        for view, pose in enumerate(self.poses):
+            own = scene.gaussians.levels < BACKGROUND_LEVEL
+            if not scene.joint:
+                own &= scene.gaussians.views == view
+            self.reaches.append(measure_reach(scene.gaussians.select(own), pose, _REACH_ROWS).cpu())
+        self.eyes = rooms.positions @ rooms.level
+
+    def is_open(self, room: int, wall: Float[np.ndarray, "2 2"], floor: float) -> bool:
+        """Whether the nearest camera of a room sees through a wall, which is open then, or a window."""
+        views, (start, end) = self.rooms.outlines[room][0], wall
+        view = min(views, key=lambda view: np.linalg.norm(self.eyes[view][[0, 2]] - (start + end) / 2))
+        shares, heights = np.meshgrid(np.linspace(0.1, 0.9, 9), np.linspace(0, 0.8, 5))
+        flat = start + shares.reshape(-1, 1) * (end - start)
+        down = self.eyes[view][1] + heights.reshape(-1) * (floor - self.eyes[view][1])
+        offsets = np.stack((flat[:, 0], down, flat[:, 1]), axis=1) - self.eyes[view]
+        behind = torch.from_numpy(self.eyes[view] + _THROUGH * offsets) @ self.level.T
+        return bool(are_seen(behind, self.poses[view], self.reaches[view]).double().mean() > _OPEN)
+
+    def paint(self, panel: Panel, density: float) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+        """The texture of a panel, premultiplied, and where it is seen, 0 to 1."""
+        width, height = (size - 2 * _MARGIN for size in _measure(panel, density))
+        unit = float(np.median(self.rooms.floors))
+        coarse = [max(round(size / density / (_STEP * unit)), 1) for size in (width, height)]
+        grid = _grid(*coarse, width / density, height / density)
+        costs = np.array([self._judge(panel, grid, view, unit) for view in self.rooms.houses[panel.house]])
+        is_seen = np.isfinite(costs)
+        shares = is_seen & (costs == costs.min(axis=0))
+        wide = np.array([cv2.GaussianBlur(share.astype(np.float32), (0, 0), _WIDE / 2) for share in shares]) * is_seen
+        shares = is_seen & (wide == wide.max(axis=0))  # no small pieces
+        shares = np.array([cv2.GaussianBlur(share.astype(np.float32), (0, 0), _SOFT) for share in shares]) * is_seen
+        shares /= np.maximum(shares.sum(axis=0), 1e-9)
+        places = torch.from_numpy(panel.locate(_grid(width, height, width / density, height / density)))
+        color = np.zeros((height, width, 3), np.float32)
+        for number, view in enumerate(self.rooms.houses[panel.house]):
+            if not shares[number].any():
+                continue
+            share = cv2.resize(shares[number], (width, height))  # linear
+            chosen = torch.from_numpy(share > 0)
+            offsets = (places[chosen] - torch.from_numpy(self.eyes[view])) @ self.level.T @ self.poses[view, :3, :3]
+            found = sample_equirect(self.read(view), uv_from_directions(offsets).float()).T.numpy()
+            color[share > 0] += share[share > 0][:, None] * found
+        return color, cv2.resize(is_seen.any(axis=0).astype(np.float32), (width, height))
+
+    def _judge(
+        self, panel: Panel, grid: Float[np.ndarray, "h w 2"], view: int, unit: float
+    ) -> Float[np.ndarray, "h w"]:
+        """How badly a camera shows places of a panel: its distance, more where something is in front; inf if unseen."""
+        views, outline = self.rooms.outlines[panel.room]
+        places, normal = panel.locate(grid), np.cross(panel.down, panel.right)  # into the room
+        offsets = places - self.eyes[view]
+        distance = np.linalg.norm(offsets, axis=-1)
+        world = torch.from_numpy(places.reshape(-1, 3)) @ self.level.T
+        is_shown = are_seen(world, self.poses[view], self.reaches[view]).numpy().reshape(distance.shape)
+        clear = cv2.GaussianBlur(is_shown.astype(np.float32), (0, 0), _WIDE)
+        is_below = (np.hypot(offsets[..., 0], offsets[..., 2]) < _TRIPOD * unit) & (offsets[..., 1] > 0.5 * unit)
+        cost = distance * (1 + (_HIDDEN - 1) * (1 - clear)) + np.where(is_below, _AWAY * unit, 0)
+        is_seen = (-(offsets @ normal) > _GRAZING * distance) & (is_shown | (view in views))
+        ahead = shapely.Point(self.eyes[view][[0, 2]])
+        if outline.contains(ahead) and outline.area < 0.999 * outline.convex_hull.area:
+            flat = (places + _ASIDE * unit * normal)[..., (0, 2)][is_seen]
+            ways = shapely.linestrings(np.stack(np.broadcast_arrays(flat, self.eyes[view][[0, 2]]), axis=-2))
+            shapely.prepare(outline)
+            is_seen[is_seen.copy()] = shapely.covers(outline, ways)
+        return np.where(is_seen, cost, np.inf)
+
+
+def _grid(columns: int, rows: int, width: float, height: float) -> Float[np.ndarray, "rows columns 2"]:
+    """Centres of equal cells of a rectangle."""
+    x, y = (np.arange(columns) + 0.5) * width / columns, (np.arange(rows) + 0.5) * height / rows
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def _fill(
+    color: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"], mean: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "h w 3"]:
+    """Premultiplied colours over the colours around them, ever more blurred away from what is known, or over a mean."""
+    if min(weight.shape) > 1 and weight.min() < 1:
+        size = (weight.shape[1] + 1) // 2, (weight.shape[0] + 1) // 2
+        half, share = (cv2.resize(values, size, interpolation=cv2.INTER_AREA) for values in (color, weight))
+        known = np.minimum(4 * share, 1)
+        below = _fill(half * (known / np.maximum(share, 1e-9))[..., None], known, mean)
+        below = cv2.resize(below, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        return color + (1 - weight[..., None]) * below
+    return color + (1 - weight[..., None]) * mean

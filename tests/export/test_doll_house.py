@@ -1,0 +1,206 @@
+"""The doll's house: panels on the floor and the walls of rooms, with the colours of photographs of boxes."""
+
+import dataclasses
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from PIL import Image
+from shapely.geometry import box
+from synthetic_scenes import make_balls, place_cameras, see_box
+
+from pansplat.export.doll_house import _ATLAS, DollHouse, _fill, _measure, _pack, _Painter, build_panels, make_house
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.tours.doll_house import Rooms
+from pansplat.tours.graph import make_graph
+from pansplat.tours.plan import Door, Plan
+
+FLOOR, CEILING = 1.5, -1.1  # from the cameras, downwards
+BOXES = (box(0, 0, 5, 4), box(5.2, 0, 8, 4))
+CAMERAS = ((1.2, 0.0, 2.0), (3.8, 0.0, 2.2), (6.5, 0.0, 2.0))
+DOOR = Door(np.array(((5.0, 1.0), (5.0, 1.9))), (0, 1))
+
+
+def _box_of(view: int) -> tuple[np.ndarray, np.ndarray]:
+    left, near, right, far = BOXES[int(view == 2)].bounds
+    return np.array((left, CEILING, near)), np.array((right, FLOOR, far))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Two rooms: the first one with two cameras."""
+    seen = [see_box(*_box_of(view), np.array(place), 20_000) for view, place in enumerate(CAMERAS)]
+    gaussians = make_balls(torch.cat(seen), 0.03, views=torch.arange(3).repeat_interleave(20_000))
+    return Scene(gaussians, place_cameras(*CAMERAS), 0.3, 12.0, overlaps=((0, 1, 0.9), (1, 2, 0.3)))
+
+
+@pytest.fixture(scope="module")
+def rooms(scene: Scene) -> Rooms:
+    """The known rooms."""
+    plan = Plan(make_graph(scene), (), (DOOR,), FLOOR, None, None, 3, 0)
+    heights = np.full(3, FLOOR), np.full(3, -CEILING)
+    outlines = ((0, 1), BOXES[0]), ((2,), BOXES[1])
+    return Rooms(np.eye(3), np.array(CAMERAS), *heights, shapely.union_all(BOXES), outlines, ((0, 1, 2),), plan)
+
+
+def _color(places: np.ndarray) -> np.ndarray:
+    """The colour of each place of the boxes, 0 to 1."""
+    return np.stack((places[..., 0] / 8, (places[..., 1] + 1.5) / 3, places[..., 2] / 4), axis=-1).clip(0, 1)
+
+
+@pytest.fixture
+def photograph(tmp_path: Path) -> Callable[..., list[Pair]]:
+    """A function that writes the photographs; by default of the colours of places, else of one for each camera."""
+
+    def write(*colors: tuple[int, int, int]) -> list[Pair]:
+        pairs = []
+        for view, place in enumerate(CAMERAS):
+            rays = pixel_directions(256, 512, dtype=torch.float64).numpy()
+            low, high = _box_of(view)
+            with np.errstate(divide="ignore"):
+                reach = (np.where(rays > 0, high, low) - place) / rays
+            image = 255 * _color(place + reach.min(axis=-1, keepdims=True) * rays)
+            if colors:
+                image = np.broadcast_to(np.array(colors[view]), image.shape)
+            path = tmp_path / f"{view}.png"
+            Image.fromarray(image.round().astype(np.uint8)).save(path)
+            panorama = Panorama(f"{view}", path, place_cameras(place)[0])
+            pairs.append(Pair(f"{view}", tmp_path, (panorama,), (), 0.3, 12.0, (path,)))
+        return pairs
+
+    return write
+
+
+def _sample(house: DollHouse, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """Random places of all textured triangles, and their colours in the atlas, 0 to 1."""
+    (corners,) = house.corners
+    triangles = corners.reshape(-1, 3, 5)
+    triangles = triangles[triangles[..., 3:].max(axis=(1, 2)) <= 1]
+    shares = np.random.default_rng(0).dirichlet((1, 1, 1), (count, len(triangles)))
+    places, uv = np.split(np.einsum("ntk,tkc->ntc", shares, triangles).reshape(-1, 5), [3], axis=1)
+    atlas = np.array(Image.open(io.BytesIO(house.atlas)).convert("RGB")) / 255
+    column, row = np.floor(uv * len(atlas)).astype(int).T
+    return places, atlas[row, column]
+
+
+def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(
+    scene: Scene, rooms: Rooms, photograph: Callable[..., list[Pair]]
+) -> None:
+    house = make_house(scene, rooms, np.eye(3), photograph())
+    places, colors = _sample(house)
+    walls = shapely.union_all([outline.exterior for outline in BOXES])
+    to_wall = shapely.distance(walls, shapely.points(places[:, [0, 2]]))
+    assert (np.minimum(to_wall, np.abs(places[:, 1] - FLOOR)) < 1e-6).all()
+    assert places[:, 1].min() > CEILING and places[:, 1].max() == pytest.approx(FLOOR)
+    errors = np.abs(colors - _color(places)).max(axis=1)
+    assert np.median(errors) < 0.02 and np.quantile(errors, 0.95) < 0.06
+
+
+def test_fronts_face_the_room(rooms: Rooms) -> None:
+    for panel in build_panels(rooms, lambda *_: False):
+        normal = np.cross(panel.down, panel.right)
+        middle = panel.locate(np.array(panel.shape.representative_point().coords[0]))
+        if panel.facing is not None:
+            assert normal[1] == pytest.approx(-1) and abs(middle[1] - CEILING) < 0.1
+        else:
+            inside = middle + 0.01 * normal
+            assert BOXES[panel.room].buffer(1e-6).contains(shapely.Point(inside[[0, 2]])) and inside[1] < FLOOR
+
+
+def test_a_door_to_another_room_is_a_gap_in_both_walls_below_its_top(rooms: Rooms) -> None:
+    panels = [panel for panel in build_panels(rooms, lambda *_: False) if panel.facing is None]
+
+    def find(place: tuple[float, float, float]) -> list[int]:
+        return [
+            panel.room
+            for panel in panels
+            if abs((place - panel.corner) @ np.cross(panel.right, panel.down)) < 1e-6
+            and panel.shape.contains(
+                shapely.Point((place - panel.corner) @ np.stack((panel.right, panel.down), axis=1))
+            )
+        ]
+
+    for x, room in ((5.0, 0), (5.2, 1)):
+        assert find((x, 0.5, 1.45)) == [] and find((x, 1.4, 1.45)) == []
+        assert find((x, -0.9, 1.45)) == [room] and find((x, 0.5, 2.5)) == [room]
+    assert find((5.1, FLOOR, 1.45)) == [0] and find((5.1, FLOOR, 2.5)) == [], "the ground below the door"
+    closed = dataclasses.replace(rooms, plan=dataclasses.replace(rooms.plan, doors=()))
+    outward = Door(np.array(((1.0, 0.0), (2.0, 0.0))), (0,))  # a window of a room's height
+    window = dataclasses.replace(rooms, plan=dataclasses.replace(rooms.plan, doors=(outward,)))
+    for other in (closed, window):
+        panels = [panel for panel in build_panels(other, lambda *_: False) if panel.facing is None]
+        assert find((5.0, 0.5, 1.45)) == [0] and find((1.5, 0.5, 0.0)) == [0]
+
+
+def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(
+    scene: Scene, rooms: Rooms, photograph: Callable[..., list[Pair]]
+) -> None:
+    pairs = photograph((200, 0, 0), (0, 0, 200), (0, 200, 0))
+    hidden = see_box(np.array((0.5, -2, 1.0)), np.array((0.6, 2, 3.0)), np.array((0.55, 0, 2)), 4000)
+    screen = Gaussians.cat([scene.gaussians, make_balls(hidden, 0.03, views=0)])
+    for shown, expected in ((scene, 0), (dataclasses.replace(scene, gaussians=screen), 2)):
+        house = make_house(shown, rooms, np.eye(3), pairs)
+        places, colors = _sample(house, 3000)
+        own = colors.argmax(axis=1)
+        x, y, z = places.T
+        assert (own[x > 5.3] == 1).all(), "another room"
+        away = np.linalg.norm(places[:, None] - CAMERAS[:2], axis=2)
+        floor = (np.abs(y - FLOOR) < 1e-6) & (x < 4.9) & (x > 1.0)
+        clear = floor & (np.abs(away[:, 0] - away[:, 1]) > 0.3)
+        tripod = np.linalg.norm(places[:, None] - CAMERAS[:2], axis=2).min(axis=1) < np.hypot(FLOOR, 0.6)
+        assert (own[clear & ~tripod] == 2 * (away[:, 1] < away[:, 0])[clear & ~tripod]).all()
+        for number, camera in enumerate(CAMERAS[:2]):
+            below = floor & (np.hypot(x - camera[0], z - camera[2]) < 0.25)
+            assert below.sum() > 5 and (own[below] == 2 - 2 * number).all(), "the tripod"
+        behind = (x < 1e-6) & (np.abs(z - 2) < 0.6) & (np.abs(y) < 0.5)
+        assert behind.sum() > 5 and (own[behind] == expected).all(), "a surface is in front of the wall"
+
+
+def test_what_no_camera_sees_has_the_colours_around_it() -> None:
+    weight = np.zeros((40, 60), np.float32)
+    weight[:, :10], weight[:, 50:] = 1, 1
+    color = weight[..., None] * np.linspace(0.2, 0.8, 60)[None, :, None] * np.ones(3)
+    filled = _fill(color.astype(np.float32), weight, np.ones(3))
+    assert np.allclose(filled[weight > 0], color[weight > 0]) and filled.min() >= 0.19 and filled.max() <= 0.81
+    assert np.abs(np.diff(filled, axis=1)).max() < 0.1, "softly"
+    nothing = _fill(np.zeros((3, 40, 3), np.float32), np.zeros((3, 40), np.float32), np.array((0.1, 0.5, 0.9)))
+    assert np.allclose(nothing, (0.1, 0.5, 0.9)), "of the other walls"
+
+
+def test_textures_of_many_rooms_fit_into_the_atlas(rooms: Rooms) -> None:
+    panels = [panel for panel in build_panels(rooms, lambda *_: False) if panel.facing is None] * 12
+    density, places = _pack(panels, 100.0)
+    boxes = [box(*place, *(place + _measure(panel, density))) for panel, place in zip(panels, places, strict=True)]
+    assert shapely.union_all(boxes).area == pytest.approx(sum(each.area for each in boxes)), "none covers another one"
+    assert max(each.bounds[2] for each in boxes) <= _ATLAS and max(each.bounds[3] for each in boxes) <= _ATLAS
+    assert density < 100
+
+
+def test_without_a_house_there_is_no_atlas(scene: Scene, rooms: Rooms) -> None:
+    house = make_house(scene, dataclasses.replace(rooms, houses=()), np.eye(3))
+    assert (house.corners, house.atlas) == ((), b"")
+
+
+def test_without_photographs_the_gaussians_are_shown(scene: Scene, rooms: Rooms) -> None:
+    means = scene.gaussians.means
+    color = torch.from_numpy(_color(means.numpy()))
+    gaussians = make_balls(means, 0.03, 0.99, color=color, views=scene.gaussians.views)
+    house = make_house(dataclasses.replace(scene, gaussians=gaussians, height=128), rooms, np.eye(3))
+    places, colors = _sample(house)
+    assert np.median(np.abs(colors - _color(places)).max(axis=1)) < 0.1
+
+
+def test_a_wall_that_the_cameras_see_through_is_open(scene: Scene, rooms: Rooms) -> None:
+    own = scene.gaussians.select(scene.gaussians.views != 1)
+    seen = make_balls(see_box(_box_of(0)[0], _box_of(2)[1], np.array(CAMERAS[1]), 20_000), 0.03, views=1)
+    through = dataclasses.replace(scene, gaussians=Gaussians.cat([own, seen]))
+    for shown, expected in ((scene, False), (through, True)):
+        painter = _Painter(shown, rooms, ())
+        assert painter.is_open(0, np.array(((5.0, 0.5), (5.0, 3.5))), FLOOR) == expected
+        assert not painter.is_open(0, np.array(((0.0, 3.5), (0.0, 0.5))), FLOOR)
