@@ -50,12 +50,12 @@ from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import SOFTWARE, is_written
 from pansplat.tours.doll_house import Rooms, find_rooms, measure_box
-from pansplat.tours.edges import find_poor_edges
-from pansplat.tours.floor import choose_camera_height, find_camera_height
-from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, make_graph, select_views
+from pansplat.tours.facts import TourFacts
+from pansplat.tours.floor import choose_camera_height
+from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
-from pansplat.tours.outlook import choose_heading, find_blank, is_hidden, measure_outlook
+from pansplat.tours.outlook import choose_heading, find_blank, is_hidden
 from pansplat.tours.plan import Plan
 from pansplat.tours.route import Route, find_angles, plan_route
 from pansplat.tours.surfaces import locate_surfaces
@@ -159,14 +159,14 @@ def write_page(
             stacklevel=2,
         )
         scene = dataclasses.replace(scene, overlaps=(), links=(), starts=())
-    tour, has_cameras = make_graph(scene), len(scene.cam2world) > 0
-    if not scene.joint and tour.overlaps:
-        tour = dataclasses.replace(tour, poor=find_poor_edges(scene, range(len(tour)), tour.overlaps))
-    rooms = find_rooms(scene) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
+    has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
+    facts = TourFacts(scene if has_cameras else prepared, folder=photographs[0].folder if photographs else None)
+    tour = dataclasses.replace(facts.tour, poor=facts.poor)
+    rooms = find_rooms(facts) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
     if rooms is not None and not rooms.plan.num_heights:
         rooms = None  # without a floor the doll's house is a heap
-    scene = _prepare(scene)
-    flights = _plan_flights(scene, tour)
+    scene = prepared
+    flights = _plan_flights(scene, tour, facts)
     if len(scene.gaussians) > gaussians:
         report("merging Gaussians", 0.1)
         scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0)
@@ -189,7 +189,7 @@ def write_page(
             lambda what, fraction: report(what, 0.75 + 0.2 * fraction),
         )
     report("writing", 0.95)
-    header = _describe_scene(scene, packed, origin, flights, tour)
+    header = _describe_scene(scene, packed, origin, flights, tour, facts)
     header |= {"embed": embed, "doll": None, "photographs": [picture.describe() for picture in pictures]}
     header["rough"] = [] if rooms is None else [view for view, clear in enumerate(rooms.is_clear) if not clear]
     header["plan"] = _describe_plan(None if rooms is None else rooms.plan, tour, origin, flights.level)
@@ -239,22 +239,21 @@ class _Flights:
     hysteresis: float = 0.0
 
 
-def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
+def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
     """The flights of a tour; without edges, the camera flies from view to view.
 
     Args:
         scene: of `_prepare`.
-        tour: of the scene before.
+        tour, facts: of the scene before.
     """
     views = tuple(range(len(scene.cam2world)))
     if not tour.overlaps:
-        first = tour.find_start_view(0) if len(tour) else None
+        first, level = tour.find_start_view(0), tour.level_axes
         start = path_poses(scene.cam2world)[0]
-        level = start[:3, :3].numpy()
+        yaw, pitch = find_angles(level.T @ (start[:3, 2].numpy() if first is None else first))
         if first is None:
-            yaw, pitch = choose_heading(measure_outlook(scene, 0, level), 0.0), 0.0
-        else:
-            yaw, pitch = find_angles(level.T @ first)
+            yaw = choose_heading(facts.outlooks[0], yaw)
+        start[:3, :3] = torch.from_numpy(level)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
@@ -263,7 +262,7 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
     samples, jumps = _resample(route)
     start, (yaw, pitch) = torch.from_numpy(route.pose(0.0)), samples[0, 3:].tolist()
     if tour.find_start_view(walk[0]) is None:
-        _, yaw = find_blank(measure_outlook(scene, walk[0], route.level))
+        _, yaw = find_blank(facts.outlooks[walk[0]])
     start[:3, :3] = torch.from_numpy(route.level)
     return _Flights(
         _look(start, route.level, yaw, pitch),
@@ -402,13 +401,13 @@ def _describe_scene(
     origin: Float[np.ndarray, "3"],
     flights: _Flights,
     tour: TourGraph,
+    facts: TourFacts,
 ) -> dict[str, Any]:
     """The numbers of a page, without those of single Gaussians; a part of `PageHeader`."""
     level = flights.level
     positions = scene.cam2world[:, :3, 3].numpy() - origin
-    known = [find_camera_height(scene, view, level) for view in range(len(positions))]
-    usual_height = choose_camera_height(known, scene.far)
-    heights = [height or usual_height for height in known]
+    usual_height = choose_camera_height(facts.heights, scene.far)
+    heights = [height or usual_height for height in facts.heights]
     starts = [tour.find_start_view(node) for node in range(len(tour))] or [None]
     marks = positions + np.outer(heights, level[:, 1])
     spots = [
@@ -417,7 +416,7 @@ def _describe_scene(
             "position": _round(position),
             "mark": _round(mark),
             "notes": [],
-            **_describe_outlook(scene, view, level, (marks - position) @ level),
+            **_describe_outlook(facts, view, (marks - position) @ level),
             "radius": round(0.12 * height, 6),
             **({} if start is None else {"start": _round(np.array(find_angles(level.T @ start)))}),
         }
@@ -466,18 +465,15 @@ def _describe_scene(
     }
 
 
-def _describe_outlook(
-    scene: Scene, view: int, level: Float[np.ndarray, "3 3"], marks: Float[np.ndarray, "node 3"]
-) -> dict[str, Any]:
+def _describe_outlook(facts: TourFacts, view: int, marks: Float[np.ndarray, "node 3"]) -> dict[str, Any]:
     """Where a camera at a view faces a wall (bits of the directions of `measure_outlook`), and the yaw of the widest
     view; and the panoramas whose marks furniture or walls hide.
 
     Args:
-        level: axes of a level camera.
         marks: of all panoramas on the floor, relative to the camera.
     """
-    is_blank, widest = find_blank(measure_outlook(scene, view, level))
-    places = locate_surfaces(scene, view, level, min_opacity=0.5)
+    is_blank, widest = find_blank(facts.outlooks[view])
+    places = locate_surfaces(facts.scene, view, facts.tour.level_axes, min_opacity=0.5)
     hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
     blank = sum(1 << number for number in np.flatnonzero(is_blank).tolist())
     return {"blank": blank, "ahead": round(widest, 3), "hidden": hidden}

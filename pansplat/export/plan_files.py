@@ -26,10 +26,10 @@ from pansplat.gaussians.scene import Scene
 from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import SOFTWARE
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import assign_storeys, write_floor_plan
-from pansplat.tours.graph import make_graph
 from pansplat.tours.layout import arrange_in_rows
-from pansplat.tours.plan import Plan, Room, make_plan
+from pansplat.tours.plan import Plan, Room
 
 SUFFIXES = (".svg", ".png", ".dxf")
 
@@ -70,8 +70,8 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
             f"cannot write {path}: needed all that each panorama shows, got a scene with each surface once; give the "
             "folder of the panoramas, or a scene that was exported with --layers"
         )
-    plan = _find_rooms(scene)
-    if plan is None:
+    plan = TourFacts(scene).plan
+    if not plan.rooms:
         raise InputError(
             f"cannot write {path}: needed a floor, and walls around at least one of "
             f"{describe_count(len(scene.cam2world), 'input camera')}, got none; "
@@ -91,12 +91,12 @@ def write_picture(scene: Scene, path: str | Path) -> Plan | None:
     Returns:
         The plan; None if only the floors are shown, as in a scene with each surface once.
     """
-    plan = None if scene.joint else _find_rooms(scene)
-    if plan is None:
-        write_floor_plan(scene, path)
-    else:
-        _write(plan, Path(path))
-    return plan
+    facts = TourFacts(scene)
+    if scene.joint or not facts.plan.rooms:
+        write_floor_plan(facts.tour, facts.outlines, path)
+        return None
+    _write(facts.plan, Path(path))
+    return facts.plan
 
 
 def _write(plan: Plan, path: Path) -> None:
@@ -106,13 +106,6 @@ def _write(plan: Plan, path: Path) -> None:
     drawing = _Drawing(plan)
     with replacing(path) as partial:
         partial.write_bytes(_draw_dxf(drawing) if suffix == ".dxf" else _draw_figure(drawing, suffix[1:]))
-
-
-def _find_rooms(scene: Scene) -> Plan | None:
-    """The plan of a scene; None if it has no rooms."""
-    tour = make_graph(scene)
-    plan = make_plan(scene, tour) if len(tour) else None
-    return plan if plan is not None and plan.rooms else None
 
 
 def describe_plan(plan: Plan) -> list[str]:

@@ -20,17 +20,11 @@ from shapely.geometry import Polygon
 from torch import Tensor
 
 from pansplat.constants import FRONT_COSINE
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.tours.floor import (
-    assign_storeys,
-    choose_camera_height,
-    find_camera_height,
-    find_ceiling,
-    find_floor_outline,
-)
-from pansplat.tours.graph import make_graph
-from pansplat.tours.plan import Plan, make_plan
+from pansplat.tours.facts import TourFacts
+from pansplat.tours.floor import assign_storeys, choose_camera_height, find_ceiling
+from pansplat.tours.plan import Plan
 from pansplat.tours.surfaces import locate_surfaces
 
 _CEILING = 0.88  # of its height over the camera; above that nothing is drawn
@@ -130,34 +124,31 @@ def find_fronts(gaussians: Gaussians, positions: Float[Tensor, "view 3"], eye: F
     return is_same_side & ((ray * seen).sum(dim=1) >= FRONT_COSINE * ray.norm(dim=1) * seen.norm(dim=1))
 
 
-def find_rooms(scene: Scene) -> Rooms:
-    """The rooms of a scene with input cameras: those of the floor plan, and the floors of panoramas without walls.
+def find_rooms(facts: TourFacts) -> Rooms:
+    """The rooms of a scene of all panoramas: those of the floor plan, and the floors of panoramas without walls.
 
     Where a view shows neither, most of its surfaces are.
     """
-    tour, gaussians = make_graph(scene), scene.gaussians.to(device="cpu")
+    tour, scene, plan, gaussians = facts.tour, facts.scene, facts.plan, facts.scene.gaussians.to(device="cpu")
     level, count = tour.level_axes, len(tour)
     gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
-    plan = make_plan(dataclasses.replace(scene, gaussians=gaussians), tour)  # too few show no walls
     step = max(len(gaussians) // (_SAMPLES * max(len(gaussians.views.unique()), 1)), 1)
     gaussians = gaussians.select(torch.arange(0, len(gaussians), step))
     scene = dataclasses.replace(scene, gaussians=gaussians)
-    heights = [find_camera_height(scene, view, level) for view in range(count)]
-    unit = choose_camera_height(heights, scene.far)
+    unit = choose_camera_height(facts.heights, scene.far)
     ceilings = [find_ceiling(locate_surfaces(scene, view, level)) for view in range(count)]
     shapes = [Polygon(room.outline).buffer(_WALL * unit, join_style="mitre") for room in plan.rooms]
     enclosed = {view for room in plan.rooms for view in room.panoramas}
     for view in set(range(count)) - enclosed:
-        outline = find_floor_outline(scene, view, level)
-        if outline is not None:
-            shapes.append(shapely.make_valid(Polygon(outline.corners)).buffer(_BEYOND * unit))
+        if view in facts.outlines:
+            shapes.append(shapely.make_valid(Polygon(facts.outlines[view].corners)).buffer(_BEYOND * unit))
         elif len(places := locate_surfaces(scene, view, level)):
             reach = float(np.quantile(np.hypot(places[:, 0], places[:, 2]), _SHOWN))
             shapes.append(shapely.Point(tour.positions[view] @ level[:, (0, 2)]).buffer(reach))
     return Rooms(
         level,
         tour.positions,
-        np.array([height or unit for height in heights]),
+        np.array([height or unit for height in facts.heights]),
         np.array([ceiling or _USUAL_CEILING * unit for ceiling in ceilings]),
         shapely.union_all(shapes),
         tour.worlds,

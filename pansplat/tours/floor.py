@@ -15,7 +15,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
 from pansplat.system.descriptions import describe_count
-from pansplat.tours.graph import TourGraph, ViewNumbers, make_graph
+from pansplat.tours.graph import TourGraph
 from pansplat.tours.route import Route
 from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
 
@@ -235,21 +235,14 @@ def draw_floor_plan(
     return plan
 
 
-def find_floor_outlines(tour: TourGraph, scene: Scene, views: ViewNumbers) -> dict[int, FloorOutline]:
-    """The floor outlines of a scene's views that show a floor, by panorama."""
-    outlines = {node: find_floor_outline(scene, view, tour.level_axes) for view, node in enumerate(views)}
-    return {node: outline for node, outline in outlines.items() if outline is not None}
-
-
-def write_floor_plan(scene: Scene, path: str | Path) -> None:
-    """Write the floor plan of a scene as an image, with the edges of its tour.
+def write_floor_plan(tour: TourGraph, outlines: Mapping[int, FloorOutline], path: str | Path) -> None:
+    """Write the floors of a tour as an image, with its edges.
 
     Args:
-        scene: with input cameras.
+        tour: the graph.
+        outlines: by panorama.
         path: the file, such as a .png.
     """
-    tour = make_graph(scene)
-    outlines = find_floor_outlines(tour, scene, tuple(range(len(tour)))) if len(tour) else {}
     if not outlines:
         raise InputError(
             f"cannot write {path}: needed a floor below at least one of {describe_count(len(tour), 'input camera')}, "

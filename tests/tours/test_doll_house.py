@@ -10,6 +10,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.tours.doll_house import find_fronts, find_rooms, measure_roughness
+from pansplat.tours.facts import TourFacts
 
 LOW, HIGH = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0))  # of the room around the first camera: x, y down, z
 
@@ -48,7 +49,7 @@ def room() -> Scene:
 
 
 def test_floor_and_walls_are_inside_and_ceiling_garden_and_coarse_levels_are_not(room: Scene) -> None:
-    rooms = find_rooms(room)
+    rooms = find_rooms(TourFacts(room))
     inside = rooms.find_inside(room.gaussians).numpy()
     means, first = room.gaussians.means.numpy(), (room.gaussians.views == 0).numpy()
     is_floor, is_ceiling = means[:, 1] > 1.4999, means[:, 1] < -1.09
@@ -66,8 +67,8 @@ def test_surfaces_of_a_storey_that_scatter_are_not_clear(room: Scene) -> None:
     centers = room.cam2world[views, :3, 3].float()
     factors = torch.where(views < 2, torch.exp(0.1 * torch.randn(len(means), generator=random)), 1.0)
     heap = dataclasses.replace(room.gaussians, means=centers + factors[:, None] * (means - centers))
-    assert find_rooms(room).is_clear == (True, True, True)
-    assert find_rooms(dataclasses.replace(room, gaussians=heap)).is_clear == (False, False, True)
+    assert find_rooms(TourFacts(room)).is_clear == (True, True, True)
+    assert find_rooms(TourFacts(dataclasses.replace(room, gaussians=heap))).is_clear == (False, False, True)
 
 
 @pytest.mark.parametrize(("thickness", "expected"), [(0.0, 0.0), (1.0, 0.8)])
@@ -79,7 +80,7 @@ def test_a_plane_is_smooth_and_a_heap_is_rough(thickness: float, expected: float
 def test_what_a_camera_saw_from_far_is_left_to_a_nearer_camera(room: Scene) -> None:
     far = dataclasses.replace(room.gaussians, views=torch.full_like(room.gaussians.views, 2))
     near = (room.gaussians.views == 0) & (room.gaussians.means.norm(dim=1) < 2.5)
-    assert not find_rooms(room).find_inside(far)[near].any()
+    assert not find_rooms(TourFacts(room)).find_inside(far)[near].any()
 
 
 def test_an_upper_storey_is_not_in_the_level_of_the_lower_one(room: Scene) -> None:
@@ -88,7 +89,7 @@ def test_an_upper_storey_is_not_in_the_level_of_the_lower_one(room: Scene) -> No
     means[room.gaussians.views == 2] += torch.tensor((0.0, -2.8, -9.0))
     gaussians = dataclasses.replace(room.gaussians, means=means)
     above = dataclasses.replace(room, gaussians=gaussians, cam2world=poses, overlaps=((0, 1, 0.9), (0, 2, 0.5)))
-    assert find_rooms(above).list_level(0) == (0, 1) and find_rooms(above).list_level(2) == (2,)
+    assert find_rooms(TourFacts(above)).list_level(0) == (0, 1) and find_rooms(TourFacts(above)).list_level(2) == (2,)
 
 
 def test_from_its_own_camera_each_gaussian_shows_its_front(room: Scene) -> None:

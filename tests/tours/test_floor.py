@@ -15,6 +15,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import Placement
 from pansplat.tours import floor
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import draw_floor_plan, find_floor_outline
 from pansplat.tours.graph import TourGraph, make_graph
 
@@ -64,7 +65,8 @@ def test_the_plan_shows_the_floor_and_its_walls(room_scene):
 
 
 def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):
-    floor.write_floor_plan(room_scene, tmp_path / "plan.png")
+    facts = TourFacts(room_scene)
+    floor.write_floor_plan(facts.tour, facts.outlines, tmp_path / "plan.png")
     with PIL.Image.open(tmp_path / "plan.png") as image:
         colors = np.asarray(image.convert("RGB")).astype(int)
     assert max(colors.shape[:2]) in (1024, 1025)
@@ -72,7 +74,7 @@ def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):
     empty = dataclasses.replace(room_scene, gaussians=room_scene.gaussians.select(torch.arange(20)))
     for scene in (empty, dataclasses.replace(empty, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64))):
         with pytest.raises(InputError, match="needed a floor below"):
-            floor.write_floor_plan(scene, tmp_path / "none.png")
+            write_picture(scene, tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
 
 

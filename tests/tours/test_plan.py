@@ -22,8 +22,8 @@ from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
 from pansplat.tours import doll_house
-from pansplat.tours.graph import make_graph
-from pansplat.tours.plan import Plan, make_plan
+from pansplat.tours.facts import TourFacts
+from pansplat.tours.plan import Plan
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
@@ -109,7 +109,7 @@ CAMERAS = [(1.5, 1.5), (1.2, 4.5), (7.0, 2.0)]
 
 
 def _plan(scene: Scene) -> Plan:
-    return make_plan(scene, make_graph(scene))
+    return TourFacts(scene).plan
 
 
 def _measure_angles(outline: np.ndarray) -> list[float]:
@@ -136,7 +136,7 @@ def test_rooms_have_their_areas_angles_and_corners(noise: float) -> None:
 def test_the_dolls_house_has_the_plan_of_all_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doll_house, "_SAMPLES", 1000)  # which show no walls
     scene = _make_house(WALLS, CAMERAS, count=20000)
-    pairs = zip(doll_house.find_rooms(scene).plan.rooms, _plan(scene).rooms, strict=True)
+    pairs = zip(doll_house.find_rooms(TourFacts(scene)).plan.rooms, _plan(scene).rooms, strict=True)
     assert [np.array_equal(found.outline, room.outline) for found, room in pairs] == [True, True]
 
 

@@ -35,6 +35,7 @@ from pansplat.geometry.path import path_poses
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.pairs import Note, Pair
 from pansplat.tours.doll_house import find_fronts, find_rooms
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import make_graph, select_views
 
 SIZE = (320, 240)
@@ -152,7 +153,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: l
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
         patch.setattr(page_module, "_PART_BYTES", 30_000)
-        patch.setattr(page_module, "find_poor_edges", lambda *_: ())  # surfaces of the scenes do not agree
+        patch.setattr(TourFacts, "poor", ())  # surfaces of the scenes do not agree
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
         write_page(house, folder / "house.html")
@@ -164,7 +165,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: l
         write_page(house, folder / "hosted.html", split=True)
         (folder / "poor").mkdir()
         poor = {"photographs": photographs, "photo_height": 512, "split": True}
-        patch.setattr(page_module, "find_poor_edges", lambda *_: ((0, 1),))
+        patch.setattr(TourFacts, "poor", ((0, 1),))
         write_page(house, folder / "poor" / "index.html", **poor)
     return folder
 
@@ -304,7 +305,7 @@ def test_the_dolls_house_is_the_picture_of_the_fronts_in_the_rooms_and_a_click_g
     image = home.draw()
     level, origin = path_poses(scene.cam2world)[0, :3, :3].numpy(), scene.cam2world[:, :3, 3].mean(0).numpy()
     positions, gaussians = scene.cam2world[:, :3, 3], scene.gaussians
-    shown = find_rooms(scene).find_inside(gaussians)
+    shown = find_rooms(TourFacts(scene)).find_inside(gaussians)
     shown &= find_fronts(gaussians, positions, torch.from_numpy(camera["position"] + origin))
     assert 0.1 < shown.double().mean() < 0.7
     joint = dataclasses.replace(scene, gaussians=gaussians.select(shown), joint=True)

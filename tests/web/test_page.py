@@ -30,9 +30,9 @@ from pansplat.inputs.pairs import Pair
 from pansplat.refinement.budget import merge_to
 from pansplat.tours import doll_house, edges
 from pansplat.tours.doll_house import find_rooms
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import find_camera_height
 from pansplat.tours.graph import make_graph, select_views
-from pansplat.tours.plan import make_plan
 
 
 @pytest.fixture(autouse=True)
@@ -70,7 +70,7 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     header = read_header(tmp_path / "room.html")
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
     tour = make_graph(room)
-    (drawn,), (expected,) = header["plan"]["rooms"], make_plan(room, tour).rooms
+    (drawn,), (expected,) = header["plan"]["rooms"], TourFacts(room).plan.rooms
     assert drawn["name"] == "west / east" and drawn["nodes"] == [0, 1] and header["plan"]["worlds"] == [0, 0]
     turn = level[:, (0, 2)].T @ tour.level_axes[:, (0, 2)]  # they differ by a quarter turn
     outline = np.array(drawn["outline"]) + level[:, (0, 2)].T @ middle
@@ -205,7 +205,7 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
 def test_the_dolls_house_of_a_scene_without_views_has_the_nearest_cameras(scene: Scene) -> None:
     views = torch.zeros_like(scene.gaussians.views)
     merged = dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, views=views), joint=True)
-    cameras = page_module._find_cameras(merged, find_rooms(scene))
+    cameras = page_module._find_cameras(merged, find_rooms(TourFacts(scene)))
     distances = torch.cdist(scene.gaussians.means.double(), scene.cam2world[:, :3, 3]).numpy()
     inside = cameras >= 0
     assert 0.2 < inside.mean() < 0.95 and (cameras == distances.argmin(axis=1))[inside].all()
