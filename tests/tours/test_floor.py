@@ -11,6 +11,7 @@ import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.errors import InputError
+from pansplat.export.plan_files import write_picture
 from pansplat.gaussians.scene import Scene
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.placements import Placement
