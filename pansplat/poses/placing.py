@@ -200,8 +200,8 @@ class Piece:
         """Places (right, forward) of walls above doors, and yaws of their normals, away from the camera."""
         depth = self.surroundings.depth.log_depth
         places = pixel_directions(*depth.shape).numpy() * np.exp(depth)[..., None]
-        across = np.roll(places, -2, axis=1) - np.roll(places, 2, axis=1)
-        normals = np.cross(across, np.gradient(places, axis=0))
+        across, along = (np.roll(places, -2, axis=axis) - np.roll(places, 2, axis=axis) for axis in (1, 0))
+        normals = np.cross(across, along)
         normals *= np.sign((normals * places).sum(axis=-1, keepdims=True))
         normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
         places, normals = (values[::2, ::2].reshape(-1, 3) for values in (places, normals))
