@@ -160,7 +160,11 @@ def write_page(
         )
         scene = dataclasses.replace(scene, overlaps=(), links=(), starts=())
     has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
-    facts = TourFacts(scene if has_cameras else prepared, folder=photographs[0].folder if photographs else None)
+    facts = TourFacts(
+        scene if has_cameras else prepared,
+        folder=photographs[0].folder if photographs else None,
+        level=None if scene.overlaps else path_poses(prepared.cam2world)[0, :3, :3].numpy(),
+    )
     tour = dataclasses.replace(facts.tour, poor=facts.poor)
     rooms = find_rooms(facts) if 0 < len(scene.cam2world) <= _MAX_CAMERAS else None
     if rooms is not None and not rooms.plan.num_heights:
@@ -248,12 +252,12 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
     """
     views = tuple(range(len(scene.cam2world)))
     if not tour.overlaps:
-        first, level = tour.find_start_view(0), tour.level_axes
+        first, level = tour.find_start_view(0), facts.level
         start = path_poses(scene.cam2world)[0]
-        yaw, pitch = find_angles(level.T @ (start[:3, 2].numpy() if first is None else first))
         if first is None:
-            yaw = choose_heading(facts.outlooks[0], yaw)
-        start[:3, :3] = torch.from_numpy(level)
+            yaw, pitch = choose_heading(facts.outlooks[0], 0.0), 0.0
+        else:
+            yaw, pitch = find_angles(level.T @ first)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
@@ -473,7 +477,7 @@ def _describe_outlook(facts: TourFacts, view: int, marks: Float[np.ndarray, "nod
         marks: of all panoramas on the floor, relative to the camera.
     """
     is_blank, widest = find_blank(facts.outlooks[view])
-    places = locate_surfaces(facts.scene, view, facts.tour.level_axes, min_opacity=0.5)
+    places = locate_surfaces(facts.scene, view, facts.level, min_opacity=0.5)
     hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
     blank = sum(1 << number for number in np.flatnonzero(is_blank).tolist())
     return {"blank": blank, "ahead": round(widest, 3), "hidden": hidden}

@@ -41,6 +41,7 @@ class TourFacts:
         scene: of some panoramas of the tour, in its world, with all Gaussians of each.
         tour: the graph.
         views: the number in the tour of each of the scene's views.
+        level: axes of a level camera (columns right, down, forward) that `outlooks` are relative to.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class TourFacts:
         views: ViewNumbers | None = None,
         *,
         folder: Path | None = None,
+        level: Float[np.ndarray, "3 3"] | None = None,
     ) -> None:
         """Compute nothing yet.
 
@@ -58,16 +60,23 @@ class TourFacts:
             tour: by default that of the scene's cameras.
             views: by default all panoramas.
             folder: of the panoramas, in which the parts are stored; None keeps none.
+            level: by default `TourGraph.level_axes`.
         """
         self.scene = scene
         self.tour = make_graph(scene) if tour is None else tour
         self.views = tuple(range(len(self.tour))) if views is None else views
+        self._level = level
         self._store = None if folder is None else Store(folder, (FloorOutline, Room, Door))
 
     def prepare(self) -> TourFacts:
         """Compute what a viewer reads while it draws."""
         _ = self.outlines, self.outlooks, self.walls, self.poor
         return self
+
+    @property
+    def level(self) -> Float[np.ndarray, "3 3"]:
+        """See the class."""
+        return self.tour.level_axes if self._level is None else self._level
 
     @cached_property
     def _key(self) -> str:
@@ -80,6 +89,7 @@ class TourFacts:
             hash_sources(__name__),
             json.dumps([self.views, edges, tour.worlds, names, self.scene.joint]),
             tour.cam2world.numpy(),
+            self.level,
             *(array.detach().cpu().numpy() for array in arrays),
         )
 
@@ -101,7 +111,7 @@ class TourFacts:
     @_stored
     def outlooks(self) -> Float[np.ndarray, "view bin"]:
         """Distances around the horizon (`measure_outlook`)."""
-        return np.stack([measure_outlook(self.scene, k, self.tour.level_axes) for k in range(len(self.views))])
+        return np.stack([measure_outlook(self.scene, k, self.level) for k in range(len(self.views))])
 
     @_stored
     def walls(self) -> list[Edge]:
