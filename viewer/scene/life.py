@@ -100,5 +100,6 @@ class SceneLife:
         """The life of the same scene with fewer Gaussians, `keep_largest` of a scene and a number."""
         assert self.loaded is not None
         life = SceneLife(self.entry)
-        life.receive(LoadedScene(self.entry, keep_largest(self.loaded.scene, self.reduced)))
+        smaller = keep_largest(self.loaded.scene, self.reduced)
+        life.receive(replace(self.loaded, scene=smaller, is_final=True, facts=None))
         return life
