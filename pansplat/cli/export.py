@@ -105,6 +105,7 @@ class _Mesh:
         from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
         from pansplat.export.mesh_files import name_mesh_files, remove_old_meshes, save_mesh
         from pansplat.tours.doll_house import find_rooms
+        from pansplat.tours.facts import TourFacts
         from pansplat.tours.graph import make_graph, select_views
 
         require_replaceable("--out", name_mesh_files(export.out, 1), export.overwrite)  # before the prediction
@@ -118,7 +119,7 @@ class _Mesh:
         meshes = {}
         for number, views in enumerate(places or [list(range(len(scene.cam2world)))], 1):
             part = select_views(scene, views) if len(places) > 1 else scene
-            inside = None if self.whole or not views else find_rooms(part).contains
+            inside = None if self.whole or not views else find_rooms(TourFacts(part)).contains
             limit = (self.triangles or DEFAULT_TRIANGLES) * len(views) // max(len(scene.cam2world), 1)
             textures = (lambda view, views=views: load(views[view])) if photographs else None
             mesh = make_mesh(part, triangles=limit, textures=textures, inside=inside)

@@ -25,9 +25,9 @@ from pansplat.geometry.equirect import pad_equirect, row_weights, uv_from_direct
 from pansplat.pipeline import render
 from pansplat.rendering import rasterize
 from pansplat.system.descriptions import describe_count
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import make_graph
-from pansplat.tours.plan import make_plan
 
 _NEIGHBOURS = 16  # of a Gaussian
 _CHUNK = 1 << 17  # Gaussians whose neighbours are looked for at once
@@ -166,7 +166,7 @@ def crop_to_rooms(scene: Scene, names: Sequence[str], layers: Scene | None = Non
         raise InputError("rooms need a scene with input cameras, got one without; crop it to a box")
     tour = make_graph(scene)
     shown = scene if layers is None else layers
-    rooms = () if shown.joint else make_plan(shown, tour).rooms
+    rooms = () if shown.joint else TourFacts(shown).plan.rooms
     labels = [panorama.label.casefold() for panorama in tour.panoramas]
     views: set[int] = set()
     for name in names:

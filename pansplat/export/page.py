@@ -51,12 +51,12 @@ from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import is_written
 from pansplat.tours.doll_house import find_rooms
-from pansplat.tours.edges import find_poor_edges
-from pansplat.tours.floor import assign_storeys, choose_camera_height, find_camera_height, find_floor_outline
-from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, make_graph, select_views
+from pansplat.tours.facts import TourFacts
+from pansplat.tours.floor import assign_storeys, choose_camera_height
+from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
-from pansplat.tours.outlook import choose_arrival, find_bin, find_turned, is_hidden, measure_outlook
+from pansplat.tours.outlook import choose_arrival, find_bin, find_turned, is_hidden
 from pansplat.tours.plan import Plan, Room
 from pansplat.tours.route import Route, find_angles, plan_route
 from pansplat.tours.surfaces import locate_surfaces
@@ -168,14 +168,18 @@ def write_page(
             stacklevel=2,
         )
         scene = dataclasses.replace(scene, overlaps=(), links=(), starts=())
-    tour, has_cameras = make_graph(scene), len(scene.cam2world) > 0
-    if not scene.joint and tour.overlaps:
-        tour = dataclasses.replace(tour, poor=find_poor_edges(scene, range(len(tour)), tour.overlaps))
-    rooms = find_rooms(scene) if has_cameras else None
+    has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
+    facts = TourFacts(
+        scene if has_cameras else prepared,
+        folder=photographs[0].folder if photographs else None,
+        level=None if scene.overlaps else path_poses(prepared.cam2world)[0, :3, :3].numpy(),
+    )
+    tour = dataclasses.replace(facts.tour, poor=facts.poor)
+    rooms = find_rooms(facts) if has_cameras else None
     plan = None if rooms is None or not rooms.plan.num_heights else rooms.plan
-    floors = _outline_floors(scene, tour, () if plan is None else plan.rooms)
-    scene = _prepare(scene)
-    flights = _plan_flights(scene, tour)
+    floors = _outline_floors(facts, () if plan is None else plan.rooms) if has_cameras else []
+    scene = prepared
+    flights = _plan_flights(scene, tour, facts)
     house, has_pictures = DollHouse((), b""), len(photographs) > 0 and photo_height != 0
     if rooms is not None:
         report("building the doll's house", 0.0)
@@ -203,7 +207,7 @@ def write_page(
             lambda what, fraction: report(what, 0.75 + 0.2 * fraction),
         )
     report("writing", 0.95)
-    header = _describe_scene(scene, packed, origin, flights, tour)
+    header = _describe_scene(scene, packed, origin, flights, tour, facts)
     header |= {"embed": embed, "doll": [], "photographs": [picture.describe() for picture in pictures]}
     header["plan"] = _describe_plan(plan, floors, tour, origin, flights.level)
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
@@ -253,20 +257,19 @@ class _Flights:
     hysteresis: float = 0.0
 
 
-def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
+def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
     """The flights of a tour; without edges, the camera flies from view to view.
 
     Args:
         scene: of `_prepare`.
-        tour: of the scene before.
+        tour, facts: of the scene before.
     """
     views = tuple(range(len(scene.cam2world)))
     if not tour.overlaps:
-        first = tour.find_start_view(0) if len(tour) else None
+        first, level = tour.find_start_view(0), facts.level
         start = path_poses(scene.cam2world)[0]
-        level = start[:3, :3].numpy()
         view = None if first is None else find_angles(level.T @ first)
-        yaw, pitch = choose_arrival(measure_outlook(scene, 0, level), 0.0, start=view)
+        yaw, pitch = choose_arrival(facts.outlooks[0], 0.0, start=view)
         return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
@@ -275,7 +278,7 @@ def _plan_flights(scene: Scene, tour: TourGraph) -> _Flights:
     samples, jumps = _resample(route)
     start, (yaw, pitch) = torch.from_numpy(route.pose(0.0)), samples[0, 3:].tolist()
     if tour.find_start_view(walk[0]) is None:
-        _, (yaw, pitch) = find_turned(measure_outlook(scene, walk[0], route.level))
+        _, (yaw, pitch) = find_turned(facts.outlooks[walk[0]])
     start[:3, :3] = torch.from_numpy(route.level)
     return _Flights(
         _look(start, route.level, yaw, pitch),
@@ -436,23 +439,22 @@ def _describe_scene(
     origin: Float[np.ndarray, "3"],
     flights: _Flights,
     tour: TourGraph,
+    facts: TourFacts,
 ) -> dict[str, Any]:
     """The numbers of a page, without those of single Gaussians; a part of `PageHeader`."""
     level = flights.level
     positions = scene.cam2world[:, :3, 3].numpy() - origin
-    known = [find_camera_height(scene, view, level) for view in range(len(positions))]
-    usual_height = choose_camera_height(known, scene.far)
-    heights = [height or usual_height for height in known]
+    usual_height = choose_camera_height(facts.heights, scene.far)
+    heights = [height or usual_height for height in facts.heights]
     starts = [tour.find_start_view(node) for node in range(len(tour))] or [None]
     marks = positions + np.outer(heights, level[:, 1])
-    outlooks = [measure_outlook(scene, view, level) for view in range(len(positions))]
     spots = [
         {
             "name": name,
             "position": _round(position),
             "mark": _round(mark),
             "notes": [],
-            **_describe_outlook(scene, view, outlooks[view], level, (marks - position) @ level, start),
+            **_describe_outlook(facts, view, (marks - position) @ level, start),
             "radius": round(0.12 * height, 6),
         }
         for view, (name, position, mark, height, start) in enumerate(
@@ -472,7 +474,7 @@ def _describe_scene(
         "views": views_of_page,
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(link_parts(tour), spots, heights, outlooks) if flights.edges else [],
+        "links": _describe_links(link_parts(tour), spots, heights, facts.outlooks) if flights.edges else [],
         "level": [_round(row) for row in level],
         "start": {
             "position": _round(flights.start[:3, 3].numpy() - origin),
@@ -501,40 +503,31 @@ def _describe_scene(
 
 
 def _describe_outlook(
-    scene: Scene,
-    view: int,
-    outlook: Float[np.ndarray, "bin"],
-    level: Float[np.ndarray, "3 3"],
-    marks: Float[np.ndarray, "node 3"],
-    start: Float[np.ndarray, "3"] | None,
+    facts: TourFacts, view: int, marks: Float[np.ndarray, "node 3"], start: Float[np.ndarray, "3"] | None
 ) -> dict[str, Any]:
     """The rule of `choose_arrival` at a view, as the bits of the directions from which a camera turns, and yaw and
     pitch to which it does; and the panoramas whose marks furniture or walls hide.
 
     Args:
-        outlook: of the view (`measure_outlook`).
-        level: axes of a level camera.
         marks: of all panoramas on the floor, relative to the camera.
         start: direction of the start view.
     """
-    angles = None if start is None else find_angles(level.T @ start)
-    is_turned, ahead = find_turned(outlook, angles)
-    places = locate_surfaces(scene, view, level, min_opacity=0.5)
+    angles = None if start is None else find_angles(facts.level.T @ start)
+    is_turned, ahead = find_turned(facts.outlooks[view], angles)
+    places = locate_surfaces(facts.scene, view, facts.level, min_opacity=0.5)
     hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
     turned = sum(1 << number for number in np.flatnonzero(is_turned).tolist())
     return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": hidden}
 
 
-def _outline_floors(scene: Scene, tour: TourGraph, rooms: Sequence[Room]) -> list[Room]:
+def _outline_floors(facts: TourFacts, rooms: Sequence[Room]) -> list[Room]:
     """Rooms around the panoramas that stand in none of the floor plan: where their floor ends, else a circle."""
     floors: list[Room] = []
-    if not len(tour):
-        return floors
-    level, storeys = tour.level_axes, assign_storeys(tour)
-    for node, center in enumerate(tour.positions @ level[:, (0, 2)]):
+    tour, storeys = facts.tour, assign_storeys(facts.tour)
+    for node, center in enumerate(tour.positions @ tour.level_axes[:, (0, 2)]):
         point = Point(center)
         if not any(room.storey == storeys[node] and Polygon(room.outline).contains(point) for room in rooms):
-            found = find_floor_outline(scene, node, level)
+            found = facts.outlines.get(node)
             shape = point.buffer(_UNKNOWN_FLOOR) if found is None else Polygon(found.corners)
             outline = np.array(shape.simplify(_ROUGH_OUTLINE).exterior.coords)[:-1]
             name = tour.panoramas[node].title or tour.panoramas[node].name

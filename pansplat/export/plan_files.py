@@ -26,10 +26,10 @@ from pansplat.gaussians.scene import Scene
 from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import SOFTWARE
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import assign_storeys
-from pansplat.tours.graph import make_graph
 from pansplat.tours.layout import arrange_in_rows
-from pansplat.tours.plan import Plan, Room, make_plan
+from pansplat.tours.plan import Plan, Room
 
 SUFFIXES = (".svg", ".png", ".dxf")
 
@@ -70,8 +70,8 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
             f"cannot write {path}: needed all that each panorama shows, got a scene with each surface once; give the "
             "folder of the panoramas, or a scene that was exported with --layers"
         )
-    tour = make_graph(scene)
-    plan = make_plan(scene, tour) if len(tour) else None
+    facts = TourFacts(scene)
+    plan = facts.plan if len(facts.tour) else None
     if plan is None or not plan.rooms:
         raise InputError(
             f"cannot write {path}: needed a floor, and walls around at least one of "

@@ -22,13 +22,13 @@ from numpy import ndarray as Array
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.path import level_pose, up_direction, wrap_angle
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.pairs import Link, Panorama
 from pansplat.poses.axes import find_axes, with_hints
 from pansplat.poses.dense import Comparison, Surroundings, compare
 from pansplat.poses.depth import estimate_depth
 from pansplat.poses.hints import read_hints
 from pansplat.poses.two_view import RelativePose
-from pansplat.tours.floor import trace_floor
+from pansplat.tours.floor import find_ceiling, trace_floor
 
 DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
 _IMAGE_HEIGHT = 1024  # largest one, in which edges are looked for
@@ -40,6 +40,10 @@ POOR_FIT = 0.25  # quality below which a place is doubtful
 _LEAST_OVERLAP = 0.01  # of a comparison that counts
 _LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind (docs/poses.md)
 _LINK_REACH = 1.0, 4.0  # camera heights, of a place by a link
+_DOOR = math.radians(8)  # standard deviation of what counts in the direction of a door
+_LINTEL = 0.6, 0.95  # what is above doors and below the ceiling, fractions of the ceiling's height over the camera
+_WALL_TURN, _GRAZING = math.radians(25), 0.12  # of a surface and its wall; least cosine of a direction and a wall's
+_LEAST_WALL, _THICKNESS = 0.25, 0.08  # distance of a wall with a door, and its thickness, camera heights
 _MOST_SUGGESTIONS = 4  # of a pair
 _NEIGHBOURS = 4  # nearest panoramas that a place is compared with
 
@@ -119,8 +123,7 @@ def suggest_by_links(
         first, second: names and links count.
         upright: axes of both upright cameras in the cameras' frames, as columns (`DepthMap.rotation`).
     """
-    there = next((link for link in first.links if link.target == second.name), None)
-    back = next((link for link in second.links if link.target == first.name), None)
+    there, back = _find_link(first, second), _find_link(second, first)
     if there is None:
         turned = None if back is None else suggest_by_links(second, first, (upright[1], upright[0]))
         return None if turned is None else turned.inverse()
@@ -130,6 +133,31 @@ def suggest_by_links(
     else:
         heading = yaw - (_meet_floor(*second.start, upright[1])[0] if second.start else 0.0)
     return PlanPose(distance * math.sin(yaw), distance * math.cos(yaw), wrap_angle(heading))
+
+
+def suggest_through_door(first: Panorama, second: Panorama, pieces: tuple[Piece, Piece]) -> PlanPose | None:
+    """The place of the second panorama relative to the first one if their links lead to one door, camera heights.
+
+    Both sides of the wall with the door state the heading and the place. None without links of both, or without walls.
+
+    Args:
+        first, second: names and links count.
+        pieces: of both.
+    """
+    doors = []
+    for piece, link in zip(pieces, (_find_link(first, second), _find_link(second, first)), strict=True):
+        door = None if link is None else piece.find_door(_meet_floor(link.yaw, link.pitch, piece.upright)[0])
+        if door is None:
+            return None
+        doors.append(door)
+    there, back = doors
+    right, forward = _THICKNESS * math.sin(there.yaw), _THICKNESS * math.cos(there.yaw)
+    behind = PlanPose(there.right + right, there.forward + forward, wrap_angle(there.yaw + math.pi - back.yaw))
+    return behind.add(PlanPose(-back.right, -back.forward, 0.0))
+
+
+def _find_link(start: Panorama, end: Panorama) -> Link | None:
+    return next((link for link in start.links if link.target == end.name), None)
 
 
 def _meet_floor(yaw: float, pitch: float, upright: Float[Array, "3 3"]) -> tuple[float, float]:
@@ -166,6 +194,49 @@ class Piece:
         places = (rays * np.exp(depth)[..., None])[::_OUTLINE_STEP, ::_OUTLINE_STEP].reshape(-1, 3)
         found = trace_floor(places.astype(np.float64))
         return None if found is None else found[0] / found[1]
+
+    @functools.cached_property
+    def _lintels(self) -> tuple[Float[Array, "n 2"], Float[Array, "n"]] | None:
+        """Places (right, forward) of walls above doors, and yaws of their normals, away from the camera."""
+        depth = self.surroundings.depth.log_depth
+        places = pixel_directions(*depth.shape).numpy() * np.exp(depth)[..., None]
+        across, along = (np.roll(places, -2, axis=axis) - np.roll(places, 2, axis=axis) for axis in (1, 0))
+        normals = np.cross(across, along)
+        normals *= np.sign((normals * places).sum(axis=-1, keepdims=True))
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+        places, normals = (values[::2, ::2].reshape(-1, 3) for values in (places, normals))
+        ceiling = find_ceiling(places)
+        if ceiling is None:
+            return None
+        heights = -places[:, 1] / ceiling
+        chosen = (heights > _LINTEL[0]) & (heights < _LINTEL[1]) & (np.abs(normals[:, 1]) < 0.35)
+        return places[chosen][:, (0, 2)], np.arctan2(normals[chosen, 0], normals[chosen, 2])
+
+    def find_door(self, yaw: float) -> PlanPose | None:
+        """Where a direction meets a wall, and the yaw of the wall's normal; None if there is none.
+
+        It is the wall that most of the surfaces around the direction, above doors, are parallel to.
+        """
+        if self.wall_yaw is None or self._lintels is None:
+            return None
+        places, normals = self._lintels
+        turns = np.angle(np.exp(1j * (np.arctan2(*places.T) - yaw)))
+        weights = np.exp(-0.5 * (turns / _DOOR) ** 2)
+        found = []
+        for normal in self.wall_yaw + math.pi / 2 * np.arange(4):
+            cosine = math.cos(yaw - normal)
+            own = (np.abs(np.angle(np.exp(1j * (normals - normal)))) < _WALL_TURN) & (np.abs(turns) < 3 * _DOOR)
+            if cosine > _GRAZING and own.any():
+                offsets = places[own] @ (math.sin(normal), math.cos(normal))
+                order = offsets.argsort()
+                sums = weights[own][order].cumsum()
+                distance = offsets[order][np.searchsorted(sums, 0.5 * sums[-1])]
+                if distance > _LEAST_WALL:
+                    found.append((sums[-1], distance / cosine, normal))
+        if not found:
+            return None
+        _, reach, normal = max(found)
+        return PlanPose(reach * math.sin(yaw), reach * math.cos(yaw), wrap_angle(float(normal)))
 
     def draw_outline(self, place: PlanPose, unit: float) -> Float[Array, "azimuth 2"]:
         """The outline on the plan, metres; a small circle if there is none."""

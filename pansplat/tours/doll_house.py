@@ -11,16 +11,9 @@ import torch
 from jaxtyping import Bool, Float
 from shapely.geometry import Polygon
 
-from pansplat.gaussians.scene import Scene
-from pansplat.tours.floor import (
-    assign_storeys,
-    choose_camera_height,
-    find_camera_height,
-    find_ceiling,
-    find_floor_outline,
-)
-from pansplat.tours.graph import make_graph
-from pansplat.tours.plan import Plan, make_plan
+from pansplat.tours.facts import TourFacts
+from pansplat.tours.floor import assign_storeys, choose_camera_height, find_ceiling
+from pansplat.tours.plan import Plan
 from pansplat.tours.surfaces import locate_surfaces
 
 _USUAL_CEILING = 0.65  # height over the camera of one that is not seen, in heights of the camera
@@ -60,25 +53,23 @@ class Rooms:
         return shapely.contains_xy(self.shape, plan[:, 0], plan[:, 1])
 
 
-def find_rooms(scene: Scene) -> Rooms:
-    """The rooms of a scene with input cameras: those of the floor plan, and the floors of panoramas without walls.
+def find_rooms(facts: TourFacts) -> Rooms:
+    """The rooms of a scene of all panoramas: those of the floor plan, and the floors of panoramas without walls.
 
     Where a view shows neither, most of its surfaces are.
     """
-    tour, gaussians = make_graph(scene), scene.gaussians.to(device="cpu")
+    tour, scene, plan, gaussians = facts.tour, facts.scene, facts.plan, facts.scene.gaussians.to(device="cpu")
     level, count = tour.level_axes, len(tour)
     gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
     scene = dataclasses.replace(scene, gaussians=gaussians)
-    plan = make_plan(scene, tour)
-    heights = [find_camera_height(scene, view, level) for view in range(count)]
-    unit = choose_camera_height(heights, scene.far)
+    unit = choose_camera_height(facts.heights, scene.far)
     ceilings = [find_ceiling(locate_surfaces(scene, view, level)) for view in range(count)]
     outlines = [(room.panoramas, Polygon(room.outline)) for room in plan.rooms]  # anticlockwise
     shapes = [outline.buffer(_WALL * unit, join_style="mitre") for _, outline in outlines]
     keys = list(zip(tour.worlds, assign_storeys(tour), strict=True))
     enclosed = {view for views, _ in outlines for view in views}
     for view in set(range(count)) - enclosed:
-        floor = find_floor_outline(scene, view, level)
+        floor = facts.outlines.get(view)
         if floor is not None:
             ground = shapely.make_valid(Polygon(floor.corners))
             shapes.append(ground.buffer(_BEYOND * unit))
@@ -106,7 +97,7 @@ def find_rooms(scene: Scene) -> Rooms:
     return Rooms(
         level,
         tour.positions,
-        np.array([height or unit for height in heights]),
+        np.array([height or unit for height in facts.heights]),
         np.array([ceiling or _USUAL_CEILING * unit for ceiling in ceilings]),
         shapely.union_all(shapes),
         tuple(outlines),

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.graph import TourGraph, ViewNumbers
+from pansplat.tours.graph import TourGraph
 from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
 
 _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
@@ -178,9 +178,3 @@ def _find_levels(tour: TourGraph, world: int) -> tuple[list[int], Float[np.ndarr
     members = [node for node, own in enumerate(tour.worlds) if own == world]
     heights = tour.positions[members] @ -tour.level_axes[:, 1]
     return members, np.sort([float(np.median(heights[storey])) for storey in find_storeys(heights)])
-
-
-def find_floor_outlines(tour: TourGraph, scene: Scene, views: ViewNumbers) -> dict[int, FloorOutline]:
-    """The floor outlines of a scene's views that show a floor, by panorama."""
-    outlines = {node: find_floor_outline(scene, view, tour.level_axes) for view, node in enumerate(views)}
-    return {node: outline for node, outline in outlines.items() if outline is not None}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -13,7 +14,10 @@ from torch import Tensor
 from pansplat.geometry.equirect import pad_equirect, row_weights
 from pansplat.geometry.warp import relative_pose, warp_panorama
 from pansplat.images.image_files import read_panorama
-from pansplat.tours.graph import TourGraph
+from pansplat.inputs.content import hash_image
+from pansplat.system.source_hash import hash_sources
+from pansplat.system.store import Store, hash_parts
+from pansplat.tours.graph import Edge, TourGraph
 
 _HEIGHT = 48
 _CANDIDATES = 24
@@ -38,22 +42,34 @@ def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = Non
         for other in distances[node].argsort(kind="stable")[1 : _MAX_NEIGHBOURS + 1].tolist():
             if other != node and distances[node, other] <= _MAX_BASELINE * tour.far:
                 compared.add((min(node, other), max(node, other)))
-    features = {}
-    for node in sorted({node for edge in compared for node in edge}):
-        report("comparing panoramas", 0.5 * node / len(tour))
-        features[node] = _compute_features(read_panorama(tour.panoramas[node].image, _HEIGHT)[0])
+    edges, images = sorted(compared), {node: tour.panoramas[node].image for edge in compared for node in edge}
+    key = hash_parts(
+        hash_sources(__name__),
+        json.dumps([edges, tour.near, tour.far, [(node, hash_image(images[node])) for node in sorted(images)]]),
+        tour.cam2world[sorted(images)].numpy(),
+    )
+    measured = Store(tour.folder).get("overlaps", key, lambda: _measure_overlaps(tour, edges, report))
     overlaps, walls = {}, []
-    for index, (a, b) in enumerate(sorted(compared)):
-        report("comparing panoramas", 0.5 + 0.5 * index / len(compared))
-        poses = tour.cam2world[[a, b]]
-        overlap = _measure_overlap(features[a], features[b], poses, tour.near, tour.far)
-        if overlap >= (_MIN_GIVEN_OVERLAP if (a, b) in tour.overlaps else _MIN_OVERLAP):
-            overlaps[a, b] = overlap
-        elif (a, b) in tour.overlaps:
-            walls.append((a, b))
+    for edge, overlap in zip(edges, measured, strict=True):
+        if overlap >= (_MIN_GIVEN_OVERLAP if edge in tour.overlaps else _MIN_OVERLAP):
+            overlaps[edge] = overlap
+        elif edge in tour.overlaps:
+            walls.append(edge)
     joined = {node for edge in (*overlaps, *walls) for node in edge}
     overlaps |= {(a, b): overlap for (a, b), overlap in tour.overlaps.items() if a == b and a not in joined}
     return dataclasses.replace(tour, overlaps=overlaps).with_walls(walls)
+
+
+def _measure_overlaps(tour: TourGraph, edges: Sequence[Edge], report: Callable[[str, float], None]) -> list[float]:
+    """The overlap of each pair of panoramas."""
+    features, overlaps = {}, []
+    for node in sorted({node for edge in edges for node in edge}):
+        report("comparing panoramas", 0.5 * node / len(tour))
+        features[node] = _compute_features(read_panorama(tour.panoramas[node].image, _HEIGHT)[0])
+    for index, (a, b) in enumerate(edges):
+        report("comparing panoramas", 0.5 + 0.5 * index / len(edges))
+        overlaps.append(_measure_overlap(features[a], features[b], tour.cam2world[[a, b]], tour.near, tour.far))
+    return overlaps
 
 
 def _compute_features(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "feature height width"]:

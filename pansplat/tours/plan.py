@@ -23,7 +23,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.components import label_components
-from pansplat.tours.floor import assign_storeys, find_camera_height, find_ceiling, trace_floor
+from pansplat.tours.floor import assign_storeys, find_ceiling, trace_floor
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
 
@@ -162,19 +162,18 @@ class _Lines:
     offsets: Float[np.ndarray, "line"]
 
 
-def make_plan(scene: Scene, tour: TourGraph) -> Plan:
+def make_plan(scene: Scene, tour: TourGraph, heights: Sequence[float | None]) -> Plan:
     """The floor plan of a scene; without rooms if no panorama shows walls around it.
 
     Args:
         scene: with input cameras, not fused: each panorama with its own Gaussians.
         tour: the graph of the scene's cameras (`make_graph`).
+        heights: of the cameras over the floor (`find_camera_height`).
     """
-    level, count = tour.level_axes, len(tour)
-    heights = [find_camera_height(scene, view, level) for view in range(count)]
     known = np.array([height for height in heights if height is not None])
     if not len(known):
         return Plan(tour, (), (), math.nan, None, None, 0, 0)
-    unit = float(np.median(known))
+    level, count, unit = tour.level_axes, len(tour), float(np.median(known))
     sights = [_look(scene, view, level, heights[view] or unit) for view in range(count)]
     storeys, parts = assign_storeys(tour), tour.worlds
     rooms: list[Room] = []

@@ -27,6 +27,7 @@ def locate_surfaces(
     gaussians = scene.gaussians
     # Coarse levels have Gaussians behind the surfaces.
     shown = (gaussians.views == view) & (gaussians.opacities > min_opacity) & (gaussians.levels <= 1)
+    shown &= gaussians.means.isfinite().all(dim=1)
     return (gaussians.means[shown].double().cpu().numpy() - scene.cam2world[view, :3, 3].double().cpu().numpy()).dot(
         level
     )

@@ -22,6 +22,7 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.images.image_files import write_image
 from pansplat.system.files import is_written
 from pansplat.tours.doll_house import find_rooms
+from pansplat.tours.facts import TourFacts
 
 LOW, HIGH = torch.tensor((-2.0, -1.1, -3.0)), torch.tensor((2.0, 1.5, 3.0))  # y is down
 CENTERS = torch.tensor(((-0.8, 0.0, -1.0), (0.8, 0.1, 1.2)))
@@ -94,7 +95,7 @@ def test_what_a_window_shows_is_left_out_of_the_rooms() -> None:
     poses[:, :3, 3] = CENTERS.double()
     scene = Scene(Gaussians.cat(views), poses, 0.5, 10.0, names=("a.jpg", "b.jpg"), height=128)
     whole = make_mesh(scene, triangles=TRIANGLES)
-    cropped = make_mesh(scene, triangles=TRIANGLES, inside=find_rooms(scene).contains)
+    cropped = make_mesh(scene, triangles=TRIANGLES, inside=find_rooms(TourFacts(scene)).contains)
     reach = [max(float(part.positions[part.triangles, 0].max()) for part in mesh.parts) for mesh in (whole, cropped)]
     assert reach[0] > float(HIGH[0]) + 4 and reach[1] < float(HIGH[0]) + 0.5
     size = (HIGH - LOW).numpy()

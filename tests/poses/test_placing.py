@@ -20,6 +20,7 @@ from pansplat.poses.placing import (
     measure_fit,
     snap,
     suggest_by_links,
+    suggest_through_door,
 )
 from pansplat.poses.solvers import rotation_exp
 from pansplat.poses.two_view import Hypotheses, RelativePose
@@ -157,6 +158,29 @@ def test_links_suggest_the_place_at_which_they_meet_the_floor_also_of_tilted_cam
     assert turned.yaw == pytest.approx(onwards.yaw - 0.5)
     horizontal = replace(first, links=(replace(links["a"], pitch=-0.3),))
     assert math.hypot(*suggest_by_links(horizontal, second, upright)[:2]) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(("door", "tilt"), [(0.6, 0.0), (-1.7, 0.0), (0.6, 0.1)])
+def test_links_to_one_door_suggest_the_place_behind_its_wall(look_around, door, tilt):
+    """Rooms of 5.2 by 4.2 m, the second on the right of the first; the door is at a place along the wall, metres."""
+    centres, rooms, unit = np.array(((0.5, 0, 0.3), (-1.0, 0, -0.4))), np.array((0, 5.2)), 1.35
+    pieces, places, views = [], [], []
+    for n, yaw in enumerate((0.4, -2.0)):
+        rotation = _upright(yaw) @ _tilt(tilt)
+        surroundings = look_around(0, rotation, centres[n])
+        axes = rotation @ surroundings.depth.rotation  # of the upright camera
+        wall, ahead = axes.T @ (0, 0, 1), axes[:, 2]
+        pieces.append(Piece(surroundings, math.atan2(wall[0], wall[2])))
+        right = (centres[n, 0] + rooms[n]) / unit + 0.08 * n
+        places.append(PlanPose(right, centres[n, 2] / unit, math.atan2(ahead[0], ahead[2])))
+        x, y, z = rotation.T @ ((2.6 - 5.2 * n, 1.0, door) - centres[n])
+        link = Link("ba"[n], math.atan2(x, z), math.atan2(y, math.hypot(x, z)))
+        views.append(Panorama("ab"[n], Path("ab"[n]), torch.eye(4, dtype=torch.float64), links=(link,)))
+    truth, found = places[0].inverse().add(places[1]), suggest_through_door(views[0], views[1], tuple(pieces))
+    assert found.distance(truth) < 0.05 and found.turn_between(truth) < 1e-6
+    assert suggest_through_door(views[1], views[0], tuple(pieces[::-1])).distance(truth.inverse()) < 0.05
+    assert suggest_through_door(views[0], replace(views[1], links=()), tuple(pieces)) is None
+    assert suggest_through_door(views[0], views[1], (pieces[0], Piece(pieces[1].surroundings, None))) is None
 
 
 def _tilt(angle: float) -> np.ndarray:

@@ -9,6 +9,7 @@ from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.doll_house import find_rooms
+from pansplat.tours.facts import TourFacts
 
 LOW, HIGH = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0))  # of the room around a camera: x, y down, z
 PLACES = ((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (10.0, 0.0, 0.0))
@@ -30,7 +31,7 @@ def _without_walls(scene: Scene, views: tuple[int, ...]) -> Scene:
 
 
 def test_rooms_are_those_of_the_plan(rooms: Scene) -> None:
-    found = find_rooms(rooms)
+    found = find_rooms(TourFacts(rooms))
     assert [views for views, _ in found.outlines] == [(0,), (1,), (2,)] and found.houses == ((0, 1, 2),)
     assert [outline.area for _, outline in found.outlines] == pytest.approx([22.5] * 3, rel=0.02)
     assert found.floors == pytest.approx([1.5] * 3, rel=0.02) and found.ceilings == pytest.approx([1.1] * 3, rel=0.02)
@@ -43,9 +44,9 @@ def test_rooms_are_those_of_the_plan(rooms: Scene) -> None:
 
 
 def test_a_house_with_walls_of_fewer_than_half_of_its_rooms_is_hidden(rooms: Scene) -> None:
-    half = find_rooms(_without_walls(rooms, (1,)))
+    half = find_rooms(TourFacts(_without_walls(rooms, (1,))))
     assert half.houses == ((0, 1, 2),) and [views for views, _ in half.outlines] == [(0,), (2,)]
-    assert find_rooms(_without_walls(rooms, (1, 2))).houses == ()
+    assert find_rooms(TourFacts(_without_walls(rooms, (1, 2)))).houses == ()
 
 
 def test_an_upper_storey_is_another_house(rooms: Scene) -> None:
@@ -53,4 +54,5 @@ def test_an_upper_storey_is_another_house(rooms: Scene) -> None:
     poses[2, :3, 3] = torch.tensor((0.0, -2.8, 0.0))
     shift = torch.where((rooms.gaussians.views == 2)[:, None], torch.tensor((-10.0, -2.8, 0.0)), 0.0)
     gaussians = dataclasses.replace(rooms.gaussians, means=rooms.gaussians.means + shift)
-    assert find_rooms(dataclasses.replace(rooms, gaussians=gaussians, cam2world=poses)).houses == ((0, 1), (2,))
+    above = dataclasses.replace(rooms, gaussians=gaussians, cam2world=poses)
+    assert find_rooms(TourFacts(above)).houses == ((0, 1), (2,))

@@ -7,6 +7,7 @@ import torch
 
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.images.image_files import write_image
+from pansplat.tours import overlap
 from pansplat.tours.overlap import connect
 
 
@@ -38,3 +39,28 @@ def test_panoramas_of_one_room_overlap_and_those_of_two_rooms_do_not(tmp_path, m
     other_world = dataclasses.replace(tour.panoramas[2], world=1)
     parts = dataclasses.replace(given, panoramas=(*tour.panoramas[:2], other_world, tour.panoramas[3]))
     assert set(connect(parts).overlaps) == {(0, 1), (3, 3), (2, 2)}, "only panoramas of one world are compared"
+
+
+def test_overlaps_are_measured_again_only_if_an_image_or_a_pose_has_changed(tmp_path, make_tour, monkeypatch):
+    tour = make_tour(((0.0, 0.0), (0.0, 1.0)), ((0, 1),), tmp_path)
+
+    def draw(node: int, seed: int) -> None:
+        x, z = ((0.0, 0.0), (0.0, 1.0))[node]
+        image = draw_room((x, 0.0, z), np.array((-1.5, -1.3, -2.0)), np.array((1.5, 1.2, 2.0)), seed)
+        write_image(tour.panoramas[node].image, image.numpy())
+
+    for node in (0, 1):
+        draw(node, seed=0)
+    measured = []
+    measure = overlap._measure_overlaps
+    monkeypatch.setattr(overlap, "_measure_overlaps", lambda *rest: measured.append(1) or measure(*rest))
+    first = connect(tour)
+    assert connect(tour).overlaps == first.overlaps and len(measured) == 1
+    draw(1, seed=1)
+    assert connect(tour).overlaps != first.overlaps and len(measured) == 2, "the image has changed"
+    pose = tour.cam2world[1].clone()
+    pose[0, 3] += 0.2
+    connect(
+        dataclasses.replace(tour, panoramas=(tour.panoramas[0], dataclasses.replace(tour.panoramas[1], cam2world=pose)))
+    )
+    assert len(measured) == 3, "a pose has changed"

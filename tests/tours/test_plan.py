@@ -21,8 +21,8 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
-from pansplat.tours.graph import make_graph
-from pansplat.tours.plan import Plan, make_plan
+from pansplat.tours.facts import TourFacts
+from pansplat.tours.plan import Plan
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
@@ -108,7 +108,7 @@ CAMERAS = [(1.5, 1.5), (1.2, 4.5), (7.0, 2.0)]
 
 
 def _plan(scene: Scene) -> Plan:
-    return make_plan(scene, make_graph(scene))
+    return TourFacts(scene).plan
 
 
 def _measure_angles(outline: np.ndarray) -> list[float]:

@@ -23,8 +23,10 @@ from pansplat.geometry.pose import rotations_from_quats
 from pansplat.images.image_files import write_image
 from pansplat.inputs.pairs import Link, Pair, Panorama
 from pansplat.rendering import Rendering, rasterize
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import FloorOutline
 from pansplat.tours.graph import TourGraph, merge_scenes
+from pansplat.tours.outlook import BINS
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
@@ -315,7 +317,9 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     corners = torch.stack((angles.sin(), angles.cos()), dim=1).double().numpy()
     centers = {view: tour.positions[view][[0, 2]] for view in entry.views}
     outlines = {view: FloorOutline(center, center + corners, 1.0) for view, center in centers.items()}
-    return LoadedScene(entry, scene, outlines=outlines)
+    facts = TourFacts(scene, tour, entry.views)
+    vars(facts).update(outlines=outlines, outlooks=np.zeros((len(entry.views), BINS)), walls=[], poor=())
+    return LoadedScene(entry, scene, facts=facts)
 
 
 @pytest.fixture(scope="session")

@@ -38,6 +38,7 @@ from pansplat.images.image_files import read_panorama
 from pansplat.inputs.pairs import Note, Pair
 from pansplat.notebook import _bundle_scene
 from pansplat.tours.doll_house import find_rooms
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import make_graph, select_views
 
 SIZE = (320, 240)
@@ -156,7 +157,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: l
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
         patch.setattr(page_module, "_PART_BYTES", 30_000)
-        patch.setattr(page_module, "find_poor_edges", lambda *_: ())  # surfaces of the scenes do not agree
+        patch.setattr(TourFacts, "poor", ())  # surfaces of the scenes do not agree
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
         write_page(house, folder / "house.html")
@@ -168,7 +169,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: l
         write_page(house, folder / "hosted.html", split=True)
         (folder / "poor").mkdir()
         poor = {"photographs": photographs, "photo_height": 512, "split": True}
-        patch.setattr(page_module, "find_poor_edges", lambda *_: ((0, 1),))
+        patch.setattr(TourFacts, "poor", ((0, 1),))
         write_page(house, folder / "poor" / "index.html", **poor)
     return folder
 
@@ -312,7 +313,7 @@ def room() -> Scene:
 def test_the_dolls_house_shows_the_photographs_on_its_floor_and_a_click_goes_back_inside(
     chromium: Any, room: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path
 ) -> None:
-    photographs, rooms = take_photographs(room, 256), find_rooms(room)
+    photographs, rooms = take_photographs(room, 256), find_rooms(TourFacts(room))
     write_page(room, tmp_path / "doll.html", photographs=photographs)
     origin, cameras = room.cam2world[:, :3, 3].mean(0).numpy(), room.cam2world[:, :3, 3].numpy()
     with opened(chromium, tmp_path / "doll.html") as page:

@@ -30,10 +30,10 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.inputs.pairs import Pair
 from pansplat.refinement.budget import merge_to
 from pansplat.tours import edges
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import find_camera_height
 from pansplat.tours.graph import make_graph, select_views
 from pansplat.tours.outlook import find_bin, measure_outlook
-from pansplat.tours.plan import make_plan
 
 
 @pytest.fixture(autouse=True)
@@ -71,7 +71,7 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     header = read_header(tmp_path / "room.html")
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
     tour = make_graph(room)
-    (drawn,), (expected,) = header["plan"]["rooms"], make_plan(room, tour).rooms
+    (drawn,), (expected,) = header["plan"]["rooms"], TourFacts(room).plan.rooms
     assert drawn["name"] == "west / east" and drawn["nodes"] == [0, 1] and header["plan"]["worlds"] == [0, 0]
     turn = level[:, (0, 2)].T @ tour.level_axes[:, (0, 2)]  # they differ by a quarter turn
     outline = np.array(drawn["outline"]) + level[:, (0, 2)].T @ middle

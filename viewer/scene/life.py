@@ -77,7 +77,7 @@ class SceneLife:
     def revert(self) -> None:
         """Go back to the prediction, because the renderer refuses the refined scene."""
         if self.prediction is not None and self.loaded is not None:
-            self.loaded, self.prediction = replace(self.loaded, scene=self.prediction), None
+            self.loaded, self.prediction = replace(self.loaded, scene=self.prediction, facts=None), None
             self.state = "predicted"
 
     def drop(self) -> LoadedScene:
@@ -100,5 +100,6 @@ class SceneLife:
         """The life of the same scene with fewer Gaussians, `keep_largest` of a scene and a number."""
         assert self.loaded is not None
         life = SceneLife(self.entry)
-        life.receive(replace(self.loaded, scene=keep_largest(self.loaded.scene, self.reduced), is_final=True))
+        smaller = keep_largest(self.loaded.scene, self.reduced)
+        life.receive(replace(self.loaded, scene=smaller, is_final=True, facts=None))
         return life

@@ -17,12 +17,10 @@ from pansplat.system.files import is_scene_file, make_portable_name
 from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.pairs import Pair, Panorama
-    from pansplat.tours.floor import FloorOutline
-    from pansplat.tours.graph import Edge, TourGraph
+    from pansplat.tours.facts import TourFacts
+    from pansplat.tours.graph import TourGraph
 
 
 Progress = Callable[[str, float], None]  # task, fraction done
@@ -96,18 +94,13 @@ class LoadedScene:
 
     Attributes:
         is_final: False for a prediction whose refinement will follow.
-        outlines: of a scene of a tour: floor outlines by panorama.
-        walls, poor: of a scene of a tour: edges that it shows to be none, and those whose flights would be poor.
-        outlooks: of a scene of a tour: distances around the horizon by panorama (`measure_outlook`).
+        facts: of a scene of a tour.
     """
 
     entry: SceneEntry
     scene: "Scene"
     is_final: bool = True
-    outlines: "dict[int, FloorOutline]" = field(default_factory=dict)
-    walls: "Sequence[Edge]" = ()
-    poor: "Sequence[Edge]" = ()
-    outlooks: "dict[int, np.ndarray]" = field(default_factory=dict)
+    facts: "TourFacts | None" = None
 
 
 @dataclass(frozen=True)
@@ -239,11 +232,9 @@ def _load_tour_scene(
     The first scene of a window is not refined if it is predicted again with the rest of its part.
     """
     from pansplat import pipeline
-    from pansplat.tours.edges import find_poor_edges, find_walls
-    from pansplat.tours.floor import find_floor_outlines
+    from pansplat.tours.facts import TourFacts
     from pansplat.tours.graph import select_views
     from pansplat.tours.links import link_parts
-    from pansplat.tours.outlook import measure_outlook
     from pansplat.tours.overlap import connect
 
     tour, views, merged, prediction = entry.tour, entry.views, entry.merged, options.prediction
@@ -251,10 +242,7 @@ def _load_tour_scene(
     if merged is not None:
         first, views = _choose_first_scene(tour, tour)
         entry = replace(entry, tour=link_parts(tour), views=views, start=first)
-        outlines = find_floor_outlines(tour, merged, tuple(range(len(tour))))
-        outlooks = {node: measure_outlook(merged, node, tour.level_axes) for node in range(len(tour))}
-        poor = () if merged.joint else find_poor_edges(merged, range(len(tour)), tour.overlaps)
-        return LoadedScene(entry, select_views(merged, views), outlines=outlines, poor=poor, outlooks=outlooks)
+        return LoadedScene(entry, select_views(merged, views), facts=TourFacts(merged, tour).prepare())
     predictor = pipeline.load_predictor(prediction)
     if not views:
         connected, max_views = connect(tour, progress), pipeline.find_max_views(predictor)
@@ -271,10 +259,7 @@ def _load_tour_scene(
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
         scene = tour.place(scene, views)
-        outlines, walls = find_floor_outlines(tour, scene, views), find_walls(scene, views, tour.overlaps)
-        outlooks = {node: measure_outlook(scene, view, tour.level_axes) for view, node in enumerate(views)}
-        poor = find_poor_edges(scene, views, tour.overlaps)
-        return LoadedScene(entry, scene, is_final, outlines, walls, poor, outlooks)
+        return LoadedScene(entry, scene, is_final, TourFacts(scene, tour, views, folder=tour.folder).prepare())
 
     scene = pipeline.predict(
         pair,

@@ -32,6 +32,7 @@ from pansplat.poses.placing import (
     read_piece,
     snap,
     suggest_by_links,
+    suggest_through_door,
 )
 from pansplat_viewer.scene.background import BackgroundWorker, CancelledError, Report
 from pansplat_viewer.scene.loader import SceneEntry, list_panoramas
@@ -413,10 +414,11 @@ class Placing:
                 for suggestion in self._suggestions.get(ends, ()):
                     relative = suggestion.place.inverse() if is_reversed else suggestion.place
                     found.append(Ghost(place.add(relative, self.floor.unit), suggestion.log_odds, target))
-            upright = self.pieces[other].upright, self.pieces[image].upright
-            linked = suggest_by_links(self.panoramas[target], self.panoramas[self.node], upright)
-            if linked is not None:
-                found.append(Ghost(place.add(linked, self.floor.unit), -math.inf, target))
+            ends, pieces = (self.panoramas[target], self.panoramas[self.node]), (self.pieces[other], self.pieces[image])
+            upright = pieces[0].upright, pieces[1].upright
+            for linked in (suggest_through_door(*ends, pieces), suggest_by_links(*ends, upright)):
+                if linked is not None:
+                    found.append(Ghost(place.add(linked, self.floor.unit), -math.inf, target))
         kept: list[Ghost] = []
         for ghost in sorted(found, key=lambda ghost: -ghost.log_odds):
             same = [

@@ -143,11 +143,12 @@ class TourScenes:
         The least recently used ones are dropped if the memory is exceeded.
         """
         views = loaded.entry.views
-        self.outlines |= loaded.outlines
-        self._outlooks |= loaded.outlooks
-        self._block(loaded.walls)
-        if poor := set(loaded.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
-            self._change(replace(self.tour, poor=(*self.tour.poor, *sorted(poor))))
+        if (facts := loaded.facts) is not None:
+            self.outlines |= facts.outlines
+            self._outlooks |= zip(facts.views, facts.outlooks, strict=True)
+            self._block(facts.walls)
+            if poor := set(facts.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
+                self._change(replace(self.tour, poor=(*self.tour.poor, *sorted(poor))))
         if views not in self._lives:
             self._selected[views] = loaded
             return

@@ -66,7 +66,7 @@ def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_fil
     assert tour.name == "home" and tour.overlaps == house.overlaps and first.is_final
     assert np.allclose(tour.positions, house.positions) and first.entry.views == (0, 1)
     assert first.entry.panoramas == () and first.entry.files == (house_file,)
-    assert set(first.outlines) <= {0, 1, 2, 3} and scenes.edge == (0, 1) and not scenes.list_next(None, 0.0)[1:]
+    assert set(first.facts.outlines) <= {0, 1, 2, 3} and scenes.edge == (0, 1) and not scenes.list_next(None, 0.0)[1:]
     other = scenes.get((2, 3))
     assert other.entry.views == (2, 3) and scenes.loaded == [(0, 1), (1, 2), (2, 3)]
     assert other.scene.gaussians.views.unique().tolist() == [0, 1]
@@ -117,7 +117,7 @@ def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_f
     part = load_entry(request, LoadOptions(), ignore, lambda loaded: None)
     assert asked[0] == ((0, 1, 2), 0.0, False), "the first scene is not refined"
     assert asked[1] == ((0, 1, 2, 3), pytest.approx(10.0 * 4 / 3), True)
-    assert part.entry.views == request.views and set(part.outlines) <= set(request.views)
+    assert part.entry.views == request.views and set(part.facts.outlines) <= set(request.views)
     film = load_entry(SceneEntry("house", tour=house), LoadOptions(), ignore)
     assert film.entry.views == (0, 1, 2, 3), "a film needs all, so that nothing is predicted twice"
 

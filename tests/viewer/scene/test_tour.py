@@ -96,7 +96,9 @@ def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
     assert scenes.plan_way(camera, 1).fades == () and "fades" not in describe_panoramas(scenes.tour)
     (part,) = scenes.list_next(None, 0.0)
     for _ in range(2):
-        scenes.add(replace(load_house(scenes.make_entry(part)), poor=[(0, 1), (0, 3)]))
+        loaded = load_house(scenes.make_entry(part))
+        vars(loaded.facts).update(poor=[(0, 1), (0, 3)])
+        scenes.add(loaded)
     assert scenes.tour.poor == ((0, 1),), "each edge once, and no others"
     assert len(scenes.plan_way(camera, 1).fades) == 1
     edges = sum(a != b for a, b in scenes.tour.overlaps)
@@ -128,7 +130,9 @@ def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(hous
     )
     scenes = TourScenes.start(first)
     (part,) = scenes.list_next(None, 0.0)
-    scenes.add(replace(load_house(scenes.make_entry(part)), walls=[(0, 1), (2, 3)]))
+    loaded = load_house(scenes.make_entry(part))
+    vars(loaded.facts).update(walls=[(0, 1), (2, 3)])
+    scenes.add(loaded)
     assert scenes.tour.walls == ((0, 1), (2, 3)) and scenes.tour.parts == (0, 1, 1, 2)
     assert scenes.edge == (0, 0) and scenes.get(scenes.views) is not None, "the camera stays where it is"
     assert scenes.list_next(None, 0.0) == [part]

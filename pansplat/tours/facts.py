@@ -1,0 +1,134 @@
+"""What the surfaces of a scene show of its tour. One place computes each part, once, and stores it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from pansplat.gaussians.scene import Scene
+from pansplat.system.source_hash import hash_sources
+from pansplat.system.store import Store, hash_parts
+from pansplat.tours.edges import find_poor_edges, find_walls
+from pansplat.tours.floor import FloorOutline, find_camera_height, find_floor_outline
+from pansplat.tours.graph import Edge, TourGraph, ViewNumbers, make_graph
+from pansplat.tours.outlook import measure_outlook
+from pansplat.tours.plan import Door, Plan, Room, make_plan
+
+Value = TypeVar("Value")
+
+
+def _stored(compute: Callable[[TourFacts], Value]) -> cached_property[Value]:
+    """A property that is computed when it is read first, and stored under its name."""
+
+    def read(facts: TourFacts) -> Value:
+        if facts._store is None:
+            return compute(facts)
+        return facts._store.get(f"tour_{compute.__name__.strip('_')}", facts._key, lambda: compute(facts))
+
+    return cached_property(read)
+
+
+class TourFacts:
+    """What a scene shows of a tour: each part is computed when it is read first.
+
+    Attributes:
+        scene: of some panoramas of the tour, in its world, with all Gaussians of each.
+        tour: the graph.
+        views: the number in the tour of each of the scene's views.
+        level: axes of a level camera (columns right, down, forward) that `outlooks` are relative to.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        tour: TourGraph | None = None,
+        views: ViewNumbers | None = None,
+        *,
+        folder: Path | None = None,
+        level: Float[np.ndarray, "3 3"] | None = None,
+    ) -> None:
+        """Compute nothing yet.
+
+        Args:
+            scene: see the class.
+            tour: by default that of the scene's cameras.
+            views: by default all panoramas.
+            folder: of the panoramas, in which the parts are stored; None keeps none.
+            level: by default `TourGraph.level_axes`.
+        """
+        self.scene = scene
+        self.tour = make_graph(scene) if tour is None else tour
+        self.views = tuple(range(len(self.tour))) if views is None else views
+        self._level = level
+        self._store = None if folder is None else Store(folder, (FloorOutline, Room, Door))
+
+    def prepare(self) -> TourFacts:
+        """Compute what a viewer reads while it draws."""
+        _ = self.outlines, self.outlooks, self.walls, self.poor
+        return self
+
+    @property
+    def level(self) -> Float[np.ndarray, "3 3"]:
+        """See the class."""
+        return self.tour.level_axes if self._level is None else self._level
+
+    @cached_property
+    def _key(self) -> str:
+        """A hash of all that a part depends on."""
+        tour, gaussians = self.tour, self.scene.gaussians
+        edges = [row for row in tour.list_overlaps() if {*row[:2]} <= {*self.views}]
+        names = [(panorama.name, panorama.title) for panorama in tour.panoramas]
+        arrays = gaussians.means, gaussians.opacities, gaussians.views, gaussians.levels, self.scene.cam2world
+        return hash_parts(
+            hash_sources(__name__),
+            json.dumps([self.views, edges, tour.worlds, names, self.scene.joint]),
+            tour.cam2world.numpy(),
+            self.level,
+            *(array.detach().cpu().numpy() for array in arrays),
+        )
+
+    @_stored
+    def heights(self) -> list[float | None]:
+        """Heights of the cameras over the floor, metres; None where a view shows no floor."""
+        return [find_camera_height(self.scene, view, self.tour.level_axes) for view in range(len(self.views))]
+
+    @_stored
+    def _floors(self) -> list[FloorOutline | None]:
+        return [find_floor_outline(self.scene, view, self.tour.level_axes) for view in range(len(self.views))]
+
+    @cached_property
+    def outlines(self) -> dict[int, FloorOutline]:
+        """The floor outlines of the views that show a floor, by panorama."""
+        found = zip(self.views, self._floors, strict=True)
+        return {node: outline for node, outline in found if outline is not None}
+
+    @_stored
+    def outlooks(self) -> Float[np.ndarray, "view bin"]:
+        """Distances around the horizon (`measure_outlook`)."""
+        return np.stack([measure_outlook(self.scene, k, self.level) for k in range(len(self.views))])
+
+    @_stored
+    def walls(self) -> list[Edge]:
+        """The edges that the scene shows to be none (`find_walls`); a scene of `merge_scenes` has no others."""
+        return [] if self.scene.overlaps else find_walls(self.scene, self.views, self.tour.overlaps)
+
+    @_stored
+    def poor(self) -> tuple[Edge, ...]:
+        """The edges whose flights would be poor (`find_poor_edges`); unknown where each surface is kept once."""
+        return () if self.scene.joint else find_poor_edges(self.scene, self.views, self.tour.overlaps)
+
+    @cached_property
+    def plan(self) -> Plan:
+        """The floor plan of a scene of all panoramas."""
+        return Plan(self.tour, **self._plan)
+
+    @_stored
+    def _plan(self) -> dict[str, Any]:
+        plan = make_plan(self.scene, self.tour, self.heights)
+        return {name: value for name, value in vars(plan).items() if name != "tour"}
