@@ -60,7 +60,9 @@ def load_guided_sweep(path: Path, name: str = "default", depth_network: Path | s
     digest = hashlib.blake2b(b"".join(file.read_bytes() for file in files_of_weights), digest_size=8)
     fingerprint = digest.hexdigest() + hash_sources(__name__) + ("" if relative is None else relative.fingerprint)
     prior = NetworkPrior(*networks, fingerprint, relative=relative)
-    return Sweep(SweepConfig(search=SearchConfig(finest_height=_SEARCH_HEIGHT)), prior, name)
+    # A user's network has better shapes than ours, whose scale errs so that the whole range of depth is searched.
+    search = SearchConfig(finest_height=_SEARCH_HEIGHT, near_single_views=relative is not None)
+    return Sweep(SweepConfig(search=search), prior, name)
 
 
 @lru_cache(maxsize=1)

@@ -5,7 +5,8 @@ paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searc
 and with planes across the scene's axes. It runs twice: the first pass, at a smaller size, finds the surfaces which the
 second one uses for occlusion, consistency between views, and the support of planes. Each finer level searches a narrow
 range around the coarser surface. With a prior, the surfaces of the finest level and of the result are those of single
-views, bent by the matches (`bend`).
+views, bent by the matches (`bend`). A prior of accurate shapes replaces the search of the whole range: all levels then
+search near the surfaces of single views.
 """
 
 from __future__ import annotations
@@ -77,6 +78,13 @@ class SearchConfig:
     """The largest depth of the search, relative to `far`: rooms are often larger than the range that was given."""
     narrow_candidates: tuple[int, int] = (16, 8)
     """Hypotheses of a set at the two finer levels."""
+    near_single_views: bool = False
+    """Search near the surfaces of single views only: for a depth network of better shapes than those of matches."""
+    single_view_reach: tuple[float, float, float] = (0.4, 0.2, 0.1)
+    """Largest relative change of inverse depth that the levels of this search find."""
+    single_view_candidates: tuple[int, int, int] = (33, 25, 17)
+    single_view_penalty: float = 0.03
+    """Of the largest change: walls without texture keep their place."""
     unsupported_plane_penalty: float = 0.3
     """Penalty of a plane without support in the scene."""
     sphere_penalty: float = 0.18
@@ -138,6 +146,8 @@ def observe(
         neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
 
     def find_planes() -> list[ScenePlanes]:
+        if config.near_single_views:
+            return [empty] * len(posed.images)
         by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
         pairs = list_best_pairs(neighbours)
         for pair in set(pairs):
@@ -173,6 +183,8 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     if not scene.planes:
         return _place_unmatched(scene, finest)
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
+    if config.near_single_views:
+        return _search_near_single_views(scene, heights, report)
     pixel = math.pi / heights[0] / (depths.high - depths.low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
     counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]
@@ -202,6 +214,29 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     return surfaces if sharp is None else bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
 
 
+def _search_near_single_views(scene: ObservedScene, heights: Sequence[int], report: Progress) -> list[Surface]:
+    """The surfaces of single views, bent at each level by a search near them."""
+    config, posed = scene.config, scene.posed
+    assert scene.estimator is not None
+    log_depths, bent = [], []
+    for sharp, (prior, *_) in zip(
+        scene.estimator.sharpen((scene.depths.low, scene.depths.high)), scene.priors, strict=True
+    ):
+        scale = np.median(prior.log_depth - resize_sphere(sharp, len(prior.log_depth)))
+        log_depths.append((sharp + scale).astype(np.float32))
+    for n, height in enumerate(heights):
+        report("searching near the estimated depth", 0.25 + 0.15 * n)
+        small = [resize_sharp(log_depth, height) for log_depth in log_depths]
+        level = _SearchLevel(scene, height, [_make_surface(-log_depth) for log_depth in small])
+        found = [level.refine_near(view, n) for view in range(len(small))]
+        bent = bend_surfaces(posed.resize(height), found, scene.neighbours, small, config.bend)
+        log_depths = [
+            log_depth + resize_sphere(-np.log(surface.inverse_depth) - start, len(log_depth))
+            for log_depth, surface, start in zip(log_depths, bent, small, strict=True)
+        ]
+    return bent
+
+
 def _upsample(surfaces: list[Surface], images: np.ndarray, height: int) -> list[Surface]:
     """The surfaces at a height, guided by their photographs; none before the first pass."""
     return [
@@ -227,6 +262,10 @@ def _place_unmatched(scene: ObservedScene, height: int) -> list[Surface]:
         sharp = scene.estimator.sharpen((scene.depths.low, scene.depths.high))
         inverse = np.stack([np.exp(-resize_sharp(values, height)) for values in sharp]).clip(*scene.depths.limits)
     return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
+
+
+def _make_surface(log_inverse: np.ndarray) -> Surface:
+    return Surface(np.exp(log_inverse).astype(np.float32), np.zeros(log_inverse.shape, np.uint8))
 
 
 def _make_views(
@@ -303,10 +342,22 @@ class _SearchLevel:
         if widen:
             window = np.ones((5, 5), np.uint8)
             centres += [cv2.dilate(known, window), cv2.erode(known, window)]
-        steps = np.full(known.shape, step, np.float32)
+        return self._refine(view, centres, np.full(known.shape, step, np.float32), np.zeros(count, np.float32))
+
+    def refine_near(self, view: int, level: int) -> Surface:
+        """The best hypotheses near the surface, in steps of relative depth; changes have a penalty."""
+        count = self.config.single_view_candidates[level]
+        change = np.linspace(-1, 1, count, dtype=np.float32)
+        known = self.surfaces[view].inverse_depth
+        steps = known * np.float32(2 * self.config.single_view_reach[level] / (count - 1))
+        return self._refine(view, [known], steps, self.config.single_view_penalty * np.abs(change))
+
+    def _refine(self, view: int, centres: list[np.ndarray], step: np.ndarray, penalty: np.ndarray) -> Surface:
+        """The best of hypotheses a step (h, w) apart around each of some surfaces, with a penalty (count) each."""
+        known, count = self.surfaces[view].inverse_depth, len(penalty)
         side = np.zeros(known.shape, np.uint8)
-        penalty = np.zeros((2, count), np.float32)
-        sets = [HypothesisSet((c - step * (count // 2)).astype(np.float32), steps, penalty, side) for c in centres]
+        penalties = np.stack((penalty, penalty))
+        sets = [HypothesisSet((c - step * (count // 2)).astype(np.float32), step, penalties, side) for c in centres]
         slots = 2 * count
         # Far beyond the slots an offset has no meaning, and must fit an integer.
         starts = np.stack([np.clip((c - known) / step, -4 * slots, 4 * slots) + count / 2 for c in centres], axis=2)

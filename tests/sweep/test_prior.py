@@ -193,3 +193,35 @@ def test_prior_decides_where_photographs_are_blank(make_room):
     surfaces = search(observe(observed.posed, SearchConfig(), TrueHeights(room, room.two_poses())))
     for surface, depth in zip(surfaces, observed.depths, strict=True):
         assert np.median(np.abs(surface.inverse_depth * depth - 1)) < 0.05
+
+
+class BentDepth(TrueHeights):
+    """The same with single views whose depth has smooth errors of up to 20 %."""
+
+    def sharpen(self):
+        return [log_depth + _smooth_error(96) for log_depth in super().sharpen()]
+
+
+def _smooth_error(height):
+    x, y, z = np.moveaxis(ray_grid(height), -1, 0)
+    return 0.2 * np.sin(2 * x + 1) * np.cos(2 * z) * np.cos(y)
+
+
+def _search_near(room, model_type):
+    """The median error of log-depth of each view, and the steps of the finest level."""
+    observed = room.observe(96)
+    model = model_type(room, list(observed.posed.cam2world))
+    surfaces = search(observe(observed.posed, SearchConfig(near_single_views=True), model))
+    errors = [np.abs(np.log(s.inverse_depth * depth)) for s, depth in zip(surfaces, observed.depths, strict=True)]
+    steps = SearchConfig.single_view_candidates[-1] - 1
+    return [np.median(error) for error in errors], 2 * SearchConfig.single_view_reach[-1] / steps
+
+
+def test_search_near_single_views_removes_their_smooth_errors(make_room):
+    errors, step = _search_near(make_room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7))), BentDepth)
+    assert max(errors) < step < np.median(np.abs(_smooth_error(96))) / 4
+
+
+def test_search_near_exact_single_views_keeps_walls_without_texture(make_room):
+    errors, step = _search_near(make_room(paint="blank"), TrueHeights)
+    assert max(errors) < step / 2  # the middle hypothesis, with any fraction of a step
