@@ -147,7 +147,7 @@ def _relation(log_odds: float, problem: str | None = None) -> RelativePose:
 def test_without_the_learned_matcher_poses_are_estimated_by_sift_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse() -> None:
+    def refuse(**_: object) -> None:
         raise MatcherMissingError("needed the learned matcher's weights, got none; run setup.sh again")
 
     monkeypatch.setattr("pansplat.poses.estimate.load_matcher", refuse)

@@ -802,14 +802,14 @@ def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
 @pytest.mark.slow
 def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     user = tour_user
-    user.state.camera = replace(user.state.camera, yaw_radians=-0.25)  # the hotspot is right of the panel
+    user.state.camera = replace(user.state.camera, yaw_radians=-0.25, pitch_radians=-0.9)  # right of the panel
     user.draw_frames(2)
-    (hotspot,) = [spot for spot in user.viewer.hotspots if spot.node == 2]
+    (hotspot,) = [spot for spot in user.viewer.hotspots if spot.node == 1]
     first, color = user.viewer.stage.slot.scene, user.read_image().mean((0, 1))
     user.click_at(*hotspot.center)
     assert user.state.playing and not user.state.points
     fly(user)
-    assert np.linalg.norm(user.state.camera.position - user.viewer.tour.tour.positions[2]) < 1e-6
+    assert np.linalg.norm(user.state.camera.position - user.viewer.tour.tour.positions[1]) < 1e-6
     user.click_at(*user.panels.minimap.nodes[3])
     steps = fly(user)
     assert find_node(user) == 3 and user.viewer.stage.slot.scene is not first

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock, Mock
 
@@ -570,7 +571,8 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
     def load(entry: SceneEntry, progress: object, show: Callable[..., None]) -> LoadedScene:
         if not entry.views:
             return load_house(replace(entry, views=(0, 1), pair=house.make_pair((0, 1)), max_views=64))
-        loaded = replace(load_house(entry), **found)
+        facts = {"outlines": {}, "views": (), "outlooks": (), "walls": [], "poor": ()} | found
+        loaded = replace(load_house(entry), facts=SimpleNamespace(**facts))
         if len(entry.views) == 4:
             show(replace(loaded, is_final=False))
             assert go.wait(300)
@@ -628,6 +630,8 @@ def tour_app(make_app, house) -> App:
 
 def test_hotspots_are_in_points_of_a_screen_with_two_pixels_a_point(tour_app):
     app = tour_app
+    app.state.camera = replace(app.state.camera, pitch_radians=-0.9)
+    app.frames(2)
     expected = [(spot.node, spot.center) for spot in app.viewer.hotspots]
     app.target.viewport = (0, 0, 2 * SIZE[0], 2 * SIZE[1])
     app.frames(2)

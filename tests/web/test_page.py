@@ -130,17 +130,17 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
 
 
 def test_every_panorama_stands_in_an_outline_of_its_storey(flat: Scene) -> None:
-    tour = make_graph(flat)
-    floors = page_module._outline_floors(flat, tour, ())
+    tour, facts = make_graph(flat), TourFacts(flat)
+    floors = page_module._outline_floors(facts, ())
     assert [room.panoramas for room in floors] == [(0,), (1,), (2,), (3,)]
     places = tour.positions @ tour.level_axes[:, (0, 2)]
     assert all(shapely.Polygon(room.outline).contains(shapely.Point(places[room.panoramas[0]])) for room in floors)
     around = dataclasses.replace(floors[0], outline=shapely.Point(places[0]).buffer(60).exterior.coords[:])
-    assert page_module._outline_floors(flat, tour, [around]) == [], "all stand in it"
+    assert page_module._outline_floors(facts, [around]) == [], "all stand in it"
     above = dataclasses.replace(around, storey=around.storey + 1)
-    assert len(page_module._outline_floors(flat, tour, [above])) == 4
+    assert len(page_module._outline_floors(facts, [above])) == 4
     hidden = flat.gaussians.select(flat.gaussians.means[:, 1] < -2)  # no floor
-    (circle, *_) = page_module._outline_floors(dataclasses.replace(flat, gaussians=hidden), tour, ())
+    (circle, *_) = page_module._outline_floors(TourFacts(dataclasses.replace(flat, gaussians=hidden)), ())
     assert shapely.Polygon(circle.outline).area == pytest.approx(math.pi * 1.5**2, rel=0.1)
 
 

@@ -260,14 +260,14 @@ def test_the_hotspot_of_a_link_is_where_it_meets_the_floor(parted_house, load_ho
 
 
 def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(scenes):
-    camera = Camera(position=(0.0, 0.0, 0.0), vertical_fov_degrees=90.0)
+    camera, focal = Camera(position=(0.0, 0.0, 0.8), vertical_fov_degrees=120.0), 100 / np.tan(np.radians(60))
     hotspots = find_hotspots(scenes, camera, (200, 200))
-    assert [hotspot.node for hotspot in hotspots] == [2], "the floor below panorama 1 is not in the image"
+    assert [hotspot.node for hotspot in hotspots] == [2], "0 is behind the camera, no flight leads to 3"
     x, y = hotspots[0].center
-    assert x == pytest.approx(100) and y == pytest.approx(100 + 100 / 1.6), "1 m below the camera, 1.6 m ahead"
+    assert x == pytest.approx(100) and y == pytest.approx(100 + focal / 0.8), "1 m below the camera, 0.8 m ahead"
     assert find_clicked(hotspots, (x + 5, y)) == 2
     assert find_clicked(hotspots, (x, y - 60)) is None
-    assert find_hotspots(scenes, replace(camera, yaw_radians=np.pi), (200, 200)) == []
+    assert [spot.node for spot in find_hotspots(scenes, replace(camera, yaw_radians=np.pi), (200, 200))] == [0]
 
 
 @pytest.fixture
@@ -370,9 +370,9 @@ def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house,
     rows = {p.image.name: p.cam2world.tolist() for p in house.panoramas}
     (house.folder / "poses.json").write_text(str({"convention": "cam2world opencv", "poses": rows}).replace("'", '"'))
 
-    def predict(pair, **options):
+    def predict(pair, *_, options, **__):
         views = tuple(int(panorama.name[-1]) for panorama in pair.context)
-        assert options["height"] == 128
+        assert options.height == 128
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
