@@ -299,7 +299,7 @@ def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m,
             textured = own_variance[i, j] / (own_variance[i, j] + weights.texture_variance)
             textured = weights.textureless_weight + (1 - weights.textureless_weight) * textured
             cost = textured * cost + (1 - textured) * weights.textureless_cost
-            extra = set_penalty[side[i, j], k] + penalty[i, j]
+            extra = set_penalty[k] + penalty[i, j]
             seen = np.float32(1)
             if other.has_surface:
                 if ratio[i, j] > 1 + weights.tolerance:
@@ -326,7 +326,7 @@ def _compute_block_cost(view, other, hypotheses, bounds, weights, cost, total, o
     Without `total`, there is one other view: its costs are written. The set starts at `offset`.
     """
     first = block * _BLOCK
-    last = min(first + _BLOCK, hypotheses.penalty.shape[1])
+    last = min(first + _BLOCK, len(hypotheses.penalty))
     height, width = view.mean.shape
     m = (view.gray.shape[0] - height) // 2
     maps, row = np.empty((6, height, width), np.float32), np.empty((5, width), np.float32)
@@ -383,16 +383,16 @@ class HypothesisSet:
 
     Attributes:
         base, step: (h, w) float32, 1/m.
-        penalty: (2, count) added to the cost of a hypothesis, by `side`.
+        penalty: (count) added to the cost of a hypothesis.
         side: (h, w) 0 where a pixel sees the planes at negative distances along their normal, 1 at positive ones.
-        back_facing: (2, count) planes that the two views see from different sides; None for none.
+        back_facing: (2, count) by `side`, planes that the two views see from different sides; None for none.
         sphere: the hypotheses are spheres around the camera.
     """
 
     base: np.ndarray
     step: np.ndarray
     penalty: np.ndarray
-    side: np.ndarray
+    side: np.ndarray | None = None
     back_facing: np.ndarray | None = None
     sphere: bool = False
 
@@ -454,7 +454,7 @@ def compute_matching_cost(
     matched = _Matched(view.image, view.valid, view.down, ray_grid(height), gray, mean, variance)
     bounds = _Bounds(*np.float32((*limits, *floor_ceiling)))
     weights = _Weights(*(np.float32(getattr(config, name)) for name in _Weights._fields))
-    count = others[0].sets[0].penalty.shape[1]
+    count = len(others[0].sets[0].penalty)
     shape = height, width, len(others[0].sets) * count
     several = len(others) > 1
     cost = np.zeros(shape, np.float32) if several else np.empty(shape, np.float32)
@@ -473,7 +473,8 @@ def compute_matching_cost(
             back_facing = np.zeros((2, count), bool) if own.back_facing is None else own.back_facing
             # One type for all sets: the kernel is compiled once.
             maps = (np.ascontiguousarray(each, np.float32) for each in (own.base, own.step, own.penalty))
-            hypotheses = _Set(*maps, np.ascontiguousarray(own.side), back_facing)
+            side = np.zeros((height, width), np.uint8) if own.side is None else np.ascontiguousarray(own.side)
+            hypotheses = _Set(*maps, side, back_facing)
             own_weights = weights if own.sphere else weights._replace(opposed_penalty=np.float32(0))
             arguments = matched, warped, hypotheses, bounds, own_weights, cost, total, n * count
             parallel_for(partial(_compute_block_cost, *arguments), -(-count // _BLOCK), thread_count())

@@ -1,48 +1,32 @@
-"""The scene's axes and its planes.
+"""The scene's axes, its floor and its ceiling.
 
 Rooms consist of horizontal planes and of two directions of vertical ones (a Manhattan world). The axes follow from
 image gradients: a straight line and the camera span a plane, whose normal is the gradient's direction on the sphere,
-and the line's direction is perpendicular to this normal.
-
-The planes across each axis are detected by Hough voting, before any surface is known. Most hypotheses of a single
-pixel are wrong. Wrong hypotheses are spread over all offsets, while the pixels of a floor or a wall have one offset.
-Each pixel distributes one vote over its hypotheses by their matching cost. A wall without texture matches everywhere
-and therefore has no influence. After the first pass the histogram of the consistent surfaces supplements the votes.
+and the line's direction is perpendicular to this normal. Floor and ceiling follow from the surfaces found so far.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.sweep.matching import DepthRange, HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
+from pansplat.sweep.matching import View
 from pansplat.sweep.surface import Surface, pad_sphere, ray_grid, world_points
 
 _MIN_GRADIENT = 0.02  # per pixel; smaller gradients are noise
 _MAX_GRADIENT = 0.2  # larger gradients have the weight of this one
 
-_BIN_WIDTH = 1 / 9  # in units of `near`: 5 cm indoors
-_REACH = 1.5  # largest offset of a plane from the cameras' mean, relative to the largest depth
-_MIN_SOLID_ANGLE, _MAX_SOLID_ANGLE = 2e-4, 2e-2  # fractions of the sphere at which a plane's support is 0 and 1
-_DOWN_AXIS = 0
-MIN_FLOOR = 0.9  # smallest distance of the floor or ceiling from the camera, in units of `near`
+_BIN_WIDTH = 1 / 9  # of the offsets of horizontal planes, in units of `near`: 5 cm indoors
+_MIN_FLOOR_BINS = 8  # smallest distance of the floor or ceiling from the cameras' mean
 _FLOOR_SOLID_ANGLE = 0.02  # smallest fraction of the sphere that a floor or ceiling covers
+_HORIZONTAL = 1  # orientation of a surface across the down axis
+_MARGIN = 1.06  # of the scene's extent, relative to the distance of floor and ceiling
 
-_CANDIDATES = 96  # planes across an axis
-_SOFTNESS = np.float32(0.1)  # difference of cost that divides a vote by e
-_MAX_COST = np.float32(0.6)  # smallest cost of a match without a vote
 _MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
-_MIN_SLANT = 0.2  # smallest component of a ray along a plane's normal
-_MIN_VOTES = 0.1  # scale of a plane's votes, relative to the strongest plane
-_DISTINCT = 3  # ratio of a floor's or ceiling's votes to the median
-
-_UNBOUNDED = (math.inf, -math.inf)
 
 
 def estimate_axes(images: Sequence[np.ndarray], rotations: Sequence[np.ndarray]) -> np.ndarray:
@@ -131,162 +115,52 @@ def axis_components(axes: np.ndarray, rotation: np.ndarray, height: int) -> np.n
     return np.moveaxis(ray_grid(height) @ (rotation.T @ axes.T), -1, 0)
 
 
-@dataclass(frozen=True, eq=False)
-class ScenePlanes:
-    """Evidence for planes across the scene's axes, by their offset from `origin` along the axis.
-
-    Attributes:
-        axes: (3, 3) see `estimate_axes`.
-        origin: (3,) in the world.
-        histogram: (3, bins) fraction of the sphere whose surface lies on a plane.
-        bin: width of a bin, metres.
-        votes: (3, bins) support in [0, 1] by Hough voting.
-        floor_ceiling: offsets down and up (negative) of the detected floor and ceiling, metres; infinite without one.
-    """
-
-    axes: np.ndarray
-    origin: np.ndarray
-    histogram: np.ndarray
-    bin: float
-    votes: np.ndarray
-    floor_ceiling: tuple[float, float] = _UNBOUNDED
-
-    @property
-    def offsets(self) -> np.ndarray:
-        """Offsets (bins) of the bins' centres, metres."""
-        bins = self.histogram.shape[1]
-        return (np.arange(bins) - bins // 2 + 0.5) * self.bin
-
-    def _bin(self, offset: np.ndarray) -> np.ndarray:
-        middle = self.histogram.shape[1] // 2
-        return np.clip(np.floor(offset / self.bin).astype(np.int64) + middle, 0, self.histogram.shape[1] - 1)
-
-    def support(self, axis: int, cam2world: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """Support in [0, 1], (2, n), of planes at distances 1 / `inverse` on the negative and positive side."""
-        centre = self.axes[axis] @ (cam2world[:3, 3] - self.origin)
-        index = np.stack([self._bin(centre + sign / inverse) for sign in (-1, 1)])
-        found = np.log1p(self.histogram[axis, index] / _MIN_SOLID_ANGLE) / np.log1p(_MAX_SOLID_ANGLE / _MIN_SOLID_ANGLE)
-        return np.clip(np.maximum(found, self.votes[axis, index]), 0, 1)
-
-    def separating(self, axis: int, cam2world: np.ndarray, other: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """Planes at distances 1 / `inverse` on the negative and positive side, (2, n), that separate two cameras.
-
-        The cameras see different sides of such a plane.
-        """
-        here, there = (self.axes[axis] @ pose[:3, 3] for pose in (cam2world, other))
-        return np.stack([sign * (here - there) + 1 / inverse <= 0 for sign in (-1, 1)])
-
-    def vertical_bounds(self, cam2world: np.ndarray) -> tuple[float, float]:
-        """Extent of the scene below and above (negative) a camera, metres; infinite where unknown."""
-        horizontal = self.histogram[_DOWN_AXIS]
-        middle, gap = len(horizontal) // 2, round(MIN_FLOOR / _BIN_WIDTH)
-        camera = self.axes[_DOWN_AXIS] @ (cam2world[:3, 3] - self.origin)
-        bounds = []
-        for voted, start, part, sign in (
-            (self.floor_ceiling[0], middle + gap, horizontal[middle + gap :], 1),
-            (self.floor_ceiling[1], 0, horizontal[: middle - gap], -1),
-        ):
-            peak = start + int(part.argmax())
-            offset = voted
-            if math.isinf(voted) and horizontal[max(peak - 2, 0) : peak + 3].sum() > _FLOOR_SOLID_ANGLE:
-                offset = self.offsets[peak]
-            bounds.append(1.06 * (offset - camera) + sign * self.bin)
-        return bounds[0], bounds[1]
-
-
-def make_empty_planes(cam2world: np.ndarray, axes: np.ndarray, near: float, far: float) -> ScenePlanes:
-    """Planes without evidence, around the mean of the cameras; `near` sets the bins' width and `far` their range."""
-    width = near * _BIN_WIDTH
-    empty = np.zeros((3, 2 * int(_REACH * far / width)))
-    return ScenePlanes(axes, cam2world[:, :3, 3].mean(axis=0), empty, width, empty)
-
-
-def collect_planes(
-    surfaces: Sequence[Surface], consistent: Sequence[np.ndarray], cam2world: np.ndarray, planes: ScenePlanes
-) -> ScenePlanes:
-    """The planes with a new histogram, of the pixels (h, w) whose surfaces are consistent between views."""
-    histogram = np.zeros_like(planes.histogram)
-    bins = histogram.shape[1]
-    for surface, mask, pose in zip(surfaces, consistent, cam2world, strict=True):
-        height, width = surface.inverse_depth.shape
-        area = np.repeat(row_weights(height).numpy()[:, None], width, axis=1)
-        area /= area.sum() * len(surfaces)
-        points = world_points(surface, pose) - planes.origin
-        for axis in range(3):
-            chosen = mask & (surface.orientation == axis + 1)
-            index = planes._bin(points[chosen] @ planes.axes[axis])
-            histogram[axis] += np.bincount(index, weights=area[chosen], minlength=bins)
-    return dataclasses.replace(planes, histogram=cv2.GaussianBlur(histogram, (9, 1), 1.0))
-
-
-def detect_planes(
-    views: Sequence[View],
-    rays: Sequence[np.ndarray],
-    cam2world: np.ndarray,
-    planes: ScenePlanes,
-    depths: DepthRange,
-    min_floor: float,
-    config: MatchingConfig,
-) -> ScenePlanes:
-    """The planes with the votes, the floor and the ceiling that Hough voting finds.
+def mark_separating_planes(normal: np.ndarray, here: np.ndarray, there: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Planes that separate two cameras, (2, n), of planes at distances 1 / `inverse` on the first one's negative and
+    positive side. The cameras see different sides of such a plane.
 
     Args:
-        rays: (3, h, w) for each view, components of its rays along the scene's axes.
-        depths: range of the search.
-        min_floor: smallest distance of floor and ceiling from the cameras' mean, metres.
+        normal: (3,) of the planes.
+        here: (4, 4) pose of the camera.
+        there: (4, 4) pose of the other one.
     """
-    votes = np.zeros_like(planes.histogram)
-    for view in range(len(views)):
-        for other in range(len(views)):
-            if other != view:
-                poses = (cam2world[view], cam2world[other])
-                votes += _count_votes(views[view], views[other], rays[view], poses, planes, depths, config)
-    support = np.log1p(votes / (_MIN_VOTES * votes.max() + 1e-9)) / math.log1p(1 / _MIN_VOTES)
-    offsets = planes.offsets
-    floor_ceiling = []
+    along = float(normal @ (here[:3, 3] - there[:3, 3]))
+    return np.stack([sign * along + 1 / inverse <= 0 for sign in (-1, 1)])
+
+
+def measure_vertical_bounds(
+    surfaces: Sequence[Surface], consistent: Sequence[np.ndarray], cam2world: np.ndarray, down: np.ndarray, near: float
+) -> tuple[float, float]:
+    """Extent of the scene below and above (negative) the first camera, metres; infinite where unknown.
+
+    Floor and ceiling are the planes of the most horizontal surface.
+
+    Args:
+        surfaces: of each view.
+        consistent: (h, w) of each view, the pixels that count.
+        cam2world: (v, 4, 4).
+        down: (3,) unit vector of the world.
+        near: smallest depth of the scene, metres.
+    """
+    width, origin = near * _BIN_WIDTH, cam2world[:, :3, 3].mean(axis=0)
+    offsets, areas = [], []
+    for surface, mask, pose in zip(surfaces, consistent, cam2world, strict=True):
+        chosen = mask & (surface.orientation == _HORIZONTAL)
+        area = np.broadcast_to(row_weights(surface.height).numpy()[:, None], chosen.shape)
+        offsets.append((world_points(surface, pose)[chosen] - origin) @ down / width)
+        areas.append(area[chosen] / (area.sum() * len(surfaces)))
+    offset, weights = np.concatenate(offsets), np.concatenate(areas)
+    camera = down @ (cam2world[0, :3, 3] - origin)
+    bounds = []
     for sign in (1, -1):
-        side = np.where(sign * offsets > min_floor, votes[0], 0)
-        usual = (sign * offsets > min_floor) & (sign * offsets < _REACH / depths.low)
-        distinct = side.max() > _DISTINCT * np.median(side[usual])
-        floor_ceiling.append(float(offsets[side.argmax()]) if distinct else sign * math.inf)
-    return dataclasses.replace(planes, votes=support, floor_ceiling=(floor_ceiling[0], floor_ceiling[1]))
-
-
-def _count_votes(
-    view: View,
-    other: View,
-    rays: np.ndarray,
-    poses: tuple[np.ndarray, np.ndarray],
-    planes: ScenePlanes,
-    depths: DepthRange,
-    config: MatchingConfig,
-) -> np.ndarray:
-    """Votes (3, bins) of one view's pixels, matched against one other view."""
-    here, there = poses
-    inverse = depths.sample(_CANDIDATES)
-    step, count = depths.step(_CANDIDATES), len(inverse)
-    no_penalty = np.zeros((2, count), np.float32)
-    sets = [
-        HypothesisSet(
-            (inverse[0] * slope).astype(np.float32), (step * slope).astype(np.float32), no_penalty, side,
-            planes.separating(axis, here, there, inverse),
-        )
-        for axis, (slope, side) in enumerate(zip(np.abs(rays), (rays > 0).astype(np.uint8), strict=True))
-    ]  # fmt: skip
-    matched = OtherView(other, np.linalg.inv(there) @ here, sets)
-    cost = compute_matching_cost(view, [matched], depths.limits, _UNBOUNDED, config)
-    vote = np.exp(-cost / _SOFTNESS)
-    vote *= (_vote_weights(view) / vote.sum(axis=-1))[..., None] * np.maximum(_MAX_COST - cost, 0)
-    votes = np.zeros_like(planes.histogram)
-    for axis in range(3):
-        centre = planes.axes[axis] @ (here[:3, 3] - planes.origin)
-        for sign in (-1, 1):
-            facing = sign * rays[axis] > _MIN_SLANT
-            found = vote[facing][:, axis * count : (axis + 1) * count].sum(axis=0)
-            offset = centre + sign / inverse
-            order = np.argsort(offset)
-            votes[axis] += np.interp(planes.offsets, offset[order], found[order], left=0, right=0)
-    return votes
+        bins = np.floor(sign * offset).astype(np.int64) - _MIN_FLOOR_BINS
+        votes = np.bincount(bins[bins >= 0], weights=weights[bins >= 0], minlength=1)
+        votes = cv2.GaussianBlur(votes[None], (9, 1), 1.0)[0]
+        peak = int(votes.argmax())
+        found = votes[max(peak - 2, 0) : peak + 3].sum() > _FLOOR_SOLID_ANGLE
+        plane = (peak + _MIN_FLOOR_BINS + 0.5) * width if found else math.inf
+        bounds.append(_MARGIN * (sign * plane - camera) + sign * width)
+    return bounds[0], bounds[1]
 
 
 def texture_weights(view: View) -> np.ndarray:
@@ -295,9 +169,3 @@ def texture_weights(view: View) -> np.ndarray:
     variance = cv2.boxFilter(gray * gray, -1, (5, 5)) - cv2.boxFilter(gray, -1, (5, 5)) ** 2
     area = row_weights(len(view.image)).numpy()[:, None]
     return np.clip(variance, 0, _MAX_VARIANCE) * view.valid * area
-
-
-def _vote_weights(view: View) -> np.ndarray:
-    """The texture weights (h, w), divided by their sum; zero without texture."""
-    weight = texture_weights(view)
-    return (weight / max(float(weight.sum()), 1e-9)).astype(np.float32)

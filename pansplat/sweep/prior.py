@@ -3,9 +3,8 @@
 The model sees upright panoramas. Its first estimate is the logarithm of depth in units of the camera's height over the
 floor; the height follows by matching: the estimated surfaces, scaled by each candidate, are warped into the other
 views. The floor gives one height and all surfaces another one, because the walls of a hall are farther away than the
-model expects. The model refines its estimates by comparison of the views: from both heights and from the surfaces of
-the search's first pass. In the search a prior is a cost for hypotheses whose depth differs from it, relative to its
-uncertainty. The prior of lowest cost counts.
+model expects. The model refines its estimates by comparison of the views, from both heights. In the search a prior is a
+cost for hypotheses whose depth differs from it, relative to its uncertainty. The prior of lowest cost counts.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
-from pansplat.sweep.surface import Surface, list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
+from pansplat.sweep.surface import list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
@@ -137,8 +136,6 @@ class PriorEstimator:
         for pose, turn in zip(self._upright_poses, self._turns, strict=True):
             if turn is not None:
                 pose[:3, :3] = pose[:3, :3] @ turn
-        self._priors: list[list[DepthPrior]] = [[] for _ in self._turns]
-        self._neighbours: Sequence[Sequence[int]] = []
 
     def sharpen(self, limits: tuple[float, float]) -> list[np.ndarray]:
         """Sharpened log-depth (h, w) of each view by itself, in the unit of the poses for a usual camera height.
@@ -197,7 +194,6 @@ class PriorEstimator:
             neighbours: the other views that each view is compared with.
             limits: smallest and largest inverse height of the cameras over the floor.
         """
-        self._neighbours = neighbours
         first = self._turn_back(self._observed.priors)
         by_pair = {}  # by the best neighbour: the model errs by another factor in each room
         pairs = list_best_pairs(neighbours)
@@ -212,23 +208,10 @@ class PriorEstimator:
         heights = [[by_pair[nodes][kind][nodes.index(view)] for view, nodes in enumerate(pairs)] for kind in range(2)]
         if np.abs(np.log(np.divide(*heights))).max() < _SAME_HEIGHT:
             heights.pop()
-        refined = [self._refine(_scale_depth(self._observed.priors, h), self._config.iterations) for h in heights]
-        self._priors = [list(own) for own in zip(*refined, strict=True)]
-        return self._priors
-
-    def estimate_from_surfaces(self, surfaces: Sequence[Surface]) -> list[list[DepthPrior]]:
-        """The priors of `estimate_by_matching`, called before, and one of each view refined once from its surface."""
-        estimates = []
-        for surface, own, turn in zip(surfaces, self._priors, self._turns, strict=True):
-            inverse = resize_sphere(surface.inverse_depth, len(own[0].scale))
-            start = DepthPrior(-np.log(np.maximum(inverse, 1e-6)), own[0].scale)
-            estimates.append(start if turn is None else start.rotate(turn))
-        refined = self._refine(estimates, 1)
-        return [[*own, last] for own, last in zip(self._priors, refined, strict=True)]
-
-    def _refine(self, estimates: Sequence[DepthPrior], iterations: int) -> list[DepthPrior]:
-        """Estimates of the upright panoramas, refined and turned back."""
-        return self._turn_back(self._observed.refine(estimates, self._upright_poses, self._neighbours, iterations))
+        starts = [_scale_depth(self._observed.priors, own) for own in heights]
+        poses, iterations = self._upright_poses, self._config.iterations
+        refined = [self._turn_back(self._observed.refine(each, poses, neighbours, iterations)) for each in starts]
+        return [list(own) for own in zip(*refined, strict=True)]
 
     def _turn_back(self, priors: Sequence[DepthPrior]) -> list[DepthPrior]:
         """Priors of the upright panoramas as ones of the panoramas."""
@@ -332,8 +315,7 @@ def _match_heights(
     shape = HypothesisSet(
         (candidates[0] * inverse).astype(np.float32),
         ((candidates[1] - candidates[0]) * inverse).astype(np.float32),
-        np.zeros((2, len(candidates)), np.float32),
-        np.zeros(inverse.shape, np.uint8),
+        np.zeros(len(candidates), np.float32),
     )
     total = np.zeros(len(candidates))
     for n, other in enumerate(views):
@@ -348,7 +330,7 @@ def apply_prior_cost(
     cost: np.ndarray, priors: Sequence[DepthPrior], sets: Sequence[HypothesisSet], config: PriorConfig
 ) -> None:
     """Add the lowest cost of the priors to that of all hypotheses (h, w, sets * count), in place."""
-    count = sets[0].penalty.shape[1]
+    count = len(sets[0].penalty)
     log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
     scale = np.stack([np.maximum(prior.scale, config.min_scale) for prior in priors]).astype(np.float32)
     penalty = np.where(np.arange(len(priors)) > 0, config.further_penalty, 0).astype(np.float32)

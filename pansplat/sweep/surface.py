@@ -109,6 +109,11 @@ class Surface:
     inverse_depth: np.ndarray
     orientation: np.ndarray
 
+    @classmethod
+    def unoriented(cls, inverse_depth: np.ndarray) -> Surface:
+        """A surface of inverse depths (h, w) without known planes."""
+        return cls(inverse_depth.astype(np.float32), np.zeros(inverse_depth.shape, np.uint8))
+
     @property
     def height(self) -> int:
         return self.inverse_depth.shape[0]

@@ -178,7 +178,7 @@ def test_the_fingerprint_depends_on_the_settings():
     assert Sweep().fingerprint == Sweep(SweepConfig()).fingerprint
     others = [
         SweepConfig(lift=LiftConfig(footprint=0.71)),
-        SweepConfig(search=SearchConfig(coarse_passes=1)),
+        SweepConfig(search=SearchConfig(max_candidates=128)),
         SweepConfig(search=dataclasses.replace(SearchConfig(), matching=dataclasses.replace(
             SearchConfig().matching, window=3))),
     ]  # fmt: skip
