@@ -23,10 +23,10 @@ from pansplat.geometry.equirect import rotate_equirect, row_weights
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
-from pansplat.sweep.planes import texture_weights
 from pansplat.sweep.surface import list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
+_MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
@@ -35,7 +35,6 @@ _FLOOR_TOLERANCE = 0.15  # in camera heights, from the floor to the pixels that 
 _SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
 _MIN_SPREAD = 0.1  # relative deviation of an estimate, at least, when it decides what a view sees
 _MIN_OVERLAP = 0.5  # of views that are matched
-_UNBOUNDED = (math.inf, -math.inf)
 
 
 @dataclass(frozen=True)
@@ -259,7 +258,11 @@ def _estimate_camera_heights(
     above = -(cam2world[:, :3, 3] @ down)  # of each camera, over any level
     above -= above.mean()
     priors = [prior.resize(len(view.image)) for prior, view in zip(priors, views, strict=True)]
-    weights = [_height_weights(*pair, floor_only=floor_only) for pair in zip(priors, views, strict=True)]
+    weights = [_weight_pixels(*pair) for pair in zip(priors, views, strict=True)]
+    if floor_only:
+        for weight, prior, pose in zip(weights, priors, cam2world, strict=True):
+            below = np.exp(prior.log_depth) * (ray_grid(len(weight)) @ (pose[:3, :3].T @ down))
+            weight *= np.abs(below - 1) < _FLOOR_TOLERANCE
     unit = (len(views) - 1) * max(sum(float(weight.sum()) for weight in weights), 1e-9)
     low, high = limits
     for penalty in (_HEIGHT_PENALTY, 0.01 * _HEIGHT_PENALTY):  # all heights, then the ones around the best
@@ -293,12 +296,13 @@ def _share_seen(here: DepthPrior, there: DepthPrior, pose: np.ndarray) -> float:
     return float(seen.mean(axis=1) @ areas / areas.sum())
 
 
-def _height_weights(prior: DepthPrior, view: View, *, floor_only: bool) -> np.ndarray:
-    """Weights (h, w) of a view's pixels in the search of the height: textured, and of a certain prior."""
-    weight = texture_weights(view) * np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
-    if floor_only:
-        weight *= np.abs(np.exp(prior.log_depth) * view.down - 1) < _FLOOR_TOLERANCE
-    return weight
+def _weight_pixels(prior: DepthPrior, view: View) -> np.ndarray:
+    """Weights (h, w) of a view's pixels in the search of the height: textured, not masked, and of a certain prior."""
+    gray = view.image.mean(axis=2)
+    variance = cv2.boxFilter(gray * gray, -1, (5, 5)) - cv2.boxFilter(gray, -1, (5, 5)) ** 2
+    area = row_weights(len(view.image)).numpy()[:, None]
+    certain = np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
+    return np.clip(variance, 0, _MAX_VARIANCE) * view.valid * area * certain
 
 
 def _match_heights(
@@ -321,7 +325,7 @@ def _match_heights(
     for n, other in enumerate(views):
         if n != index:
             matched = OtherView(other, np.linalg.inv(cam2world[n]) @ cam2world[index], [shape])
-            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), _UNBOUNDED, config)
+            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), config)
             total += np.einsum("hw,hwk->k", weight, np.minimum(cost, _MAX_COST))
     return total
 

@@ -2,8 +2,8 @@
 
 Three levels of matching, at 1/4, 1/2 and 1/1 of the height, follow each other as in the paper's hierarchical cost
 volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres and with planes across the
-scene's axes. Each finer level searches a narrow range around the coarser surface, which gives occlusion, consistency
-between views, floor and ceiling. With a prior, the surfaces of the finest level and of the result are those of single
+scene's axes. Each finer level searches a narrow range around the coarser surface, which gives occlusion and consistency
+between views. With a prior, the surfaces of the finest level and of the result are those of single
 views, bent by the matches (`bend`). A prior of accurate shapes replaces the search of the whole range: all levels then
 search near the surfaces of single views.
 """
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -21,6 +20,12 @@ import numpy as np
 
 from pansplat.inputs.views import ONE_POSITION
 from pansplat.predictor import Progress, part_of
+from pansplat.sweep.axes import (
+    axis_components,
+    estimate_axes,
+    mark_separating_planes,
+    match_axes,
+)
 from pansplat.sweep.bend import BendConfig, bend_surfaces
 from pansplat.sweep.matching import (
     AggregationConfig,
@@ -33,18 +38,10 @@ from pansplat.sweep.matching import (
     compute_matching_cost,
     select_labels,
 )
-from pansplat.sweep.planes import (
-    axis_components,
-    estimate_axes,
-    mark_separating_planes,
-    match_axes,
-    measure_vertical_bounds,
-)
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
 from pansplat.sweep.surface import (
     PosedImages,
     Surface,
-    consistency_mask,
     guided_upsample,
     list_best_pairs,
     measure_distances,
@@ -140,7 +137,7 @@ def observe(
     report("finding the cameras' heights", 0.15)
     priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
-        views = _make_views(posed, own_axes, min(height, _HEIGHTS_SIZE))
+        views = _make_views(posed, min(height, _HEIGHTS_SIZE))
         priors = estimator.estimate_by_matching(views, neighbours, (low, high), config.matching)
     return ObservedScene(posed, config, depths, neighbours, own_axes, priors, estimator)
 
@@ -197,7 +194,7 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int], repo
     for n, height in enumerate(heights):
         report("searching near the estimated depth", 0.25 + 0.15 * n)
         small = [resize_sharp(log_depth, height) for log_depth in log_depths]
-        level = _SearchLevel(scene, height, [Surface.unoriented(np.exp(-log_depth)) for log_depth in small])
+        level = _SearchLevel(scene, height, [Surface(np.exp(-log_depth)) for log_depth in small])
         found = [level.refine_near(view, n) for view in range(len(small))]
         bent = bend_surfaces(posed.resize(height), found, scene.neighbours, small, config.bend)
         log_depths = [
@@ -223,44 +220,23 @@ def _place_unmatched(scene: ObservedScene, height: int) -> list[Surface]:
     else:
         sharp = scene.estimator.sharpen((scene.depths.low, scene.depths.high))
         inverse = np.stack([np.exp(-resize_sharp(values, height)) for values in sharp]).clip(*scene.depths.limits)
-    return [Surface.unoriented(values) for values in inverse]
+    return [Surface(values.astype(np.float32)) for values in inverse]
 
 
-def _make_views(
-    posed: PosedImages, axes: Sequence[np.ndarray], height: int, surfaces: Sequence[Surface] = ()
-) -> list[View]:
+def _make_views(posed: PosedImages, height: int, surfaces: Sequence[Surface] = ()) -> list[View]:
     """What is matched of each view at a height."""
     images, masks = [resize_sphere(i, height) for i in posed.images], [resize_mask(m, height) for m in posed.masks]
-    downs = [
-        np.ascontiguousarray(axis_components(own[:1], pose[:3, :3], height)[0], np.float32)
-        for own, pose in zip(axes, posed.cam2world, strict=True)
-    ]
     known = [surface.inverse_depth for surface in surfaces] or [None] * len(images)
-    return list(map(View, images, masks, downs, known))
+    return list(map(View, images, masks, known))
 
 
 class _SearchLevel:
     """All views at the height of one level of the search, with the surfaces found so far, if any."""
 
     def __init__(self, scene: ObservedScene, height: int, surfaces: Sequence[Surface] = ()) -> None:
-        posed, neighbours = scene.posed, scene.neighbours
-        self.posed, self.height, self.limits, self.config = posed, height, scene.depths.limits, scene.config
-        self.surfaces, self.neighbours, self.axes = surfaces, neighbours, scene.axes
-        self.views = _make_views(posed, scene.axes, height, surfaces)
-        self.bounds = [(math.inf, -math.inf)] * len(self.views)
-        if surfaces and not os.environ.get("NB"):
-            consistent = [
-                consistency_mask(surfaces, posed.cam2world, n, neighbours[n]) & view.valid
-                for n, view in enumerate(self.views)
-            ]
-            groups = [[view, *others] for view, others in enumerate(neighbours)]
-            self.bounds = [
-                measure_vertical_bounds(
-                    *([maps[n] for n in group] for maps in (surfaces, consistent)),
-                    posed.cam2world[group], own[0], posed.near,
-                )
-                for group, own in zip(groups, scene.axes, strict=True)
-            ]  # fmt: skip
+        self.posed, self.height, self.limits, self.config = scene.posed, height, scene.depths.limits, scene.config
+        self.surfaces, self.neighbours, self.axes = surfaces, scene.neighbours, scene.axes
+        self.views = _make_views(scene.posed, height, surfaces)
 
     def search_full_range(self, view: int, inverse: np.ndarray, priors: Sequence[DepthPrior]) -> Surface:
         """The best hypotheses: spheres of inverse depths (set 0) and planes across the axes (sets 1 to 3)."""
@@ -285,15 +261,8 @@ class _SearchLevel:
     ) -> list[HypothesisSet]:
         """Copies of the sets in which the planes that separate the two views are back-facing."""
         pose, there = self.posed.cam2world[[view, other]]
-        marks = (
-            [None] * 4
-            if os.environ.get("NSEP")
-            else [None] + [mark_separating_planes(axis, pose, there, inverse) for axis in self.axes[view]]
-        )
-        return [
-            dataclasses.replace(s, back_facing=m, sphere=n == 0)
-            for n, (s, m) in enumerate(zip(sets, marks, strict=True))
-        ]
+        marks = [None] + [mark_separating_planes(axis, pose, there, inverse) for axis in self.axes[view]]
+        return [dataclasses.replace(s, back_facing=m, sphere=m is None) for s, m in zip(sets, marks, strict=True)]
 
     def refine(self, view: int, count: int, step: float, *, widen: bool) -> Surface:
         """The best hypotheses near the surface; with `widen` also near the depths of neighbouring pixels."""
@@ -321,8 +290,7 @@ class _SearchLevel:
         starts = np.stack([np.clip((c - known) / step, -4 * slots, 4 * slots) + count / 2 for c in centres], axis=2)
         slot_map = np.stack((np.ones_like(starts), starts), axis=-1).astype(np.float32)
         cost = self._compute_cost(view, lambda other: sets)
-        surface = self._select_hypotheses(view, sets, cost, slot_map, slots)
-        return Surface(surface.inverse_depth, self.surfaces[view].orientation)
+        return self._select_hypotheses(view, sets, cost, slot_map, slots)
 
     def _compute_cost(self, view: int, make_sets: Callable[[int], list[HypothesisSet]]) -> np.ndarray:
         """Matching cost (h, w, sets * count) by the neighbours, of the sets that `make_sets(other)` returns."""
@@ -330,7 +298,7 @@ class _SearchLevel:
             OtherView(self.views[other], self.posed.relative_pose(view, other), make_sets(other))
             for other in self.neighbours[view]
         ]
-        return compute_matching_cost(self.views[view], others, self.limits, self.bounds[view], self.config.matching)
+        return compute_matching_cost(self.views[view], others, self.limits, self.config.matching)
 
     def _select_hypotheses(
         self, view: int, sets: list[HypothesisSet], cost: np.ndarray, slot_map: np.ndarray, slots: int
@@ -344,4 +312,4 @@ class _SearchLevel:
         step = np.stack([s.step for s in sets], axis=-1)
         rows, columns = np.indices(label.shape)
         inverse = base[rows, columns, chosen] + (k + offset) * step[rows, columns, chosen]
-        return Surface(np.clip(inverse, *self.limits).astype(np.float32), chosen.astype(np.uint8))
+        return Surface(np.clip(inverse, *self.limits).astype(np.float32))

@@ -1,7 +1,6 @@
 """The matching cost of hypotheses, and its semi-global aggregation on the sphere."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -37,16 +36,15 @@ def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | N
     return View(
         np.ascontiguousarray(image, np.float32),
         np.ones(shape, bool) if valid is None else valid,
-        np.ascontiguousarray(ray_grid(shape[0])[..., 1]),
         None if inverse is None else np.full(shape, inverse, np.float32),
     )
 
 
-def _cost(views, *sets, pose=None, limits=(0.1, 2.0), bounds=(math.inf, -math.inf), config=_PLAIN) -> np.ndarray:
+def _cost(views, *sets, pose=None, limits=(0.1, 2.0), config=_PLAIN) -> np.ndarray:
     """Cost of a view against another, by default with the same pose."""
     view, *others = views
     pose = np.eye(4) if pose is None else pose
-    return compute_matching_cost(view, [OtherView(o, pose, list(sets)) for o in others], limits, bounds, config)
+    return compute_matching_cost(view, [OtherView(o, pose, list(sets)) for o in others], limits, config)
 
 
 @pytest.fixture(scope="module")
@@ -122,15 +120,6 @@ def test_only_views_that_can_see_a_hypothesis_count(twice):
     assert np.allclose(both[..., :2], second[..., :2], atol=0.02), "occluded in the first one"
     assert np.allclose(both[..., 2:], (first + second)[..., 2:] / 2, atol=1e-4)
     assert np.allclose(_cost((twice[0], near, near), spheres), first, atol=1e-4), "nobody sees the farthest ones"
-
-
-def test_hypotheses_below_the_floor_or_above_the_ceiling_are_penalised(twice):
-    cost = _cost(twice, _spheres((0.25, 0.5)), bounds=(1.5, -1.0))
-    down = twice[0].down[..., None] * np.array((4.0, 2.0))
-    outside = (down > 1.5) | (down < -1.0)
-    clear = np.minimum(np.abs(down - 1.5), np.abs(down + 1.0)) > 1e-4
-    assert outside.any() and not outside.all()
-    assert np.allclose(cost[clear], np.where(outside, _PLAIN.outside_penalty, 0)[clear], atol=0.02)
 
 
 def test_penalties_are_added_and_a_window_without_texture_has_less_weight(twice):

@@ -63,8 +63,7 @@ class TrueHeights(TrueDepth):
 
 def _estimate(room, poses, model_type=TrueDepth):
     images = [room.cast(pose, 64)[0] for pose in poses]
-    down = [ray_grid(64) @ pose[:3, :3].T @ _DOWN for pose in poses]
-    views = [View(i, np.ones(i.shape[:2], bool), d.astype(np.float32)) for i, d in zip(images, down, strict=True)]
+    views = [View(image, np.ones(image.shape[:2], bool)) for image in images]
     upright = [pose.copy() for pose in poses]
     for pose in upright:
         turn = prior_module.upright_rotation(pose[:3, :3], _DOWN)

@@ -1,8 +1,8 @@
-"""The scene's axes, its floor and its ceiling.
+"""The scene's axes.
 
 Rooms consist of horizontal planes and of two directions of vertical ones (a Manhattan world). The axes follow from
 image gradients: a straight line and the camera span a plane, whose normal is the gradient's direction on the sphere,
-and the line's direction is perpendicular to this normal. Floor and ceiling follow from the surfaces found so far.
+and the line's direction is perpendicular to this normal.
 """
 
 from __future__ import annotations
@@ -13,20 +13,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from pansplat.geometry.equirect import row_weights
-from pansplat.sweep.matching import View
-from pansplat.sweep.surface import Surface, pad_sphere, ray_grid, world_points
+from pansplat.sweep.surface import pad_sphere, ray_grid
 
 _MIN_GRADIENT = 0.02  # per pixel; smaller gradients are noise
 _MAX_GRADIENT = 0.2  # larger gradients have the weight of this one
-
-_BIN_WIDTH = 1 / 9  # of the offsets of horizontal planes, in units of `near`: 5 cm indoors
-_MIN_FLOOR_BINS = 8  # smallest distance of the floor or ceiling from the cameras' mean
-_FLOOR_SOLID_ANGLE = 0.02  # smallest fraction of the sphere that a floor or ceiling covers
-_HORIZONTAL = 1  # orientation of a surface across the down axis
-_MARGIN = 1.06  # of the scene's extent, relative to the distance of floor and ceiling
-
-_MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
 
 
 def estimate_axes(images: Sequence[np.ndarray], rotations: Sequence[np.ndarray]) -> np.ndarray:
@@ -126,46 +116,3 @@ def mark_separating_planes(normal: np.ndarray, here: np.ndarray, there: np.ndarr
     """
     along = float(normal @ (here[:3, 3] - there[:3, 3]))
     return np.stack([sign * along + 1 / inverse <= 0 for sign in (-1, 1)])
-
-
-def measure_vertical_bounds(
-    surfaces: Sequence[Surface], consistent: Sequence[np.ndarray], cam2world: np.ndarray, down: np.ndarray, near: float
-) -> tuple[float, float]:
-    """Extent of the scene below and above (negative) the first camera, metres; infinite where unknown.
-
-    Floor and ceiling are the planes of the most horizontal surface.
-
-    Args:
-        surfaces: of each view.
-        consistent: (h, w) of each view, the pixels that count.
-        cam2world: (v, 4, 4).
-        down: (3,) unit vector of the world.
-        near: smallest depth of the scene, metres.
-    """
-    width, origin = near * _BIN_WIDTH, cam2world[:, :3, 3].mean(axis=0)
-    offsets, areas = [], []
-    for surface, mask, pose in zip(surfaces, consistent, cam2world, strict=True):
-        chosen = mask & (surface.orientation == _HORIZONTAL)
-        area = np.broadcast_to(row_weights(surface.height).numpy()[:, None], chosen.shape)
-        offsets.append((world_points(surface, pose)[chosen] - origin) @ down / width)
-        areas.append(area[chosen] / (area.sum() * len(surfaces)))
-    offset, weights = np.concatenate(offsets), np.concatenate(areas)
-    camera = down @ (cam2world[0, :3, 3] - origin)
-    bounds = []
-    for sign in (1, -1):
-        bins = np.floor(sign * offset).astype(np.int64) - _MIN_FLOOR_BINS
-        votes = np.bincount(bins[bins >= 0], weights=weights[bins >= 0], minlength=1)
-        votes = cv2.GaussianBlur(votes[None], (9, 1), 1.0)[0]
-        peak = int(votes.argmax())
-        found = votes[max(peak - 2, 0) : peak + 3].sum() > _FLOOR_SOLID_ANGLE
-        plane = (peak + _MIN_FLOOR_BINS + 0.5) * width if found else math.inf
-        bounds.append(_MARGIN * (sign * plane - camera) + sign * width)
-    return bounds[0], bounds[1]
-
-
-def texture_weights(view: View) -> np.ndarray:
-    """Weights (h, w) of the pixels by texture and solid angle; zero where masked."""
-    gray = view.image.mean(axis=2)
-    variance = cv2.boxFilter(gray * gray, -1, (5, 5)) - cv2.boxFilter(gray, -1, (5, 5)) ** 2
-    area = row_weights(len(view.image)).numpy()[:, None]
-    return np.clip(variance, 0, _MAX_VARIANCE) * view.valid * area

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep.planes import estimate_axes, mark_separating_planes, measure_vertical_bounds
-from pansplat.sweep.surface import Surface, world_points
+from pansplat.sweep.axes import estimate_axes, mark_separating_planes
 
 
 def _degrees_off(found: np.ndarray, true: np.ndarray) -> float:
@@ -54,38 +53,6 @@ def test_cameras_upside_down_to_each_other_give_orthonormal_axes(turn):
 
 
 _AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))  # down and the room's two wall normals
-
-
-def _orient_surfaces(room, poses, surfaces) -> list[Surface]:
-    """Surfaces of the walls of a room, with the true orientation of every pixel."""
-    low, high = np.array(room.low) @ _AXES.T, np.array(room.high) @ _AXES.T
-    oriented = []
-    for pose, surface in zip(poses, surfaces, strict=True):
-        points = world_points(surface, pose) @ _AXES.T
-        wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)
-        oriented.append(Surface(surface.inverse_depth, (wall + 1).astype(np.uint8)))
-    return oriented
-
-
-@pytest.fixture(scope="module")
-def oriented(empty_room) -> list[Surface]:
-    return _orient_surfaces(empty_room.room, empty_room.posed.cam2world, empty_room.make_exact_surfaces())
-
-
-def test_vertical_bounds_contain_the_floor_and_the_ceiling(oriented, empty_room, view):
-    poses, masks, room = empty_room.posed.cam2world[:: -1 if view else 1], empty_room.posed.masks, empty_room.room
-    down, up = measure_vertical_bounds(oriented[:: -1 if view else 1], list(masks), poses, _AXES[0], 0.5)
-    floor, ceiling = room.high[1] - poses[0, 1, 3], room.low[1] - poses[0, 1, 3]
-    assert floor < down < 1.15 * floor + 0.1
-    assert 1.15 * ceiling - 0.1 < up < ceiling
-
-
-def test_without_consistent_horizontal_surface_there_are_no_bounds(oriented, empty_room):
-    poses, masks = empty_room.posed.cam2world, empty_room.posed.masks
-    nothing = [np.zeros_like(mask) for mask in masks]
-    spheres = [Surface.unoriented(surface.inverse_depth) for surface in oriented]
-    for surfaces, consistent in ((oriented, nothing), (spheres, list(masks))):
-        assert measure_vertical_bounds(surfaces, consistent, poses, _AXES[0], 0.5) == (math.inf, -math.inf)
 
 
 def test_planes_between_two_cameras_are_separating():
