@@ -73,7 +73,7 @@ def bend_surfaces(
     for view, (surface, log_depth) in enumerate(zip(surfaces, log_depths, strict=True)):
         evidence = measure_evidence(posed, surfaces, view, neighbours[view], config)
         field = fit_field(-np.log(surface.inverse_depth) - log_depth, evidence, log_depth, config)
-        bent.append(Surface(np.exp(-log_depth - field).astype(np.float32), np.zeros(log_depth.shape, np.uint8)))
+        bent.append(Surface(np.exp(-log_depth - field).astype(np.float32)))
     return bent
 
 

@@ -151,7 +151,7 @@ def _remove_inconsistent(scene: _PosedSurfaces, view: int) -> Surface:
     _, kept = _estimate_opacity(points, scene, view)
     far = _background_inverse_depth(surface.inverse_depth, scene.posed.masks[view], 2, config)
     behind = np.minimum(surface.inverse_depth, resize_sphere(far, surface.height))
-    return Surface(np.where(kept.reshape(behind.shape), surface.inverse_depth, behind), surface.orientation)
+    return Surface(np.where(kept.reshape(behind.shape), surface.inverse_depth, behind))
 
 
 def _lattice_heights(height: int, surface_height: int) -> list[int]:

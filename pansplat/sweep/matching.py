@@ -57,8 +57,6 @@ class MatchingConfig:
     """Cost of a plane between the two cameras: each would see a different side of it."""
     tolerance: float = 0.08
     """Relative difference of inverse depth within which two views are consistent."""
-    outside_penalty: float = 0.3
-    """For a hypothesis below the floor or above the ceiling."""
     textureless_weight: float = 0.3
     """Weight of the matching cost in a window without texture; it is one in a textured window."""
     textureless_cost: float = 0.4
@@ -177,7 +175,6 @@ class _Matched(NamedTuple):
 
     image: np.ndarray
     valid: np.ndarray
-    down: np.ndarray
     rays: np.ndarray
     gray: np.ndarray
     mean: np.ndarray
@@ -205,15 +202,6 @@ class _Set(NamedTuple):
     back_facing: np.ndarray
 
 
-class _Bounds(NamedTuple):
-    """Limits of inverse depth, and the extent of the scene below and above (negative) the camera."""
-
-    low: np.float32
-    high: np.float32
-    floor: np.float32
-    ceiling: np.float32
-
-
 class _Warped(NamedTuple):
     """The other view, warped by one hypothesis.
 
@@ -233,7 +221,7 @@ _UNSEEN = np.float32(1e-3)  # weight of a view that cannot see a hypothesis; it 
 
 
 @nb.njit(fastmath=True, forceinline=True, error_model="numpy")
-def _warp(k, view, other, hypotheses, bounds, weights, row, warped):
+def _warp(k, view, other, hypotheses, limits, weights, row, warped):
     """Warp the other view by hypothesis `k`; `row` (5, w) is scratch."""
     height, width = view.mean.shape
     image, rays, base, step = view.image, view.rays, hypotheses.base, hypotheses.step
@@ -263,7 +251,7 @@ def _warp(k, view, other, hypotheses, bounds, weights, row, warped):
             color_cost[i, j] = min(difference * np.float32(1 / 3), truncation) / truncation
             row_there = min(max(int(v[j] - np.float32(0.5)), 0), height - 1)
             column_there = int(u[j] - np.float32(0.5)) % width
-            in_range = bounds.low <= inverse[j] <= bounds.high
+            in_range = limits[0] <= inverse[j] <= limits[1]
             state[i, j] = (_MATCHED if valid[row_there, column_there] else _MASKED) if in_range else _OUT_OF_RANGE
             if other.has_surface:
                 ratio[i, j] = inverse[j] * scale[j] / inverse_there[row_there, column_there]
@@ -274,14 +262,14 @@ def _warp(k, view, other, hypotheses, bounds, weights, row, warped):
 
 
 @nb.njit(fastmath=True, forceinline=True, error_model="numpy")
-def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m, result, share, slot):
+def _combine_costs(k, view, other, hypotheses, weights, warped, sums, m, result, share, slot):
     """Write the cost of hypothesis `k` to `result[..., slot]`, and its weight among the other views to `share`.
 
     `sums` are those of `_window_sums`.
     """
     height, width = view.mean.shape
-    own_mean, own_variance, valid, down = view.mean, view.variance, view.valid, view.down
-    base, step, set_penalty, side, back_facing = hypotheses
+    own_mean, own_variance, valid = view.mean, view.variance, view.valid
+    set_penalty, side, back_facing = hypotheses.penalty, hypotheses.side, hypotheses.back_facing
     _, color_cost, state, ratio, penalty = warped
     sum_b, sum_bb, sum_ab = sums
     area = np.float32(1.0 / ((2 * m + 1) * (2 * m + 1)))
@@ -299,7 +287,7 @@ def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m,
             textured = own_variance[i, j] / (own_variance[i, j] + weights.texture_variance)
             textured = weights.textureless_weight + (1 - weights.textureless_weight) * textured
             cost = textured * cost + (1 - textured) * weights.textureless_cost
-            extra = set_penalty[side[i, j], k] + penalty[i, j]
+            extra = set_penalty[k] + penalty[i, j]
             seen = np.float32(1)
             if other.has_surface:
                 if ratio[i, j] > 1 + weights.tolerance:
@@ -312,21 +300,18 @@ def _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m,
                 cost, seen = weights.back_facing_cost, _UNSEEN
             if state[i, j] == _MASKED or not valid[i, j]:
                 cost, seen = neutral, _UNSEEN
-            below = down[i, j] / max(base[i, j] + np.float32(k) * step[i, j], bounds.low)
-            if below > bounds.floor or below < bounds.ceiling:
-                extra += weights.outside_penalty
             result[i, j, slot] = impossible if state[i, j] == _OUT_OF_RANGE else cost + extra
             share[i, j, slot] = seen
 
 
 @cached_njit(fastmath=True, nogil=True)
-def _compute_block_cost(view, other, hypotheses, bounds, weights, cost, total, offset, block):
+def _compute_block_cost(view, other, hypotheses, limits, weights, cost, total, offset, block):
     """Add the weighted costs of a block of a set's hypotheses to `cost`, the weights to `total` (h, w, labels).
 
     Without `total`, there is one other view: its costs are written. The set starts at `offset`.
     """
     first = block * _BLOCK
-    last = min(first + _BLOCK, hypotheses.penalty.shape[1])
+    last = min(first + _BLOCK, len(hypotheses.penalty))
     height, width = view.mean.shape
     m = (view.gray.shape[0] - height) // 2
     maps, row = np.empty((6, height, width), np.float32), np.empty((5, width), np.float32)
@@ -335,10 +320,10 @@ def _compute_block_cost(view, other, hypotheses, bounds, weights, cost, total, o
     column = np.empty((3, width + 2 * m), np.float32)
     result, share = np.empty((height, width, _BLOCK), np.float32), np.empty((height, width, _BLOCK), np.float32)
     for k in range(first, last):
-        _warp(k, view, other, hypotheses, bounds, weights, row, warped)
+        _warp(k, view, other, hypotheses, limits, weights, row, warped)
         _pad_in_place(warped.gray, m)
         _window_sums(view.gray, warped.gray, m, column[0], column[1], column[2], sums[0], sums[1], sums[2])
-        _combine_costs(k, view, other, hypotheses, bounds, weights, warped, sums, m, result, share, k - first)
+        _combine_costs(k, view, other, hypotheses, weights, warped, sums, m, result, share, k - first)
     for i in range(height):
         for j in range(width):
             for k in range(first, last):
@@ -383,16 +368,16 @@ class HypothesisSet:
 
     Attributes:
         base, step: (h, w) float32, 1/m.
-        penalty: (2, count) added to the cost of a hypothesis, by `side`.
+        penalty: (count) added to the cost of a hypothesis.
         side: (h, w) 0 where a pixel sees the planes at negative distances along their normal, 1 at positive ones.
-        back_facing: (2, count) planes that the two views see from different sides; None for none.
+        back_facing: (2, count) by `side`, planes that the two views see from different sides; None for none.
         sphere: the hypotheses are spheres around the camera.
     """
 
     base: np.ndarray
     step: np.ndarray
     penalty: np.ndarray
-    side: np.ndarray
+    side: np.ndarray | None = None
     back_facing: np.ndarray | None = None
     sphere: bool = False
 
@@ -404,13 +389,11 @@ class View:
     Attributes:
         image: (h, w, 3) float32.
         valid: (h, w) False for masked pixels.
-        down: (h, w) components of the rays along the scene's down axis.
-        inverse_depth: (h, w) of the surface found so far; None before the first pass.
+        inverse_depth: (h, w) of the surface found so far; None before the coarse level.
     """
 
     image: np.ndarray
     valid: np.ndarray
-    down: np.ndarray
     inverse_depth: np.ndarray | None = None
 
 
@@ -432,7 +415,6 @@ def compute_matching_cost(
     view: View,
     others: Sequence[OtherView],
     limits: tuple[float, float],
-    floor_ceiling: tuple[float, float],
     config: MatchingConfig,
 ) -> np.ndarray:
     """Matching cost (h, w, sets * count) of every hypothesis, in the unit of the config's weights.
@@ -441,7 +423,6 @@ def compute_matching_cost(
 
     Args:
         limits: smallest and largest inverse depth, 1/m.
-        floor_ceiling: extent of the scene below and above (negative) `view`'s camera, metres.
     """
     height, width = view.image.shape[:2]
     m = config.window
@@ -451,10 +432,10 @@ def compute_matching_cost(
     mean = np.ascontiguousarray(cv2.boxFilter(gray, -1, window)[inside])
     variance = np.ascontiguousarray(cv2.boxFilter(gray * gray, -1, window)[inside])
     variance = np.maximum(variance - mean * mean, 0)
-    matched = _Matched(view.image, view.valid, view.down, ray_grid(height), gray, mean, variance)
-    bounds = _Bounds(*np.float32((*limits, *floor_ceiling)))
+    matched = _Matched(view.image, view.valid, ray_grid(height), gray, mean, variance)
+    low, high = np.float32(limits)
     weights = _Weights(*(np.float32(getattr(config, name)) for name in _Weights._fields))
-    count = others[0].sets[0].penalty.shape[1]
+    count = len(others[0].sets[0].penalty)
     shape = height, width, len(others[0].sets) * count
     several = len(others) > 1
     cost = np.zeros(shape, np.float32) if several else np.empty(shape, np.float32)
@@ -473,9 +454,10 @@ def compute_matching_cost(
             back_facing = np.zeros((2, count), bool) if own.back_facing is None else own.back_facing
             # One type for all sets: the kernel is compiled once.
             maps = (np.ascontiguousarray(each, np.float32) for each in (own.base, own.step, own.penalty))
-            hypotheses = _Set(*maps, np.ascontiguousarray(own.side), back_facing)
+            side = np.zeros((height, width), np.uint8) if own.side is None else np.ascontiguousarray(own.side)
+            hypotheses = _Set(*maps, side, back_facing)
             own_weights = weights if own.sphere else weights._replace(opposed_penalty=np.float32(0))
-            arguments = matched, warped, hypotheses, bounds, own_weights, cost, total, n * count
+            arguments = matched, warped, hypotheses, (low, high), own_weights, cost, total, n * count
             parallel_for(partial(_compute_block_cost, *arguments), -(-count // _BLOCK), thread_count())
     if several:
         cost /= total

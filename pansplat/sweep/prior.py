@@ -3,9 +3,8 @@
 The model sees upright panoramas. Its first estimate is the logarithm of depth in units of the camera's height over the
 floor; the height follows by matching: the estimated surfaces, scaled by each candidate, are warped into the other
 views. The floor gives one height and all surfaces another one, because the walls of a hall are farther away than the
-model expects. The model refines its estimates by comparison of the views: from both heights and from the surfaces of
-the search's first pass. In the search a prior is a cost for hypotheses whose depth differs from it, relative to its
-uncertainty. The prior of lowest cost counts.
+model expects. The model refines its estimates by comparison of the views, from both heights. In the search a prior is a
+cost for hypotheses whose depth differs from it, relative to its uncertainty. The prior of lowest cost counts.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from pansplat.geometry.equirect import rotate_equirect, row_weights
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
-from pansplat.sweep.planes import texture_weights
-from pansplat.sweep.surface import Surface, list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
+from pansplat.sweep.surface import list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
+_MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
@@ -36,7 +35,6 @@ _FLOOR_TOLERANCE = 0.15  # in camera heights, from the floor to the pixels that 
 _SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
 _MIN_SPREAD = 0.1  # relative deviation of an estimate, at least, when it decides what a view sees
 _MIN_OVERLAP = 0.5  # of views that are matched
-_UNBOUNDED = (math.inf, -math.inf)
 
 
 @dataclass(frozen=True)
@@ -137,8 +135,6 @@ class PriorEstimator:
         for pose, turn in zip(self._upright_poses, self._turns, strict=True):
             if turn is not None:
                 pose[:3, :3] = pose[:3, :3] @ turn
-        self._priors: list[list[DepthPrior]] = [[] for _ in self._turns]
-        self._neighbours: Sequence[Sequence[int]] = []
 
     def sharpen(self, limits: tuple[float, float]) -> list[np.ndarray]:
         """Sharpened log-depth (h, w) of each view by itself, in the unit of the poses for a usual camera height.
@@ -197,7 +193,6 @@ class PriorEstimator:
             neighbours: the other views that each view is compared with.
             limits: smallest and largest inverse height of the cameras over the floor.
         """
-        self._neighbours = neighbours
         first = self._turn_back(self._observed.priors)
         by_pair = {}  # by the best neighbour: the model errs by another factor in each room
         pairs = list_best_pairs(neighbours)
@@ -212,23 +207,10 @@ class PriorEstimator:
         heights = [[by_pair[nodes][kind][nodes.index(view)] for view, nodes in enumerate(pairs)] for kind in range(2)]
         if np.abs(np.log(np.divide(*heights))).max() < _SAME_HEIGHT:
             heights.pop()
-        refined = [self._refine(_scale_depth(self._observed.priors, h), self._config.iterations) for h in heights]
-        self._priors = [list(own) for own in zip(*refined, strict=True)]
-        return self._priors
-
-    def estimate_from_surfaces(self, surfaces: Sequence[Surface]) -> list[list[DepthPrior]]:
-        """The priors of `estimate_by_matching`, called before, and one of each view refined once from its surface."""
-        estimates = []
-        for surface, own, turn in zip(surfaces, self._priors, self._turns, strict=True):
-            inverse = resize_sphere(surface.inverse_depth, len(own[0].scale))
-            start = DepthPrior(-np.log(np.maximum(inverse, 1e-6)), own[0].scale)
-            estimates.append(start if turn is None else start.rotate(turn))
-        refined = self._refine(estimates, 1)
-        return [[*own, last] for own, last in zip(self._priors, refined, strict=True)]
-
-    def _refine(self, estimates: Sequence[DepthPrior], iterations: int) -> list[DepthPrior]:
-        """Estimates of the upright panoramas, refined and turned back."""
-        return self._turn_back(self._observed.refine(estimates, self._upright_poses, self._neighbours, iterations))
+        starts = [_scale_depth(self._observed.priors, own) for own in heights]
+        poses, iterations = self._upright_poses, self._config.iterations
+        refined = [self._turn_back(self._observed.refine(each, poses, neighbours, iterations)) for each in starts]
+        return [list(own) for own in zip(*refined, strict=True)]
 
     def _turn_back(self, priors: Sequence[DepthPrior]) -> list[DepthPrior]:
         """Priors of the upright panoramas as ones of the panoramas."""
@@ -276,7 +258,11 @@ def _estimate_camera_heights(
     above = -(cam2world[:, :3, 3] @ down)  # of each camera, over any level
     above -= above.mean()
     priors = [prior.resize(len(view.image)) for prior, view in zip(priors, views, strict=True)]
-    weights = [_height_weights(*pair, floor_only=floor_only) for pair in zip(priors, views, strict=True)]
+    weights = [_weight_pixels(*pair) for pair in zip(priors, views, strict=True)]
+    if floor_only:
+        for weight, prior, pose in zip(weights, priors, cam2world, strict=True):
+            below = np.exp(prior.log_depth) * (ray_grid(len(weight)) @ (pose[:3, :3].T @ down))
+            weight *= np.abs(below - 1) < _FLOOR_TOLERANCE
     unit = (len(views) - 1) * max(sum(float(weight.sum()) for weight in weights), 1e-9)
     low, high = limits
     for penalty in (_HEIGHT_PENALTY, 0.01 * _HEIGHT_PENALTY):  # all heights, then the ones around the best
@@ -310,12 +296,13 @@ def _share_seen(here: DepthPrior, there: DepthPrior, pose: np.ndarray) -> float:
     return float(seen.mean(axis=1) @ areas / areas.sum())
 
 
-def _height_weights(prior: DepthPrior, view: View, *, floor_only: bool) -> np.ndarray:
-    """Weights (h, w) of a view's pixels in the search of the height: textured, and of a certain prior."""
-    weight = texture_weights(view) * np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
-    if floor_only:
-        weight *= np.abs(np.exp(prior.log_depth) * view.down - 1) < _FLOOR_TOLERANCE
-    return weight
+def _weight_pixels(prior: DepthPrior, view: View) -> np.ndarray:
+    """Weights (h, w) of a view's pixels in the search of the height: textured, not masked, and of a certain prior."""
+    gray = view.image.mean(axis=2)
+    variance = cv2.boxFilter(gray * gray, -1, (5, 5)) - cv2.boxFilter(gray, -1, (5, 5)) ** 2
+    area = row_weights(len(view.image)).numpy()[:, None]
+    certain = np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
+    return np.clip(variance, 0, _MAX_VARIANCE) * view.valid * area * certain
 
 
 def _match_heights(
@@ -332,14 +319,13 @@ def _match_heights(
     shape = HypothesisSet(
         (candidates[0] * inverse).astype(np.float32),
         ((candidates[1] - candidates[0]) * inverse).astype(np.float32),
-        np.zeros((2, len(candidates)), np.float32),
-        np.zeros(inverse.shape, np.uint8),
+        np.zeros(len(candidates), np.float32),
     )
     total = np.zeros(len(candidates))
     for n, other in enumerate(views):
         if n != index:
             matched = OtherView(other, np.linalg.inv(cam2world[n]) @ cam2world[index], [shape])
-            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), _UNBOUNDED, config)
+            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), config)
             total += np.einsum("hw,hwk->k", weight, np.minimum(cost, _MAX_COST))
     return total
 
@@ -348,7 +334,7 @@ def apply_prior_cost(
     cost: np.ndarray, priors: Sequence[DepthPrior], sets: Sequence[HypothesisSet], config: PriorConfig
 ) -> None:
     """Add the lowest cost of the priors to that of all hypotheses (h, w, sets * count), in place."""
-    count = sets[0].penalty.shape[1]
+    count = len(sets[0].penalty)
     log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
     scale = np.stack([np.maximum(prior.scale, config.min_scale) for prior in priors]).astype(np.float32)
     penalty = np.where(np.arange(len(priors)) > 0, config.further_penalty, 0).astype(np.float32)

@@ -1,10 +1,9 @@
 """The hierarchical sphere sweep: from posed panoramas to one surface per view.
 
-The scene's planes are detected first. Three levels of matching follow at 1/4, 1/2 and 1/1 of the height, as in the
-paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres
-and with planes across the scene's axes. It runs twice: the first pass, at a smaller size, finds the surfaces which the
-second one uses for occlusion, consistency between views, and the support of planes. Each finer level searches a narrow
-range around the coarser surface. With a prior, the surfaces of the finest level and of the result are those of single
+Three levels of matching, at 1/4, 1/2 and 1/1 of the height, follow each other as in the paper's hierarchical cost
+volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres and with planes across the
+scene's axes. Each finer level searches a narrow range around the coarser surface, which gives occlusion and consistency
+between views. With a prior, the surfaces of the finest level and of the result are those of single
 views, bent by the matches (`bend`). A prior of accurate shapes replaces the search of the whole range: all levels then
 search near the surfaces of single views.
 """
@@ -14,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import cv2
@@ -22,7 +20,12 @@ import numpy as np
 
 from pansplat.inputs.views import ONE_POSITION
 from pansplat.predictor import Progress, part_of
-from pansplat.rendering.cpu.runtime import thread_count
+from pansplat.sweep.axes import (
+    axis_components,
+    estimate_axes,
+    mark_separating_planes,
+    match_axes,
+)
 from pansplat.sweep.bend import BendConfig, bend_surfaces
 from pansplat.sweep.matching import (
     AggregationConfig,
@@ -35,21 +38,10 @@ from pansplat.sweep.matching import (
     compute_matching_cost,
     select_labels,
 )
-from pansplat.sweep.planes import (
-    MIN_FLOOR,
-    ScenePlanes,
-    axis_components,
-    collect_planes,
-    detect_planes,
-    estimate_axes,
-    make_empty_planes,
-    match_axes,
-)
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
 from pansplat.sweep.surface import (
     PosedImages,
     Surface,
-    consistency_mask,
     guided_upsample,
     list_best_pairs,
     measure_distances,
@@ -58,7 +50,7 @@ from pansplat.sweep.surface import (
     resize_sphere,
 )
 
-_DETECTION_HEIGHT = 96  # pixels; planes are detected at this size
+_HEIGHTS_SIZE = 96  # pixels; heights of the cameras over the floor are compared at this size
 
 
 @dataclass(frozen=True)
@@ -67,9 +59,6 @@ class SearchConfig:
 
     finest_height: int = 512
     """Height of the finest level; larger panoramas are searched at this height."""
-    coarse_passes: int = 2
-    first_height: int = 64
-    """Largest height of the passes before the last one."""
     max_candidates: int = 256
     """Largest number of hypotheses of a set at the coarse level."""
     near_margin: float = 0.75
@@ -85,10 +74,6 @@ class SearchConfig:
     single_view_candidates: tuple[int, int, int] = (33, 25, 17)
     single_view_penalty: float = 0.03
     """Of the largest change: walls without texture keep their place."""
-    unsupported_plane_penalty: float = 0.3
-    """Penalty of a plane without support in the scene."""
-    sphere_penalty: float = 0.18
-    """Penalty of spheres relative to supported planes."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
@@ -104,7 +89,8 @@ class ObservedScene:
     Attributes:
         depths: of all hypotheses.
         neighbours: the other views that each view is matched against, best first.
-        planes: of each view; empty if nothing can be matched, because there is one view or all are at one place.
+        axes: (3, 3) of each view (`estimate_axes`); empty if nothing can be matched, because there is one view or all
+            are at one place.
         priors: of each view.
         estimator: of further priors; None without a prior model.
     """
@@ -113,7 +99,7 @@ class ObservedScene:
     config: SearchConfig
     depths: DepthRange
     neighbours: list[list[int]]
-    planes: Sequence[ScenePlanes] = ()
+    axes: Sequence[np.ndarray] = ()
     priors: Sequence[Sequence[DepthPrior]] = ()
     estimator: PriorEstimator | None = None
 
@@ -124,7 +110,7 @@ def observe(
     prior_model: PriorModel | None = None,
     progress: Progress | None = None,
 ) -> ObservedScene:
-    """The depth range, neighbours, planes and priors of panoramas (v, h, 2h, 3)."""
+    """The depth range, neighbours, axes and priors of panoramas (v, h, 2h, 3)."""
     report = part_of(progress)
     report("finding the scene's axes", 0.0)
     height = min(posed.images.shape[1], config.finest_height)
@@ -132,9 +118,6 @@ def observe(
     axes = estimate_axes(small, posed.cam2world[:, :3, :3])
     low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
     depths = DepthRange(low / config.far_margin, low, high)
-    empty = make_empty_planes(posed.cam2world, axes, posed.near, 1 / depths.farthest)
-    rows = min(height, _DETECTION_HEIGHT)
-    views = _make_views(posed, [axis_components(axes, pose[:3, :3], rows) for pose in posed.cam2world], rows)
     estimator = None
     if prior_model is not None:
         report("estimating depth", 0.02)
@@ -145,34 +128,18 @@ def observe(
     if estimator is not None:
         neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
 
-    def find_planes() -> list[ScenePlanes]:
-        if config.near_single_views:
-            return [empty] * len(posed.images)
-        by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
-        pairs = list_best_pairs(neighbours)
-        for pair in set(pairs):
-            poses, start = posed.cam2world[list(pair)], empty
-            if len(posed.images) > len(pair):
-                turned = estimate_axes([small[n] for n in pair], poses[:, :3, :3])
-                start = dataclasses.replace(empty, axes=turned[match_axes(turned, axes)])
-            rays = [axis_components(start.axes, pose[:3, :3], rows) for pose in poses]
-            own, floor = [views[n] for n in pair], MIN_FLOOR * posed.near
-            by_pair[pair] = detect_planes(own, rays, poses, start, depths, floor, config.matching)
-        return [by_pair[pair] for pair in pairs]
-
-    def estimate_priors() -> Sequence[Sequence[DepthPrior]]:
-        if estimator is None:
-            return [()] * len(posed.images)
-        return estimator.estimate_by_matching(views, neighbours, (low, high), config.matching)
-
-    report("finding planes", 0.15)
-    if thread_count() > 1:  # half of each is work of one thread
-        with ThreadPoolExecutor(1) as pool:
-            estimated = pool.submit(estimate_priors)
-            planes, priors = find_planes(), estimated.result()
-    else:
-        planes, priors = find_planes(), estimate_priors()
-    return ObservedScene(posed, config, depths, neighbours, planes, priors, estimator)
+    by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
+    pairs = list_best_pairs(neighbours)
+    for pair in set(pairs) if len(posed.images) > 2 else ():
+        turned = estimate_axes([small[n] for n in pair], posed.cam2world[list(pair), :3, :3])
+        by_pair[pair] = turned[match_axes(turned, axes)]
+    own_axes = [by_pair.get(pair, axes) for pair in pairs]
+    report("finding the cameras' heights", 0.15)
+    priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
+    if estimator is not None:
+        views = _make_views(posed, min(height, _HEIGHTS_SIZE))
+        priors = estimator.estimate_by_matching(views, neighbours, (low, high), config.matching)
+    return ObservedScene(posed, config, depths, neighbours, own_axes, priors, estimator)
 
 
 def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surface]:
@@ -180,7 +147,7 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     config, report = scene.config, part_of(progress)
     posed, depths, neighbours, estimator = scene.posed, scene.depths, scene.neighbours, scene.estimator
     finest = min(posed.images.shape[1], config.finest_height)
-    if not scene.planes:
+    if not scene.axes:
         return _place_unmatched(scene, finest)
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     if config.near_single_views:
@@ -188,22 +155,22 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     pixel = math.pi / heights[0] / (depths.high - depths.low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
     counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]
-    surfaces: list[Surface] = []
-    priors = scene.priors
-    for n in range(config.coarse_passes):
-        report("searching the whole depth range", 0.25 + 0.3 * n / config.coarse_passes)
-        if estimator is not None and surfaces:
-            priors = estimator.estimate_from_surfaces(surfaces)
-        rows = heights[0] if n == config.coarse_passes - 1 else min(heights[0], config.first_height)
-        level = _SearchLevel(scene, rows, _upsample(surfaces, posed.images, rows))
-        surfaces = [level.search_full_range(view, depths.sample(counts[view]), own) for view, own in enumerate(priors)]
+    report("searching the whole depth range", 0.25)
+    level = _SearchLevel(scene, heights[0])
+    surfaces = [
+        level.search_full_range(view, depths.sample(count), priors)
+        for view, (count, priors) in enumerate(zip(counts, scene.priors, strict=True))
+    ]
     sharp, finest_posed = None, posed
     if estimator is not None:
         sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen((depths.low, depths.high))]
         finest_posed = posed.resize(finest)
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.55 + 0.1 * n)
-        surfaces = _upsample(surfaces, posed.images, height)
+        surfaces = [
+            guided_upsample(surface, resize_sphere(image, surface.height), resize_sphere(image, height))
+            for surface, image in zip(surfaces, posed.images, strict=True)
+        ]
         if sharp is not None and height == finest:
             surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
         level = _SearchLevel(scene, height, surfaces)
@@ -227,7 +194,7 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int], repo
     for n, height in enumerate(heights):
         report("searching near the estimated depth", 0.25 + 0.15 * n)
         small = [resize_sharp(log_depth, height) for log_depth in log_depths]
-        level = _SearchLevel(scene, height, [_make_surface(-log_depth) for log_depth in small])
+        level = _SearchLevel(scene, height, [Surface(np.exp(-log_depth)) for log_depth in small])
         found = [level.refine_near(view, n) for view in range(len(small))]
         bent = bend_surfaces(posed.resize(height), found, scene.neighbours, small, config.bend)
         log_depths = [
@@ -235,14 +202,6 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int], repo
             for log_depth, surface, start in zip(log_depths, bent, small, strict=True)
         ]
     return bent
-
-
-def _upsample(surfaces: list[Surface], images: np.ndarray, height: int) -> list[Surface]:
-    """The surfaces at a height, guided by their photographs; none before the first pass."""
-    return [
-        s if s.height == height else guided_upsample(s, resize_sphere(image, s.height), resize_sphere(image, height))
-        for s, image in zip(surfaces, images, strict=False)
-    ]
 
 
 def choose_nearest(cam2world: np.ndarray, count: int, least: float) -> list[list[int]]:
@@ -261,64 +220,34 @@ def _place_unmatched(scene: ObservedScene, height: int) -> list[Surface]:
     else:
         sharp = scene.estimator.sharpen((scene.depths.low, scene.depths.high))
         inverse = np.stack([np.exp(-resize_sharp(values, height)) for values in sharp]).clip(*scene.depths.limits)
-    return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
+    return [Surface(values.astype(np.float32)) for values in inverse]
 
 
-def _make_surface(log_inverse: np.ndarray) -> Surface:
-    return Surface(np.exp(log_inverse).astype(np.float32), np.zeros(log_inverse.shape, np.uint8))
-
-
-def _make_views(
-    posed: PosedImages, rays: Sequence[Sequence[np.ndarray]], height: int, surfaces: Sequence[Surface] = ()
-) -> list[View]:
-    """What is matched of each view at a height; of `rays` (h, 2h), the first component is down."""
+def _make_views(posed: PosedImages, height: int, surfaces: Sequence[Surface] = ()) -> list[View]:
+    """What is matched of each view at a height."""
     images, masks = [resize_sphere(i, height) for i in posed.images], [resize_mask(m, height) for m in posed.masks]
-    downs = [np.ascontiguousarray(components[0], np.float32) for components in rays]
     known = [surface.inverse_depth for surface in surfaces] or [None] * len(images)
-    return list(map(View, images, masks, downs, known))
+    return list(map(View, images, masks, known))
 
 
 class _SearchLevel:
     """All views at the height of one level of the search, with the surfaces found so far, if any."""
 
-    def __init__(self, scene: ObservedScene, height: int, surfaces: list[Surface]) -> None:
-        posed, neighbours = scene.posed, scene.neighbours
-        self.posed, self.height, self.limits, self.config = posed, height, scene.depths.limits, scene.config
-        self.surfaces, self.neighbours, self.planes = surfaces, neighbours, scene.planes
-        self.rays = [
-            axis_components(own.axes, pose[:3, :3], height)
-            for own, pose in zip(scene.planes, posed.cam2world, strict=True)
-        ]
-        self.views = _make_views(posed, self.rays, height, surfaces)
-        if surfaces:
-            consistent = [
-                consistency_mask(surfaces, posed.cam2world, n, neighbours[n]) & view.valid
-                for n, view in enumerate(self.views)
-            ]
-            groups = [[view, *others] for view, others in enumerate(neighbours)]
-            self.planes = [
-                collect_planes(
-                    *([maps[n] for n in group] for maps in (surfaces, consistent)), posed.cam2world[group], own
-                )
-                for group, own in zip(groups, scene.planes, strict=True)
-            ]
+    def __init__(self, scene: ObservedScene, height: int, surfaces: Sequence[Surface] = ()) -> None:
+        self.posed, self.height, self.limits, self.config = scene.posed, height, scene.depths.limits, scene.config
+        self.surfaces, self.neighbours, self.axes = surfaces, scene.neighbours, scene.axes
+        self.views = _make_views(scene.posed, height, surfaces)
 
     def search_full_range(self, view: int, inverse: np.ndarray, priors: Sequence[DepthPrior]) -> Surface:
         """The best hypotheses: spheres of inverse depths (set 0) and planes across the axes (sets 1 to 3)."""
         low, step, count = inverse[0], inverse[1] - inverse[0], len(inverse)
-        shape = (self.height, 2 * self.height)
-        slopes = [np.ones(shape, np.float32)] + [np.abs(r).astype(np.float32) for r in self.rays[view]]
-        sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
-        penalties = [np.zeros((2, count), np.float32) for _ in slopes]
-        if self.surfaces:  # in the first pass nothing supports a plane yet
-            penalties[0] += self.config.sphere_penalty
-            for axis in range(3):
-                penalties[axis + 1] = self.config.unsupported_plane_penalty * (
-                    1 - self.planes[view].support(axis, self.posed.cam2world[view], inverse)
-                )
+        rays = axis_components(self.axes[view], self.posed.cam2world[view, :3, :3], self.height)
+        slopes = [np.ones(rays.shape[1:], np.float32), *np.abs(rays).astype(np.float32)]
+        sides = [np.zeros(rays.shape[1:], np.uint8), *(rays > 0).astype(np.uint8)]
+        no_penalty = np.zeros(count, np.float32)
         sets = [
-            HypothesisSet(low * slope, step * slope, penalty.astype(np.float32), side)
-            for slope, penalty, side in zip(slopes, penalties, sides, strict=True)
+            HypothesisSet(low * slope, step * slope, no_penalty, side)
+            for slope, side in zip(slopes, sides, strict=True)
         ]
         # Factor and offset from each set's hypothesis number to a depth slot that all share (`aggregate_costs`).
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
@@ -332,7 +261,7 @@ class _SearchLevel:
     ) -> list[HypothesisSet]:
         """Copies of the sets in which the planes that separate the two views are back-facing."""
         pose, there = self.posed.cam2world[[view, other]]
-        marks = [None] + [self.planes[view].separating(axis, pose, there, inverse) for axis in range(3)]
+        marks = [None] + [mark_separating_planes(axis, pose, there, inverse) for axis in self.axes[view]]
         return [dataclasses.replace(s, back_facing=m, sphere=m is None) for s, m in zip(sets, marks, strict=True)]
 
     def refine(self, view: int, count: int, step: float, *, widen: bool) -> Surface:
@@ -355,31 +284,27 @@ class _SearchLevel:
     def _refine(self, view: int, centres: list[np.ndarray], step: np.ndarray, penalty: np.ndarray) -> Surface:
         """The best of hypotheses a step (h, w) apart around each of some surfaces, with a penalty (count) each."""
         known, count = self.surfaces[view].inverse_depth, len(penalty)
-        side = np.zeros(known.shape, np.uint8)
-        penalties = np.stack((penalty, penalty))
-        sets = [HypothesisSet((c - step * (count // 2)).astype(np.float32), step, penalties, side) for c in centres]
+        sets = [HypothesisSet((c - step * (count // 2)).astype(np.float32), step, penalty) for c in centres]
         slots = 2 * count
         # Far beyond the slots an offset has no meaning, and must fit an integer.
         starts = np.stack([np.clip((c - known) / step, -4 * slots, 4 * slots) + count / 2 for c in centres], axis=2)
         slot_map = np.stack((np.ones_like(starts), starts), axis=-1).astype(np.float32)
         cost = self._compute_cost(view, lambda other: sets)
-        surface = self._select_hypotheses(view, sets, cost, slot_map, slots)
-        return Surface(surface.inverse_depth, self.surfaces[view].orientation)
+        return self._select_hypotheses(view, sets, cost, slot_map, slots)
 
     def _compute_cost(self, view: int, make_sets: Callable[[int], list[HypothesisSet]]) -> np.ndarray:
         """Matching cost (h, w, sets * count) by the neighbours, of the sets that `make_sets(other)` returns."""
-        bounds = self.planes[view].vertical_bounds(self.posed.cam2world[view])
         others = [
             OtherView(self.views[other], self.posed.relative_pose(view, other), make_sets(other))
             for other in self.neighbours[view]
         ]
-        return compute_matching_cost(self.views[view], others, self.limits, bounds, self.config.matching)
+        return compute_matching_cost(self.views[view], others, self.limits, self.config.matching)
 
     def _select_hypotheses(
         self, view: int, sets: list[HypothesisSet], cost: np.ndarray, slot_map: np.ndarray, slots: int
     ) -> Surface:
         """The surface of lowest aggregated cost."""
-        count = sets[0].penalty.shape[1]
+        count = len(sets[0].penalty)
         total = aggregate_costs(cost, self.views[view].image, slot_map, slots, self.config.aggregation)
         label, offset = select_labels(total, count)
         chosen, k = label // count, label % count
@@ -387,4 +312,4 @@ class _SearchLevel:
         step = np.stack([s.step for s in sets], axis=-1)
         rows, columns = np.indices(label.shape)
         inverse = base[rows, columns, chosen] + (k + offset) * step[rows, columns, chosen]
-        return Surface(np.clip(inverse, *self.limits).astype(np.float32), chosen.astype(np.uint8))
+        return Surface(np.clip(inverse, *self.limits).astype(np.float32))

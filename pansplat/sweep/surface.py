@@ -99,15 +99,9 @@ def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The surface that a view shows: its distance in each direction.
-
-    Attributes:
-        inverse_depth: (h, w) inverse radial depth, 1/m.
-        orientation: (h, w) 0 for a sphere around the camera; 1, 2, 3 for a plane across that axis of the scene.
-    """
+    """The surface that a view shows: inverse radial depth (h, w) in each direction, 1/m."""
 
     inverse_depth: np.ndarray
-    orientation: np.ndarray
 
     @property
     def height(self) -> int:
@@ -215,18 +209,17 @@ def guided_upsample(
     wrapped = np.concatenate((inverse[:, -2:], inverse, inverse[:, :2]), axis=1)
     lowest, highest = cv2.erode(wrapped, window)[:, 2:-2], cv2.dilate(wrapped, window)[:, 2:-2]
     smooth = highest < (1 + _SMOOTH) * lowest
-    result, orientations = np.zeros(needed.shape, np.float32), np.zeros(needed.shape, np.uint8)
-    work = partial(_upsample, inverse, surface.orientation, smooth, coarse, fine, needed, result, orientations)
+    result = np.zeros(needed.shape, np.float32)
+    work = partial(_upsample, inverse, smooth, coarse, fine, needed, result)
     parallel_for(work, len(needed), thread_count())
-    return Surface(result, orientations)
+    return Surface(result)
 
 
 @cached_njit(nogil=True, fastmath=True)
-def _upsample(inverse, orientation, is_smooth, coarse, fine, needed, result, orientations, i):
+def _upsample(inverse, is_smooth, coarse, fine, needed, result, i):
     h, w = inverse.shape
     height, width = fine.shape[:2]
     values, weights = np.empty(25, np.float32), np.empty(25, np.float32)
-    kinds = np.empty(25, np.uint8)
     y = (i + 0.5) * h / height - 0.5
     for j in range(width):
         if not needed[i, j]:
@@ -241,7 +234,7 @@ def _upsample(inverse, orientation, is_smooth, coarse, fine, needed, result, ori
         smooth += (inverse[r1, c0] * (1 - fx) + inverse[r1, c1] * fx) * fy
         r, c = min(max(cy, 0), h - 1), cx % w
         if is_smooth[r, c]:  # the median is close to the smooth value
-            result[i, j], orientations[i, j] = smooth, orientation[r, c]
+            result[i, j] = smooth
             continue
         n = 0
         total = 0.0
@@ -257,9 +250,9 @@ def _upsample(inverse, orientation, is_smooth, coarse, fine, needed, result, ori
                 total += weight
                 at = n
                 while at > 0 and values[at - 1] > value:
-                    values[at], kinds[at], weights[at] = values[at - 1], kinds[at - 1], weights[at - 1]
+                    values[at], weights[at] = values[at - 1], weights[at - 1]
                     at -= 1
-                values[at], kinds[at], weights[at] = value, orientation[r, c], weight
+                values[at], weights[at] = value, weight
                 n += 1
         below, median = weights[0], 0
         while below < 0.5 * total and median < 24:
@@ -267,4 +260,3 @@ def _upsample(inverse, orientation, is_smooth, coarse, fine, needed, result, ori
             below += weights[median]
         close = abs(smooth / values[median] - 1) < _SMOOTH
         result[i, j] = smooth if close else values[median]
-        orientations[i, j] = kinds[median]

@@ -131,7 +131,7 @@ class Observed:
 
     def make_exact_surfaces(self) -> list[Surface]:
         """Surfaces with the true depth."""
-        return [Surface((1 / d).astype(np.float32), np.zeros(d.shape, np.uint8)) for d in self.depths]
+        return [Surface((1 / d).astype(np.float32)) for d in self.depths]
 
 
 _FURNISHED = Room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7)))

@@ -21,7 +21,7 @@ SHAPE = (HEIGHT, 2 * HEIGHT)
 
 
 def _surface(depth: np.ndarray) -> Surface:
-    return Surface((1 / depth).astype(np.float32), np.zeros(depth.shape, np.uint8))
+    return Surface((1 / depth).astype(np.float32))
 
 
 def _area() -> np.ndarray:

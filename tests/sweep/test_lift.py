@@ -117,7 +117,7 @@ def _sphere_around(image: np.ndarray) -> tuple[PosedImages, list[Surface]]:
     inverse = np.full((height, 2 * height), 1 / 3, np.float32)
     masks = np.ones((2, height, 2 * height), bool)
     posed = PosedImages(np.stack((image, image)), np.stack((np.eye(4), np.eye(4))), masks, 0.5, 8.0)
-    return posed, [Surface(inverse, np.zeros(inverse.shape, np.uint8))] * 2
+    return posed, [Surface(inverse)] * 2
 
 
 def test_only_image_detail_makes_gaussians_of_level_0():
@@ -157,7 +157,7 @@ def test_points_in_the_consistent_free_space_of_another_view_are_dropped(make_ro
 def test_points_in_the_free_space_of_more_views_than_confirm_them_are_not_kept(others, is_kept):
     """Of four cameras at one place, two see a sphere of 3 m and two one of 6 m."""
     posed, (near, _) = _sphere_around(np.ones((16, 32, 3), np.float32))
-    far = Surface(near.inverse_depth / 2, near.orientation)
+    far = Surface(near.inverse_depth / 2)
     posed = PosedImages(posed.images[[0] * 4], posed.cam2world[[0] * 4], posed.masks[[0] * 4], posed.near, posed.far)
     certain = [np.ones((16, 32), bool)] * 4
     scene = _PosedSurfaces(posed, [near, far, near, far], [others], certain, LiftConfig())
@@ -178,7 +178,7 @@ def detailed() -> tuple[PosedImages, list[Surface]]:
     poses = np.stack([np.eye(4), np.eye(4)])
     poses[1, 0, 3] = 0.02
     posed = PosedImages(np.stack([image, image]), poses, np.ones((2, 128, 256), bool), near=0.5, far=10.0)
-    surface = Surface(np.full((32, 64), 0.5, np.float32), np.zeros((32, 64), np.uint8))
+    surface = Surface(np.full((32, 64), 0.5, np.float32))
     return posed, [surface, surface]
 
 

@@ -7,7 +7,7 @@ from pansplat.sweep import prior as prior_module
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, apply_prior_cost
 from pansplat.sweep.search import SearchConfig, observe, search
-from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
+from pansplat.sweep.surface import ray_grid, resize_sphere
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
 _DOWN = np.array((0.0, 1.0, 0.0))
@@ -63,8 +63,7 @@ class TrueHeights(TrueDepth):
 
 def _estimate(room, poses, model_type=TrueDepth):
     images = [room.cast(pose, 64)[0] for pose in poses]
-    down = [ray_grid(64) @ pose[:3, :3].T @ _DOWN for pose in poses]
-    views = [View(i, np.ones(i.shape[:2], bool), d.astype(np.float32)) for i, d in zip(images, down, strict=True)]
+    views = [View(image, np.ones(image.shape[:2], bool)) for image in images]
     upright = [pose.copy() for pose in poses]
     for pose in upright:
         turn = prior_module.upright_rotation(pose[:3, :3], _DOWN)
@@ -138,29 +137,13 @@ def test_tilted_cameras_are_turned_upright(make_room, turn):
     assert np.median(error) < 0.01
 
 
-def test_surfaces_give_one_more_prior(make_room, turn):
-    room = make_room()
-    poses = [room.pose((-0.6, 0.0, -0.2), turn("x", 12) @ turn("z", -9)), room.pose((0.5, 0.0, 0.1))]
-    model, priors, estimator = _estimate(room, poses)
-    depths = [1.3 * room.cast(pose, 64)[1] for pose in poses]
-    surfaces = [Surface((1 / depth).astype(np.float32), np.zeros(depth.shape, np.uint8)) for depth in depths]
-    more = estimator.estimate_from_surfaces(surfaces)
-    assert model.iterations == 1
-    for before, after, depth in zip(priors, more, depths, strict=True):
-        assert after[:-1] == before
-        assert np.median(np.abs(after[-1].log_depth - np.log(depth))) < 0.01
-        np.testing.assert_allclose(after[-1].scale, 0.05, rtol=1e-5)
-
-
 @pytest.mark.parametrize("cap", (0.5, 3.0))
 @pytest.mark.parametrize("count_priors", (1, 3))
 def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap, count_priors):
     generator = np.random.default_rng(0)
     shape, count = (4, 8), 5
     base = generator.uniform(0.2, 0.4, shape).astype(np.float32)
-    hypotheses = HypothesisSet(
-        base, np.full(shape, 0.1, np.float32), np.zeros((2, count), np.float32), np.zeros(shape, np.uint8)
-    )
+    hypotheses = HypothesisSet(base, np.full(shape, 0.1, np.float32), np.zeros(count, np.float32))
     priors = [
         DepthPrior(generator.uniform(0, 1, shape), generator.uniform(0.01, 0.5, shape)) for _ in range(count_priors)
     ]

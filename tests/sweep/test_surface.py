@@ -20,7 +20,7 @@ from pansplat.sweep.surface import (
 
 
 def _surface(inverse: np.ndarray) -> Surface:
-    return Surface(inverse.astype(np.float32), np.zeros(inverse.shape, np.uint8))
+    return Surface(inverse.astype(np.float32))
 
 
 def _sphere(radius: float, height: int = 32) -> Surface:
