@@ -136,7 +136,7 @@ KEYS = (
     KeyRow("H", "this help", {"h": _toggle("help")}),
     KeyRow("Esc, Ctrl Q", "quit", {"escape": _escape}),
 )
-"""The help in the window and the actions; docs/viewer.md has the same keys."""
+"""The help in the window and the actions."""
 
 _ACTIONS = {key: action for row in KEYS for key, action in row.actions.items()}
 _IMGUI_NAMES = {",": "comma", ".": "period"} | {name: f"{name}_arrow" for name in ("up", "down", "left", "right")}
