@@ -108,13 +108,15 @@ install_torch() {
     if [ "$build" = auto ]; then
         if nvidia-smi -L >/dev/null 2>&1; then build=cuda; else build=cpu; fi
     fi
-    if [ "$build" = cuda ] || [ "$(uname -s)" != Linux ]; then
-        pip_install "torch==$version"
-        return
-    fi
+    local has_cpu_build=""
     if .venv/bin/python -c "import importlib.metadata as m, sys; sys.exit(m.version('torch') != '$version+cpu')" 2>/dev/null; then
+        has_cpu_build=yes
+    fi
+    if [ "$build" = cuda ] || [ "$(uname -s)" != Linux ]; then
+        pip_install ${has_cpu_build:+--force-reinstall} "torch==$version"  # pip takes the CPU build for this version, too
         return
     fi
+    [ -z "$has_cpu_build" ] || return 0
     say "installing PyTorch $version for the CPU"
     local log
     log=$(mktemp)

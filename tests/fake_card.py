@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 
 CARD = torch.device("meta")  # torch's functions accept it on every machine
-_TENSOR = torch.tensor
+_TENSOR, _AUTOCAST = torch.tensor, torch.autocast
 _READS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::_unique2")  # results whose size or value is read
 
 
@@ -92,5 +92,11 @@ def pretend_card() -> Iterator[Counter[str]]:
         numbers from there, and of operations on tensors of both, which fail on a card.
     """
     card = _Card()
-    with mock.patch("torch.tensor", card.make_constant), mock.patch("torch.as_tensor", card.make_constant), card:
+    replaced = {
+        "tensor": card.make_constant,
+        "as_tensor": card.make_constant,
+        "autocast": lambda _, *args, **kwargs: _AUTOCAST("cpu", *args, **kwargs),  # "meta" has none
+        "is_autocast_enabled": lambda _: False,
+    }
+    with mock.patch.multiple(torch, **replaced), card:
         yield card.count

@@ -18,6 +18,7 @@ COMMANDS = {
     # An environment that it makes has the same program.
     "python": """echo "$*" >>"$LOG"
         case "$*" in
+            *importlib.metadata*) [ "$HAS_CPU_BUILD" ] ;;
             *ensurepip*) [ "$HAS_ENSUREPIP" ] ;;
             *-venv*) echo python3.11-venv ;;
             "-m venv "*) [ ! "$NO_VENV" ] && mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
@@ -27,7 +28,7 @@ COMMANDS = {
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="setup.sh is for Linux")
 
 
-def run_setup(folder: Path, **answers: str) -> subprocess.CompletedProcess[str]:
+def run_setup(folder: Path, *options: str, **answers: str) -> subprocess.CompletedProcess[str]:
     """Run a copy of the script; `log` has the calls of Python."""
     for name in ("setup.sh", "constraints.txt", "pyproject.toml"):
         shutil.copy(ROOT / name, folder)
@@ -35,7 +36,7 @@ def run_setup(folder: Path, **answers: str) -> subprocess.CompletedProcess[str]:
         (folder / name).write_text(f"#!/bin/bash\n{text}\n")
         (folder / name).chmod(0o755)
     environment = {"PATH": f"{folder}:{os.environ['PATH']}", "PYTHON": "python", "LOG": str(folder / "log"), **answers}
-    return subprocess.run(["bash", folder / "setup.sh"], env=environment, capture_output=True, text=True)
+    return subprocess.run(["bash", folder / "setup.sh", *options], env=environment, capture_output=True, text=True)
 
 
 @pytest.mark.parametrize(("can_sudo", "has_ensurepip"), [("", "yes"), ("yes", "")])  # with sudo, but without apt-get
@@ -64,6 +65,16 @@ def test_no_package_is_missing_where_those_of_the_dockerfile_are_installed(tmp_p
     done = run_setup(tmp_path, CAN_SUDO="", HAS_ENSUREPIP="yes", INSTALLED=" ".join(packages.split()))
     assert done.returncode == 0 and "setup: ready:" in done.stdout
     assert "apt-get" not in done.stdout, done.stdout
+
+
+@pytest.mark.parametrize(("has_cpu_build", "option"), [("yes", "--force-reinstall "), ("", "")])
+def test_the_cuda_build_of_pytorch_replaces_the_cpu_build(tmp_path: Path, has_cpu_build: str, option: str) -> None:
+    """pip takes the one for the other: their public versions are equal."""
+    assert run_setup(tmp_path, "--cuda", HAS_ENSUREPIP="yes", CAN_SUDO="", HAS_CPU_BUILD=has_cpu_build).returncode == 0
+    (call,) = [
+        line for line in (tmp_path / "log").read_text().splitlines() if re.search(r"^-m pip install.* torch==", line)
+    ]
+    assert f"constraints.txt {option}torch==" in call
 
 
 def test_setup_has_help_and_refuses_unknown_options() -> None:

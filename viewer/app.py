@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
-from pansplat.system.console import own_warnings, parse_arguments, progress_bar
+from pansplat.system.console import own_warnings, parse_arguments, print_message, progress_bar
 from pansplat.system.devices import Device, use_device
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
 from pansplat.system.options import EYE_DISTANCE, EyeDistance, check_numbers
@@ -72,7 +72,9 @@ class Options:
     at: Annotated[float, Meta(ge=0, le=1)] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     device: Device = "auto"
-    """Where predictions are refined: auto is a graphics card if torch can use one, else the processor."""
+    """As that of `pansplat predict`; OpenGL draws on its own card (--renderer)."""
+    verbose: bool = False
+    """Print what runs where."""
     projection: Projection = "perspective"
     """What the frames of --out show: a perspective image, or all directions as a panorama or as six cube faces."""
     stereo: Stereo = "mono"
@@ -135,7 +137,8 @@ def run_arguments(args: Sequence[str] | None = None) -> int:
         args,
     )
     check_numbers(options)
-    with own_warnings(), use_device(options.device):
+    say = partial(print_message, "note") if options.verbose else None
+    with own_warnings(), use_device(options.device, say):
         return _run(options)
 
 

@@ -222,7 +222,7 @@ def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict
         "status": "failed" if error else "done" if num_made else "skipped",
         "seconds": round(time.perf_counter() - began, 3),
         "outputs": [path.relative_to(batch.out).as_posix() for path in files],
-        "notes": [" ".join(note.splitlines()) for note in notes],
+        "notes": list(dict.fromkeys(" ".join(note.splitlines()) for note in notes)),  # each step reads the folder
         "error": error,
     }
 

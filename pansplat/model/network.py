@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -152,16 +153,27 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> Iterator[Gaussians]:
-        """Yield the Gaussians of `__call__` tile by tile, in bounded memory; errors are raised at the first part."""
-        with torch.no_grad():
-            tiles = self.tiles or choose_tiles(images.shape[-2])
-            matched = self._match(images, cam2world, near, far, masks, progress, tiles)
-        parts = self._lift(matched, tiles, progress)
+        """Yield the Gaussians of `__call__` tile by tile, in bounded memory; errors are raised at the first part.
+
+        Out of a card's memory the processor makes the parts that are left.
+        """
+        tiles, done = self.tiles or choose_tiles(images.shape[-2]), 0
+        parts: Iterator[TileGaussians] | None = None
         while True:
             with torch.no_grad():  # closed before each yield: the caller keeps its own grad mode
-                part = next(parts, None)
+                try:
+                    if parts is None:
+                        matched = self._match(images, cam2world, near, far, masks, progress, tiles)
+                        parts = itertools.islice(self._lift(matched, tiles, progress), done, None)
+                    part = next(parts, None)
+                except torch.cuda.OutOfMemoryError:
+                    note_full_card(self.name)
+                    self.network.cpu()
+                    parts = None
+                    continue
                 if part is None:
                     return
+                done += 1
                 gaussians = part.gaussians[0].to(device=images.device)
                 gaussians = gaussians if masks is None else remove_masked_gaussians(gaussians, cam2world, masks)
             yield gaussians

@@ -70,7 +70,7 @@ def choose_device(work: str, seconds: float = math.inf, *, kernels: bool = False
     """
     import torch
 
-    (choice, say), card = _current.get(), find_card()
+    (choice, _), card = _current.get(), find_card()
     is_short = choice == "auto" and seconds < _MIN_SECONDS
     is_chosen = card is not None and choice != "cpu" and not is_short
     problem = find_problem() if kernels and is_chosen else None
@@ -79,10 +79,16 @@ def choose_device(work: str, seconds: float = math.inf, *, kernels: bool = False
     device = torch.device("cuda" if is_chosen and problem is None else "cpu")
     if device.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # convolutions round as those of a processor do
-    if say is not None:
-        reason = ", which is faster for short work" if card is not None and is_short else ""
-        say(f"{work}: on {'the processor' if device.type == 'cpu' else card}{reason}")
+    reason = ", which is faster for short work" if card is not None and is_short else ""
+    say_place(work, f"on {'the processor' if device.type == 'cpu' else card}{reason}")
     return device
+
+
+def say_place(work: str, place: str) -> None:
+    """Say where some work runs, for `--verbose`."""
+    _, say = _current.get()
+    if say is not None:
+        say(f"{work}: {place}")
 
 
 def note_full_card(work: str, then: str = "it runs on the processor") -> None:

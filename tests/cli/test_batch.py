@@ -108,6 +108,18 @@ def test_only_what_is_not_up_to_date_is_made_and_takes_the_place_of_what_was(
         assert again["status"] == "done" and set(list_outputs(out)) == kept, "what it replaces goes"
 
 
+@pytest.mark.filterwarnings("ignore")  # as in a worker
+def test_a_note_on_the_folder_is_reported_once(rooms: Path, tmp_path: Path, sphere: None) -> None:
+    file = rooms / "room0" / "poses.json"
+    content = json.loads(file.read_text())
+    name, entry = next(iter(content["poses"].items()))
+    pose = entry["cam2world"] if isinstance(entry, dict) else entry
+    content["poses"][name] = {"cam2world": pose, "depth": "no.png"}
+    file.write_text(json.dumps(content))
+    (note,) = process(rooms / "room0", tmp_path / "out", "predict,export", format="spz")["notes"]
+    assert "no.png" in note
+
+
 def test_a_changed_note_of_a_hot_spot_makes_the_page_anew(tmp_path: Path, sphere: None, write_tour: Callable) -> None:
     house, out = write_tour(tmp_path / "house", 4, height=HEIGHT), tmp_path / "out"
     for text in ("an old stove", "a new stove"):

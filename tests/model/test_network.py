@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
 import pytest
 import torch
+from fake_card import CARD, pretend_card
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
@@ -16,6 +17,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.model.feature_pyramid import TransformerConfig
+from pansplat.model.heads import TileGaussians
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.network import (
     NetworkPredictor,
@@ -180,6 +182,27 @@ def test_out_of_a_cards_memory_a_network_has_more_tiles_and_then_the_processor(
     ending = "it runs on the processor" if tried[-1] == 1 else f"{tried[-1]}x{tried[-1]} tiles"
     assert given == tried and len(notes) == failures and str(notes[-1].message).endswith(ending)
     assert len(gaussians) == len(prediction)
+
+
+@pytest.mark.parametrize("full_after", [0, 1, 3])
+def test_out_of_a_cards_memory_the_processor_streams_the_tiles_that_are_left(
+    small_config, prediction: Gaussians, monkeypatch: pytest.MonkeyPatch, full_after: int
+) -> None:
+    predictor = _predictor(small_config, tiles=2)
+    lift = predictor.network.lift_gaussians
+
+    def lift_gaussians(matched, *, tiles: int) -> Iterator[TileGaussians]:
+        for done, part in enumerate(lift(matched, tiles=tiles)):
+            if done == full_after and part.gaussians[0].means.device == CARD:
+                raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+            yield part
+
+    monkeypatch.setattr(predictor.network, "lift_gaussians", lift_gaussians)
+    with pretend_card(), pytest.warns(InputWarning, match="too little memory; it runs on the processor") as notes:
+        predictor.network.to(CARD)
+        streamed = Gaussians.cat(list(predictor.stream(*_inputs(), 0.5, 20.0)))
+    assert len(notes) == 1 and len(streamed) == len(prediction)
+    assert streamed.means.sort(dim=0).values.allclose(prediction.means.sort(dim=0).values, atol=1e-4)
 
 
 # Loading

@@ -27,6 +27,7 @@ from pansplat.poses.estimate import (
     PoseEstimate,
     _find_file,
     _is_mirrored,
+    _load_matcher,
     _match,
     _relate_views,
     _View,
@@ -38,6 +39,7 @@ from pansplat.poses.learned import LearnedFeatures, LearnedMatches, MatcherMissi
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
 from pansplat.poses.solvers import angle_between, rotation_angle
 from pansplat.poses.two_view import RelativePose
+from pansplat.system.devices import use_device
 from pansplat.system.store import Store
 
 SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
@@ -160,6 +162,17 @@ def test_without_the_learned_matcher_poses_are_estimated_by_sift_alone(
     (message,) = {str(warning.message) for warning in caught}
     assert message.startswith("poses are estimated by SIFT alone: needed the learned matcher's weights, got none")
     assert len(caught) == 1
+
+
+def test_the_matcher_is_on_the_device_that_is_chosen_for_the_number_of_panoramas(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("pansplat.poses.estimate.load_matcher", lambda device: device.type)
+    monkeypatch.setattr("pansplat.system.devices.find_card", lambda: "Card 9000")
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", torch.backends.cudnn.allow_tf32)  # is restored
+    assert (_load_matcher(2), _load_matcher(10)) == ("cpu", "cuda")
+    with use_device("cpu"):
+        assert _load_matcher(10) == "cpu"
 
 
 def _view(features: Features, small: np.ndarray, learned: LearnedFeatures | None = None) -> _View:

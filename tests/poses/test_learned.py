@@ -1,5 +1,6 @@
 """The learned matcher: equality with the published implementation, panoramas, errors."""
 
+import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from fake_card import CARD, pretend_card
 from numpy import ndarray as Array
 
 from pansplat.poses.learned import (
@@ -77,6 +79,21 @@ def test_matches_of_a_room_are_right(matcher: Matcher, room: tuple) -> None:
     assert (np.abs(angle[likely]) < np.radians(1)).mean() > 0.9
     assert (np.diff(matches.probability) <= 0).all()
     assert all(len(np.unique(column)) == len(matches) for column in matches.indices.T)
+
+
+def test_a_matcher_on_a_card_finds_what_it_finds_on_the_processor(
+    matcher: Matcher, room: tuple, render_room: Callable[..., Array], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "inference_mode", torch.no_grad)  # which the pretended card does not have
+    image, expected = render_room(0, np.eye(3), np.zeros(3)), match_learned(matcher, room[0], room[1])
+    with pretend_card() as count:
+        on_card = copy.deepcopy(matcher).to(CARD)
+        features, matches = detect_learned(on_card, image, count=150), match_learned(on_card, room[0], room[1])
+    assert count["copies"] and not any("mixed" in name for name in count if count[name])
+    np.testing.assert_allclose(features.bearings, room[0].bearings, atol=1e-5)
+    torch.testing.assert_close(features.descriptors, room[0].descriptors, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(matches.indices, expected.indices)
+    np.testing.assert_allclose(matches.probability, expected.probability, atol=1e-4)
 
 
 def test_masked_pixels_have_no_features(matcher: Matcher, render_room: Callable[..., Array]) -> None:

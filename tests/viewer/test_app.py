@@ -126,6 +126,17 @@ def test_offscreen_writes_the_fly_through_to_the_given_folder(room):
     assert not (room.parent / "renders").exists()
 
 
+def test_verbose_says_what_runs_where(write_room, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    arguments = ["--offscreen", "out", "--renderer", "cpu", "--size", "32x32", "--seconds", "0.1"]
+    arguments += [str(write_room(tmp_path / "pair")), "--height", "64", "--model", "sweep", "--refine", "0.5"]
+    assert run([*arguments, "--verbose"]) == 0
+    printed = capsys.readouterr().err
+    assert "note: drawing: on the processor\n" in printed and "note: refinement: on the processor\n" in printed
+    assert run(arguments) == 0
+    assert "note: " not in capsys.readouterr().err
+
+
 def test_the_film_of_a_path_has_a_frame_for_each_time(room):
     frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.5)]
     Path("walk.json").write_text(json.dumps({"key_frames": frames}))

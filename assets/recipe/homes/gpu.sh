@@ -19,7 +19,7 @@ OUT=$(realpath "$OUT")
 if [ "$SIZE" = tiny ]; then
     limits=(1200 600 400 1800) film=.2 refined=4 homes=16 height=64 rows=128 steps=2 minutes=2 quick=--quick pairs=1 workers=0 real=
 else
-    limits=(180 480 120 120) film=4 refined=40 homes=1600 height=256 rows=512 steps=1500 minutes=1.2 quick= pairs=16 workers=8 real=$SHARED/data/zind
+    limits=(180 480 120 480) film=4 refined=40 homes=1600 height=256 rows=512 steps=1500 minutes=1.2 quick= pairs=16 workers=8 real=$SHARED/data/zind
 fi
 [ -d "$FURNITURE" ] && furniture="--furniture $FURNITURE" || furniture=
 
