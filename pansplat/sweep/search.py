@@ -2,10 +2,10 @@
 
 Three levels of matching, at 1/4, 1/2 and 1/1 of the height, follow each other as in the paper's hierarchical cost
 volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres and with planes across the
-scene's axes. Each finer level searches a narrow range around the coarser surface, which gives occlusion and consistency
-between views. With a prior, the surfaces of the finest level and of the result are those of single
-views, bent by the matches (`bend`). Vertical edges of the result are straightened (`straighten`). A prior of accurate shapes replaces the search of the whole range: all levels then
-search near the surfaces of single views.
+scene's axes. Each finer level searches a narrow range around the coarser surface, which gives occlusion and
+consistency between views. With a prior, the surfaces of the finest level and of the result are those of single views,
+bent by the matches (`bend`). A prior of accurate shapes replaces the search of the whole range: all levels then search
+near the surfaces of single views. Vertical edges are straightened at last (`straighten`).
 """
 
 from __future__ import annotations
@@ -145,15 +145,13 @@ def observe(
 
 def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surface]:
     """The surface (h, 2h) of each view at the height of the finest level."""
-    config = scene.config.straighten
     surfaces = _search(scene, part_of(progress))
-    for n, (surface, axes, image, pose) in enumerate(
-        zip(surfaces, scene.axes, scene.posed.images, scene.posed.cam2world, strict=True)
-    ):
-        if axes[0] @ pose[:3, 1] > math.cos(config.max_tilt):
-            small = resize_sphere(image, surface.height)
-            surfaces[n] = Surface(np.exp(-straighten(-np.log(surface.inverse_depth), small, config)))
-    return surfaces
+    straight = []
+    for surface, axes, image, pose in zip(surfaces, scene.axes, scene.posed.images, scene.posed.cam2world, strict=True):
+        small, down = resize_sphere(image, surface.height), pose[:3, :3].T @ axes[0]
+        log_depth = straighten(-np.log(surface.inverse_depth), small, down, scene.config.straighten)
+        straight.append(Surface(np.exp(-log_depth).clip(*scene.depths.limits)))
+    return straight
 
 
 def _search(scene: ObservedScene, report: Progress) -> list[Surface]:

@@ -1,9 +1,9 @@
 """Straight vertical edges of surfaces.
 
-Frames, columns and the fronts of furniture end at vertical lines. A depth network and matches place the pixels of such a
-line one by one, so that it becomes a wave when the camera moves. All points of a vertical line are at the same
-horizontal distance from the camera, and an upright panorama shows them in one column. The horizontal distance is
-therefore smoothed along columns, beside vertical edges of the photograph, where the surface is vertical.
+Frames, columns and the fronts of furniture end at vertical lines. A depth network and matches place the pixels of such
+a line one by one, so that it becomes a wave when the camera moves. All points of a vertical line have one horizontal
+distance from the camera, and an upright panorama shows them in one column. This distance is therefore smoothed along
+columns, beside vertical edges of the photograph, where the surface is vertical.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.sweep.bend import smooth_lines
+from pansplat.sweep.prior import rotate_image, upright_rotation
 from pansplat.sweep.surface import pad_sphere
 
 
@@ -26,29 +27,44 @@ class StraightenConfig:
     contrast: float = 0.1
     """Difference of grey values of the pixels left and right of an edge."""
     length: float = 0.25
-    """Smallest height of an edge."""
+    """Smallest length of an edge."""
     reach: int = 2
     """Pixels left and right of an edge that are smoothed."""
     max_latitude: float = 1.2
     """Above and below, columns are narrow."""
     span: float = 0.2
-    """Height over which the slope of the surface is measured."""
+    """Angle over which the slope of the surface is measured."""
     slope: float = 0.73
-    """Change of the logarithm of horizontal distance with the angle at which a surface is no longer vertical."""
+    """Change of the logarithm of horizontal distance with the angle at which a surface is not vertical."""
     jump: float = 0.06
     """Difference of log-depth of neighbouring pixels that divides their coupling by e."""
     color: float = 0.15
     """Mean difference of colour of neighbouring pixels that does so."""
     smoothing: float = 0.38
-    """Height over which distances are averaged."""
-    max_tilt: float = math.radians(2)
-    """Of a camera; the surfaces of others stay as they are."""
+    """Angle over which distances are averaged."""
 
 
 def straighten(
-    log_depth: Float[np.ndarray, "h w"], image: Float[np.ndarray, "h w 3"], config: StraightenConfig
+    log_depth: Float[np.ndarray, "h w"],
+    image: Float[np.ndarray, "h w 3"],
+    down: Float[np.ndarray, "3"],
+    config: StraightenConfig,
 ) -> Float[np.ndarray, "h w"]:
-    """The logarithm of an upright panorama's depth with smooth vertical edges."""
+    """The logarithm of a panorama's depth with smooth vertical edges.
+
+    Args:
+        down: unit vector in the camera's axes.
+    """
+    turn = upright_rotation(np.eye(3), down)
+    if turn is None:
+        return (log_depth + _measure_change(log_depth, image, config)).astype(np.float32)
+    turned = rotate_image(np.concatenate((log_depth[..., None], image), axis=-1), turn)
+    change = _measure_change(turned[..., 0], turned[..., 1:], config)
+    return (log_depth + rotate_image(change[..., None], turn.T)[..., 0]).astype(np.float32)
+
+
+def _measure_change(log_depth: np.ndarray, image: np.ndarray, config: StraightenConfig) -> np.ndarray:
+    """What straightens the log-depth (h, w) of an upright panorama."""
     height = len(log_depth)
     rows_per_radian = height / math.pi
     latitude = ((np.arange(height) + 0.5) / height - 0.5) * math.pi
@@ -65,7 +81,7 @@ def straighten(
     coupling[-1] = 0  # the last row is no neighbour of the first one
     columns = np.stack((distance.T, np.ones_like(distance.T)))
     smooth_lines(columns, np.ascontiguousarray(coupling.T), (config.smoothing * rows_per_radian) ** 2)
-    return ((columns[0] / columns[1]).T - to_horizontal).astype(np.float32)
+    return (columns[0] / columns[1]).T - distance
 
 
 def _find_vertical_edges(image: np.ndarray, config: StraightenConfig) -> np.ndarray:
