@@ -36,10 +36,8 @@ class StraightenConfig:
     """Angle over which the slope of the surface is measured."""
     slope: float = 0.73
     """Change of the logarithm of horizontal distance with the angle at which a surface is not vertical."""
-    jump: float = 0.06
-    """Difference of log-depth of neighbouring pixels that divides their coupling by e."""
     color: float = 0.15
-    """Mean difference of colour of neighbouring pixels that does so."""
+    """Mean difference of colour of neighbouring pixels that divides their coupling by e."""
     smoothing: float = 0.38
     """Angle over which distances are averaged."""
 
@@ -73,9 +71,8 @@ def _measure_change(log_depth: np.ndarray, image: np.ndarray, config: Straighten
     window = (1, 2 * round(0.5 * config.span * rows_per_radian) + 1)
     mean = cv2.blur(distance, window, borderType=cv2.BORDER_REPLICATE)
     slope = (np.roll(mean, -1, axis=0) - mean) * rows_per_radian
-    jump = np.abs(np.roll(distance, -1, axis=0) - distance)
     color = np.abs(np.roll(image, -1, axis=0) - image).mean(axis=2)
-    coupling = np.exp(-((slope / config.slope) ** 2) - jump / config.jump - color / config.color)
+    coupling = np.exp(-((slope / config.slope) ** 2) - color / config.color)
     beside = _find_vertical_edges(image, config) & (np.abs(latitude) < config.max_latitude)[:, None]
     coupling *= beside & np.roll(beside, -1, axis=0)
     coupling[-1] = 0  # the last row is no neighbour of the first one
