@@ -174,11 +174,21 @@ def _smooth(maps: np.ndarray, rows: np.ndarray, meridians: np.ndarray, smoothnes
     """Panoramas (2, h, w), smoothed by alternate one-dimensional smoothings of falling strength."""
     for number in range(_PASSES):
         strength = 1.5 * 4.0 ** (_PASSES - 1 - number) / (4.0**_PASSES - 1) * smoothness
-        parallel_for(partial(_smooth_line, maps, rows, strength), len(rows), thread_count())
+        smooth_lines(maps, rows, strength)
         maps = _as_meridians(maps)
-        parallel_for(partial(_smooth_line, maps, meridians, strength), len(meridians), thread_count())
+        smooth_lines(maps, meridians, strength)
         maps = _from_meridians(maps)
     return maps
+
+
+def smooth_lines(maps: np.ndarray, couplings: np.ndarray, strength: float) -> None:
+    """Smooth closed lines in place, along the last axis of both maps (2, lines, length).
+
+    Args:
+        couplings: (lines, length) of each value with the next one of its line.
+        strength: square of the length over which values of full coupling are averaged.
+    """
+    parallel_for(partial(_smooth_line, maps, couplings, strength), len(couplings), thread_count())
 
 
 @cached_njit(nogil=True, fastmath=True, error_model="numpy")

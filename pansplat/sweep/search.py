@@ -2,10 +2,10 @@
 
 Three levels of matching, at 1/4, 1/2 and 1/1 of the height, follow each other as in the paper's hierarchical cost
 volume (PanSplat, section 3.2). The coarse level searches the whole depth range with spheres and with planes across the
-scene's axes. Each finer level searches a narrow range around the coarser surface, which gives occlusion and consistency
-between views. With a prior, the surfaces of the finest level and of the result are those of single
-views, bent by the matches (`bend`). A prior of accurate shapes replaces the search of the whole range: all levels then
-search near the surfaces of single views.
+scene's axes. Each finer level searches a narrow range around the coarser surface, which gives occlusion and
+consistency between views. With a prior, the surfaces of the finest level and of the result are those of single views,
+bent by the matches (`bend`). A prior of accurate shapes replaces the search of the whole range: all levels then search
+near the surfaces of single views. Vertical edges are straightened at last (`straighten`).
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from pansplat.sweep.matching import (
     select_labels,
 )
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
+from pansplat.sweep.straighten import StraightenConfig, straighten
 from pansplat.sweep.surface import (
     PosedImages,
     Surface,
@@ -78,6 +79,7 @@ class SearchConfig:
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
     bend: BendConfig = field(default_factory=BendConfig)
+    straighten: StraightenConfig = field(default_factory=StraightenConfig)
     max_neighbours: int = 3
     """Other views, at most, that a view is matched against."""
 
@@ -89,9 +91,8 @@ class ObservedScene:
     Attributes:
         depths: of all hypotheses.
         neighbours: the other views that each view is matched against, best first.
-        axes: (3, 3) of each view (`estimate_axes`); empty if nothing can be matched, because there is one view or all
-            are at one place.
-        priors: of each view.
+        axes: (3, 3) of each view (`estimate_axes`).
+        priors: of each view; empty if nothing can be matched, because there is one view or all are at one place.
         estimator: of further priors; None without a prior model.
     """
 
@@ -99,7 +100,7 @@ class ObservedScene:
     config: SearchConfig
     depths: DepthRange
     neighbours: list[list[int]]
-    axes: Sequence[np.ndarray] = ()
+    axes: Sequence[np.ndarray]
     priors: Sequence[Sequence[DepthPrior]] = ()
     estimator: PriorEstimator | None = None
 
@@ -124,7 +125,7 @@ def observe(
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
     neighbours = choose_nearest(posed.cam2world, config.max_neighbours, 1 / high)
     if posed.measure_baseline(range(len(posed.images))) < ONE_POSITION * posed.near:
-        return ObservedScene(posed, config, depths, neighbours, estimator=estimator)
+        return ObservedScene(posed, config, depths, neighbours, [axes] * len(posed.images), estimator=estimator)
     if estimator is not None:
         neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
 
@@ -144,10 +145,20 @@ def observe(
 
 def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surface]:
     """The surface (h, 2h) of each view at the height of the finest level."""
-    config, report = scene.config, part_of(progress)
-    posed, depths, neighbours, estimator = scene.posed, scene.depths, scene.neighbours, scene.estimator
+    surfaces = _search(scene, part_of(progress))
+    straight = []
+    for surface, axes, image, pose in zip(surfaces, scene.axes, scene.posed.images, scene.posed.cam2world, strict=True):
+        small, down = resize_sphere(image, surface.height), pose[:3, :3].T @ axes[0]
+        log_depth = straighten(-np.log(surface.inverse_depth), small, down, scene.config.straighten)
+        straight.append(Surface(np.exp(-log_depth).clip(*scene.depths.limits)))
+    return straight
+
+
+def _search(scene: ObservedScene, report: Progress) -> list[Surface]:
+    config, posed, depths = scene.config, scene.posed, scene.depths
+    neighbours, estimator = scene.neighbours, scene.estimator
     finest = min(posed.images.shape[1], config.finest_height)
-    if not scene.axes:
+    if not scene.priors:
         return _place_unmatched(scene, finest)
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     if config.near_single_views:
