@@ -34,13 +34,14 @@ export function turn(yaw, pitch) {
 }
 
 // Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part, or
-// near the panoramas of a scene without edges; steps away from them become shorter near the limit. Nothing walks along poor edges.
+// near the panoramas of a scene without edges; steps away from them become shorter near the limit. Nothing walks along poor
+// edges, or into surfaces.
 export function walk(right, up, forward) {
   if (state.doll.isOn || !state.sorted) return;
   const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
   const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
   const step = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
-  const target = edges.length ? limitStep(GRAPH, camera.position, step, currentPart()) : step;
+  const target = limitStep(GRAPH, camera.position, step, currentPart());
   const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : findSpot(target).position;
   const limit = HEADER.limits[currentPart()], before = distanceOf(camera.position, from), after = distanceOf(target, from);
   const outward = Math.max(after - before, 0), slower = clamp((1 - before / limit) / SOFT, 0, 1);
