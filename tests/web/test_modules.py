@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from pansplat.export.page_data import PageHeader
+from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.pairs import Link, Panorama
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
 from pansplat.tours.layout import REACH
@@ -380,13 +381,13 @@ def test_nothing_walks_before_the_gaussians_are_sorted_or_in_the_dolls_house(nod
 def test_the_views_of_the_edge_are_blended_and_those_of_the_edge_before_fade_out(node: str, tmp_path: Path) -> None:
     program = """() => {
         shown.fill(1);
-        const weights = [];
+        const weights = [], across = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]];
         camera.position = [0, 0, 1.5];
-        weights.push(blendWeights(camera.position));
+        weights.push(blendWeights({ position: camera.position, rotation: across }));
         camera.position = [0, 0, 3];
         for (const now of [0, 250, 500, 1000]) {
             updateEdge(now);
-            weights.push(blendWeights(camera.position));
+            weights.push(blendWeights({ position: camera.position, rotation: across }));
         }
         return [weights, state.edge, state.fade];
     }"""
@@ -395,6 +396,20 @@ def test_the_views_of_the_edge_are_blended_and_those_of_the_edge_before_fade_out
     assert weights[0] == pytest.approx([0.25, 0.75, 0, 0]) and weights[-1] == pytest.approx([0, 0.5, 0.5, 0])
     assert [row[0] > 0 for row in weights] == [True, True, True, True, False] and (edge, fade) == (1, None)
     assert all(sum(row) == pytest.approx(1) for row in weights)
+
+
+def test_a_picture_blends_views_as_pansplat_does(node: str, tmp_path: Path) -> None:
+    """By their distance, and by whether they are ahead."""
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+    random = np.random.default_rng(0)
+    places = [[0.0, 0.0, 0.0], *random.uniform((-1, -1, 0), (1, 1, 2), (9, 3)).tolist()]
+    rotations = [np.linalg.qr(random.normal(size=(3, 3)))[0] for _ in places]
+    seen = [{"position": place, "rotation": turn.tolist()} for place, turn in zip(places, rotations, strict=True)]
+    found = run(node, tmp_path, header, "(seen) => (shown.fill(1), seen.map(blendWeights))", seen)
+    positions = torch.tensor(ROW[:2], dtype=torch.float64)
+    for place, turn, weights in zip(places, rotations, found, strict=True):
+        expected = blend_weights(torch.tensor(place).double(), positions, torch.from_numpy(turn[:, 2]))
+        assert weights == pytest.approx([*expected.clamp_min(1e-4).tolist(), 0, 0])
 
 
 def test_the_dolls_house_is_in_the_picture_and_a_zoom_has_limits(node: str, tmp_path: Path) -> None:
