@@ -319,7 +319,9 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     outlines = {view: FloorOutline(center, center + corners, 1.0) for view, center in centers.items()}
     facts = TourFacts(scene, tour, entry.views)
     outlooks = np.zeros((len(entry.views), BINS))
-    vars(facts).update(outlines=outlines, outlooks=outlooks, clearances=outlooks[:, None], walls=[], poor=())
+    vars(facts).update(
+        outlines=outlines, outlooks=outlooks, clearances=outlooks[:, None].repeat(12, 1), walls=[], poor=()
+    )
     return LoadedScene(entry, scene, facts=facts)
 
 
