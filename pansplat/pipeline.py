@@ -758,7 +758,8 @@ def render(
     group = shown if tour is None or edge is None else list(tour.choose_scene_views()[edge])
     weights = torch.zeros(num_views, dtype=torch.float64, device=pose.device)
     near = torch.tensor(group, device=pose.device)
-    weights[near] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].to(pose))
+    forward = pose[:3, 2] if layout == "pinhole" else None
+    weights[near] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].to(pose), forward)
     views = [scene.gaussians.select(scene.gaussians.views == view) for view in shown]
     renderings = [rasterize_gaussians(view, pose) for view in views]
     return blend_renderings(renderings, weights[torch.tensor(shown, device=pose.device)])

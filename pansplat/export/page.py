@@ -517,7 +517,8 @@ def _describe_outlook(
     places = locate_surfaces(facts.scene, view, facts.level, min_opacity=0.5)
     hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
     turned = sum(1 << number for number in np.flatnonzero(is_turned).tolist())
-    return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": hidden}
+    clearances = facts.clearances[view].round(2).tolist()
+    return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": hidden, "clearances": clearances}
 
 
 def _outline_floors(facts: TourFacts, rooms: Sequence[Room]) -> list[Room]:

@@ -59,6 +59,7 @@ class PageSpot(_Record):
         turned: bits of the directions from which a camera that arrives turns (`choose_arrival`).
         ahead: yaw and pitch to which it turns, radians.
         hidden: panoramas whose marks surfaces hide.
+        clearances: distances of the nearest surfaces around the camera (`measure_clearance`).
     """
 
     name: str
@@ -69,6 +70,7 @@ class PageSpot(_Record):
     turned: int
     ahead: tuple[float, float]
     hidden: tuple[int, ...]
+    clearances: tuple[tuple[float, ...], ...]
 
 
 class PageLink(_Record):

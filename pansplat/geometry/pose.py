@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_AHEAD = 0.55  # exponent of the weight of a view straight ahead (docs/rendering.md, section 7)
+
 
 def rotations_from_quats(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of quaternions (wxyz) of any length; the zero quaternion is the identity."""
@@ -107,13 +109,21 @@ def nearest_views(cam2world: Float[Tensor, "view 4 4"], view: int, count: int) -
     return [other for other in order if other != view][:count]
 
 
-def blend_weights(position: Float[Tensor, "3"], positions: Float[Tensor, "view 3"]) -> Float[Tensor, "view"]:
+def blend_weights(
+    position: Float[Tensor, "3"], positions: Float[Tensor, "view 3"], forward: Float[Tensor, "3"] | None = None
+) -> Float[Tensor, "view"]:
     """Weights of the input views at a camera position: normalised inverse distances.
 
     The weights are non-negative and sum to one. At an input position they are one-hot; inputs that coincide with the
     position have equal weights.
 
     Source: PanSplat, section 3.4 (deferred blending), for any number of views; docs/rendering.md, section 7.
+
+    Args:
+        position: of the camera.
+        positions: of the input views.
+        forward: unit direction of a perspective picture. An input view ahead weighs more, one behind less: it has seen
+            from nearer what is ahead.
     """
     if positions.shape[0] < 1:
         raise ValueError("`positions` must hold at least one view, got none")
@@ -123,4 +133,11 @@ def blend_weights(position: Float[Tensor, "3"], positions: Float[Tensor, "view 3
     # Only ratios matter. In units of the nearest distance nothing overflows.
     closeness = nearest / torch.where(is_at_position, torch.ones_like(distances), distances)
     closeness = torch.where(is_at_position, torch.ones_like(distances), closeness)
+    if forward is not None:
+        ahead = (
+            (positions - position)
+            @ forward.to(distances)
+            / torch.where(is_at_position, torch.ones_like(distances), distances)
+        )
+        closeness = closeness * torch.exp(_AHEAD * ahead)
     return closeness / closeness.sum()

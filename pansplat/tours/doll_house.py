@@ -19,7 +19,7 @@ from pansplat.tours.surfaces import locate_surfaces
 _USUAL_CEILING = 0.65  # height over the camera of one that is not seen, in heights of the camera
 _WALL = 0.15  # how far behind the outline of a room its walls are, in heights of the camera
 _BEYOND = 0.4  # the same around a floor without walls, where furniture may stand
-_BROAD = 0.08, 0.92  # of its ends, at equal steps of azimuth: a floor goes on behind doors and windows
+_BROAD = 0.12, 0.88  # of its ends, at equal steps of azimuth: a floor goes on behind doors and windows
 _LEAST_AREA = 0.4  # of a floor that is a room, squared camera heights
 _SHOWN = 0.9  # of the surfaces of a view without walls and floor
 

@@ -17,7 +17,7 @@ from pansplat.system.store import Store, hash_parts
 from pansplat.tours.edges import find_poor_edges, find_walls
 from pansplat.tours.floor import FloorOutline, find_camera_height, find_floor_outline
 from pansplat.tours.graph import Edge, TourGraph, ViewNumbers, make_graph
-from pansplat.tours.outlook import measure_outlook
+from pansplat.tours.outlook import measure_clearance, measure_outlook
 from pansplat.tours.plan import Door, Plan, Room, make_plan
 
 Value = TypeVar("Value")
@@ -41,7 +41,7 @@ class TourFacts:
         scene: of some panoramas of the tour, in its world, with all Gaussians of each.
         tour: the graph.
         views: the number in the tour of each of the scene's views.
-        level: axes of a level camera (columns right, down, forward) that `outlooks` are relative to.
+        level: axes of a level camera (columns right, down, forward) that `outlooks` and `clearances` are relative to.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class TourFacts:
 
     def prepare(self) -> TourFacts:
         """Compute what a viewer reads while it draws."""
-        _ = self.outlines, self.outlooks, self.walls, self.poor
+        _ = self.outlines, self.outlooks, self.clearances, self.walls, self.poor
         return self
 
     @property
@@ -112,6 +112,11 @@ class TourFacts:
     def outlooks(self) -> Float[np.ndarray, "view bin"]:
         """Distances around the horizon (`measure_outlook`)."""
         return np.stack([measure_outlook(self.scene, k, self.level) for k in range(len(self.views))])
+
+    @_stored
+    def clearances(self) -> Float[np.ndarray, "view row bin"]:
+        """Distances of the nearest surfaces around the cameras (`measure_clearance`)."""
+        return np.stack([measure_clearance(self.scene, k, self.level) for k in range(len(self.views))])
 
     @_stored
     def walls(self) -> list[Edge]:

@@ -23,6 +23,7 @@ from pansplat.system.components import label_components
 from pansplat.system.descriptions import describe_count, describe_range, list_first
 from pansplat.tours.edges import find_walls
 from pansplat.tours.layout import REACH, lay_out
+from pansplat.tours.outlook import find_clearance
 
 Edge = tuple[int, int]
 """Indices of two panoramas, the smaller one first; a panorama without another one has a self-edge, twice its index."""
@@ -32,6 +33,7 @@ ViewNumbers = tuple[int, ...]
 
 EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
 POOR_REACH = 0.5  # metres that a camera may walk from a panorama along a poor edge, at most a quarter of it
+CLEARANCE = 0.25  # metres before a surface, at which a walk ends
 MAX_SCENE_VIEWS = 3  # of a scene of an edge
 _MAX_PREDICTED = 16  # panoramas that a window predicts at once; bounds its memory and the time until they are shown
 _MIN_PANORAMAS = 3  # of a tour of one part
@@ -60,6 +62,7 @@ class TourGraph:
             are `panoramas`.
         walls: pairs of panoramas of one world between which is a wall or a closed door; they are no edges.
         poor: edges along which the image fades, because the surfaces of their panoramas disagree (`judge_edges`).
+        clearances: of panoramas whose surfaces are known (`measure_clearance`, relative to `level_axes`).
     """
 
     name: str
@@ -72,6 +75,7 @@ class TourGraph:
     originals: tuple[Panorama, ...] = ()
     walls: tuple[Edge, ...] = ()
     poor: tuple[Edge, ...] = ()
+    clearances: dict[int, Float[np.ndarray, "row bin"]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         names = list_first([panorama.label for panorama in self.panoramas])
@@ -314,15 +318,41 @@ class TourGraph:
     def limit_step(
         self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], part: int | None = None
     ) -> Float[np.ndarray, "3"]:
-        """Where a step of a camera that walks ends: near a poor edge not between its panoramas, as before a wall.
+        """Where a step of a camera that walks ends: before surfaces, and near a poor edge not between its panoramas.
 
         Args:
             start, end: of the step.
             part: of the camera, if it is known.
         """
         edge, _ = self.find_nearest_edge(end, part)
-        if edge not in self.poor:
-            return end
+        if edge in self.poor:
+            end = self._limit_along(edge, start, end, part)
+        most = min(self._measure_free(edge, start)[0], 0.0)
+        free, away = self._measure_free(edge, end)
+        slid = end - max(most - free, 0.0) * away
+        is_step = np.linalg.norm(slid - start) <= np.linalg.norm(end - start) + 1e-9
+        return slid if is_step and self._measure_free(edge, slid)[0] >= most - 1e-9 else start
+
+    def _measure_free(self, edge: Edge, place: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
+        """How far a camera near an edge may go on, metres, negative too near a surface; and the direction from the
+        panorama that sees it free.
+
+        Beside a panorama, and beside a line along which cameras fly, it is free.
+        """
+        found = []
+        for node in [node for node in edge if node in self.clearances]:
+            offset = place - self.positions[node]
+            distance = float(np.linalg.norm(offset))
+            free = find_clearance(self.clearances[node], self.level_axes.T @ offset) - distance - CLEARANCE
+            found.append((max(free, CLEARANCE - distance), offset / max(distance, 1e-9)))
+        free, away = max(found, key=lambda item: item[0], default=(math.inf, np.zeros(3)))
+        beside = -math.inf if edge in self.poor else CLEARANCE - self.measure_distance(edge, place)
+        return max(free, beside), away
+
+    def _limit_along(
+        self, edge: Edge, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], part: int | None
+    ) -> Float[np.ndarray, "3"]:
+        """Where a step near a poor edge ends."""
         first, last = self.positions[list(edge)]
         length = max(float(np.linalg.norm(last - first)), 1e-9)
         along, reach = (last - first) / length, min(POOR_REACH, length / 4)

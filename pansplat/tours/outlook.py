@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.surfaces import locate_surfaces
 
 BINS = 24  # of the horizon; the first one begins at the yaw -pi
+_ROWS = 12  # of clearances, from above to below
+_NEAREST = 0.1  # quantile of the distances of surfaces in one direction
 _ELEVATION = math.sin(math.radians(20))  # of the surfaces that count, above and below the horizon
 _OPAQUE = 0.5  # least opacity of a surface
 _WALL = 1.2  # metres, the distance of surfaces below which a view faces a wall
@@ -33,6 +35,32 @@ def measure_outlook(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) ->
     bins = ((np.arctan2(offsets[:, 0], offsets[:, 2]) / (2 * math.pi) + 0.5) * BINS).astype(int) % BINS
     found = [distances[is_ahead & (bins == number)] for number in range(BINS)]
     return np.array([np.median(own) if len(own) else 0.0 for own in found])
+
+
+def measure_clearance(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "row bin"]:
+    """Distances of the nearest surfaces around a view's camera, from above to below; 0 where it sees nothing.
+
+    Args:
+        scene, view, level: see `measure_outlook`.
+    """
+    offsets = locate_surfaces(scene, view, level, min_opacity=_OPAQUE)
+    distances, cells = np.linalg.norm(offsets, axis=1), _find_cells(offsets)
+    order = np.lexsort((distances, cells))
+    first, last = (np.searchsorted(cells[order], np.arange(_ROWS * BINS), side) for side in ("left", "right"))
+    nearest = np.append(distances[order], 0.0)[first + (_NEAREST * (last - first)).astype(int)]
+    return np.where(last > first, nearest, 0.0).reshape(_ROWS, BINS)
+
+
+def find_clearance(clearance: Float[np.ndarray, "row bin"], offset: Float[np.ndarray, "3"]) -> float:
+    """The distance of the nearest surface in the direction of a place, relative to the camera; infinite if unknown."""
+    return float(clearance.ravel()[_find_cells(offset[None])[0]]) or math.inf
+
+
+def _find_cells(offsets: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    """The directions of places (right, down, forward), as numbers of clearances."""
+    right, down, forward = offsets.T
+    rows = (np.arctan2(np.hypot(right, forward), -down) / math.pi * _ROWS).astype(int).clip(0, _ROWS - 1)
+    return rows * BINS + ((np.arctan2(right, forward) / (2 * math.pi) + 0.5) * BINS).astype(int) % BINS
 
 
 def choose_arrival(

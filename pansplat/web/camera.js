@@ -3,7 +3,7 @@
 // origin. Matrices are arrays of rows.
 
 import {
-  clamp, closestOnEdge, DEGREE, distanceOf, dot, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
+  clamp, closestOnEdge, column, DEGREE, distanceOf, dot, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
 } from "./graph.js";
 import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, state } from "./state.js";
 
@@ -34,13 +34,14 @@ export function turn(yaw, pitch) {
 }
 
 // Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part, or
-// near the panoramas of a scene without edges; steps away from them become shorter near the limit. Nothing walks along poor edges.
+// near the panoramas of a scene without edges; steps away from them become shorter near the limit. Nothing walks along poor
+// edges, or into surfaces.
 export function walk(right, up, forward) {
   if (state.doll.isOn || !state.sorted) return;
   const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
   const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
   const step = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
-  const target = edges.length ? limitStep(GRAPH, camera.position, step, currentPart()) : step;
+  const target = limitStep(GRAPH, camera.position, step, currentPart());
   const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : findSpot(target).position;
   const limit = HEADER.limits[currentPart()], before = distanceOf(camera.position, from), after = distanceOf(target, from);
   const outward = Math.max(after - before, 0), slower = clamp((1 - before / limit) / SOFT, 0, 1);
@@ -87,17 +88,21 @@ export function floorPoint(position) {
   return plus(HEADER.spots[from].mark, scaled(minus(HEADER.spots[to].mark, HEADER.spots[from].mark), part));
 }
 
+const AHEAD = 0.55;                 // exponent of the weight of a view straight ahead
 const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
 export const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
 export const DOLLY_MS = 500;               // of a fade along a poor edge
 
-// Weights of the views of a group at a position: normalised inverse distances (docs/rendering.md, section 7). Other
-// views have weight 0.
-function groupWeights(group, position) {
+// Weights of the views of a group in a picture of a position and a direction: blend_weights of pansplat. Other views
+// have weight 0.
+function groupWeights(group, position, forward) {
   const views = HEADER.groups[group], weights = HEADER.views.map(() => 0);
   const distances = views.map((view) => distanceOf(position, HEADER.views[view].position));
   const nearest = Math.min(...distances);
-  const closeness = distances.map((distance) => distance > 0 ? nearest / distance : 1);
+  const closeness = views.map((view, i) => {
+    const ahead = dot(minus(HEADER.views[view].position, position), forward) / (distances[i] || 1);
+    return (distances[i] > 0 ? nearest / distances[i] : 1) * Math.exp(AHEAD * ahead);
+  });
   const sum = closeness.reduce((a, b) => a + b);
   views.forEach((view, i) => { weights[view] = Math.max(closeness[i] / sum, MIN_WEIGHT); });
   return weights;
@@ -105,8 +110,8 @@ function groupWeights(group, position) {
 
 // The views of the edge at the camera, and for a second after a change also those of the edge before. A view fades in
 // when it has arrived.
-export function blendWeights(position) {
-  const { fade } = state, weights = groupWeights(state.group, position), old = fade ? groupWeights(fade.group, position) : weights;
+export function blendWeights({ position, rotation }) {
+  const { fade } = state, [weights, old] = [state, fade || state].map(({ group }) => groupWeights(group, position, column(rotation, 2)));
   const done = fade ? fade.done : 1;
   return weights.map((weight, view) => shown[view] * (done * weight + (1 - done) * old[view]));
 }

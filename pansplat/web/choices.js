@@ -51,13 +51,13 @@ const DOT = 7, GAP = 3;  // pixels: half of a panorama's dot in the plan, and be
 
 // Where names stand in a plan: the middle of each, as near to its own as it covers neither a dot nor a name before; null where
 // there is no such place.
-export function placeNames(names, dots, size) {
+export function placeNames(names, dots, [across, tall]) {
   const taken = dots.map(([x, y]) => [x - DOT, y - DOT, x + DOT, y + DOT]);
   return names.map(({ x, y, width, height }) => {
-    const half = 0.5 * width + GAP, middle = clamp(x, half, Math.max(size - half, half));
+    const half = 0.5 * width + GAP, middle = clamp(x, half, Math.max(across - half, half));
     for (const step of [0, -1, 1, -2, 2, -3, 3]) {
       const at = y + 0.6 * step * height, box = [middle - half, at - 0.5 * height, middle + half, at + 0.5 * height];
-      if (box[1] < 0 || box[3] > size || taken.some((other) => isCovered(box, other))) continue;
+      if (box[1] < 0 || box[3] > tall || taken.some((other) => isCovered(box, other))) continue;
       taken.push(box);
       return [middle, at];
     }

@@ -8,7 +8,7 @@ import { camera, changed, state } from "./state.js";
 const DOLL_FOV = 45;                               // degrees, vertical, of a landscape picture
 const DOLL_PITCH = -45 * Math.PI / 180;            // of the first view
 const LOWEST = -8 * Math.PI / 180;                 // pitch of a camera that looks along the floor
-const DOLL_ZOOM = [0.15, 2];                       // of the first distance
+const DOLL_ZOOM = [0.15, 2];                       // of the distance from which all rooms are in the picture
 const DOLL_TURN = Math.PI / 2;                     // radians a second, by keys
 
 // The house of the panorama that the camera leaves: corners of triangles (x, y, z, and u, v in the atlas).
@@ -25,7 +25,7 @@ export function frameDoll(size) {
   const middle = scaled(plus(...box), 0.5), offsets = places.map((place) => minus(place, middle));
   const distances = yaws.map((yaw) => fit(offsets, yaw, DOLL_PITCH, size)), best = Number(distances[1] < 0.95 * distances[0]);
   const center = HEADER.level.map((row) => dot(row, middle));
-  Object.assign(state.doll, { center, first: distances[best], distance: distances[best] });
+  Object.assign(state.doll, { center, offsets, size, first: distances[best], zoom: 1 });
   return { position: placeOutside(yaws[best], DOLL_PITCH), yaw: yaws[best], pitch: DOLL_PITCH, fov: DOLL_FOV };
 }
 
@@ -39,10 +39,10 @@ function fit(offsets, yaw, pitch, [width, height]) {
   return 1.05 * needed.reduce((most, each) => Math.max(most, each));
 }
 
-// Where a camera with these angles sees the rooms.
+// Where a camera with these angles sees all rooms, unless a visitor has come nearer.
 function placeOutside(yaw, pitch) {
-  const forward = HEADER.level.map((row) => dot(row, column(turned(yaw, pitch), 2)));
-  return minus(state.doll.center, scaled(forward, state.doll.distance));
+  const { center, offsets, size, first, zoom } = state.doll, forward = HEADER.level.map((row) => dot(row, column(turned(yaw, pitch), 2)));
+  return minus(center, scaled(forward, zoom * Math.max(first, fit(offsets, yaw, pitch, size))));
 }
 
 export function orbit(yaw, pitch) {
@@ -56,7 +56,7 @@ export function orbit(yaw, pitch) {
 export function zoomDoll(factor) {
   const { doll } = state;
   if (doll.flight) return;
-  doll.distance = clamp(doll.distance * factor, ...DOLL_ZOOM.map((limit) => limit * doll.first));
+  doll.zoom = clamp(doll.zoom * factor, ...DOLL_ZOOM);
   orbit(0, 0);
 }
 

@@ -2,10 +2,12 @@
 // pansplat.tours.graph.TourGraph that they name; tests/web/test_browser.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
-// on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; and the `reach` around a part,
-// within which a camera that has jumped is in it. Edges are numbers in `edges`.
+// on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; the `reach` around a part,
+// within which a camera that has jumped is in it; and the `clearances` of panoramas, relative to the axes `level`.
+// Edges are numbers in `edges`.
 
 export const DEGREE = Math.PI / 180;
+const CLEARANCE = 0.25;  // metres before a surface, at which a walk ends
 const POOR_REACH = 0.5;  // metres that a camera may walk from a panorama along a poor edge, at most a quarter of it
 
 export const minus = (a, b) => a.map((value, i) => value - b[i]);
@@ -50,10 +52,40 @@ export function followEdge(graph, position, current) {
   return distanceToEdge(graph, current, position) <= limit ? current : nearest;
 }
 
-// limit_step
+// limit_step; in a scene without edges, surfaces alone limit it
 export function limitStep(graph, start, end, part = null) {
-  const edge = nearestEdge(graph, end, part), ends = graph.edges[edge].slice(0, 2), [first, last] = ends.map((node) => graph.positions[node]);
-  if (!isFade(graph, ...ends)) return end;
+  const edge = graph.edges.length ? nearestEdge(graph, end, part) : null;
+  const target = edge !== null && isPoor(graph, edge) ? limitAlong(graph, edge, start, end, part) : end;
+  const most = Math.min(measureFree(graph, edge, start)[0], 0), [free, away] = measureFree(graph, edge, target);
+  const slid = minus(target, scaled(away, Math.max(most - free, 0)));
+  const isStep = distanceOf(slid, start) <= distanceOf(target, start) + 1e-9;
+  return isStep && measureFree(graph, edge, slid)[0] >= most - 1e-9 ? slid : start;
+}
+
+// measure_free; of all panoramas without an edge
+function measureFree(graph, edge, place) {
+  const nodes = edge === null ? [...graph.positions.keys()] : graph.edges[edge].slice(0, 2);
+  const found = nodes.filter((node) => graph.clearances[node].length).map((node) => {
+    const offset = minus(place, graph.positions[node]), distance = Math.hypot(...offset);
+    const free = Math.max(findClearance(graph, node, offset) - distance - CLEARANCE, CLEARANCE - distance);
+    return [free, scaled(offset, 1 / Math.max(distance, 1e-9))];
+  });
+  if (!found.length) return [Infinity, [0, 0, 0]];
+  const [free, away] = found.reduce((best, each) => each[0] > best[0] ? each : best);
+  const beside = edge === null || isPoor(graph, edge) ? -Infinity : CLEARANCE - distanceToEdge(graph, edge, place);
+  return [Math.max(free, beside), away];
+}
+
+// find_clearance
+function findClearance(graph, node, offset) {
+  const [right, down, forward] = [0, 1, 2].map((k) => dot(column(graph.level, k), offset)), table = graph.clearances[node], [{ length }] = table;
+  const row = Math.min(Math.floor(Math.atan2(Math.hypot(right, forward), -down) / Math.PI * table.length), table.length - 1);
+  return table[row][Math.floor((Math.atan2(right, forward) / (2 * Math.PI) + 0.5) * length) % length] || Infinity;
+}
+
+// _limit_along
+function limitAlong(graph, edge, start, end, part) {
+  const [first, last] = graph.edges[edge].slice(0, 2).map((node) => graph.positions[node]);
   const length = Math.max(distanceOf(first, last), 1e-9), along = scaled(minus(last, first), 1 / length), reach = Math.min(POOR_REACH, length / 4);
   const depthOf = (place) => {
     const walked = dot(minus(place, first), along);
@@ -63,6 +95,8 @@ export function limitStep(graph, start, end, part = null) {
   const excess = Math.max(depthOf(end) - Math.max(depthOf(start), reach), 0);
   return minus(end, scaled(along, dot(minus(end, first), along) < length / 2 ? excess : -excess));
 }
+
+const isPoor = (graph, edge) => isFade(graph, ...graph.edges[edge].slice(0, 2));
 
 // is_fade
 export const isFade = (graph, from, to) => {

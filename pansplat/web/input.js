@@ -184,7 +184,7 @@ export function listen() {
   byId("map").onclick = () => plan.toggle();
   byId("doll").onclick = toggleDoll;
   byId("doll").hidden = !HEADER.doll.length;
-  byId("no-doll").hidden = HEADER.doll !== null;
+  byId("no-doll").hidden = HEADER.doll.length > 0;
   byId("more").onclick = () => showMore(byId("menu").hidden);
   for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", savePicture], ["link", copyLink]]) {
     byId(id).onclick = () => {

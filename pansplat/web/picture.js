@@ -13,7 +13,7 @@ export function drawAt(width, height) {
   const rotation = rotationOf(camera), tangent = tangentOf(width, height), half = [tangent * width / height, tangent];
   const seen = { position: camera.position, rotation, center: [0, 0], half };
   if (state.doll.isOn) drawHouse(seen, width, height);
-  else if (!photographs.isOpaque) state.renderer.draw(seen, blendWeights(camera.position), null, [0, 0, width, height]);
+  else if (!photographs.isOpaque) state.renderer.draw(seen, blendWeights(seen), null, [0, 0, width, height]);
   photographs.draw(seen, width, height);
   return rotation;
 }
@@ -35,7 +35,7 @@ export function measureAt(left, top) {
   if (state.doll.isOn) return meetHouse(camera.position, rayOf(left, top));
   const [width, height] = fullSize(), tangent = tangentOf(width, height), half = [tangent / height, tangent / height];
   const seen = { position: camera.position, rotation: rotationOf(camera), center: planeOf(left, top), half };
-  return state.renderer.measure(seen, blendWeights(camera.position));
+  return state.renderer.measure(seen, blendWeights(seen));
 }
 
 export function takePicture() {

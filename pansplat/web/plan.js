@@ -44,9 +44,10 @@ class Plan {
     const size = byId("drawing").clientWidth, sides = [0, 1].map((k) => places.map((place) => place[k]));
     const [low, high] = [Math.min, Math.max].map((choose) => sides.map((side) => choose(...side)));
     const scale = Math.min((size - 2 * PLAN_MARGIN) / Math.max(...minus(high, low), 1e-6), LARGEST_PLAN_SCALE);
-    const middle = scaled(plus(low, high), 0.5);
-    this.toPlan = ([right, forward]) => [0.5 * size + scale * (right - middle[0]), 0.5 * size - scale * (forward - middle[1])];
-    const svg = drawSvg("svg", { width: size, height: size, "aria-hidden": true }), named = new Set();
+    const middle = scaled(plus(low, high), 0.5), tall = scale * (high[1] - low[1]) + 2 * PLAN_MARGIN;
+    this.toPlan = ([right, forward]) => [0.5 * size + scale * (right - middle[0]), 0.5 * tall - scale * (forward - middle[1])];
+    byId("drawing").style.height = `${tall}px`;
+    const svg = drawSvg("svg", { width: size, height: tall, "aria-hidden": true }), named = new Set();
     this.marks = [];
     const add = (node, element) => {
       this.marks.push([node, element]);
@@ -83,7 +84,7 @@ class Plan {
     byId("drawing").replaceChildren(svg, ...buttons);
     svg.append(...names.map(({ element }) => element));  // over all outlines; then their width is known
     const sizes = names.map(({ x, y, element }) => ({ x, y, width: element.getComputedTextLength(), height: PLAN_TEXT }));
-    placeNames(sizes, dots, size).forEach((place, k) => {
+    placeNames(sizes, dots, [size, tall]).forEach((place, k) => {
       if (place) ["x", "y"].forEach((axis, i) => names[k].element.setAttribute(axis, place[i]));
       else names[k].element.remove();
     });

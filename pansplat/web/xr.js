@@ -139,7 +139,7 @@ class Headset {
       const { x, y, width, height } = layer.getViewport(view);
       if (!width || !height) continue;
       const eye = this.makeEye(view);
-      state.renderer.draw(eye, blendWeights(eye.position), layer.framebuffer, [x, y, width, height]);
+      state.renderer.draw(eye, blendWeights(eye), layer.framebuffer, [x, y, width, height]);
       this.drawMarks(eye, [...marks, ...this.findVeils(eye)]);
     }
   }

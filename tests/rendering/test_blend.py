@@ -1,5 +1,7 @@
 """Deferred blending: weights are a partition of unity, alpha scales them, and the limits are finite."""
 
+import math
+
 import pytest
 import torch
 from dense_renderer import ORIGIN, make_spheres
@@ -45,6 +47,19 @@ def test_weights_are_a_partition_of_unity(position, others):
 def test_two_views_have_the_papers_weights():
     weights = blend_weights(_points((0, 0, 0.2))[0], _points((0, 0, 0), (0, 0, 1)))
     assert torch.allclose(weights, torch.tensor([0.8, 0.2], dtype=torch.float64))
+
+
+def test_a_view_ahead_weighs_more_than_one_behind_and_across_they_weigh_as_without_a_direction():
+    position, positions = _points((0, 0, 0.2))[0], _points((0, 0, 0), (0, 0, 1))
+    across, ahead, back = _points((1, 0, 0), (0, 0, 1), (0, 0, -1))
+    plain = blend_weights(position, positions)
+    assert torch.allclose(blend_weights(position, positions, across), plain)
+    for forward, sign in ((ahead, 1), (back, -1)):
+        first, second = blend_weights(position, positions, forward).tolist()
+        assert first + second == pytest.approx(1) and second / first == pytest.approx(0.25 * math.exp(1.1 * sign))
+    for number in range(2):
+        at_input = blend_weights(positions[number], positions, ahead)
+        assert torch.equal(at_input, torch.eye(2, dtype=torch.float64)[number])
 
 
 def test_opaque_views_mix_by_weight():

@@ -10,6 +10,7 @@ from synthetic_scenes import make_balls, place_cameras, see_box
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
+from pansplat.tours.floor import FloorOutline
 
 LOW, HIGH = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0))  # of the room around a camera: x, y down, z
 PLACES = ((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (10.0, 0.0, 0.0))
@@ -56,3 +57,16 @@ def test_an_upper_storey_is_another_house(rooms: Scene) -> None:
     gaussians = dataclasses.replace(rooms.gaussians, means=rooms.gaussians.means + shift)
     above = dataclasses.replace(rooms, gaussians=gaussians, cam2world=poses)
     assert find_rooms(TourFacts(above)).houses == ((0, 1), (2,))
+
+
+def test_a_floor_without_walls_ends_where_most_of_it_does(rooms: Scene) -> None:
+    """A tenth of the horizon looks through a window to each side, where the floor seems to go on."""
+    azimuths = (np.arange(360) + 0.5) * np.pi / 180
+    rays = np.stack((np.sin(azimuths), np.cos(azimuths)), axis=1)
+    ends = 2.0 / np.abs(rays).max(axis=1)
+    beyond = np.abs((azimuths + np.pi / 4) % (np.pi / 2) - np.pi / 4) < np.pi / 10
+    corners = rays * np.where(beyond, 6.0, ends)[:, None] + np.array((5.0, 0.0))
+    facts = TourFacts(_without_walls(rooms, (1,)))
+    facts.outlines[1] = FloorOutline(np.array((5.0, 0.0)), corners, 1.5)
+    outlines = dict((views, outline) for views, outline in find_rooms(facts).outlines)
+    assert outlines[1,].bounds == pytest.approx((3.0, -2.0, 7.0, 2.0), abs=0.1)

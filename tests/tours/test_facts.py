@@ -12,7 +12,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours import facts
 from pansplat.tours.facts import TourFacts
 
-PARTS = ("heights", "outlines", "outlooks", "walls", "poor", "plan")
+PARTS = ("heights", "outlines", "outlooks", "clearances", "walls", "poor", "plan")
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +34,10 @@ def test_what_is_read_from_the_store_equals_what_was_computed(
     computed = TourFacts(scene, folder=tmp_path)
     expected = [getattr(computed, part) for part in PARTS]
     assert len(computed.plan.rooms) == 1 and set(computed.outlines) == {0, 1}
-    for name in ("find_camera_height", "find_floor_outline", "measure_outlook", "find_walls", "find_poor_edges"):
+    for name in ("find_camera_height", "find_floor_outline", "measure_outlook", "measure_clearance"):
         monkeypatch.setattr(facts, name, forbid)
-    monkeypatch.setattr(facts, "make_plan", forbid)
+    for name in ("find_walls", "find_poor_edges", "make_plan"):
+        monkeypatch.setattr(facts, name, forbid)
     stored = TourFacts(scene, folder=tmp_path)
     for part, value in zip(PARTS, expected, strict=True):
         found = getattr(stored, part)

@@ -353,3 +353,24 @@ def test_a_walk_ends_half_a_metre_from_the_ends_of_a_poor_edge(comb):
     assert walk(poor, places) == pytest.approx(0.25) == walk(poor, places[::-1])
     assert walk(comb, places) == pytest.approx(comb.length((0, 1))) == 1
     assert walk(poor, places[20::-1]) == pytest.approx(0.5), "from the middle it goes back"
+
+
+def test_a_walk_ends_a_quarter_of_a_metre_before_a_surface_and_is_free_along_a_flight(comb):
+    """The surfaces around the third panorama are 0.6 m away; those of the fourth one are unknown."""
+    seen = dataclasses.replace(comb, clearances={2: np.full((12, 24), 0.6)})
+    start = comb.positions[2]
+
+    def walk(tour: TourGraph, place: np.ndarray, step: np.ndarray) -> np.ndarray:
+        for _ in range(300):
+            place = tour.limit_step(place, place + step)
+        return place
+
+    for step in np.array(((-1, 0, 0), (0, 1, 0), (0, -1, 0), (-1, 1, 0))) / 100:
+        assert np.linalg.norm(walk(seen, start, step) - start) == pytest.approx(0.35, abs=0.011)
+        assert np.linalg.norm(walk(comb, start, step) - start) > 2.9
+    assert walk(seen, start, np.array((0, 0, 0.01)))[2] == pytest.approx(3.25, abs=0.011), "along the flight"
+    stuck = start + np.array((-0.5, 0, 0))
+    assert walk(seen, stuck, np.array((-0.01, 0, 0))) == pytest.approx(stuck, abs=0.011), "placed there by a script"
+    assert walk(seen, stuck, np.array((0.001, 0, 0)))[0] > stuck[0] + 0.2, "it can go back"
+    slid = walk(seen, start + np.array((-0.34, 0.05, 0)), np.array((-0.001, 0.001, 0)))
+    assert slid[1] > start[1] + 0.15 and np.linalg.norm(slid - start) < 0.361, "it slides along"

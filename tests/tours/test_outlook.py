@@ -5,10 +5,19 @@ import math
 
 import numpy as np
 import pytest
+from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.outlook import BINS, choose_arrival, find_turned, is_hidden, measure_outlook
+from pansplat.tours.outlook import (
+    BINS,
+    choose_arrival,
+    find_clearance,
+    find_turned,
+    is_hidden,
+    measure_clearance,
+    measure_outlook,
+)
 from pansplat.tours.route import plan_route
 from pansplat.tours.surfaces import locate_surfaces
 
@@ -21,6 +30,21 @@ def test_the_outlook_is_the_distance_of_the_walls_around():
     for yaw, distance in ((0, 3.9 - z), (math.pi / 2, 3.0 - x), (-math.pi / 2, 3.4 + x)):
         bins = [int(((yaw + turn) / (2 * math.pi) + 0.5) * BINS) % BINS for turn in (-0.1, 0.1)]
         assert max(outlook[bins]) == pytest.approx(distance, rel=0.15), yaw
+
+
+def test_the_clearance_is_the_distance_of_the_room_around():
+    """Above and below, too; the room is 2.6 m high."""
+    low, high, camera = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0)), np.zeros(3)
+    balls = make_balls(see_box(low, high, camera, 20_000), 0.02)
+    clearance = measure_clearance(Scene(balls, place_cameras((0.0, 0.0, 0.0)), 0.3, 12.0), 0, np.eye(3))
+    for axis in range(3):
+        for sign, end in ((-1, low), (1, high)):
+            direction = sign * np.eye(3)[axis] + 0.01
+            found = find_clearance(clearance, direction)
+            assert found == pytest.approx(abs(end[axis]), rel=0.05), (axis, sign)
+    empty = dataclasses.replace(balls, opacities=0 * balls.opacities)
+    nothing = measure_clearance(Scene(empty, place_cameras((0.0, 0.0, 0.0)), 0.3, 12.0), 0, np.eye(3))
+    assert not nothing.any() and find_clearance(nothing, np.array((0.0, 0.0, 1.0))) == math.inf
 
 
 def test_a_flight_turns_from_a_wall_to_the_widest_view(comb):

@@ -318,7 +318,10 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     centers = {view: tour.positions[view][[0, 2]] for view in entry.views}
     outlines = {view: FloorOutline(center, center + corners, 1.0) for view, center in centers.items()}
     facts = TourFacts(scene, tour, entry.views)
-    vars(facts).update(outlines=outlines, outlooks=np.zeros((len(entry.views), BINS)), walls=[], poor=())
+    outlooks = np.zeros((len(entry.views), BINS))
+    vars(facts).update(
+        outlines=outlines, outlooks=outlooks, clearances=outlooks[:, None].repeat(12, 1), walls=[], poor=()
+    )
     return LoadedScene(entry, scene, facts=facts)
 
 

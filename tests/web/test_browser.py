@@ -1113,6 +1113,12 @@ def test_the_keys_that_open_a_dialog_close_it(home: OpenPage) -> None:
         assert not home.page.is_visible(dialog)
 
 
+def test_the_help_says_why_there_is_no_dolls_house(home: OpenPage) -> None:
+    home.page.keyboard.press("h")
+    assert home.page.is_visible("#no-doll") and home.page.is_hidden("#doll") and not home.run("HEADER.doll.length")
+    home.page.keyboard.press("Escape")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(195, 422), (420, 240), (300, 270)])
 def test_the_poster_is_in_place_of_the_picture(
@@ -1425,6 +1431,8 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
         corners = np.array([float(number) for number in drawn[0].replace(",", " ").split()]).reshape(-1, 2)
         expected = centers[0] + scale * (np.array(outline) @ turn - places[0])
         assert corners == pytest.approx(expected - (drawing["x"], drawing["y"]), abs=0.6)
+        above, below = corners[:, 1].min(), drawing["height"] - corners[:, 1].max()
+        assert above == pytest.approx(below, abs=0.6) and above < 40, "it is as high as what it shows"
         elsewhere = page.page.locator("#elsewhere button")
         assert elsewhere.all_inner_texts() == ["</script><b>hall", "attic"]
         assert page.page.inner_text("#elsewhere").startswith("Not on the plan")

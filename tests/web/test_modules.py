@@ -1,5 +1,6 @@
 """The modules of the page in node: their imports, and those that need no browser as functions of HEADER and state."""
 
+import dataclasses
 import json
 import math
 import os
@@ -16,6 +17,7 @@ import pytest
 import torch
 
 from pansplat.export.page_data import PageHeader
+from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.pairs import Link, Panorama
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
 from pansplat.tours.layout import REACH
@@ -116,7 +118,10 @@ def make_house(nodes: list[int]) -> dict[str, Any]:
 
 def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]], parts: list[int]) -> dict[str, Any]:
     """What the modules read of a header of level panoramas; each edge blends its two views."""
-    spots = [{"position": place, "mark": [place[0], place[1] + 1.5, place[2]], "name": ""} for place in positions]
+    spots = [
+        {"position": place, "mark": [place[0], place[1] + 1.5, place[2]], "name": "", "clearances": []}
+        for place in positions
+    ]
     return {
         "spots": spots,
         "views": [{"position": place, "count": 1, "start": view} for view, place in enumerate(positions)],
@@ -149,13 +154,18 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
     links = {6: (Link("8", 0.0),), 8: (Link("10", 0.0),)}
     panoramas = tuple(Panorama(str(node), Path(), pose, links=links.get(node, ())) for node, pose in enumerate(poses))
     overlaps = {edge: 0.1 + 0.02 * edge[1] for edge in edges}
-    tour = TourGraph("", Path(), panoramas, 0.5, 10.0, (), overlaps, poor=((1, 2), (4, 5)))
+    random = np.random.default_rng(1)
+    clearances = {node: random.choice([0, 0.3, 0.5, 1, 3], (12, 24)) for node in (0, 1, 5, 8)}
+    poor = ((1, 2), (4, 5))
+    tour = TourGraph("", Path(), panoramas, 0.5, 10.0, (), overlaps, poor=poor, clearances=clearances)
     graph = {
         "positions": places.tolist(),
         "parts": tour.parts,
         "edges": edges,
         "next": tour.find_next_nodes(),
         "poor": tour.poor,
+        "clearances": [clearances[view].tolist() if view in clearances else [] for view in range(len(places))],
+        "level": tour.level_axes.tolist(),
         "hysteresis": EDGE_HYSTERESIS,
         "reach": REACH,
     }
@@ -192,7 +202,10 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         assert case["fades"] == [tour.is_fade(node, edge[0]) for node in nodes]
     steps = [tour.limit_step(start, end) for start, end in zip(starts, positions, strict=True)]
     np.testing.assert_allclose([case["step"] for case in found], steps, atol=1e-9)
-    assert 0 < np.any(np.abs(positions - steps) > 1e-6, axis=1).sum() < 30
+    free = dataclasses.replace(tour, clearances={})
+    along = [free.limit_step(start, end) for start, end in zip(starts, positions, strict=True)]
+    for before, after in ((positions, along), (along, steps)):
+        assert 0 < np.any(np.abs(np.array(before) - after) > 1e-6, axis=1).sum() < 30
     followed = [tuple(case["followed"]) for case in found]
     assert len({edge == tuple(case["nearest"]) for edge, case in zip(followed, found, strict=True)}) == 2, "hysteresis"
     parts = [
@@ -268,7 +281,13 @@ def test_names_of_a_plan_cover_neither_dots_nor_each_other(node: str, tmp_path: 
     dots = random.uniform(20, 280, (9, 2))
     names = [{"x": x, "y": y, "width": 60, "height": 13} for x, y in [*dots, *dots[:4], (-5, 150), (299, 150)]]
     places = run(
-        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names, dots.tolist(), 300
+        node,
+        tmp_path,
+        make_header(ROW, [], [0] * 4),
+        "(...all) => placeNames(...all)",
+        names,
+        dots.tolist(),
+        [300, 300],
     )
     boxes = [(x - 30, y - 6.5, x + 30, y + 6.5) for x, y in filter(None, places)]
     assert len(boxes) > 9 and all(box[0] >= 0 and box[2] <= 300 and box[1] >= 0 and box[3] <= 300 for box in boxes)
@@ -278,7 +297,7 @@ def test_names_of_a_plan_cover_neither_dots_nor_each_other(node: str, tmp_path: 
         assert not any(left < box[2] and right > box[0] and top < box[3] and bottom > box[1] for box in others)
     crowd = [[x, y] for x in range(0, 300, 10) for y in range(0, 300, 10)]
     assert run(
-        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names[:1], crowd, 300
+        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names[:1], crowd, [300, 300]
     ) == [None]
 
 
@@ -318,6 +337,35 @@ def test_a_camera_stops_half_a_metre_along_a_poor_edge_but_a_script_may_place_it
     assert ahead[2] > 4 and back[2] == pytest.approx(1.5), "the other edge can be walked"
 
 
+@pytest.mark.parametrize("edges", [[], [(0, 1), (1, 2), (3, 3)]])
+def test_a_walk_stops_before_surfaces_but_a_script_may_place_the_camera_there(
+    edges: list[tuple[int, int]], node: str, tmp_path: Path
+) -> None:
+    """The surfaces around the first panorama are 0.6 m away, but those ahead 1.4 m."""
+    parts = [0, 0, 0, 1] if edges else [0] * 4
+    header = make_header(ROW, edges, parts)
+    header["spots"][0]["clearances"] = [[0.6] * 24, *[[0.6] * 11 + [1.4] * 2 + [0.6] * 11] * 10, [0.6] * 24]
+    program = f"""(steps, position) => {{
+        {SORTED}
+        camera.position = cameraFor({{ position }}).position;
+        return steps.map(([right, up, forward]) => {{
+            for (let k = 0; k < 99; k++) walk(right, up, forward);
+            return [...camera.position];
+        }});
+    }}"""
+    header["limits"] = [30.0] * 2
+    for step in ((0.03, 0, 0), (-0.03, 0, 0), (0, 0.03, 0), (0, -0.03, 0), (0, 0, -0.03), (0.02, 0.02, 0)):
+        (end,) = run(node, tmp_path, header, program, [step], [0, 0, 0])
+        assert math.dist(end, (0, 0, 0)) == pytest.approx(0.35, abs=0.031), step
+    placed, back = run(node, tmp_path, header, program, [(0.03, 0, 0), (-0.03, 0, 0)], [0.9, 0, 0])
+    assert placed[0] == pytest.approx(0.9, abs=0.01) and back[0] < 0.3, "it can go back"
+    (slid,) = run(node, tmp_path, header, program, [(0.02, 0, 0.004)], [0.33, 0, -0.1])
+    assert slid[2] > 0 and math.hypot(slid[0], slid[2]) < 0.36, "it slides along"
+    if edges:
+        (beside,) = run(node, tmp_path, header, program, [(0, 0, 0.03)], [0, 0, 0])
+        assert beside[2] > 2.5, "along a flight it is free"
+
+
 def test_nothing_walks_before_the_gaussians_are_sorted_or_in_the_dolls_house(node: str, tmp_path: Path) -> None:
     program = f"""() => {{
         walk(1, 0, 0);
@@ -333,13 +381,13 @@ def test_nothing_walks_before_the_gaussians_are_sorted_or_in_the_dolls_house(nod
 def test_the_views_of_the_edge_are_blended_and_those_of_the_edge_before_fade_out(node: str, tmp_path: Path) -> None:
     program = """() => {
         shown.fill(1);
-        const weights = [];
+        const weights = [], across = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]];
         camera.position = [0, 0, 1.5];
-        weights.push(blendWeights(camera.position));
+        weights.push(blendWeights({ position: camera.position, rotation: across }));
         camera.position = [0, 0, 3];
         for (const now of [0, 250, 500, 1000]) {
             updateEdge(now);
-            weights.push(blendWeights(camera.position));
+            weights.push(blendWeights({ position: camera.position, rotation: across }));
         }
         return [weights, state.edge, state.fade];
     }"""
@@ -348,6 +396,20 @@ def test_the_views_of_the_edge_are_blended_and_those_of_the_edge_before_fade_out
     assert weights[0] == pytest.approx([0.25, 0.75, 0, 0]) and weights[-1] == pytest.approx([0, 0.5, 0.5, 0])
     assert [row[0] > 0 for row in weights] == [True, True, True, True, False] and (edge, fade) == (1, None)
     assert all(sum(row) == pytest.approx(1) for row in weights)
+
+
+def test_a_picture_blends_views_as_pansplat_does(node: str, tmp_path: Path) -> None:
+    """By their distance, and by whether they are ahead."""
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+    random = np.random.default_rng(0)
+    places = [[0.0, 0.0, 0.0], *random.uniform((-1, -1, 0), (1, 1, 2), (9, 3)).tolist()]
+    rotations = [np.linalg.qr(random.normal(size=(3, 3)))[0] for _ in places]
+    seen = [{"position": place, "rotation": turn.tolist()} for place, turn in zip(places, rotations, strict=True)]
+    found = run(node, tmp_path, header, "(seen) => (shown.fill(1), seen.map(blendWeights))", seen)
+    positions = torch.tensor(ROW[:2], dtype=torch.float64)
+    for place, turn, weights in zip(places, rotations, found, strict=True):
+        expected = blend_weights(torch.tensor(place).double(), positions, torch.from_numpy(turn[:, 2]))
+        assert weights == pytest.approx([*expected.clamp_min(1e-4).tolist(), 0, 0])
 
 
 def test_the_dolls_house_is_in_the_picture_and_a_zoom_has_limits(node: str, tmp_path: Path) -> None:
@@ -359,7 +421,7 @@ def test_the_dolls_house_is_in_the_picture_and_a_zoom_has_limits(node: str, tmp_
             return [Math.abs(x) / z / tangent * size[1] / size[0], Math.abs(y) / z / tangent, z];
         });
         zoomDoll(100);
-        const far = state.doll.distance / state.doll.first;
+        const far = state.doll.zoom;
         orbit(1, 9);
         return [seen, far, camera.pitch, HEADER.spots.map((_, node) => isInDoll(node))];
     }"""
@@ -369,6 +431,26 @@ def test_the_dolls_house_is_in_the_picture_and_a_zoom_has_limits(node: str, tmp_
         x, y, z = np.array(corners).T
         assert 0.8 < max(x.max(), y.max()) <= 1 and z.min() > 0
         assert far == 2 and pitch == pytest.approx(-np.pi * 8 / 180) and inside == [True, True, True, False]
+
+
+def test_the_dolls_house_stays_in_the_picture_when_it_is_turned(node: str, tmp_path: Path) -> None:
+    """The house is 2 m wide and 6 m long; at first a phone shows it lengthwise."""
+    program = """(size) => {
+        Object.assign(camera, frameDoll(size));
+        const tangent = tangentOf(...size, camera.fov), distances = [], widths = [];
+        for (let step = 0; step < 24; step++) {
+            orbit(Math.PI / 12, step < 12 ? 0.05 : -0.05);
+            distances.push(distanceOf(camera.position, state.doll.center));
+            const places = findHouse().corners.map((place) => minus(place, camera.position));
+            const local = places.map((place) => [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), place)));
+            const [wide, tall] = [0, 1].map((k) => Math.max(...local.map((place) => Math.abs(place[k] / place[2]))));
+            widths.push(Math.max(wide * size[1] / size[0], tall) / tangent);
+        }
+        return [distances, state.doll.first, widths];
+    }"""
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+    distances, first, widths = run(node, tmp_path, header, program, (390, 844))
+    assert max(widths) <= 1 and min(distances) == pytest.approx(first) and max(distances) > 1.3 * first
 
 
 def test_a_ray_meets_the_nearest_front_of_the_dolls_house(node: str, tmp_path: Path) -> None:

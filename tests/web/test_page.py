@@ -33,7 +33,7 @@ from pansplat.tours import edges
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import find_camera_height
 from pansplat.tours.graph import make_graph, select_views
-from pansplat.tours.outlook import find_bin, measure_outlook
+from pansplat.tours.outlook import find_bin, measure_clearance, measure_outlook
 
 
 @pytest.fixture(autouse=True)
@@ -199,6 +199,7 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
     assert spots[3]["ahead"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and spots[3]["turned"] == 2**24 - 1
     assert spots[1]["turned"] < 2**24 - 1 and spots[1]["ahead"][1] == 0
+    np.testing.assert_allclose(spots[1]["clearances"], measure_clearance(flat, 1, level), atol=0.0051)
     to, back = header["links"]
     assert (to["from"], to["to"], to["text"]) == (0, 2, "<i>down") and (back["from"], back["to"]) == (2, 0)
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4)

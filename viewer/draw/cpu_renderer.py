@@ -96,6 +96,7 @@ class _FaceSet:
     """Cube faces of one position and settings, and those that are finished."""
 
     faces: PixelFaces
+    groups: _Groups  # of the first frame, in whose direction the weights are chosen
     done: set[int] = field(default_factory=set)
 
     def find_missing(self, frame: Frame) -> list[int]:
@@ -219,12 +220,12 @@ class CpuRenderer:
         frame = self._create_cached_frame(cam2world, size, settings)
         if frame.storage != LayerStorage.PADDED_FACES:
             return
-        stored, groups = self._find_face_set(frame), self._choose_groups(frame)
+        stored = self._find_face_set(frame)
         faces = [face for face in dict.fromkeys([*stored.find_missing(frame), *range(6)]) if face not in stored.done]
 
         def draw() -> None:
             for face in faces:
-                self._draw_face(frame, groups, stored, face)
+                self._draw_face(frame, stored, face)
 
         if faces:
             self._start(draw)
@@ -363,7 +364,7 @@ class CpuRenderer:
 
             def draw_missing() -> None:
                 nonlocal drawn
-                drawn = sum(self._draw_face(frame, groups, stored, face) for face in missing)
+                drawn = sum(self._draw_face(frame, stored, face) for face in missing)
 
             self._start(draw_missing).result()
             stages["faces"] = 1e3 * (time.perf_counter() - start)
@@ -375,14 +376,14 @@ class CpuRenderer:
         stats = self._make_stats(frame, groups, drawn, 1e3 * (time.perf_counter() - start), stages)
         return _Picture(frame, pixels, None, None, replace(stats, cached=not missing))
 
-    def _draw_face(self, frame: Frame, groups: _Groups, stored: _FaceSet, face: int) -> int:
+    def _draw_face(self, frame: Frame, stored: _FaceSet, face: int) -> int:
         """Draw one face unless it is finished; returns the number of Gaussians."""
         if face in stored.done:
             return 0
         plane = stored.faces.plane(face)
         camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size)
-        layers = self._rasterize(frame, groups, camera)
-        _write_pixels(frame.settings, groups, layers.sums, stored.faces.pixels[face])
+        layers = self._rasterize(frame, stored.groups, camera)
+        _write_pixels(frame.settings, stored.groups, layers.sums, stored.faces.pixels[face])
         stored.done.add(face)
         return layers.statistics.visible
 
@@ -392,7 +393,7 @@ class CpuRenderer:
         if key not in self._faces:
             while len(self._faces) >= _MAX_FACE_SETS:
                 self._faces.popitem(last=False)
-            self._faces[key] = _FaceSet(PixelFaces.allocate(frame.focal))
+            self._faces[key] = _FaceSet(PixelFaces.allocate(frame.focal), self._choose_groups(frame))
         self._faces.move_to_end(key)
         return self._faces[key]
 

@@ -148,7 +148,8 @@ def _render_eye(
         for name, plane in planes.items():
             pose = cam2world.copy()
             pose[:3, :3] = cam2world[:3, :3] @ plane.rotation.numpy()
-            faces[name] = draw(pose, (side, side), layout="pinhole", vertical_fov_degrees=90.0)
+            options = {"layout": "pinhole", "vertical_fov_degrees": 90.0, "by_direction": False}
+            faces[name] = draw(pose, (side, side), **options)
     else:  # at the poles, a face has no columns of one longitude: interpolate in the exact panorama
         height = round(_STEREO_FACE_OVERSAMPLING * math.pi * side / 2)
         images = draw(cam2world, (2 * height, height), layout="equirect", eye_offset=offset)

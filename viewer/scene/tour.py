@@ -147,6 +147,9 @@ class TourScenes:
             self.outlines |= facts.outlines
             self._outlooks |= zip(facts.views, facts.outlooks, strict=True)
             self._block(facts.walls)
+            clearances = dict(zip(facts.views, facts.clearances, strict=True))
+            if clearances.keys() - self.tour.clearances.keys():  # a refinement changes them little
+                self._change(replace(self.tour, clearances=self.tour.clearances | clearances))
             if poor := set(facts.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
                 self._change(replace(self.tour, poor=(*self.tour.poor, *sorted(poor))))
         if views not in self._lives:

@@ -148,7 +148,8 @@ def test_deferred_blending_equals_the_reference(
     renderer = make_renderer(scene, renderer_name)
     panorama = "equirect" if renderer_name == "cpu" else "cubemap"
     images = [reference(select_view(scene, view), pose, SIZE, settings, panorama) for view in (0, 1)]
-    weights = blend_weights(torch.from_numpy(pose[:3, 3].copy()), scene.cam2world[:, :3, 3])
+    forward = torch.from_numpy(pose[:3, 2].copy()) if layout == "pinhole" else None
+    weights = blend_weights(torch.from_numpy(pose[:3, 3].copy()), scene.cam2world[:, :3, 3], forward)
     total = sum(weight * image.alpha for weight, image in zip(weights, images, strict=True))
     band = (total > 0) & (total < 1e-3)  # where the weighted views are nearly empty (docs/rendering.md, section 7)
     assert band.float().mean() < 0.02

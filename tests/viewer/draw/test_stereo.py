@@ -1,5 +1,6 @@
 """Projections and stereo of stills and films."""
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from pansplat.errors import InputError
 from pansplat_viewer import run
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.renderer import SplatRenderer
-from pansplat_viewer.draw.stereo import ImageFormat, arrange_eyes, move_eye, render_image
+from pansplat_viewer.draw.stereo import _GRID, ImageFormat, arrange_eyes, move_eye, render_image
 from pansplat_viewer.draw.window_renderer import StereoRenderer, get_eye_size
 from pansplat_viewer.scene.settings import DrawSettings
 
@@ -84,6 +85,21 @@ def test_the_faces_of_a_cubemap_are_where_players_read_them(renderer, pose):
             graph.push(frame)
             error = np.abs(graph.pull().to_ndarray() / 255.0 - panorama)
             assert error.mean() < 0.02
+
+
+def test_blended_views_leave_no_seams_between_the_faces_of_a_cubemap(renderer, random_scene, pose):
+    """Half-way between the views, where their weights in a perspective image depend most on its direction."""
+    pose = pose.copy()
+    pose[:3, 3] = random_scene().cam2world[:, :3, 3].mean(dim=0)
+    image = draw(renderer, pose, (384, 256), projection="cubemap", mode="deferred")
+    faces = dict(
+        zip(np.ravel(_GRID), [face for row in np.split(image, 2) for face in np.split(row, 3, axis=1)], strict=True)
+    )
+    inside, seams = [], []
+    for left, right in itertools.pairwise(("front", "right", "back", "left", "front")):
+        inside.append(np.abs(faces[left][:, -1] - faces[left][:, -2]).mean())
+        seams.append(np.abs(faces[left][:, -1] - faces[right][:, 0]).mean())
+    assert np.mean(seams) < 1.2 * np.mean(inside)
 
 
 @pytest.mark.gl
