@@ -21,7 +21,6 @@ import cv2
 import numpy as np
 
 from pansplat.inputs.views import ONE_POSITION
-from pansplat.predictor import Progress, part_of
 from pansplat.rendering.cpu.runtime import thread_count
 from pansplat.sweep.bend import BendConfig, bend_surfaces
 from pansplat.sweep.matching import (
@@ -57,6 +56,7 @@ from pansplat.sweep.surface import (
     resize_sharp,
     resize_sphere,
 )
+from pansplat.system.progress import report_progress
 
 _DETECTION_HEIGHT = 96  # pixels; planes are detected at this size
 
@@ -122,11 +122,9 @@ def observe(
     posed: PosedImages,
     config: SearchConfig,
     prior_model: PriorModel | None = None,
-    progress: Progress | None = None,
 ) -> ObservedScene:
     """The depth range, neighbours, planes and priors of panoramas (v, h, 2h, 3)."""
-    report = part_of(progress)
-    report("finding the scene's axes", 0.0)
+    report_progress("finding the scene's axes", 0.0)
     height = min(posed.images.shape[1], config.finest_height)
     small = [resize_sphere(image, max(height // 2, 32)) for image in posed.images]
     axes = estimate_axes(small, posed.cam2world[:, :3, :3])
@@ -137,7 +135,7 @@ def observe(
     views = _make_views(posed, [axis_components(axes, pose[:3, :3], rows) for pose in posed.cam2world], rows)
     estimator = None
     if prior_model is not None:
-        report("estimating depth", 0.02)
+        report_progress("estimating depth", 0.02)
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
     neighbours = choose_nearest(posed.cam2world, config.max_neighbours, 1 / high)
     if posed.measure_baseline(range(len(posed.images))) < ONE_POSITION * posed.near:
@@ -165,7 +163,7 @@ def observe(
             return [()] * len(posed.images)
         return estimator.estimate_by_matching(views, neighbours, (low, high), config.matching)
 
-    report("finding planes", 0.15)
+    report_progress("finding planes", 0.15)
     if thread_count() > 1:  # half of each is work of one thread
         with ThreadPoolExecutor(1) as pool:
             estimated = pool.submit(estimate_priors)
@@ -175,23 +173,23 @@ def observe(
     return ObservedScene(posed, config, depths, neighbours, planes, priors, estimator)
 
 
-def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surface]:
+def search(scene: ObservedScene) -> list[Surface]:
     """The surface (h, 2h) of each view at the height of the finest level."""
-    config, report = scene.config, part_of(progress)
+    config = scene.config
     posed, depths, neighbours, estimator = scene.posed, scene.depths, scene.neighbours, scene.estimator
     finest = min(posed.images.shape[1], config.finest_height)
     if not scene.planes:
         return _place_unmatched(scene, finest)
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     if config.near_single_views:
-        return _search_near_single_views(scene, heights, report)
+        return _search_near_single_views(scene, heights)
     pixel = math.pi / heights[0] / (depths.high - depths.low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
     counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]
     surfaces: list[Surface] = []
     priors = scene.priors
     for n in range(config.coarse_passes):
-        report("searching the whole depth range", 0.25 + 0.3 * n / config.coarse_passes)
+        report_progress("searching the whole depth range", 0.25 + 0.3 * n / config.coarse_passes)
         if estimator is not None and surfaces:
             priors = estimator.estimate_from_surfaces(surfaces)
         rows = heights[0] if n == config.coarse_passes - 1 else min(heights[0], config.first_height)
@@ -202,7 +200,7 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
         sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen((depths.low, depths.high))]
         finest_posed = posed.resize(finest)
     for n, height in enumerate(heights[1:]):
-        report("refining the surfaces", 0.55 + 0.1 * n)
+        report_progress("refining the surfaces", 0.55 + 0.1 * n)
         surfaces = _upsample(surfaces, posed.images, height)
         if sharp is not None and height == finest:
             surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
@@ -214,7 +212,7 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     return surfaces if sharp is None else bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
 
 
-def _search_near_single_views(scene: ObservedScene, heights: Sequence[int], report: Progress) -> list[Surface]:
+def _search_near_single_views(scene: ObservedScene, heights: Sequence[int]) -> list[Surface]:
     """The surfaces of single views, bent at each level by a search near them."""
     config, posed = scene.config, scene.posed
     assert scene.estimator is not None
@@ -225,7 +223,7 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int], repo
         scale = np.median(prior.log_depth - resize_sphere(sharp, len(prior.log_depth)))
         log_depths.append((sharp + scale).astype(np.float32))
     for n, height in enumerate(heights):
-        report("searching near the estimated depth", 0.25 + 0.15 * n)
+        report_progress("searching near the estimated depth", 0.25 + 0.15 * n)
         small = [resize_sharp(log_depth, height) for log_depth in log_depths]
         level = _SearchLevel(scene, height, [_make_surface(-log_depth) for log_depth in small])
         found = [level.refine_near(view, n) for view in range(len(small))]

@@ -187,7 +187,7 @@ CALLERS = {
 def test_all_commands_estimate_poses_from_the_same_arguments(linked: Path, tmp_path: Path, estimator) -> None:
     calls: list[tuple[list[Path], dict]] = []
 
-    def record(images, *, progress, **options) -> PoseEstimate:
+    def record(images, **options) -> PoseEstimate:
         calls.append((list(images), options))
         raise NoPosesError(dict.fromkeys(images, "no door"))
 
