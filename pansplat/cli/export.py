@@ -134,7 +134,7 @@ class _Mesh:
         for file, mesh in meshes.items():
             require_replaceable("--out", name_mesh_files(file, len(mesh.parts)), export.overwrite)
         for file, mesh in meshes.items():
-            files = save_mesh(mesh, file, overwrite=export.overwrite)
+            files = save_mesh(mesh, file)
             size = sum(written.stat().st_size for written in files)
             beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
             count, names = len(mesh.parts), ", ".join(part.name for part in mesh.parts)
