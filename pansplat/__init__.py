@@ -37,6 +37,7 @@ _PUBLIC = {
     "render": "pansplat.pipeline",
     "save": "pansplat.pipeline",
     "show": "pansplat.notebook",
+    "show_progress": "pansplat.system.progress",
 }
 
 __all__ = sorted(_PUBLIC)

@@ -34,7 +34,7 @@ from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
 from pansplat.prediction_options import CompatChoice, Precision, PredictOptions
-from pansplat.predictor import Predictor, Progress, part_of
+from pansplat.predictor import Predictor
 from pansplat.refinement import (
     DISPLAY_HEIGHT,
     RefineConfig,
@@ -50,6 +50,7 @@ from pansplat.system.console import with_progress_bar
 from pansplat.system.devices import choose_device, note_full_card, with_device
 from pansplat.system.files import expand_home, find_scene_suffix
 from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT
+from pansplat.system.progress import CONNECTED, POSED, report_progress, stage
 from pansplat.tours.graph import (
     MAX_SCENE_VIEWS,
     TourGraph,
@@ -97,7 +98,6 @@ def load_pairs(
     near: float | None = None,
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
-    progress: Progress | None = None,
     on_unposed: Callable[[list[Pair]], None] | None = None,
 ) -> list[Pair]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
@@ -111,7 +111,6 @@ def load_pairs(
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
         camera_height: of the cameras over the floor, metres; the scale of estimated poses and of single views.
-        progress: called with a description of the estimate of poses and the completed fraction.
         on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
             panorama.
     """
@@ -121,7 +120,7 @@ def load_pairs(
     if collections[0].needs_poses:
         folder, panoramas = collections[0].folder, collections[0].unposed
         options = {"near": near, "far": far, "camera_height": camera_height}
-        return estimate_pairs(folder, panoramas, **options, progress=progress, on_unposed=on_unposed)
+        return estimate_pairs(folder, panoramas, **options, on_unposed=on_unposed)
     return folders.make_pairs(collections, near, far, camera_height)
 
 
@@ -328,7 +327,6 @@ def predict(
     model: str | Path | Predictor | None = None,
     *,
     options: PredictOptions | None = None,
-    progress: Progress | None = None,
     on_predicted: Callable[[Scene], None] | None = None,
     **keywords: Any,
 ) -> Scene:
@@ -341,7 +339,6 @@ def predict(
             to use, whose poses are estimated if they have none; or loaded panoramas (never cached).
         model: the name of a predictor, a file of weights, or a predictor; by default that of the options.
         options: all of the following keywords in one object; a keyword replaces its value.
-        progress: called with a description of the current work and the completed fraction.
         on_predicted: called with the prediction before it is refined.
         compat, precision, depth_network: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
@@ -354,10 +351,10 @@ def predict(
         cache: whether to read and write the cache.
         device: of all work in the call, "cpu", "cuda" or "auto": a graphics card for long work (docs/platforms.md).
     """
-    task = _prepare(source, *_choose_options(model, options, keywords), progress)
+    task = _prepare(source, *_choose_options(model, options, keywords))
     if task.options.refine_seconds:
-        return _refine_prediction(task, progress, on_predicted)
-    scene = _predict_views(task, part_of(progress))
+        return _refine_prediction(task, on_predicted)
+    scene = _predict_views(task)
     return fuse(scene, task.views) if task.options.joint else scene
 
 
@@ -379,11 +376,11 @@ def _prepare(
     source: Pair | Views | str | Path | Sequence[str | Path],
     predictor: Predictor,
     options: PredictOptions,
-    progress: Progress | None,
 ) -> _Task:
     """The task of `predict`; what cannot be predicted is refused."""
     seconds = options.refine_seconds
-    pair = _load_source(source, progress)
+    with stage(POSED):
+        pair = _load_source(source)
     _require_views(pair, predictor)
     is_single = len(pair.images if isinstance(pair, Views) else pair.context) == 1
     joint = options.joint and not is_single
@@ -403,32 +400,33 @@ def _prepare(
     return task
 
 
-def _predict_views(task: _Task, progress: Progress) -> Scene:
+@stage()
+def _predict_views(task: _Task) -> Scene:
     """The scene without a refinement."""
     cached = task.open_cache(refined=False)
     content = cached.read()
     if content is not None:
-        progress("read from the cache", 1.0)
+        report_progress("read from the cache", 1.0)
         return _make_scene(content, task)
     views = task.views
-    gaussians = task.predictor(
-        views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
-    )
+    gaussians = task.predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks)
     assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
     content = CachedScene(gaussians)
     cached.write(content)
     return _make_scene(content, task)
 
 
-def _refine_prediction(task: _Task, progress: Progress | None, on_predicted: Callable[[Scene], None] | None) -> Scene:
+@stage()
+def _refine_prediction(task: _Task, on_predicted: Callable[[Scene], None] | None) -> Scene:
     """The scene after its refinement."""
     cached, options = task.open_cache(refined=True), task.options
     found = cached.read()
     final = None if found is None or found.is_starved else _make_scene(found, task, options.joint)
     if final is not None and on_predicted is None:
-        part_of(progress)("read from the cache", 1.0)
+        report_progress("read from the cache", 1.0)
         return final
-    scene = _predict_views(task, part_of(progress, 0, 0.5))
+    with stage(0.5):
+        scene = _predict_views(task)
     if options.joint:
         scene = fuse_views(scene)
     if on_predicted is not None:
@@ -439,8 +437,8 @@ def _refine_prediction(task: _Task, progress: Progress | None, on_predicted: Cal
     photographs = task.views
     if isinstance(task.source, Pair) and options.gaussians is not None:
         photographs = load_photographs(task.source, scene.height, options.gaussians)
-    config, shown = RefineConfig(gaussians=options.gaussians), part_of(progress, 0.5)
-    refined, report = _refine_scene(scene, photographs, config, seconds=options.refine_seconds, progress=shown)
+    config = RefineConfig(gaussians=options.gaussians)
+    refined, report = _refine_scene(scene, photographs, config, seconds=options.refine_seconds)
     content = cached.write_refinement(refined, report, time.process_time() - began)
     return _make_scene(content, task, options.joint)
 
@@ -455,7 +453,6 @@ def refine(
     steps: int | None = None,
     config: RefineConfig | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
 ) -> Scene:
     """Fit a scene to the photographs that it was predicted from, by rendering and comparison.
 
@@ -469,12 +466,11 @@ def refine(
         config: settings of the objective, the step sizes and the number of Gaussians.
         seed: of the blocks of pixels that are held out of the loss.
         device: see `predict`; a scene on a card is refined there.
-        progress: called with a description of the current work and the completed fraction.
 
     Returns:
         The refined scene, or the given one if held-out pixels show that it is better, or if it is of a single view.
     """
-    return _run_refinement(scene, views, config, seed, seconds=seconds, steps=steps, progress=progress)[0]
+    return _run_refinement(scene, views, config, seed, seconds=seconds, steps=steps)[0]
 
 
 @with_device
@@ -488,13 +484,12 @@ def refine_to_file(
     steps: int | None = None,
     config: RefineConfig | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Scene, RefineReport]:
     """Refine a scene and write it in the format of the file's suffix.
 
     Args:
-        scene, views, seconds, steps, config, seed, progress: see `refine`.
+        scene, views, seconds, steps, config, seed: see `refine`.
         path: the file.
         should_stop: called after each step; True ends the refinement early.
 
@@ -503,7 +498,7 @@ def refine_to_file(
     """
     find_scene_suffix(path)  # an error before the work
     limits = {"seconds": seconds, "steps": steps}
-    refined, report = _run_refinement(scene, views, config, seed, **limits, progress=progress, should_stop=should_stop)
+    refined, report = _run_refinement(scene, views, config, seed, **limits, should_stop=should_stop)
     save(refined, path)
     return refined, report
 
@@ -550,7 +545,6 @@ def predict_tour(
     model: str | Path | Predictor | None = None,
     *,
     options: PredictOptions | None = None,
-    progress: Progress | None = None,
     **keywords: Any,
 ) -> Scene:
     """Predict one scene of all panoramas of a tour: the scenes of its parts, merged.
@@ -560,35 +554,36 @@ def predict_tour(
 
     Args:
         tour: of `pansplat.tours.overlap.connect`, or the path of a folder that holds the panoramas of one tour.
-        model, options, progress, compat, precision, depth_network, refine_seconds, cache: see `predict`; the time limit
-            is that of three panoramas.
+        model, options, compat, precision, depth_network, refine_seconds, cache: see `predict`; the time limit is that
+            of three panoramas.
         height: panoramas are resized to (height, 2 height); by default that of the photographs, at most 512.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.
         joint: see `predict`; the refinement is then that of each part of the tour as a whole, and not cached.
     """
     predictor, options = _choose_options(model, options, keywords)
+    if isinstance(tour, (str, Path)):
+        return predict_tour(_load_only_tour(tour), predictor, options=options)
     if options.refine_seconds is None:
         options = replace(options, refine_seconds=choose_refine_seconds(None, joint=options.joint))
-    tour = _load_only_tour(tour, progress) if isinstance(tour, (str, Path)) else tour
     warn_of_single_views(tour, predictor)
     max_views, is_refined = find_max_views(predictor), bool(options.joint and options.refine_seconds)
     total = len(tour.choose_sources(max_views))
     part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # of a panorama
-    counter, predicted = itertools.count(), 0.5 if is_refined else 1.0
+    counter = itertools.count(1)
     each = replace(options, joint=False, refine_seconds=0.0) if options.joint else options
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
         number, pair = next(counter), tour.make_pair(views)
-        begun = predicted * number
-        shown = part_of(progress, begun / total, (begun + predicted) / total, f"scene {number + 1} of {total}: ")
         fitted = fit_to_scene(each, pair, part)
-        return predict(pair, choose_predictor(pair, predictor), options=fitted, progress=shown)
+        with stage(number / total, f"scene {number} of {total}: "):
+            return predict(pair, choose_predictor(pair, predictor), options=fitted)
 
-    scene = merge_scenes(tour, predict_scene, max_views)
+    with stage(0.5 if is_refined else 1.0):
+        scene = merge_scenes(tour, predict_scene, max_views)
     if not options.joint:
         return scene
-    return fuse_tour(tour, scene, refine_seconds=options.refine_seconds or 0.0, progress=part_of(progress, predicted))
+    return fuse_tour(tour, scene, refine_seconds=options.refine_seconds or 0.0)
 
 
 def fuse(scene: Scene, views: Views) -> Scene:
@@ -607,26 +602,24 @@ def fuse(scene: Scene, views: Views) -> Scene:
 
 @with_device
 @with_progress_bar
-def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0, progress: Progress | None = None) -> Scene:
+def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0) -> Scene:
     """The scene of a whole tour with each surface once, and fitted to all photographs of each part.
 
     Args:
         tour, scene: the graph, and its scene by `predict_tour`.
         refine_seconds: time limit of the refinement, of three panoramas; without one only colours are fitted.
-        progress: see `predict`.
     """
     fused: list[Gaussians] = []
     gains = [(1.0, 1.0, 1.0)] * len(tour)
     parts = tour.list_parts()
-    for number, nodes in enumerate(parts):
+    for number, nodes in enumerate(parts, 1):
         part = select_views(scene, nodes)
         if len(nodes) > 1:
             pair = tour.make_pair(nodes)
             views = replace(pair.load_context(scene.height), cam2world=part.cam2world, frame=part.frame)
             if refine_seconds:
-                shown = part_of(progress, number / len(parts), (number + 1) / len(parts))
-                seconds = scale_seconds(refine_seconds, pair)
-                part, _ = _refine_scene(fuse_views(part), views, seconds=seconds, progress=shown)
+                with stage(number / len(parts)):
+                    part, _ = _refine_scene(fuse_views(part), views, seconds=scale_seconds(refine_seconds, pair))
             else:
                 part = fuse(part, views)
         for view, node in enumerate(nodes):
@@ -645,7 +638,6 @@ def predict_to_file(
     options: PredictOptions | None = None,
     degree: int | None = None,
     min_opacity: float = 0.0,
-    progress: Progress | None = None,
     **keywords: Any,
 ) -> int:
     """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
@@ -654,7 +646,7 @@ def predict_to_file(
     is written tile by tile, too. The Gaussians are those of `predict`, ordered by tile.
 
     Args:
-        source, model, options, progress, **keywords: see `predict`.
+        source, model, options, **keywords: see `predict`.
         path: the file.
         degree: highest degree of harmonics in the file; None keeps all.
         min_opacity: Gaussians of lower opacity are omitted.
@@ -666,20 +658,20 @@ def predict_to_file(
     suffix = find_scene_suffix(path)
     if options is None:
         keywords.setdefault("cache", False)
-    task = _prepare(source, *_choose_options(model, options, keywords), progress)
+    task = _prepare(source, *_choose_options(model, options, keywords))
     predictor, options = task.predictor, task.options
     is_cached = options.cache and (options.height or 0) <= _MAX_CACHED_HEIGHT
     if can_stream(predictor) and not (options.joint or options.refine_seconds or is_cached):
         views = task.views
         parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
-            views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
+            views.images, views.cam2world, views.near, views.far, masks=views.masks
         )
         pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
         if suffix == ".ply":
             return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), task), pruned, path)
         scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), task)
     else:
-        scene = predict(task.source, predictor, options=options, progress=progress)
+        scene = predict(task.source, predictor, options=options)
         scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
     save(scene, path)
     return len(scene.gaussians)
@@ -806,10 +798,10 @@ def _choose_rasterizer(
     return partial(rasterize_official, size=size, near=scene.near, **raster)
 
 
-def _load_source(source: Pair | Views | str | Path | Sequence[str | Path], progress: Progress | None) -> Pair | Views:
+def _load_source(source: Pair | Views | str | Path | Sequence[str | Path]) -> Pair | Views:
     """The pair of a path or of listed panoramas; a pair or views as they are, with tensors in place of arrays."""
     if isinstance(source, (str, Path)):
-        return _load_only_pair(source, progress)
+        return _load_only_pair(source)
     if isinstance(source, Pair):
         return source
     if isinstance(source, Views):
@@ -819,7 +811,7 @@ def _load_source(source: Pair | Views | str | Path | Sequence[str | Path], progr
             f"needed a pair, a path, a list of paths or Views, got {type(source).__name__}; "
             "give arrays as Views(images, cam2world, masks, near, far, names)"
         )
-    return _load_only_pair(source[0], progress) if len(source) == 1 else _load_listed(source, progress)
+    return _load_only_pair(source[0]) if len(source) == 1 else _load_listed(source)
 
 
 def _as_tensors(views: Views) -> Views:
@@ -833,7 +825,7 @@ def _as_tensors(views: Views) -> Views:
     return replace(views, images=images, masks=masks, cam2world=poses)
 
 
-def _load_listed(paths: Sequence[str | Path], progress: Progress | None) -> Pair:
+def _load_listed(paths: Sequence[str | Path]) -> Pair:
     """The pair of some panoramas of one folder, by the folder's poses, or by poses that are estimated of them alone."""
     files = [expand_home(path).absolute() for path in paths]
     others = {file.parent for file in files} - {files[0].parent} if files else {Path()}
@@ -845,7 +837,7 @@ def _load_listed(paths: Sequence[str | Path], progress: Progress | None) -> Pair
     collections = folders.load_collections(folder)
     if collections[0].needs_poses:
         listed = [panorama for panorama in collections[0].unposed if panorama.image.absolute() in files]
-        pairs = estimate_pairs(folder, listed, progress=progress) if len(listed) > 1 else []
+        pairs = estimate_pairs(folder, listed) if len(listed) > 1 else []
     else:
         pairs = folders.make_pairs(collections)
     found = {view.image.absolute(): view for pair in pairs for view in (*pair.context, *pair.targets)}
@@ -861,8 +853,8 @@ def _load_listed(paths: Sequence[str | Path], progress: Progress | None) -> Pair
     return Pair("-".join(view.name for view in views), folder, views, (), near, far, own[0].siblings)
 
 
-def _load_only_pair(path: str | Path, progress: Progress | None) -> Pair:
-    pairs = load_pairs(path, progress=progress)
+def _load_only_pair(path: str | Path) -> Pair:
+    pairs = load_pairs(path)
     if len(pairs) != 1:
         names = ", ".join(pair.name for pair in pairs[:8]) + (", ..." if len(pairs) > 8 else "")
         every = ", or all in one scene: predict_tour(path)" if len(find_tours(pairs)) == 1 else ""
@@ -870,13 +862,15 @@ def _load_only_pair(path: str | Path, progress: Progress | None) -> Pair:
     return pairs[0]
 
 
-def _load_only_tour(path: str | Path, progress: Progress | None) -> TourGraph:
-    tours = find_tours(load_pairs(path, progress=progress))
+def _load_only_tour(path: str | Path) -> TourGraph:
+    with stage(POSED):
+        tours = find_tours(load_pairs(path))
     if len(tours) != 1:
         names = f" ({', '.join(tour.name for tour in tours[:8])}{', ...' if len(tours) > 8 else ''})" if tours else ""
         advice = "give its folder" if tours else "predict one pair: predict(load_pairs(path)[0])"
         raise InputError(f"{path}: needed the panoramas of one tour, got {len(tours)} tours{names}; {advice}")
-    return connect(tours[0], progress)
+    with stage(CONNECTED):
+        return connect(tours[0])
 
 
 def _make_scene(content: CachedScene, task: _Task, joint: bool = False) -> Scene:

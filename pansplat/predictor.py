@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -12,18 +11,6 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.system.options import MIN_HEIGHT
-
-Progress = Callable[[str, float], None]  # current step, fraction done in [0, 1]
-
-
-def part_of(progress: Progress | None, start: float = 0.0, end: float = 1.0, name: str = "") -> Progress:
-    """The progress of a part of the work with a name, between two fractions of the whole; None shows nothing."""
-
-    def report(what: str, done: float) -> None:
-        if progress is not None:
-            progress(name + what, start + (end - start) * done)
-
-    return report
 
 
 def require_matching_inputs(images: Tensor, cam2world: Tensor, masks: Tensor | None) -> None:
@@ -68,7 +55,6 @@ class Predictor(Protocol):
         far: float,
         *,
         masks: Bool[Tensor, "*batch view height width"] | None = None,
-        progress: Progress | None = None,
     ) -> Gaussians | list[Gaussians]:
         """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis."""
         ...

@@ -188,7 +188,7 @@ class SpherePredictor:
     def __init__(self, fingerprint: str = "1") -> None:
         self.name, self.fingerprint, self.calls = "sphere", fingerprint, 0
 
-    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None) -> Any:
+    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None) -> Any:
         from synthetic_scenes import make_balls  # after the import hook
 
         from pansplat.geometry.equirect import pixel_directions

@@ -19,6 +19,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.inputs.pairs import Note, Pair
 from pansplat.pipeline import load_pairs, predict
+from pansplat.system.progress import show_progress
 from pansplat.system.store import cache_folders
 
 HEIGHT = 16
@@ -33,7 +34,8 @@ def test_a_second_prediction_is_read_from_the_cache_bit_for_bit(pair_folder: Pat
     predictor = sphere_predictor()
     messages: list[str] = []
     first = predict(pair_folder, predictor, height=HEIGHT)
-    second = predict(pair_folder, predictor, height=HEIGHT, progress=lambda what, _: messages.append(what))
+    with show_progress(lambda what, _: messages.append(what)):
+        second = predict(pair_folder, predictor, height=HEIGHT)
     assert predictor.calls == 1
     assert have_equal_gaussians(first, second)
     assert all(getattr(second, name) == getattr(first, name) for name in ("names", "near", "far", "model"))
@@ -142,8 +144,8 @@ def test_a_refinement_that_load_has_starved_is_run_once_more(
         clock = SimpleNamespace(process_time=itertools.count(step=processor_seconds).__next__)
         monkeypatch.setattr(pipeline, "time", clock)
         work.clear()
-        report = lambda what, _: work.append(what)  # noqa: E731
-        return predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_seconds=1.0, progress=report)
+        with show_progress(lambda what, _: work.append(what)):
+            return predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_seconds=1.0)
 
     first = refine(0.1)
     second = refine(0.1)  # starved again, and a run of as many steps
@@ -159,11 +161,11 @@ def test_a_refinement_that_load_has_starved_is_run_once_more(
 @pytest.mark.usefixtures("refinement_clock")
 def test_an_interrupted_refinement_is_not_cached(pair_folder: Path, sphere_predictor) -> None:
     def interrupt(what: str, fraction: float) -> None:
-        if what == "refining" and fraction > 0.6:
+        if what == "refining" and fraction > 0.2:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=3.0, progress=interrupt)
+    with pytest.raises(KeyboardInterrupt), show_progress(interrupt):
+        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=3.0)
     assert len(list((pair_folder / ".pansplat").iterdir())) == 1  # the prediction
 
 

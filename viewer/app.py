@@ -16,10 +16,10 @@ from pansplat.system.console import own_warnings, parse_arguments, print_message
 from pansplat.system.devices import Device, use_device
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
 from pansplat.system.options import EYE_DISTANCE, EyeDistance, check_numbers
+from pansplat.system.progress import stage
 from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
-    Progress,
     SceneEntry,
     SceneLoader,
     ShowEntries,
@@ -169,8 +169,8 @@ def _run(options: Options) -> int:
         require_output_folder("the folder", Path("renders"))
     if path is not None and options.out is None:
         raise InputError("--path without a window needs --out; add --out FILE")
-    with progress_bar() as progress:  # of poses, which take minutes for a tour without them
-        entries = find_entries(expand_home(options.path), options.load_options, progress)
+    with progress_bar():  # of poses, which take minutes for a tour without them
+        entries = find_entries(expand_home(options.path), options.load_options)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)
     if options.out is not None:
@@ -212,10 +212,10 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
     source = expand_home(options.path)
 
     def create_loader() -> SceneLoader:
-        return SceneLoader(lambda entry, progress, show: load_entry(entry, load_options, progress, show))
+        return SceneLoader(lambda entry, show: load_entry(entry, load_options, show))
 
-    def find(path: Path, progress: Progress, show: ShowEntries) -> list[SceneEntry]:
-        found = find_entries(path, load_options, progress, show)
+    def find(path: Path, show: ShowEntries) -> list[SceneEntry]:
+        found = find_entries(path, load_options, show)
         choose_entry(found, options.pair if path == source else None)
         return found
 
@@ -282,31 +282,19 @@ def _write_film(
     out, format_, fps = options.out, options.image_format, options.fps
     choice = "cpu" if format_.is_omnidirectional else options.renderer
     ctx = _create_context(choice)  # before the prediction, so that missing OpenGL is reported early
-    predicted = 0.0  # fraction of the panoramas
-    with progress_bar() as progress:
+    with progress_bar():
 
-        def load(entry: SceneEntry) -> LoadedScene:
-            nonlocal predicted
-            part = _find_part(entry)
-            loaded = load_entry(
-                entry,
-                options.load_options,
-                lambda task, done: progress(
-                    f"{entry.name}: {task}", _PREDICTION_PART * min(predicted + part * done, 1.0)
-                ),
-            )
-            predicted = min(predicted + part, 1.0)
+        def load(entry: SceneEntry, end: float = 0.0) -> LoadedScene:  # 0: within the frames of the film
+            with stage(end, f"{entry.name}: "):
+                loaded = load_entry(entry, options.load_options)
             name = loaded.entry.pair.name if loaded.entry.pair is not None else entry.name
             print(f"{name}: {len(loaded.scene.gaussians):,} Gaussians", flush=True)
             return loaded
 
-        def show_progress(task: str, done: float) -> None:
-            progress(f"film: {task}", _PREDICTION_PART * predicted + (1 - _PREDICTION_PART) * done)
-
         def show_file(file: Path) -> None:
             print(file, flush=True)
 
-        loaded = load(entry)
+        loaded = load(entry, _PREDICTION_PART * _find_part(entry))
         scene, tour, settings = loaded.scene, loaded.entry.tour, fit_settings(options.settings, loaded.scene)
         scenes = None if tour is None else TourScenes.start(loaded, options.memory)
         create = partial(create_renderer, ctx, choice, color_bits=32)
@@ -317,11 +305,11 @@ def _write_film(
                     shots = follow_path(path, fps, scene, tour)
                     projection = None if format_.projection == "perspective" else format_.projection
                     options_of_file = {"projection": projection, "stereo": format_.stereo, "unit": scene.frame.unit}
-                    for file in write_film(out, film, shots, fps, **options_of_file, progress=show_progress):
+                    for file in write_film(out, film, shots, fps, **options_of_file):
                         show_file(file)
                 else:
-                    at, show = 0.5 if options.at is None else options.at, (show_progress, show_file)
-                    write_flight(film, scene, scenes, folder, fps, options.seconds, at, settings, *show)
+                    at = 0.5 if options.at is None else options.at
+                    write_flight(film, scene, scenes, folder, fps, options.seconds, at, settings, show_file)
         finally:
             if ctx is not None:
                 ctx.release()

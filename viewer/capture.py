@@ -16,7 +16,6 @@ from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, write
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import write_image
-from pansplat.predictor import Progress
 from pansplat.rendering.image_planes import Layout
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.route import FADE_SECONDS, NEAR_OF_FAR, Route, plan_route
@@ -112,7 +111,6 @@ def write_flight(
     seconds: float | None,
     at: float,
     settings: DrawSettings,
-    progress: Progress,
     show_file: Callable[[Path], None],
 ) -> None:
     """Write the film of a flight, and frames of it as stills before the film is complete.
@@ -128,7 +126,6 @@ def write_flight(
         fps, seconds: see `list_flight`.
         at: fraction of the flight at which the panorama is rendered.
         settings: draw settings, whose mode the panorama has.
-        progress: called with the task and the fraction done.
         show_file: called with each file that is written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -149,7 +146,7 @@ def write_flight(
             show_file(folder / name)
 
     name = "flythrough.mp4" if scenes is None else "tour.mp4"
-    for file in write_film(folder / name, film, shots, fps, progress=progress, show=show):
+    for file in write_film(folder / name, film, shots, fps, show=show):
         show_file(file)
     if scenes is None:
         file = folder / f"panorama_{round(100 * at):03d}.png"

@@ -34,6 +34,7 @@ from pansplat.system.descriptions import describe_count
 from pansplat.system.devices import with_device
 from pansplat.system.files import expand_home, make_portable_name, require_output_folder, require_replaceable
 from pansplat.system.options import Count, Threads
+from pansplat.system.progress import report_progress
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
@@ -117,12 +118,14 @@ class Batch(Computation):
             with (
                 start_workers(self.workers) if self.scheduler is None else contextlib.nullcontext() as local,
                 open(self.out / REPORT_NAME, "wb", 0) as file,
-                progress_bar() as progress,
+                progress_bar(),
             ):
                 for line in run_items(str(local.scheduler_address if local else self.scheduler), items, self):
                     file.write(json.dumps({"software": "pansplat", **line}).encode() + b"\n")
                     count[line["status"]] += 1
-                    progress(f"{count.total()} of {len(items)}: {line['item'][-30:]}", count.total() / len(items))
+                    report_progress(
+                        f"{count.total()} of {len(items)}: {line['item'][-30:]}", count.total() / len(items)
+                    )
                     if line["error"] is not None:
                         print_message("note", f"{line['item']}: {line['error']}")
         finally:

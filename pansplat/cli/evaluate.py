@@ -122,7 +122,7 @@ class Evaluate(Computation):
                     print(f"note: {path}: no target view in {count}; skipped", file=sys.stderr)
             pairs += with_targets
         predictor = pipeline.load_predictor(self.prediction)
-        with progress_bar() as progress:
+        with progress_bar():
             cases = evaluate(
                 pairs,
                 predictor,
@@ -132,7 +132,6 @@ class Evaluate(Computation):
                 blend=blend,
                 drawing=self.drawing,
                 lpips=lpips,
-                progress=progress,
             )
         make_table_console().print(results_table(cases))
         if lpips is not None:
@@ -149,8 +148,8 @@ class Evaluate(Computation):
         options = ProtocolOptions(self._height, self.protocol.limit, self.protocol.pictures)
         lpips = choose_lpips(self.lpips, self._height)
         methods = self._protocol_methods(protocol)
-        with progress_bar() as progress:
-            result = run_protocol(protocol, data, methods, self.out, options=options, lpips=lpips, progress=progress)
+        with progress_bar():
+            result = run_protocol(protocol, data, methods, self.out, options=options, lpips=lpips)
         written = write_report(result, self.out)
         console = make_table_console(_PROTOCOL_WIDTH)
         for table in rich_tables(result):

@@ -29,6 +29,7 @@ from pansplat.system.files import (
     require_replaceable,
 )
 from pansplat.system.options import Count, Fraction, Real
+from pansplat.system.progress import stage
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -133,7 +134,7 @@ class _Mesh:
         for file, mesh in meshes.items():
             require_replaceable("--out", name_mesh_files(file, len(mesh.parts)), export.overwrite)
         for file, mesh in meshes.items():
-            files = save_mesh(mesh, file, overwrite=export.overwrite)
+            files = save_mesh(mesh, file)
             size = sum(written.stat().st_size for written in files)
             beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
             count, names = len(mesh.parts), ", ".join(part.name for part in mesh.parts)
@@ -187,9 +188,10 @@ class Page:
         shows_all = not (export.crop or export.rooms)  # photographs would show what a crop leaves out
         has_photographs = shows_all and self.photo_height != 0 and not is_scene_file(export.path)
         count = self.gaussians or (PHOTO_GAUSSIANS if has_photographs and not split else DEFAULT_GAUSSIANS)
-        scene, changes, photographs = export.open(gaussians=count)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with progress_bar() as progress:
+        with progress_bar():
+            with stage(0.8):
+                scene, changes, photographs = export.open(gaussians=count)
+            out.parent.mkdir(parents=True, exist_ok=True)
             page = write_page(
                 scene,
                 out,
@@ -199,7 +201,6 @@ class Page:
                 embed=self.embed,
                 photographs=photographs if shows_all else (),
                 photo_height=self.photo_height,
-                progress=progress,
             )
         beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if split else ""
         pictures, rows = "", max((photograph.image_height for photograph in photographs), default=0)
@@ -257,6 +258,7 @@ class _TrainingSet:
     training_set: bool = False
     """Write a folder to train further from: cube faces with poses, and points."""
 
+    @progress_bar()
     def write(self, export: Export) -> None:
         """Write cube faces, poses and points to a new folder."""
         import torch
@@ -277,7 +279,8 @@ class _TrainingSet:
                 f"{export.path}: needed the folder of the panoramas to write their cube faces, got a scene file; give "
                 "the folder"
             )
-        scene, source = export.prediction.open_panoramas(export.path, joint=not export.layers)
+        with stage(0.8):
+            scene, source = export.prediction.open_panoramas(export.path, joint=not export.layers)
         gaussians = prune(scene.gaussians, degree=0, min_opacity=max(export.min_opacity, _MIN_POINT_OPACITY))
         gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
         if len(gaussians) > _MOST_POINTS:
@@ -290,8 +293,8 @@ class _TrainingSet:
         ]
         means = scene.frame.globalize_places(gaussians.means).cpu().numpy()
         colors = make_colors(gaussians).cpu().numpy()
-        with replacing_folder(export.out) as folder, progress_bar() as progress:
-            count = write_dataset(folder, views, source.siblings, means, colors, progress)
+        with replacing_folder(export.out) as folder:
+            count = write_dataset(folder, views, source.siblings, means, colors)
             save_points(dataclasses.replace(scene, gaussians=gaussians).rotated(Z_UP[:3, :3]), folder / POINTS)
         print(
             f"{export.out}: {count} cube faces of {describe_count(len(views), 'panorama')}, "
@@ -311,6 +314,7 @@ class _Photographs:
     """Write the panoramas of a tour as 2:1 photographs to a new folder, with titles, links, notes and start views. Blur
     masks are applied; no poses are estimated or written."""
 
+    @progress_bar()
     def write(self, export: Export) -> None:
         """Write the photographs and print their size."""
         from pansplat.export.panoramas import write_panoramas
@@ -323,8 +327,8 @@ class _Photographs:
                 f"{export.path}: needed a tour or a folder of panoramas, got a scene file; give the folder"
             )
         panoramas = load_panoramas(export.path)
-        with replacing_folder(export.out) as folder, progress_bar() as progress:
-            size = write_panoramas(folder, panoramas, progress)
+        with replacing_folder(export.out) as folder:
+            size = write_panoramas(folder, panoramas)
         print(f"{export.out}: {describe_count(len(panoramas), 'photograph')}, {size / 1e6:.1f} MB")
 
 
@@ -387,6 +391,7 @@ class Export(Computation):
         kind.write(self)
         return 0
 
+    @progress_bar()
     def open(self, *, joint: bool = False, gaussians: int | None = None) -> tuple[Scene, list[Change], list[Pair]]:
         """The scene of the file, pair or tour as it is to be written, what is left out, and its photographs.
 
@@ -399,7 +404,8 @@ class Export(Computation):
         from pansplat.refinement import fuse_views
 
         if not is_scene_file(self.path):
-            scene, source = self.prediction.open_panoramas(self.path, gaussians, joint=joint)
+            with stage(0.9):
+                scene, source = self.prediction.open_panoramas(self.path, gaussians, joint=joint)
             layers = self.prediction.predict_layers(source) if self.rooms and scene.joint else None
             edited, changes = self._edit(scene, layers)
             known, views = scene.cam2world.tolist(), range(len(scene.cam2world))
@@ -436,8 +442,7 @@ class Export(Computation):
             box = tuple(scene.frame.localize_places(corners).flatten().tolist())
         cleaning = Cleaning(self.rooms, box, not self.remove_floaters, self.min_opacity)
         try:
-            with progress_bar() as progress:
-                scene, changes = clean_up(scene, cleaning, layers, progress)
+            scene, changes = clean_up(scene, cleaning, layers)
         except InputError as error:
             raise InputError(f"{self.path}: {error}") from error
         return dataclasses.replace(scene, gaussians=prune(scene.gaussians, degree=self.degree)), changes

@@ -14,11 +14,11 @@ from tyro.conf import arg
 
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
-from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count
 from pansplat.system.devices import Device
 from pansplat.system.files import is_scene_file
 from pansplat.system.options import Height
+from pansplat.system.progress import CONNECTED, POSED, stage
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
@@ -107,8 +107,8 @@ class ScenePrediction:
         more = f"; left out: {describe_count(len(tours) - 1, 'other tour')}" if len(tours) > 1 else ""
         count = describe_count(len(tours[0]), "panorama")
         print(f"note: {path}: a tour of {count} ({kinds}--pair chooses one pair){more}", file=sys.stderr)
-        with progress_bar() as progress:
-            tour = connect(tours[0], progress)
+        with stage(CONNECTED):
+            tour = connect(tours[0])
         return predict_scene(tour, options), tour
 
     def predict_layers(self, source: Pair | TourGraph) -> Scene:
@@ -125,7 +125,8 @@ def load_choice(path: Path, choice: PairChoice) -> list[Pair]:
     """The pairs of a folder."""
     from pansplat import pipeline
 
-    return pipeline.load_pairs(path, **vars(choice.reading))
+    with stage(POSED):
+        return pipeline.load_pairs(path, **vars(choice.reading))
 
 
 def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
@@ -145,16 +146,15 @@ def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
 
 
 def predict_scene(source: Pair | TourGraph, options: PredictOptions) -> Scene:
-    """Predict and refine the scene of a pair or tour, and show a progress bar; networks draw layers jointly."""
+    """Predict and refine the scene of a pair or tour; networks draw layers jointly."""
     from pansplat import pipeline
     from pansplat.inputs.pairs import Pair
 
     model = pipeline.load_predictor(options)
     options = replace(options, joint=options.joint and not pipeline.can_stream(model))
-    with progress_bar() as progress:
-        if isinstance(source, Pair):
-            return pipeline.predict(source, model, options=options, progress=progress)
-        return pipeline.predict_tour(source, model, options=options, progress=progress)
+    if isinstance(source, Pair):
+        return pipeline.predict(source, model, options=options)
+    return pipeline.predict_tour(source, model, options=options)
 
 
 def parse_blend(text: str) -> str | int:

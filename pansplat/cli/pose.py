@@ -14,6 +14,7 @@ from pansplat.errors import InputError
 from pansplat.system.console import make_table_console, print_message, progress_bar
 from pansplat.system.files import require_output_file, require_output_folder
 from pansplat.system.options import CAMERA_HEIGHT, Count, Positive
+from pansplat.system.progress import stage
 
 if TYPE_CHECKING:
     from pansplat.poses.estimate import PoseEstimate
@@ -58,18 +59,13 @@ class Pose(Computation):
         if out is not None:
             require_mergeable(out, [view.image for view in panoramas], overwrite=self.overwrite)
         folder = self.paths[0] if self.paths[0].is_dir() else self.paths[0].parent
-        with progress_bar() as progress:
+        with progress_bar():
             if is_video and out is not None:
                 folder = out.parent
-                frames = extract_key_frames(self.paths[0], out.parent, self.frames, progress, overwrite=self.overwrite)
+                with stage(0.5):
+                    frames = extract_key_frames(self.paths[0], out.parent, self.frames, overwrite=self.overwrite)
                 panoramas = list_unposed(frames)
-            estimate = estimate_panoramas(
-                folder,
-                panoramas,
-                camera_height=self.camera_height,
-                baseline=self.baseline,
-                progress=progress,
-            )
+            estimate = estimate_panoramas(folder, panoramas, camera_height=self.camera_height, baseline=self.baseline)
         _print_estimate(estimate)
         if out is not None:
             write_poses(estimate, out, overwrite=self.overwrite)

@@ -39,6 +39,7 @@ class Predict(Computation):
     prediction: PredictOptions = field(default_factory=PredictOptions)
     choice: PairChoice = field(default_factory=PairChoice)
 
+    @progress_bar()
     def run(self) -> int:
         """Predict, write the scene and print the time of the prediction."""
         from pansplat import pipeline
@@ -51,16 +52,9 @@ class Predict(Computation):
         if options.refine_seconds is None and not joint:
             options = replace(options, refine_seconds=0.0)
         began = time.perf_counter()
-        with progress_bar() as progress:
-            count = pipeline.predict_to_file(
-                pair,
-                self.out,
-                model,
-                options=options,
-                degree=self.degree,
-                min_opacity=self.min_opacity,
-                progress=progress,
-            )
+        count = pipeline.predict_to_file(
+            pair, self.out, model, options=options, degree=self.degree, min_opacity=self.min_opacity
+        )
         seconds = time.perf_counter() - began
         names = ", ".join(panorama.name for panorama in pair.context)
         print(f"{self.out}: {count:,} Gaussians from {names} in {seconds:.1f} s")

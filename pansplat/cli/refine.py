@@ -18,6 +18,7 @@ from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import call_at_first_signal, progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, is_scene_file, require_output_file
 from pansplat.system.options import Count, Seconds, Seed
+from pansplat.system.progress import report_progress, stage
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
@@ -63,6 +64,7 @@ class Refine(Computation):
     prediction: _Prediction = field(default_factory=_Prediction)
     choice: PairChoice = field(default_factory=PairChoice)
 
+    @progress_bar()
     def run(self) -> int:
         """Refine, write the scene and print the errors of held-out pixels."""
         from pansplat import pipeline
@@ -70,11 +72,12 @@ class Refine(Computation):
         from pansplat.refinement import RefineConfig, fuse_views
 
         self._refuse_invalid_arguments()
-        given, views = self._open_scene()
+        with stage(0.5):
+            given, views = self._open_scene()
         scene = given if self.layers else fuse_views(given)
         config = RefineConfig(gaussians=self.gaussians, poses=self.poses)
-        with stop_at_interrupt() as should_stop, progress_bar() as progress:
-            progress("preparing", 0.0)
+        with stop_at_interrupt() as should_stop:
+            report_progress("preparing", 0.0)
             refined, report = pipeline.refine_to_file(
                 scene,
                 views,
@@ -83,7 +86,6 @@ class Refine(Computation):
                 steps=self.steps,
                 config=config,
                 seed=self.seed,
-                progress=progress,
                 should_stop=should_stop,
             )
         if self.report is not None:

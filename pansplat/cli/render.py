@@ -16,6 +16,7 @@ from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import expand_home, read_file, require_output_file
 from pansplat.system.options import EYE_DISTANCE, EyeDistance, ImageHeight
+from pansplat.system.progress import stage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,6 +75,7 @@ class Render(Computation):
     """Frames per second of a video."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
 
+    @progress_bar()
     def run(self) -> int:
         """Render one image, or a video along a path of cameras."""
         import torch
@@ -90,7 +92,8 @@ class Render(Computation):
             raise InputError(
                 f"{self.pose} holds {len(poses)} poses; write an .mp4 or .webm, or keep one pose in the file"
             )
-        scene, source = self.prediction.open(self.path)
+        with stage(0.5 if self._is_film else 1.0):
+            scene, source = self.prediction.open(self.path)
         poses = None if poses is None else [scene.frame.localize(pose) for pose in poses]
         layout = self.layout or ("perspective" if self._is_film and not self.stereo else "equirect")
         options = self._render_options(layout, self.height or self._choose_height(layout, scene))
@@ -103,8 +106,7 @@ class Render(Computation):
                 "stereo": "top-bottom" if self.stereo else "mono",
                 "unit": scene.frame.unit,
             }
-            with progress_bar() as progress:
-                write_film(self.out, film, shots, self.fps, **marks, progress=progress)
+            write_film(self.out, film, shots, self.fps, **marks)
             print(f"{self.out}: {describe_count(len(shots), 'frame')} of {size}, {layout}")
             return 0
         pose = self._pose_between_cameras(scene) if poses is None else poses[0]

@@ -31,7 +31,8 @@ from pansplat.images.image_files import write_image
 from pansplat.inputs.views import Sample, Views
 from pansplat.model.network import NetworkPredictor
 from pansplat.pipeline import Drawing
-from pansplat.predictor import Predictor, Progress
+from pansplat.predictor import Predictor
+from pansplat.system.progress import stage
 from pansplat.training.sequences import (
     BoundedSampler,
     FramePair,
@@ -322,7 +323,6 @@ def run_protocol(
     *,
     options: ProtocolOptions | None = None,
     lpips: Lpips | None = None,
-    progress: Progress | None = None,
 ) -> ProtocolResult:
     """Evaluate the methods on the available sets; results.json is written after every case."""
     options = options or ProtocolOptions()
@@ -337,18 +337,18 @@ def run_protocol(
     chosen = [(found, _take_evenly(found.cases, options.limit)) for found in sets if found.cases]
     total = sum(len(cases) for _, cases in chosen)
     for predictor in {id(method.predictor): method.predictor for method in methods}.values():
-        warm_up(predictor)
+        with stage(0.0):
+            warm_up(predictor)
     done = 0
     for test_set, cases in chosen:
         for number, case in enumerate(cases):
-            if progress is not None:
-                progress(f"{test_set.name}: {case.name}", done / total)
             folder = out / _slugify(test_set.name) / _slugify(case.name) if number < options.image_cases else None
+            done += 1
             try:
-                result.rows += _run_case(case, test_set.name, methods, options.height, lpips, folder)
+                with stage(done / total, f"{test_set.name}: {case.name}: "):
+                    result.rows += _run_case(case, test_set.name, methods, options.height, lpips, folder)
             except InputError as error:
                 result.skipped.append(f"{test_set.name}, {case.name}: {error}")
-            done += 1
             make_folder(out)
             write_json(result.as_json(), out / "results.json")
     if not result.rows:

@@ -28,8 +28,9 @@ from pansplat.images.image_files import write_image
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
 from pansplat.pipeline import Drawing
-from pansplat.predictor import Predictor, Progress
+from pansplat.predictor import Predictor
 from pansplat.rendering import Rendering
+from pansplat.system.progress import report_progress, stage
 
 _CROSS_FADE = {  # metrics of the cross-fade, by those of the prediction
     "ws_psnr": "cross_fade_ws_psnr",
@@ -49,7 +50,6 @@ def evaluate(
     blend: str | int = "deferred",
     drawing: Drawing = "exact",
     lpips: Lpips | None = None,
-    progress: Progress | None = None,
 ) -> list[Row]:
     """Evaluate every target of the pairs, and write results.json and images into `out`.
 
@@ -69,18 +69,15 @@ def evaluate(
     if not with_targets:
         raise InputError("none of the pairs has a target view to compare with; name targets in pairs.json")
     make_folder(out)
-    warm_up(predictor)
+    with stage(0.0):
+        warm_up(predictor)
     options = {"blend": blend, "size": (height, 2 * height), "drawing": drawing}
     rows: list[Row] = []
-    for index, pair in enumerate(with_targets):
-
-        def report(what: str, fraction: float, pair: Pair = pair, index: int = index) -> None:
-            if progress is not None:
-                progress(f"{pair.name}: {what}", (index + fraction) / len(with_targets))
-
+    for number, pair in enumerate(with_targets, 1):
         taken = {row.case["name"] for row in rows}
         joint = blend == "joint" and not pipeline.can_stream(predictor)
-        rows += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, joint, options, lpips, report)
+        with stage(number / len(with_targets), f"{pair.name}: "):
+            rows += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, joint, options, lpips)
         write_json([row.as_json() for row in rows], out / "results.json")
     return rows
 
@@ -103,20 +100,20 @@ def _evaluate_pair(
     joint: bool,
     options: dict[str, Any],
     lpips: Lpips | None,
-    progress: Progress,
 ) -> Iterator[Row]:
     context, targets = pair.load_context(height), pair.load_targets(height)
     start = time.perf_counter()
-    scene = pipeline.predict(context, predictor, joint=joint, progress=progress)
+    with stage(0.5 if refine_seconds else 1.0):
+        scene = pipeline.predict(context, predictor, joint=joint)
     predict_seconds = time.perf_counter() - start
     if refine_seconds:
         start = time.perf_counter()
-        scene = pipeline.refine(scene, context, seconds=refine_seconds, progress=progress)
+        scene = pipeline.refine(scene, context, seconds=refine_seconds)
         refine_seconds = time.perf_counter() - start
     render = pipeline.make_renderer(scene, "images", len(context.images) + len(targets.images), **options)
     own_ws_psnr = measure_own_views(scene, context, lambda _, pose: render(pose))
     for view, target in enumerate(targets.images):
-        progress("rendering", 1.0)
+        report_progress("rendering", 1.0)
         pose = targets.cam2world[view]
         start = time.perf_counter()
         with torch.no_grad():

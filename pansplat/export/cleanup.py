@@ -25,6 +25,7 @@ from pansplat.geometry.equirect import pad_equirect, row_weights, uv_from_direct
 from pansplat.pipeline import render
 from pansplat.rendering import rasterize
 from pansplat.system.descriptions import describe_count
+from pansplat.system.progress import report_progress, stage
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import make_graph
@@ -88,11 +89,11 @@ class Change:
         return f"{text}; {where} before and after agree to {self.psnr:.1f} dB"
 
 
+@stage()
 def clean_up(
     scene: Scene,
     cleaning: Cleaning,
     layers: Scene | None = None,
-    progress: Callable[[str, float], None] = lambda what, done: None,
 ) -> tuple[Scene, list[Change]]:
     """The scene after the steps, and what each of them did.
 
@@ -100,7 +101,6 @@ def clean_up(
         scene: with each surface once, or not.
         cleaning: the steps.
         layers: the scene of the same cameras with all that each panorama shows, to find the rooms of a joint one.
-        progress: called with the name of the step and the completed fraction.
     """
     steps: dict[str, Callable[[Scene], Scene]] = {}
     box, least = cleaning.box, cleaning.min_opacity
@@ -117,7 +117,7 @@ def clean_up(
         )
     changes = []
     for number, (name, step) in enumerate(steps.items()):
-        progress(name, number / len(steps))
+        report_progress(name, number / len(steps))
         cleaned = step(scene)
         counts = len(scene.gaussians), len(cleaned.gaussians)
         cameras = len(scene.cam2world), len(cleaned.cam2world)

@@ -25,9 +25,9 @@ from pansplat.images.image_files import write_image
 from pansplat.images.panorama_metadata import Projection, Stereo
 from pansplat.images.video import VIDEO_SUFFIXES, write_video
 from pansplat.inputs.pairs import Pair
-from pansplat.predictor import Progress, part_of
 from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
 from pansplat.system.files import require_output_file, require_replaceable
+from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
@@ -251,6 +251,7 @@ class Film:
         return self._photographs.mix(drawn, plane, shot.seconds), depth
 
 
+@stage()
 def write_film(
     file: Path,
     film: Film,
@@ -260,7 +261,6 @@ def write_film(
     projection: Projection | None = None,
     stereo: Stereo = "mono",
     unit: float = 1.0,
-    progress: Progress | None = None,
     show: Callable[[int, Image], None] = lambda number, color: None,
 ) -> list[Path]:
     """Write a film, or the files of its frames, each completely or not at all; returns the files.
@@ -274,13 +274,12 @@ def write_film(
         projection: of frames of all directions.
         stereo: arrangement of the eyes.
         unit: of depth, see `pansplat.geometry.world.WorldFrame`.
-        progress: called with the frame and the fraction done.
         show: called with the number and the colours of each frame.
     """
 
     def draw() -> Iterator[tuple[Image, Depth | None]]:
         for number, shot in enumerate(shots):
-            part_of(progress)(f"frame {number + 1} of {len(shots)}", number / len(shots))
+            report_progress(f"film: frame {number + 1} of {len(shots)}", number / len(shots))
             color, depth = film.draw(shot)
             show(number, color)
             yield color, depth

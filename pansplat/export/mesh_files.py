@@ -29,7 +29,7 @@ from pansplat.gaussians.gltf import write_glb
 from pansplat.gaussians.scene_files import Y_UP
 from pansplat.geometry.world import USER_FRAME, WorldFrame
 from pansplat.system.atomic import replacing
-from pansplat.system.files import SOFTWARE, is_written, require_replaceable
+from pansplat.system.files import SOFTWARE, is_written
 
 MESH_SUFFIXES = (".obj", ".glb")
 
@@ -88,11 +88,11 @@ def name_mesh_files(path: Path, parts: int) -> list[Path]:
     return [path, *(path.with_name(f"{stem}{end}") for end in (".mtl", *(f"_{n}.jpg" for n in range(parts))))]
 
 
-def save_mesh(mesh: Mesh, path: Path, *, overwrite: bool | None = True) -> tuple[Path, ...]:
+def save_mesh(mesh: Mesh, path: Path) -> tuple[Path, ...]:
     """Write a mesh in the format of the suffix, each file atomically, and return the files, the named one first.
 
     Textures show only what triangles need of them: the rest has the colours around it. Further textures of the file
-    before are removed. `overwrite` is that of `pansplat.system.files.require_replaceable`.
+    before are removed.
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -100,7 +100,6 @@ def save_mesh(mesh: Mesh, path: Path, *, overwrite: bool | None = True) -> tuple
     if not mesh.num_triangles:
         raise InputError(f"cannot write {path}: needed one or more triangles, got none; give a scene with surfaces")
     files = name_mesh_files(path, len(mesh.parts))
-    require_replaceable(f"cannot write {path}", files, overwrite)
     old = _list_written_files(path)
     (_save_obj if suffix == ".obj" else _save_glb)(mesh, *files)
     _remove(set(old) - set(files))

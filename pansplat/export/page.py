@@ -42,7 +42,6 @@ from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
-from pansplat.predictor import Progress
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.image_planes import image_planes
@@ -50,6 +49,7 @@ from pansplat.shaders import load_shader
 from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
 from pansplat.system.files import is_written
+from pansplat.system.progress import report_progress, stage
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import assign_storeys, choose_camera_height
@@ -137,7 +137,6 @@ def write_page(
     embed: Sequence[str] = (),
     photographs: Sequence[Pair] = (),
     photo_height: int | None = None,
-    progress: Progress | None = None,
 ) -> PageFiles:
     """Write a scene as a web page.
 
@@ -153,13 +152,11 @@ def write_page(
         photographs: of each view, which the page shows there (`list_photographs`), with the notes of its
             tour; none without them.
         photo_height: their largest height, pixels, 0 for none; by default what fits, if it is split that of the files.
-        progress: called with a description of the current work and the completed fraction.
     """
     path, embed = Path(path), parse_origins(embed)
-    report: Progress = progress or (lambda what, fraction: None)
     if not 1 <= gaussians <= MAX_GAUSSIANS:
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
-    report("checking the scene", 0.0)
+    report_progress("checking the scene", 0.0)
     if scene.joint and scene.overlaps:
         warnings.warn(
             "a page follows the edges of a tour with all Gaussians of each panorama, got each surface once; its "
@@ -182,31 +179,26 @@ def write_page(
     flights = _plan_flights(scene, tour, facts)
     house, has_pictures = DollHouse((), b""), len(photographs) > 0 and photo_height != 0
     if rooms is not None:
-        report("building the doll's house", 0.0)
+        report_progress("building the doll's house", 0.0)
         house = make_house(scene, rooms, flights.level, photographs if has_pictures else ())
     heights = [min(each.image_height, photo_height or MAX_HEIGHT) for each in photographs if has_pictures and not split]
     shares = _share_gaussians(flights, tour.poor, gaussians, heights)
     kept = round(gaussians * sum(shares[part] for part in flights.parts) / len(flights.parts))
     if len(scene.gaussians) > kept:
-        report("merging Gaussians", 0.1)
+        report_progress("merging Gaussians", 0.1)
         scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0, shares=shares)
-    report("compressing", 0.6)
+    report_progress("compressing", 0.6)
     degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if has_pictures and not split else 1))
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree)
-    report("drawing the poster", 0.7)
+    report_progress("drawing the poster", 0.7)
     poster = _draw_poster(scene, flights.start, photographs if has_pictures else ())
     pictures: list[PackedPhotograph] = []
     if has_pictures:
         left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - sum(map(len, packed.contents)) - len(poster + house.atlas)
-        pictures = pack_photographs(
-            scene,
-            photographs,
-            math.inf if split else left,
-            photo_height,
-            lambda what, fraction: report(what, 0.75 + 0.2 * fraction),
-        )
-    report("writing", 0.95)
+        with stage(0.95):
+            pictures = pack_photographs(scene, photographs, math.inf if split else left, photo_height)
+    report_progress("writing", 0.95)
     header = _describe_scene(scene, packed, origin, flights, tour, facts)
     header |= {"embed": embed, "doll": [], "photographs": [picture.describe() for picture in pictures]}
     header["plan"] = _describe_plan(plan, floors, tour, origin, flights.level)

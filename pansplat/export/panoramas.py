@@ -11,11 +11,12 @@ import numpy as np
 from pansplat.images.image_files import read_height, read_mask, read_panorama, write_image
 from pansplat.inputs.pairs import Panorama
 from pansplat.inputs.photographs import LINKS, describe_notes
-from pansplat.predictor import Progress
 from pansplat.system.files import make_unique_name
+from pansplat.system.progress import report_progress, stage
 
 
-def write_panoramas(folder: Path, panoramas: Sequence[Panorama], progress: Progress | None = None) -> int:
+@stage()
+def write_panoramas(folder: Path, panoramas: Sequence[Panorama]) -> int:
     """Write NAME.jpg for each panorama in its full resolution, NAME_mask.png for a mask, and links.json.
 
     If a name is taken, the next panorama of that name gets the name of its folder before its own, and a number if that
@@ -24,15 +25,13 @@ def write_panoramas(folder: Path, panoramas: Sequence[Panorama], progress: Progr
     Args:
         folder: exists.
         panoramas: of any folders.
-        progress: called with a description and the completed fraction.
 
     Returns:
         The bytes of all files.
     """
     names = _name_files(panoramas)
     for number, (view, name) in enumerate(zip(panoramas, names, strict=True)):
-        if progress is not None:
-            progress(f"writing {name}.jpg", number / len(panoramas))
+        report_progress(f"writing {name}.jpg", number / len(panoramas))
         height = read_height(view.image)
         write_image(folder / f"{name}.jpg", read_panorama(view.image, height)[0], panorama="photograph")
         if view.mask is not None:

@@ -29,8 +29,8 @@ from pansplat.export.training_set import cut_faces
 from pansplat.gaussians.scene import Scene
 from pansplat.images.masks import mask_holes
 from pansplat.inputs.pairs import Pair
-from pansplat.predictor import Progress
 from pansplat.system.files import SOFTWARE
+from pansplat.system.progress import report_progress
 from pansplat.tours.graph import TourGraph, make_graph, select_views
 
 MIN_HEIGHT = 1024  # of a photograph in a page, pixels, unless it is smaller
@@ -100,7 +100,7 @@ def list_photographs(source: Pair | TourGraph, views: Sequence[int]) -> list[Pai
 
 
 def pack_photographs(
-    scene: Scene, photographs: Sequence[Pair], num_bytes: float, height: int | None, progress: Progress
+    scene: Scene, photographs: Sequence[Pair], num_bytes: float, height: int | None
 ) -> list[PackedPhotograph]:
     """The photographs of a scene's views, within a number of bytes if that is possible.
 
@@ -116,7 +116,7 @@ def pack_photographs(
         packed: list[PackedPhotograph] = []
         can_shrink, expected = height is None and rows > MIN_HEIGHT, 0.0
         for view, photograph in enumerate(photographs):
-            progress("packing photographs", view / len(photographs))
+            report_progress("packing photographs", view / len(photographs))
             image = read_photograph(scene, view, photograph, rows)
             packed.append(_pack(image, scene.cam2world[view, :3, :3].double().numpy(), qualities[0]))
             expected = sum(each.num_bytes for each in packed) * len(photographs) / len(packed)

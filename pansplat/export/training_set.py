@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -21,6 +21,7 @@ from pansplat.images.rig_images import Lens
 from pansplat.inputs.pairs import Panorama, read_scene_mask
 from pansplat.inputs.reconstructions.colmap import write_colmap
 from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
+from pansplat.system.progress import report_progress, stage
 
 POINTS = "points.ply"
 
@@ -31,13 +32,13 @@ _MARGIN = 2  # pixels, of the cubic filter
 _BAND_ROWS = 256  # rows of a face that are sampled together
 
 
+@stage()
 def write_dataset(
     folder: Path,
     views: Sequence[Panorama],
     siblings: tuple[Path, ...],
     points: Float[Array, "point 3"],
     colors: UInt8[Array, "point 3"],
-    progress: Callable[[str, float], None],
 ) -> int:
     """Write cube faces with poses, and points: images/, masks/ (if some are not white), sparse/0/, transforms.json.
 
@@ -49,7 +50,6 @@ def write_dataset(
         views: the panoramas, in a world of metres with y down.
         siblings: panoramas in which static content is detected, see `pansplat.inputs.pairs.Pair`.
         points, colors: positions, metres, and 8-bit sRGB.
-        progress: called with a description and the completed fraction.
 
     Returns:
         The number of pictures.
@@ -65,7 +65,7 @@ def write_dataset(
         (folder / "masks").mkdir()
     rigs, shots = [], []
     for number, (view, mask) in enumerate(zip(views, masks, strict=True)):
-        progress("writing cube faces", number / len(views))
+        report_progress("writing cube faces", number / len(views))
         height = min(read_height(view.image), _MAX_HEIGHT)
         size = 2 * math.ceil(height / math.pi)
         lens = Lens(size / 2, size / 2, size / 2, size / 2, size, size)

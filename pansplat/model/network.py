@@ -35,8 +35,9 @@ from pansplat.model.weights import (
     require_shapes,
 )
 from pansplat.prediction_options import CompatChoice
-from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
+from pansplat.predictor import require_matching_inputs, select_item
 from pansplat.system.devices import choose_device, note_full_card
+from pansplat.system.progress import report_progress
 from pansplat.system.source_hash import hash_sources
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
@@ -92,7 +93,6 @@ class NetworkPredictor:
         far: float | Tensor,
         *,
         masks: Bool[Tensor, "*batch view height width"] | None = None,
-        progress: Progress | None = None,
     ) -> Gaussians | list[Gaussians]:
         """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis.
 
@@ -108,11 +108,10 @@ class NetworkPredictor:
                     select_item(near, n),
                     select_item(far, n),
                     masks=None if masks is None else masks[n],
-                    progress=progress,
                 )[0]
                 for n in range(len(images))
             ]
-        return self.predict_with_depths(images, cam2world, near, far, masks=masks, progress=progress)[0]
+        return self.predict_with_depths(images, cam2world, near, far, masks=masks)[0]
 
     @torch.no_grad()
     def predict_with_depths(
@@ -123,14 +122,13 @@ class NetworkPredictor:
         far: float | Tensor,
         *,
         masks: Bool[Tensor, "view height width"] | None = None,
-        progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
         """Predict Gaussians like `__call__`, and the radial depth maps of the swept levels, metres, coarse to fine."""
         tiles = first = self.tiles or choose_tiles(images.shape[-2])
         while True:
             try:
-                matched = self._match(images, cam2world, near, far, masks, progress, tiles)
-                parts = list(self._lift(matched, tiles, progress))
+                matched = self._match(images, cam2world, near, far, masks, tiles)
+                parts = list(self._lift(matched, tiles))
                 break
             except torch.cuda.OutOfMemoryError:  # of a graphics card only
                 tiles *= 2
@@ -151,7 +149,6 @@ class NetworkPredictor:
         far: float | Tensor,
         *,
         masks: Bool[Tensor, "view height width"] | None = None,
-        progress: Progress | None = None,
     ) -> Iterator[Gaussians]:
         """Yield the Gaussians of `__call__` tile by tile, in bounded memory; errors are raised at the first part.
 
@@ -163,8 +160,8 @@ class NetworkPredictor:
             with torch.no_grad():  # closed before each yield: the caller keeps its own grad mode
                 try:
                     if parts is None:
-                        matched = self._match(images, cam2world, near, far, masks, progress, tiles)
-                        parts = itertools.islice(self._lift(matched, tiles, progress), done, None)
+                        matched = self._match(images, cam2world, near, far, masks, tiles)
+                        parts = itertools.islice(self._lift(matched, tiles), done, None)
                     part = next(parts, None)
                 except torch.cuda.OutOfMemoryError:
                     note_full_card(self.name)
@@ -185,28 +182,25 @@ class NetworkPredictor:
         near: float | Tensor,
         far: float | Tensor,
         masks: Tensor | None,
-        progress: Progress | None,
         tiles: int,
     ) -> Any:
         """Check and match the views of one item, for a number of tiles along each side."""
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
         _check_inputs(images, cam2world, low, high, masks, self.network.compat)
-        if progress is not None:
-            progress("matching views", 0.0)
+        report_progress("matching views", 0.0)
         weight = next(self.network.parameters())
         images, _ = fit_panoramas(images, None, max(_MULTIPLE, 8 * tiles))
         pose = cam2world.to(device=weight.device, dtype=weight.dtype)
         near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
         return self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views)
 
-    def _lift(self, matched: Any, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
-        report = part_of(progress, _MATCHING_FRACTION)
-        report("making Gaussians", 0.0)
+    def _lift(self, matched: Any, tiles: int) -> Iterator[TileGaussians]:
+        report_progress("making Gaussians", _MATCHING_FRACTION)
         for done, part in enumerate(self.network.lift_gaussians(matched, tiles=tiles), start=1):
             yield part
-            report("making Gaussians", min(1.0, done / tiles**2))
-        report("done", 1.0)
+            report_progress("making Gaussians", _MATCHING_FRACTION + (1 - _MATCHING_FRACTION) * done / tiles**2)
+        report_progress("done", 1.0)
 
 
 def choose_tiles(height: int) -> int:

@@ -50,12 +50,12 @@ from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
 from pansplat.poses.tour import Group, IndexPair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
-from pansplat.predictor import Progress, part_of
 from pansplat.sweep.guided_sweep import list_default_weights
 from pansplat.system.console import with_progress_bar
 from pansplat.system.descriptions import describe_count, describe_range, list_first
 from pansplat.system.devices import choose_device
 from pansplat.system.files import require_file, require_text
+from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_file, hash_parts
 from pansplat.system.threads import one_thread, worker_threads
@@ -256,7 +256,6 @@ def estimate_poses(
     baseline: tuple[Path | str, Path | str, float] | None = None,
     seed: int = 0,
     cache_folder: Path | None = None,
-    progress: Progress | None = None,
 ) -> PoseEstimate:
     """Camera poses of two or more equirectangular panoramas of one home or site.
 
@@ -270,7 +269,6 @@ def estimate_poses(
         seed: of the random samples.
         cache_folder: folder whose cache keeps features and relative poses, so that a further panorama costs its own
             only; none by default.
-        progress: called with a description of the current work and the completed fraction.
 
     Returns:
         The poses of the panoramas that could be placed; those that could not are named with the reason.
@@ -280,7 +278,6 @@ def estimate_poses(
     """
     paths = tuple(dict.fromkeys(Path(image) for image in images))
     names = {path: path.name for path in paths} | dict(names or {})
-    report = part_of(progress)
     if len(paths) < 2:
         raise InputError(f"needed two or more different panoramas to estimate poses, got {len(paths)}; add one.")
     for path in paths:
@@ -305,14 +302,16 @@ def estimate_poses(
         cache = Store(cache_folder, _CACHED)
         count = len(kept)
         split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
-        views = _describe_views(paths, files, pixels, hints, kept, cache, part_of(progress, 0.0, split))
+        with stage(split):
+            views = _describe_views(paths, files, pixels, hints, kept, cache)
         links = links or {}
         yaws = {
             (i, j): LinkDirections(links.get(paths[a], {}).get(paths[b]), links.get(paths[b], {}).get(paths[a]))
             for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
         }
-        relations = _relate_views(views, yaws, seed, cache, part_of(progress, split, 0.9))
-    report("placing the panoramas", 0.9)
+        with stage(0.9):
+            relations = _relate_views(views, yaws, seed, cache)
+    report_progress("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
     tour = build_tour([v.joined for v in views], relations, downs, noise)
@@ -323,7 +322,7 @@ def estimate_poses(
     suggestions = _suggest(views, relations, [paths[n] for n in kept])
     if not tour.groups:
         raise _no_poses(paths, names, unplaced, suggestions)
-    report("finding the floor", 0.95)
+    report_progress("finding the floor", 0.95)
     groups = [
         _finish_group(
             group,
@@ -462,7 +461,6 @@ def _describe_views(
     hints: Sequence[Hints],
     kept: Sequence[int],
     cache: Store,
-    report: Progress,
 ) -> list[_View]:
     headings = {hints[n].heading for n in kept} - {None}
     is_compass = len(headings) > 1  # one value for all pictures is a program's default
@@ -500,7 +498,7 @@ def _describe_views(
     with worker_threads() as pool:
         for position, view in enumerate(pool.map(look_up, kept)):
             views.append(view)
-            report("finding features", (position + 1) / len(kept))
+            report_progress("finding features", (position + 1) / len(kept))
     return views
 
 
@@ -538,7 +536,7 @@ def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: Store)
 
 
 def _relate_views(
-    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], seed: int, cache: Store, report: Progress
+    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], seed: int, cache: Store
 ) -> dict[IndexPair, RelativePose]:
     """Relative poses of the pairs that have most in common, and of those that links connect.
 
@@ -548,7 +546,7 @@ def _relate_views(
     pairs = list(itertools.combinations(range(len(views)), 2))
     overlap: dict[IndexPair, float] = {}
     if len(views) > _ALL_PAIRS_UP_TO:
-        report("comparing all pairs", 0.0)
+        report_progress("comparing all pairs", 0.0)
         with worker_threads() as pool:
             quick = pool.map(lambda pair: _quick_overlap(views[pair[0]].features, views[pair[1]].features), pairs)
             overlap.update(zip(pairs, quick, strict=True))
@@ -595,7 +593,7 @@ def _relate_views(
             batch = [pair for pair in pairs[start : start + size] if is_needed(pair)]
             for number, (pair, relation) in enumerate(zip(batch, pool.map(look_up, batch), strict=True)):
                 relations[pair] = relation
-                report("comparing pairs", (start + number + 1) / len(pairs))
+                report_progress("comparing pairs", (start + number + 1) / len(pairs))
                 if relation.is_certain:
                     i, j = pair
                     groups = [groups[i] if group == groups[j] else group for group in groups]

@@ -32,7 +32,6 @@ from pansplat.poses.pose_file import (
     make_pose_content,
     make_world,
 )
-from pansplat.predictor import Progress
 from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import require_replaceable
@@ -93,7 +92,6 @@ def estimate_panoramas(
     *,
     camera_height: float = CAMERA_HEIGHT,
     baseline: tuple[Path | str, Path | str, float] | None = None,
-    progress: Progress | None = None,
 ) -> PoseEstimate:
     """Poses of panoramas, by all that their folder or tour states of them; every command estimates poses by this.
 
@@ -101,7 +99,7 @@ def estimate_panoramas(
         folder: whose cache keeps features and relative poses.
         panoramas: two or more; masks and links count, and titles are used in messages. A link to a name that several
             have is not used.
-        camera_height, baseline, progress: see `estimate_poses`.
+        camera_height, baseline: see `estimate_poses`.
 
     Raises:
         NoPosesError: no two panoramas could be placed.
@@ -119,7 +117,6 @@ def estimate_panoramas(
         camera_height=camera_height,
         baseline=baseline,
         cache_folder=folder,
-        progress=progress,
     )
 
 
@@ -141,7 +138,6 @@ def estimate_pairs(
     near: float | None = None,
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
-    progress: Progress | None = None,
     on_unposed: Callable[[list[Pair]], None] | None = None,
 ) -> list[Pair]:
     """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
@@ -155,7 +151,6 @@ def estimate_pairs(
         panoramas: two or more, of unique names.
         near, far: metres; they override the estimated range.
         camera_height: of the cameras over the floor, metres.
-        progress: called with a description of the current work and the completed fraction.
         on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
             panorama.
     """
@@ -165,7 +160,7 @@ def estimate_pairs(
         if on_unposed is not None:
             single = single_view_pairs(panoramas, folder, near, far, siblings=panoramas)
             on_unposed(localize_pairs(make_names_unique(single), camera_height))
-        content = _estimate(folder, panoramas, camera_height, progress)
+        content = _estimate(folder, panoramas, camera_height)
         store.write(_KIND, key, content)
     sources = store.find(_KIND, key)
     if not sources:
@@ -174,13 +169,11 @@ def estimate_pairs(
     return localize_pairs(make_names_unique(pairs), camera_height)
 
 
-def _estimate(
-    folder: Path, panoramas: Sequence[Panorama], camera_height: float, progress: Progress | None
-) -> dict[str, Any]:
+def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float) -> dict[str, Any]:
     """What is cached: worlds of placed panoramas, and the reasons for the others, by name."""
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
-        estimate = estimate_panoramas(folder, panoramas, camera_height=camera_height, progress=progress)
+        estimate = estimate_panoramas(folder, panoramas, camera_height=camera_height)
     except NoPosesError as error:
         worlds, summary, unplaced, pairs, suggestions = [], "", error.reasons, [], error.suggestions
     else:

@@ -17,17 +17,16 @@ from pansplat.inputs.folders import require_known_masks
 from pansplat.poses.axes import NO_PRIOR
 from pansplat.poses.features import Features, detect_features, match_features
 from pansplat.poses.two_view import estimate_relative_pose
-from pansplat.predictor import Progress
 from pansplat.system.files import make_portable_name, require_replaceable
+from pansplat.system.progress import report_progress, stage
 
 _CANDIDATES_PER_FRAME = 4  # frames that are decoded for each key frame; the sharpest of them is used
 _SMALL, _FEATURES, _MATCHES = 512, 2000, 300  # to measure parallax: height of the frames, pixels; the best of each
 _MIN_PARALLAX = 0.05  # radians between key frames
 
 
-def extract_key_frames(
-    path: Path, folder: Path, count: int, progress: Progress | None = None, *, overwrite: bool = False
-) -> list[Path]:
+@stage()
+def extract_key_frames(path: Path, folder: Path, count: int, *, overwrite: bool = False) -> list[Path]:
     """Write at most `count` key frames of a video as VIDEO_NUMBER.png, and return them.
 
     The video is divided into intervals of equal length. The sharpest of some frames of each interval is a candidate; it
@@ -48,8 +47,7 @@ def extract_key_frames(
     last: Features | None = None
     groups = np.array_split(numbers, count)
     for position, group in enumerate(groups):
-        if progress is not None:
-            progress("reading the video", position / len(groups))
+        report_progress("reading the video", position / len(groups))
         if not len(group):
             continue
         frames = video.read([int(number) for number in group])

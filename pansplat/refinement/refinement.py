@@ -30,7 +30,6 @@ from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.geometry.pose import nearest_views
 from pansplat.images.masks import mask_holes
 from pansplat.inputs.views import Views
-from pansplat.predictor import Progress, part_of
 from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
@@ -38,6 +37,7 @@ from pansplat.refinement.parameters import CameraParameters, LearningRates, View
 from pansplat.rendering import rasterize
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.rendering.weights import compute_blending_weights
+from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
 
 _HEIGHT = 512  # largest of the images that are compared; colours are fitted at the photographs' own height
@@ -332,12 +332,12 @@ class Refinement:
         logs = self._cameras.log_gains.detach()
         return tuple(tuple(row) for row in (logs - logs.mean(0)).exp().tolist())
 
+    @stage()
     def run(
         self,
         *,
         seconds: float | None = None,
         steps: int | None = None,
-        progress: Progress | None = None,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> RefineReport:
         """Refine for a number of steps, or of seconds.
@@ -350,14 +350,12 @@ class Refinement:
                 of Gaussians, a run has at least 8 steps, and mergers do not count; in joint drawing it has 8 for each
                 photograph.
             steps: number of steps; the result is the same in every run on one machine.
-            progress: called with a description and the completed fraction.
             should_stop: checked before each step; True ends the run early, with the better of both scenes as always.
         """
         min_steps = 0 if self.config.gaussians is None else _MIN_STEPS
         if self._start.joint:
             min_steps = _MIN_STEPS * len(self._photographs)
         clock = _Clock(seconds, steps, self.config.release, self._created, min_steps)
-        report = part_of(progress)
         history: list[tuple[int, float, float]] = []
         if len(self._photographs) == 1:  # one photograph does not show what is wrong seen from elsewhere
             self._result, error = self._start, self.held_out_error()
@@ -375,7 +373,7 @@ class Refinement:
             if should_stop():
                 stopped = "interrupted"
                 break
-            report("refining", _STEPS_SHARE * fraction)
+            report_progress("refining", _STEPS_SHARE * fraction)
             if after is None and fraction >= self.config.release and not self._start.joint:
                 after = measure()
             if after is not None and after > before:
@@ -394,7 +392,7 @@ class Refinement:
                 stopped, after = "converged", error
                 clock.shorten()
         after = measure() if after is None else after
-        report("fitting colours", _STEPS_SHARE)
+        report_progress("fitting colours", _STEPS_SHARE)
         self._result = self.scene() if after <= before else self._start
         self._release_parameters()
         if after <= before:
@@ -404,7 +402,7 @@ class Refinement:
             stopped = "worse"
         if after <= before or self._start.joint:  # a fused scene has the colours of single photographs
             self._result = self._finish(self._result)
-        report("refined", 1.0)
+        report_progress("refined", 1.0)
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
 
     def _release_parameters(self) -> None:

@@ -16,12 +16,13 @@ from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_working_world
 from pansplat.images.masks import mask_holes
 from pansplat.inputs.pairs import MAX_CONTEXT
-from pansplat.predictor import Progress, part_of, require_matching_inputs, select_item
+from pansplat.predictor import require_matching_inputs, select_item
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import PosedImages
+from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
 
 _MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
@@ -66,7 +67,6 @@ class Sweep:
         far: float | Tensor,
         *,
         masks: Bool[Tensor, "*batch view height width"] | None = None,
-        progress: Progress | None = None,
     ) -> Gaussians | list[Gaussians]:
         """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis.
 
@@ -80,8 +80,8 @@ class Sweep:
             bounds = [[select_item(bound, n) for n in range(len(images))] for bound in (near, far)]
             item_masks = [None] * len(images) if masks is None else masks
             items = zip(images, cam2world, *bounds, item_masks, strict=True)
-            return [self._predict(*item, progress) for item in items]
-        return self._predict(images, cam2world, near, far, masks, progress)
+            return [self._predict(*item) for item in items]
+        return self._predict(images, cam2world, near, far, masks)
 
     def _predict(
         self,
@@ -90,7 +90,6 @@ class Sweep:
         near: float | Tensor,
         far: float | Tensor,
         masks: Tensor | None,
-        progress: Progress | None,
     ) -> Gaussians:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
         _check_inputs(images, cam2world, low, high, masks)
@@ -107,20 +106,20 @@ class Sweep:
             near=low,
             far=high,
         )
-        report, config = part_of(progress), self.config
-        searching = part_of(progress, 0, 0.57)  # of the time, as are all fractions here (the sample on two cores)
-        # Axes of the scene, planes, and of each view its neighbours and the depth that the prior model expects.
-        scene = observe(posed, config.search, self.prior, searching)
-        # Inverse depth (h, 2h) of each view, at most `SearchConfig.finest_height` high.
-        surfaces = search(scene, searching)
-        report("placing Gaussians", 0.57)
+        config = self.config
+        with stage(0.57):  # of the time, as are all fractions here (the sample on two cores)
+            # Axes of the scene, planes, and of each view its neighbours and the depth that the prior model expects.
+            scene = observe(posed, config.search, self.prior)
+            # Inverse depth (h, 2h) of each view, at most `SearchConfig.finest_height` high.
+            surfaces = search(scene)
+        report_progress("placing Gaussians", 0.57)
         # A Gaussian for each point of the lattices (n); the photograph's height gives their spacing.
         gaussians = lift(posed, surfaces, config.lift, scene.neighbours)
-        report("fitting colours", 0.76)
+        report_progress("fitting colours", 0.76)
         # Colours (n, 1, 3) with which the Gaussians of each view draw its photograph.
         poses = torch.from_numpy(posed.cam2world)
         gaussians = fit_colors(gaussians, images.detach().cpu(), poses, fitted, config.colors)
-        report("done", 1.0)
+        report_progress("done", 1.0)
         return gaussians.to(device=images.device)
 
 

@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 
 from pansplat.inputs.views import ONE_POSITION
-from pansplat.predictor import Progress, part_of
 from pansplat.sweep.axes import (
     axis_components,
     estimate_axes,
@@ -50,6 +49,7 @@ from pansplat.sweep.surface import (
     resize_sharp,
     resize_sphere,
 )
+from pansplat.system.progress import report_progress
 
 _HEIGHTS_SIZE = 96  # pixels; heights of the cameras over the floor are compared at this size
 
@@ -109,11 +109,9 @@ def observe(
     posed: PosedImages,
     config: SearchConfig,
     prior_model: PriorModel | None = None,
-    progress: Progress | None = None,
 ) -> ObservedScene:
     """The depth range, neighbours, axes and priors of panoramas (v, h, 2h, 3)."""
-    report = part_of(progress)
-    report("finding the scene's axes", 0.0)
+    report_progress("finding the scene's axes", 0.0)
     height = min(posed.images.shape[1], config.finest_height)
     small = [resize_sphere(image, max(height // 2, 32)) for image in posed.images]
     axes = estimate_axes(small, posed.cam2world[:, :3, :3])
@@ -121,7 +119,7 @@ def observe(
     depths = DepthRange(low / config.far_margin, low, high)
     estimator = None
     if prior_model is not None:
-        report("estimating depth", 0.02)
+        report_progress("estimating depth", 0.02)
         estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
     neighbours = choose_nearest(posed.cam2world, config.max_neighbours, 1 / high)
     if posed.measure_baseline(range(len(posed.images))) < ONE_POSITION * posed.near:
@@ -135,7 +133,7 @@ def observe(
         turned = estimate_axes([small[n] for n in pair], posed.cam2world[list(pair), :3, :3])
         by_pair[pair] = turned[match_axes(turned, axes)]
     own_axes = [by_pair.get(pair, axes) for pair in pairs]
-    report("finding the cameras' heights", 0.15)
+    report_progress("finding the cameras' heights", 0.15)
     priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
         views = _make_views(posed, min(height, _HEIGHTS_SIZE))
@@ -143,9 +141,9 @@ def observe(
     return ObservedScene(posed, config, depths, neighbours, own_axes, priors, estimator)
 
 
-def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surface]:
+def search(scene: ObservedScene) -> list[Surface]:
     """The surface (h, 2h) of each view at the height of the finest level."""
-    surfaces = _search(scene, part_of(progress))
+    surfaces = _search(scene)
     straight = []
     for surface, axes, image, pose in zip(surfaces, scene.axes, scene.posed.images, scene.posed.cam2world, strict=True):
         small, down = resize_sphere(image, surface.height), pose[:3, :3].T @ axes[0]
@@ -154,7 +152,7 @@ def search(scene: ObservedScene, progress: Progress | None = None) -> list[Surfa
     return straight
 
 
-def _search(scene: ObservedScene, report: Progress) -> list[Surface]:
+def _search(scene: ObservedScene) -> list[Surface]:
     config, posed, depths = scene.config, scene.posed, scene.depths
     neighbours, estimator = scene.neighbours, scene.estimator
     finest = min(posed.images.shape[1], config.finest_height)
@@ -162,11 +160,11 @@ def _search(scene: ObservedScene, report: Progress) -> list[Surface]:
         return _place_unmatched(scene, finest)
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     if config.near_single_views:
-        return _search_near_single_views(scene, heights, report)
+        return _search_near_single_views(scene, heights)
     pixel = math.pi / heights[0] / (depths.high - depths.low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
     counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]
-    report("searching the whole depth range", 0.25)
+    report_progress("searching the whole depth range", 0.25)
     level = _SearchLevel(scene, heights[0])
     surfaces = [
         level.search_full_range(view, depths.sample(count), priors)
@@ -177,7 +175,7 @@ def _search(scene: ObservedScene, report: Progress) -> list[Surface]:
         sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen((depths.low, depths.high))]
         finest_posed = posed.resize(finest)
     for n, height in enumerate(heights[1:]):
-        report("refining the surfaces", 0.55 + 0.1 * n)
+        report_progress("refining the surfaces", 0.55 + 0.1 * n)
         surfaces = [
             guided_upsample(surface, resize_sphere(image, surface.height), resize_sphere(image, height))
             for surface, image in zip(surfaces, posed.images, strict=True)
@@ -192,7 +190,7 @@ def _search(scene: ObservedScene, report: Progress) -> list[Surface]:
     return surfaces if sharp is None else bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
 
 
-def _search_near_single_views(scene: ObservedScene, heights: Sequence[int], report: Progress) -> list[Surface]:
+def _search_near_single_views(scene: ObservedScene, heights: Sequence[int]) -> list[Surface]:
     """The surfaces of single views, bent at each level by a search near them."""
     config, posed = scene.config, scene.posed
     assert scene.estimator is not None
@@ -203,7 +201,7 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int], repo
         scale = np.median(prior.log_depth - resize_sphere(sharp, len(prior.log_depth)))
         log_depths.append((sharp + scale).astype(np.float32))
     for n, height in enumerate(heights):
-        report("searching near the estimated depth", 0.25 + 0.15 * n)
+        report_progress("searching near the estimated depth", 0.25 + 0.15 * n)
         small = [resize_sharp(log_depth, height) for log_depth in log_depths]
         level = _SearchLevel(scene, height, [Surface(np.exp(-log_depth)) for log_depth in small])
         found = [level.refine_near(view, n) for view in range(len(small))]

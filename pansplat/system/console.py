@@ -19,9 +19,10 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, ParamSpec, TextIO, TypeVar
+from typing import TYPE_CHECKING, ParamSpec, TextIO, TypeVar
 
 from pansplat.errors import InputError, InputWarning
+from pansplat.system.progress import is_progress_shown, show_progress, stage
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -256,19 +257,24 @@ def is_notebook() -> bool:
 
 
 @contextlib.contextmanager
-def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """A function that shows the current step and the fraction done, with the time left.
+def progress_bar() -> Iterator[None]:
+    """Show the progress of the block: the current step, the fraction done and the time left.
 
     A temporary bar on standard error shows them, or below the cell of a notebook. If standard error is not a terminal,
-    a line is printed each half minute.
+    a line is printed each half minute. In a block whose progress is shown, the block is a stage of it.
     """
+    if is_progress_shown():
+        with stage():
+            yield
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
     from rich.text import Text
 
     in_notebook, console = is_notebook(), Console(stderr=True)
     if not console.is_terminal and not in_notebook:
-        yield _print_progress()
+        with show_progress(_print_progress()):
+            yield
         return
     columns = TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
     time_left = _TimeLeft()
@@ -284,13 +290,14 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
     with _draw_in_notebook(bar) if in_notebook else bar as redraw:
         task = bar.add_task("", total=1.0)
 
-        def report(stage: str, fraction: float) -> None:
+        def show(step: str, fraction: float) -> None:
             time_left.report(fraction)
-            bar.update(task, description=stage, completed=fraction)
+            bar.update(task, description=step, completed=fraction)
             if callable(redraw):  # in a notebook
                 redraw()
 
-        yield report
+        with show_progress(show):
+            yield
 
 
 class _TimeLeft:
@@ -329,7 +336,7 @@ def _print_progress() -> Callable[[str, float], None]:
     """A function that prints the progress on standard error, a line each half minute."""
     printed, time_left = time.monotonic(), _TimeLeft()
 
-    def report(stage: str, fraction: float) -> None:
+    def show(step: str, fraction: float) -> None:
         nonlocal printed
         now = time.monotonic()
         time_left.report(fraction)
@@ -337,9 +344,9 @@ def _print_progress() -> Callable[[str, float], None]:
             return
         printed = now
         rest = time_left.describe()
-        print_message("progress", f"{stage or 'working'}, {100 * fraction:.0f} %{rest and f', {rest}'}")
+        print_message("progress", f"{step or 'working'}, {100 * fraction:.0f} %{rest and f', {rest}'}")
 
-    return report
+    return show
 
 
 @contextlib.contextmanager
@@ -363,27 +370,13 @@ def _draw_in_notebook(bar: Progress) -> Iterator[Callable[[], None]]:
             output.update(HTML(""))
 
 
-_has_bar = False  # whether a call that shows a bar in a notebook is running
-
-
 def with_progress_bar(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """The function, which shows a progress bar in a notebook unless its keyword `progress` is given.
-
-    Calls of such functions inside of the function show no bar of their own.
-    """
+    """The function as a stage of the work around it; in a notebook it shows a bar, unless its progress is shown."""
 
     @functools.wraps(function)
     def call(*args: _P.args, **options: _P.kwargs) -> _T:
-        global _has_bar
-        if options.get("progress") is not None or _has_bar or not is_notebook():
+        with progress_bar() if is_notebook() else stage():
             return function(*args, **options)
-        _has_bar = True
-        try:
-            with progress_bar() as progress:
-                accepting_progress: Callable[..., Any] = function
-                return accepting_progress(*args, **{**options, "progress": progress})
-        finally:
-            _has_bar = False
 
     return call
 

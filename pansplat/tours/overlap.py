@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from pansplat.geometry.equirect import pad_equirect, row_weights
 from pansplat.geometry.warp import relative_pose, warp_panorama
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.content import hash_image
+from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 from pansplat.tours.graph import Edge, TourGraph
@@ -27,13 +28,13 @@ _MAX_BASELINE = 0.4  # of an edge that is not given, as a fraction of far
 _MAX_NEIGHBOURS = 6  # nearest panoramas that are compared
 
 
-def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = None) -> TourGraph:
+@stage()
+def connect(tour: TourGraph) -> TourGraph:
     """The tour with measured overlaps, and with edges between further panoramas that overlap.
 
     Each panorama is compared with its nearest neighbours within 0.4 far, of those with poses in the same world. Given
     edges are walls if their panoramas show nothing in common.
     """
-    report = progress or (lambda what, done: None)
     world = np.array([panorama.world for panorama in tour.panoramas])
     distances = np.linalg.norm(tour.positions[:, None] - tour.positions[None], axis=2)
     distances[world[:, None] != world] = np.inf
@@ -48,7 +49,7 @@ def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = Non
         json.dumps([edges, tour.near, tour.far, [(node, hash_image(images[node])) for node in sorted(images)]]),
         tour.cam2world[sorted(images)].numpy(),
     )
-    measured = Store(tour.folder).get("overlaps", key, lambda: _measure_overlaps(tour, edges, report))
+    measured = Store(tour.folder).get("overlaps", key, lambda: _measure_overlaps(tour, edges))
     overlaps, walls = {}, []
     for edge, overlap in zip(edges, measured, strict=True):
         if overlap >= (_MIN_GIVEN_OVERLAP if edge in tour.overlaps else _MIN_OVERLAP):
@@ -60,14 +61,14 @@ def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = Non
     return dataclasses.replace(tour, overlaps=overlaps).with_walls(walls)
 
 
-def _measure_overlaps(tour: TourGraph, edges: Sequence[Edge], report: Callable[[str, float], None]) -> list[float]:
+def _measure_overlaps(tour: TourGraph, edges: Sequence[Edge]) -> list[float]:
     """The overlap of each pair of panoramas."""
     features, overlaps = {}, []
     for node in sorted({node for edge in edges for node in edge}):
-        report("comparing panoramas", 0.5 * node / len(tour))
+        report_progress("comparing panoramas", 0.5 * node / len(tour))
         features[node] = _compute_features(read_panorama(tour.panoramas[node].image, _HEIGHT)[0])
     for index, (a, b) in enumerate(edges):
-        report("comparing panoramas", 0.5 + 0.5 * index / len(edges))
+        report_progress("comparing panoramas", 0.5 + 0.5 * index / len(edges))
         overlaps.append(_measure_overlap(features[a], features[b], tour.cam2world[[a, b]], tour.near, tour.far))
     return overlaps
 

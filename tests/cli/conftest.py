@@ -11,6 +11,7 @@ from torch import Tensor
 from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.system.progress import report_progress
 
 HEIGHT = 64
 
@@ -20,9 +21,8 @@ class Sphere:
 
     name, fingerprint = "sphere", "1"
 
-    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
-        if progress is not None:
-            progress("predicting", 0.5)
+    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None):
+        report_progress("predicting", 0.5)
         images = images[..., :: images.shape[-2] // 16, :: images.shape[-2] // 16]
         view, _, height, width = images.shape
         directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)

@@ -75,7 +75,7 @@ def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room) ->
     assert (tmp_path / "results" / "results.json").exists()
     options = LoadOptions(prediction=PredictOptions(str(weights), "fixed", height=64, refine_seconds=0))
     (entry,) = (entry for entry in find_entries(room, options) if entry.pair is not None)
-    viewed = load_entry(entry, options, lambda what, done: None).scene
+    viewed = load_entry(entry, options).scene
     assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)
 
 

@@ -19,6 +19,7 @@ from pansplat.cli import run
 from pansplat.export import page as page_module
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.world import WorldFrame
+from pansplat.system.progress import show_progress
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
 
@@ -295,3 +296,13 @@ def test_floaters_are_left_out_and_counted(scene: Path, tmp_path: Path, capsys: 
     assert run(["export", str(tmp_path / "dirty.ply"), "-o", str(out), "--layers", "--remove-floaters"]) == 0
     assert "floaters: 1 of 1,025 Gaussians left out; the pictures at the 2 cameras" in capsys.readouterr().out
     assert torch.equal(pipeline.load(out).gaussians.means, clean.gaussians.means)
+
+
+def test_the_steps_of_a_command_are_stages_of_one_progress(room: Path, tmp_path: Path) -> None:
+    calls: list[tuple[str, float]] = []
+    arguments = ["--model", "sphere", "--predict-height", "64", "--refine", "1", "-o", str(tmp_path / "page.html")]
+    with show_progress(lambda *call: calls.append(call)):
+        assert run(["export", str(room), *arguments]) == 0
+    steps = dict(reversed(calls))  # when each begins
+    order = [steps[name] for name in ("predicting", "refining", "checking the scene", "compressing", "writing")]
+    assert order == sorted(set(order)) and order[-1] < 1, "each begins after the one before"

@@ -16,6 +16,7 @@ from pansplat.images.image_files import write_image
 from pansplat.images.video import write_video
 from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
+from pansplat.system.progress import is_progress_shown
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
@@ -187,7 +188,7 @@ CALLERS = {
 def test_all_commands_estimate_poses_from_the_same_arguments(linked: Path, tmp_path: Path, estimator) -> None:
     calls: list[tuple[list[Path], dict]] = []
 
-    def record(images, *, progress, **options) -> PoseEstimate:
+    def record(images, **options) -> PoseEstimate:
         calls.append((list(images), options))
         raise NoPosesError(dict.fromkeys(images, "no door"))
 
@@ -204,6 +205,20 @@ def test_all_commands_estimate_poses_from_the_same_arguments(linked: Path, tmp_p
         assert len(calls) == number and calls[-1] == calls[0], name
     images, options = calls[0]
     assert len(images) == 3 and options["links"][images[0]] == {images[1]: pytest.approx(1.5, abs=0.1)}
+
+
+@pytest.mark.parametrize("command", ["predict", "render", "export", "refine"])
+def test_commands_show_the_estimate_of_poses(command: str, folder: Path, tmp_path: Path, estimator) -> None:
+    shown = []
+
+    def record(images, **options) -> PoseEstimate:
+        shown.append(is_progress_shown())
+        raise NoPosesError(dict.fromkeys(images, "no door"))
+
+    estimator(record)
+    out = tmp_path / ("view.png" if command == "render" else "view.ply")
+    run([command, str(folder), "--model", "sphere", "-o", str(out)])
+    assert shown == [True]
 
 
 def test_the_written_poses_are_those_that_other_commands_use(linked: Path, estimator) -> None:

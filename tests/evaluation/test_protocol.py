@@ -47,10 +47,10 @@ class Network(NetworkPredictor):
     def __init__(self, sphere) -> None:
         self.sphere = sphere
 
-    def __call__(self, images, cam2world, near, far, *, masks=None, progress=None):
+    def __call__(self, images, cam2world, near, far, *, masks=None):
         return self.sphere(images, cam2world, near, far)
 
-    def predict_with_depths(self, images, cam2world, near, far, *, masks=None, progress=None):
+    def predict_with_depths(self, images, cam2world, near, far, *, masks=None):
         depths = [torch.full((len(images), rows, 2 * rows), metres) for rows, metres in ((4, 9.0), (8, RADIUS))]
         return self(images, cam2world, near, far), depths
 

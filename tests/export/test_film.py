@@ -17,6 +17,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.rendering.image_planes import image_planes
+from pansplat.system.progress import show_progress
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.route import STOP_SECONDS
 
@@ -161,8 +162,8 @@ def test_a_film_that_fails_leaves_no_file(scene: Scene, tmp_path: Path) -> None:
         if done > 0.5:
             raise RuntimeError("stopped")
 
-    with pytest.raises(RuntimeError, match="stopped"):
-        write_film(tmp_path / "film.mp4", make_film(scene), follow_path(PATH, 8.0, scene, None), 8.0, progress=fail)
+    with pytest.raises(RuntimeError, match="stopped"), show_progress(fail):
+        write_film(tmp_path / "film.mp4", make_film(scene), follow_path(PATH, 8.0, scene, None), 8.0)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -578,7 +578,7 @@ def test_scenes_training_sets_and_caches_depend_on_what_masks_leave(
         new = tmp_path / f"new{person}"
         new.mkdir()
         nothing = np.zeros((1, 3))
-        write_dataset(new, pair.context, pair.siblings, nothing, nothing.astype(np.uint8), lambda what, done: None)
+        write_dataset(new, pair.context, pair.siblings, nothing, nothing.astype(np.uint8))
         sets.append({file.name: file.read_bytes() for file in new.rglob("*.*")})
     plain, first, _, second = scenes
     assert torch.equal(first.harmonics, second.harmonics) and torch.equal(first.means, second.means)

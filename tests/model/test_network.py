@@ -32,6 +32,7 @@ from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import WeightsFile, pack_weights, save_weights
 from pansplat.pipeline import load_model
 from pansplat.sweep.guided_sweep import default_weights
+from pansplat.system.progress import show_progress
 
 SMALL_MVSPLAT = MVSplatConfig(channels=16, candidates=8, width=32, transformer=TransformerConfig(channels=16, blocks=2))
 _PER_VIEW = sum(lattice_size(128 >> level) for level in range(4))
@@ -96,7 +97,8 @@ def test_a_stream_yields_the_same_gaussians_tile_by_tile_and_its_progress(small_
     masks[0, :20] = False
     untiled = predictor(images, poses, 0.5, 20.0, masks=masks)
     reports: list[tuple[str, float]] = []
-    parts = list(predictor.stream(images, poses, 0.5, 20.0, masks=masks, progress=lambda *r: reports.append(r)))
+    with show_progress(lambda *report: reports.append(report)):
+        parts = list(predictor.stream(images, poses, 0.5, 20.0, masks=masks))
     assert len(parts) == 4 and all(len(part) > 0 for part in parts)
     fractions = [fraction for _, fraction in reports]
     assert fractions == sorted(fractions) and fractions[0] == 0 and reports[-1] == ("done", 1.0)

@@ -226,13 +226,13 @@ def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatc
     monkeypatch.setattr("pansplat.poses.estimate.match_features", lambda *_: MagicMock())
     monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_: MagicMock())
     links = {pair: NO_LINKS for pair in itertools.combinations(range(11), 2)}
-    relations = _relate_views(views, links, 0, Store(None), lambda *_: None)
+    relations = _relate_views(views, links, 0, Store(None))
     home = {pair for pair in relations if pair[1] < 8}
     assert (0, 7) not in home and 12 <= len(home) < 23, "of 28"
     assert all(sum(n in pair for pair in home) >= 4 for n in range(8))
     assert len([pair for pair in relations if pair[0] > 7]) == 3, "nothing is left out without certain pairs"
     linked = links | {(0, 7): LinkDirections(back=0.5)}
-    assert (0, 7) in _relate_views(views, linked, 0, Store(None), lambda *_: None)
+    assert (0, 7) in _relate_views(views, linked, 0, Store(None))
 
 
 def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> None:

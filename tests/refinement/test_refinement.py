@@ -15,6 +15,7 @@ from pansplat.geometry.pose import invert_pose
 from pansplat.refinement import RefineConfig, Refinement, fuse_views, refinement_fingerprint
 from pansplat.refinement.budget import merge_to
 from pansplat.rendering import rasterize
+from pansplat.system.progress import show_progress
 
 
 def _refine(room, steps: int, views=None, scene=None, **config):
@@ -132,9 +133,8 @@ def test_a_run_can_be_stopped_at_any_step_and_keeps_its_state(room) -> None:
 @pytest.mark.usefixtures("refinement_clock")
 def test_a_time_limit_ends_the_run_and_progress_grows(room) -> None:
     fractions: list[float] = []
-    report = Refinement(room.predicted, room.views).run(
-        seconds=1.0, progress=lambda what, fraction: fractions.append(fraction)
-    )
+    with show_progress(lambda what, fraction: fractions.append(fraction)):
+        report = Refinement(room.predicted, room.views).run(seconds=1.0)
     assert report.steps > 5 and 0.8 < report.seconds < 1.3
     assert fractions == sorted(fractions) and fractions[-1] == 1
 

@@ -17,6 +17,7 @@ from pansplat.inputs.pairs import Pair
 from pansplat.sweep import Sweep, SweepConfig
 from pansplat.sweep.lift import LiftConfig
 from pansplat.sweep.search import SearchConfig
+from pansplat.system.progress import show_progress
 
 
 def _tensors(observed) -> tuple[Tensor, Tensor]:
@@ -88,7 +89,8 @@ def test_full_masks_ranges_by_view_other_types_and_progress_change_no_bit(small,
     reports: list[tuple[str, float]] = []
     images, masks = small[0].double().requires_grad_(), torch.ones(2, 64, 128, dtype=torch.bool)
     near, far = torch.tensor((0.5, 0.7)), torch.tensor((5.0, 8.0))  # the range covers both views
-    again = Sweep()(images, small[1], near, far, masks=masks, progress=lambda *report: reports.append(report))
+    with show_progress(lambda *report: reports.append(report)):
+        again = Sweep()(images, small[1], near, far, masks=masks)
     assert _same(again, predicted)
     assert again.means.dtype == torch.float32 and not again.means.requires_grad
     fractions = [fraction for _, fraction in reports]

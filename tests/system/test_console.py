@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from pansplat.predictor import part_of
 from pansplat.system import console
+from pansplat.system.progress import report_progress
 
 
 class Terminal(io.StringIO):
@@ -25,10 +25,10 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 def test_without_a_terminal_a_line_with_the_time_left_is_printed_each_half_minute(clock, capsys) -> None:
-    with console.progress_bar() as progress:
+    with console.progress_bar():
         for seconds in range(0, 91, 5):
             clock.now = float(seconds)
-            progress("film", seconds / 120)
+            report_progress("film", seconds / 120)
     assert capsys.readouterr().err.splitlines() == [
         "progress: film, 25 %, about 90 s left",
         "progress: film, 50 %, about 60 s left",
@@ -55,9 +55,9 @@ def test_the_stated_end_of_work_of_unequal_speed_does_not_recede(clock, speeds, 
 
 
 def test_work_that_has_not_begun_has_no_time_left(clock, capsys) -> None:
-    with console.progress_bar() as progress:
+    with console.progress_bar():
         clock.now = 40.0
-        progress("", 0.0)
+        report_progress("", 0.0)
     assert capsys.readouterr().err == "progress: working, 0 %\n"
 
 
@@ -70,17 +70,9 @@ def test_a_terminal_shows_a_bar_and_standard_output_stays_complete(
     monkeypatch.setattr(sys, "stderr", err)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "100")
-    with console.progress_bar() as progress:
-        progress("placing Gaussians", 0.5)
+    with console.progress_bar():
+        report_progress("placing Gaussians", 0.5)
         print("a result")
     assert "a result" in (out if is_file else err).getvalue()
     text = re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]", "", err.getvalue())
     assert "placing Gaussians" in text and "50 %" in text
-
-
-def test_parts_of_parts_are_between_their_fractions_of_the_whole() -> None:
-    calls: list[tuple[str, float]] = []
-    second = part_of(lambda *call: calls.append(call), 0.5, name="room: ")
-    part_of(second, 0.2, 0.4)("searching", 0.5)
-    part_of(None)("searching", 1.0)
-    assert calls == [("room: searching", pytest.approx(0.65))]

@@ -30,13 +30,13 @@ from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
 from pansplat.rendering.cpu.display import DisplayScene
+from pansplat.system.progress import report_progress
 from pansplat.tours.graph import find_tours
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.scene.loader import (
     LoadedScene,
-    Progress,
     SceneEntry,
     SceneLoader,
 )
@@ -90,7 +90,7 @@ class User:
     def __init__(self, viewer: Viewer, target: moderngl.Framebuffer, clock: list[float], load: Callable) -> None:
         self.viewer, self.target, self.clock = viewer, target, clock
         self.load = self.first_load = load
-        self.find = lambda path, progress, show: [SceneEntry("opened")]
+        self.find = lambda path, show: [SceneEntry("opened")]
         self.state, self.panels = viewer.state, viewer.panels
 
     def draw_frames(self, count: int, seconds: float = 1 / 30) -> None:
@@ -213,7 +213,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(scope="module")
 def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp_path_factory) -> Iterator[User]:
-    def load(entry, progress, show):
+    def load(entry, show):
         if entry.tour is not None:
             return load_house(entry)
         if entry.name == "sphere":
@@ -242,7 +242,7 @@ def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp
 @pytest.fixture
 def user(session, ctx) -> User:
     """The session with scene, state and camera as at the start."""
-    session.load, session.find = session.first_load, lambda path, progress, show: [SceneEntry("opened")]
+    session.load, session.find = session.first_load, lambda path, show: [SceneEntry("opened")]
     if session.viewer.library.names != NAMES or session.viewer.library.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
@@ -395,18 +395,18 @@ def refine(prediction: Scene, refined: Scene) -> tuple[threading.Event, Callable
     """A load that shows a prediction, and its refined scene after the event."""
     go = threading.Event()
 
-    def load(entry, progress, show):
+    def load(entry, show):
         show(LoadedScene(entry, prediction, is_final=False))
         while not go.wait(0.005):
-            progress("refining", 0.75)
+            report_progress("refining", 0.75)
         return LoadedScene(entry, refined)
 
     return go, load
 
 
-def predict_forever(entry, progress, show):
+def predict_forever(entry, show):
     while True:
-        progress("estimating poses", 0.3)
+        report_progress("estimating poses", 0.3)
         time.sleep(0.002)
 
 
@@ -446,7 +446,7 @@ def test_each_state_of_a_scene_has_its_button(user, small_scene, monkeypatch, st
             return DisplayScene(means, *arguments)
 
         monkeypatch.setattr("pansplat_viewer.draw.cpu_renderer.DisplayScene", refuse_rows)
-        user.load = lambda entry, progress, show: LoadedScene(entry, twice)
+        user.load = lambda entry, show: LoadedScene(entry, twice)
         user.show(SceneEntry("large"))
         user.click("Reduce")
         after = user.read_image()
@@ -479,7 +479,7 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
 def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
     opened = []
 
-    def find(path: Path, progress: Progress, show: object) -> list[SceneEntry]:
+    def find(path: Path, show: object) -> list[SceneEntry]:
         opened.append(path.name)
         return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
 
@@ -672,7 +672,7 @@ def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair,
     before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
     monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(300) and draw(*arguments))
     other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
-    user.load = lambda entry, progress, show: LoadedScene(entry, other)
+    user.load = lambda entry, show: LoadedScene(entry, other)
     user.viewer.show([SceneEntry("large", pair=pair)], 0)
     user.draw_until(
         lambda: user.viewer.stage.slot.scene is other and user.viewer.stage.comparer.photographs._textures, "photograph"
@@ -858,7 +858,7 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
     content = {"convention": "cam2world opencv", "worlds": [{"unit": 1.0}], "poses": poses, "estimate": estimate}
     (tmp_path / "poses.json").write_text(json.dumps(content))
 
-    def find(path: Path, progress: Progress, show: object) -> list[SceneEntry]:
+    def find(path: Path, show: object) -> list[SceneEntry]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_pairs(path))]

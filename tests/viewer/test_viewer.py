@@ -21,6 +21,7 @@ from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.system.progress import report_progress
 from pansplat.tours.camera_path import CameraPath
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, load_entry
@@ -86,7 +87,7 @@ class App:
 
     def __init__(self, load: Callable[..., LoadedScene], folder: Path, **options: Any) -> None:
         self.load, self.now, self.events = load, 0.0, Input()
-        self.find: Callable[..., list[SceneEntry]] = lambda path, progress, show: [SceneEntry("opened")]
+        self.find: Callable[..., list[SceneEntry]] = lambda path, show: [SceneEntry("opened")]
         loader = SceneLoader(lambda *arguments: self.load(*arguments))
         self.viewer = Viewer(
             MagicMock(), loader, find=lambda *arguments: self.find(*arguments), folder=folder, clock=lambda: self.now,
@@ -145,7 +146,7 @@ def make_app(small_scene, load_house, tmp_path, monkeypatch) -> Iterator[Callabl
     """Makes a viewer whose window has `SIZE`; everything of OpenGL and of imgui's panels is replaced."""
     apps: list[App] = []
 
-    def load(entry: SceneEntry, progress: object, show: object) -> LoadedScene:
+    def load(entry: SceneEntry, show: object) -> LoadedScene:
         if entry.name == "damaged":
             raise InputError("damaged.ply: 100% unreadable; export it again")
         return load_house(entry) if entry.tour is not None else LoadedScene(entry, small_scene)
@@ -184,11 +185,11 @@ class Gate:
         self.load, self.progress, self.event, self.entered = load, progress, threading.Event(), threading.Event()
         self.ended = 0
 
-    def __call__(self, entry: SceneEntry, progress: Callable[..., None], show: object) -> LoadedScene:
+    def __call__(self, entry: SceneEntry, show: object) -> LoadedScene:
         try:
             self.entered.set()
             while not self.event.wait(0.003):
-                progress(*self.progress)
+                report_progress(*self.progress)
             return self.load(entry)
         finally:
             self.ended += 1
@@ -296,7 +297,7 @@ def test_each_key_has_one_action():
 
 
 def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
-    def find(path: Path, progress: object, show: object) -> list[SceneEntry]:
+    def find(path: Path, show: object) -> list[SceneEntry]:
         raise InputError(f"{path}: no such file or folder")
 
     app.find = find
@@ -315,9 +316,9 @@ def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
 def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_house, house):
     gate = Gate(lambda _: [SceneEntry("placed", tour=house)], "pairs of panoramas", 0.3)
 
-    def find(path: Path, progress: Callable[..., None], show: Callable[..., None]) -> object:
+    def find(path: Path, show: Callable[..., None]) -> object:
         show([SceneEntry("unplaced", tour=parted_house)])
-        return gate(path, progress, None)
+        return gate(path, None)
 
     app = make_app()
     app.find = find
@@ -340,7 +341,7 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
 
 def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
     gate = Gate(lambda entry: LoadedScene(entry, small_scene), "estimating poses", 0.3)
-    app.find = lambda path, progress, show: gate(path, progress, None)
+    app.find = lambda path, show: gate(path, None)
     app.viewer.open(Path("unposed"))
     app.until(lambda: app.viewer.scenes.loading == ("unposed", "estimating poses", 0.3), "search")
     app.viewer.scenes.cancel_loading()
@@ -357,9 +358,9 @@ def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
 def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(app, small_scene):
     go, refined = threading.Event(), replace(small_scene, near=0.5)
 
-    def load(entry: SceneEntry, progress: Callable[..., None], show: Callable[..., None]) -> LoadedScene:
+    def load(entry: SceneEntry, show: Callable[..., None]) -> LoadedScene:
         show(LoadedScene(entry, small_scene, is_final=False))
-        progress("refining", 0.75)
+        report_progress("refining", 0.75)
         assert go.wait(300)
         return LoadedScene(entry, refined)
 
@@ -457,7 +458,7 @@ def test_a_folder_that_changes_is_announced_and_searched_again(app, pair, tmp_pa
     image.write_bytes(pair.context[0].image.read_bytes())
     pair = replace(pair, folder=folder, context=(replace(pair.context[0], image=image), *pair.context[1:]))
 
-    def find(path: Path, progress: object, show: object) -> list[SceneEntry]:
+    def find(path: Path, show: object) -> list[SceneEntry]:
         found.append(path)
         return [SceneEntry(name, pair=pair) for name in ("new", "pair 1", "pair 2")[len(found) == 1 :]]
 
@@ -568,7 +569,7 @@ def click_on(app: App, node: int) -> None:
 def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(make_app, house, load_house, found):
     app, go = make_app(), threading.Event()
 
-    def load(entry: SceneEntry, progress: object, show: Callable[..., None]) -> LoadedScene:
+    def load(entry: SceneEntry, show: Callable[..., None]) -> LoadedScene:
         if not entry.views:
             return load_house(replace(entry, views=(0, 1), pair=house.make_pair((0, 1)), max_views=64))
         facts = {"outlines": {}, "views": (), "outlooks": (), "clearances": (), "walls": [], "poor": ()} | found

@@ -97,7 +97,7 @@ def psnr(a: Float[np.ndarray, "..."], b: Float[np.ndarray, "..."]) -> float:
 
 def pack(scene: Scene, photographs: list[Pair], **options: Any) -> list[PackedPhotograph]:
     arguments = {"num_bytes": math.inf, "height": None} | options
-    return pack_photographs(scene, photographs, progress=lambda what, fraction: None, **arguments)
+    return pack_photographs(scene, photographs, **arguments)
 
 
 def test_the_poster_shows_the_photograph_where_the_page_begins(

@@ -7,6 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Generic, TypeVar
 
+from pansplat.system.progress import show_progress
+
 Result = TypeVar("Result")
 Report = Callable[..., None]  # description of the work, fraction done
 
@@ -25,7 +27,11 @@ class _Task(Generic[Result]):
 
     def __init__(self, executor: ThreadPoolExecutor, work: Callable[[Report], Result], description: str) -> None:
         self.description, self.fraction, self.is_cancelled = description, 0.0, False
-        self.future: Future[Result] = executor.submit(copy_context().run, work, self.report)  # with its device
+        self.future: Future[Result] = executor.submit(copy_context().run, self._run, work)  # with its device
+
+    def _run(self, work: Callable[[Report], Result]) -> Result:
+        with show_progress(self.report):
+            return work(self.report)
 
     def report(self, description: str | None = None, fraction: float = 0.0) -> None:
         if self.is_cancelled:
@@ -48,7 +54,7 @@ class BackgroundWorker(Generic[Result]):
         """Call `work` in a thread with a function that takes a description and the fraction done.
 
         This function raises `CancelledError` after the work is cancelled. Any thread may call it; without arguments it
-        keeps the progress.
+        keeps the progress. `report_progress` calls it, too.
         """
         self.cancel()
         self._task = _Task(self._executor, work, description)

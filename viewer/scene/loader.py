@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from pansplat.errors import InputError, collect_notes
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_scene_file, make_portable_name
+from pansplat.system.progress import CONNECTED, report_progress, stage
 from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
@@ -23,9 +24,8 @@ if TYPE_CHECKING:
     from pansplat.tours.graph import TourGraph
 
 
-Progress = Callable[[str, float], None]  # task, fraction done
 ShowEntries = Callable[[list["SceneEntry"]], None]
-Find = Callable[[Path, Progress, ShowEntries], list["SceneEntry"]]
+Find = Callable[[Path, ShowEntries], list["SceneEntry"]]
 
 
 _WAIT = 0.01  # seconds between looks at a search
@@ -111,16 +111,13 @@ class LoadOptions:
     prediction: PredictOptions = field(default_factory=PredictOptions)
 
 
-def find_entries(
-    path: Path, options: LoadOptions, progress: Progress | None = None, show: ShowEntries | None = None
-) -> list[SceneEntry]:
+def find_entries(path: Path, options: LoadOptions, show: ShowEntries | None = None) -> list[SceneEntry]:
     """Return all scenes at `path`: tours first, then pairs and single views, then scene files.
 
     Args:
         path: a file or folder.
         options: arguments of reading.
-        progress: called while the poses of panoramas without poses are estimated.
-        show: called before that, with the panoramas as a tour of which none is placed.
+        show: called before poses are estimated, with the panoramas as a tour of which none is placed.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene file")
@@ -132,7 +129,7 @@ def find_entries(
 
         with collect_notes() as notes:
             on_unposed = None if show is None else lambda pairs: show(_list_tours(pairs))
-            pairs = load_pairs(path, progress=progress, on_unposed=on_unposed, **vars(options.reading))
+            pairs = load_pairs(path, on_unposed=on_unposed, **vars(options.reading))
     except InputError:
         if not scenes:
             raise
@@ -184,10 +181,7 @@ def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panor
 
 
 def load_entry(
-    entry: SceneEntry,
-    options: LoadOptions,
-    progress: Progress,
-    show: Callable[[LoadedScene], None] | None = None,
+    entry: SceneEntry, options: LoadOptions, show: Callable[[LoadedScene], None] | None = None
 ) -> LoadedScene:
     """Read an entry's scene, or predict and refine it. Of a tour, a scene of the panorama in which `plan_walk` starts.
 
@@ -197,15 +191,14 @@ def load_entry(
     Args:
         entry: the entry.
         options: arguments of reading and prediction.
-        progress: called with the task and the fraction done.
         show: called with the prediction before it is refined.
     """
     from pansplat import pipeline
 
     if entry.tour is not None:
-        return _load_tour_scene(entry, options, progress, show)
+        return _load_tour_scene(entry, options, show)
     if entry.pair is None:
-        progress("reading", 0.0)
+        report_progress("reading", 0.0)
         assert entry.file is not None
         scene = pipeline.load(entry.file)
         if not scene.overlaps or scene.joint:  # the views of an edge alone lack surfaces of others
@@ -213,18 +206,17 @@ def load_entry(
         from pansplat.tours.graph import make_graph
 
         tour = replace(make_graph(scene), name=entry.name)
-        return _load_tour_scene(replace(entry, tour=tour, merged=scene), options, progress, show)
+        return _load_tour_scene(replace(entry, tour=tour, merged=scene), options, show)
     scene = pipeline.predict(
         entry.pair,
         options=options.prediction,
-        progress=progress,
         on_predicted=None if show is None else lambda scene: show(LoadedScene(entry, scene, is_final=False)),
     )
     return LoadedScene(entry, scene)
 
 
 def _load_tour_scene(
-    entry: SceneEntry, options: LoadOptions, progress: Progress, show: Callable[[LoadedScene], None] | None
+    entry: SceneEntry, options: LoadOptions, show: Callable[[LoadedScene], None] | None
 ) -> LoadedScene:
     """The scene of `entry.views` of a tour, predicted and refined, with its floor outlines.
 
@@ -245,7 +237,8 @@ def _load_tour_scene(
         return LoadedScene(entry, select_views(merged, views), facts=TourFacts(merged, tour).prepare())
     predictor = pipeline.load_predictor(prediction)
     if not views:
-        connected, max_views = connect(tour, progress), pipeline.find_max_views(predictor)
+        with stage(CONNECTED):
+            connected, max_views = connect(tour), pipeline.find_max_views(predictor)
         # A window shows photographs before: they begin where the graph that is not connected yet does.
         first, views = _choose_first_scene(connected, connected if show is None else tour)
         tour, part = link_parts(connected), connected.choose_predictions(max_views).get(first, views)
@@ -265,7 +258,6 @@ def _load_tour_scene(
         pair,
         pipeline.choose_predictor(pair, predictor),
         options=fitted,
-        progress=progress,
         on_predicted=None if show is None or not fitted.refine_seconds else lambda s: show(finish(s, is_final=False)),
     )
     return finish(scene, is_final=True)
@@ -295,7 +287,7 @@ class _Request:
 class SceneLoader:
     """Finds, loads and refines entries in worker threads; a new request cancels the previous one of its kind."""
 
-    def __init__(self, load: Callable[[SceneEntry, Progress, Callable[[LoadedScene], None]], LoadedScene]) -> None:
+    def __init__(self, load: Callable[[SceneEntry, Callable[[LoadedScene], None]], LoadedScene]) -> None:
         """`load` loads one entry, such as `load_entry` with its options."""
         self._load = load
         self._loading: BackgroundWorker[LoadedScene] = BackgroundWorker("scene-loader")
@@ -313,7 +305,7 @@ class SceneLoader:
         """
         self._searched = path.name or str(path)
         early = self._early = []
-        self._searching.start(lambda report: find(path, report, early.append), "looking for panoramas and scenes")
+        self._searching.start(lambda _: find(path, early.append), "looking for panoramas and scenes")
 
     def wait_for_entries(self) -> None:
         """Wait until `poll` has the entries or the error of a search, or its panoramas without poses."""
@@ -324,7 +316,7 @@ class SceneLoader:
     def request(self, entry: SceneEntry) -> None:
         """Start loading an entry."""
         request = self._request = _Request(entry)
-        self._loading.start(lambda report: self._load(entry, report, request.show))
+        self._loading.start(lambda _: self._load(entry, request.show))
 
     @property
     def is_searching(self) -> bool:

@@ -55,7 +55,7 @@ class _Loop:
     def __init__(self, ctx: moderngl.Context, path: Path, mode: Literal["joint", "deferred"], size: tuple[int, int]):
         options, self._ctx = LoadOptions(), ctx
         self._target, self._last = ctx.simple_framebuffer(size, components=4), time.perf_counter()
-        loader = SceneLoader(lambda entry, progress, show: load_entry(entry, options, progress, show))
+        loader = SceneLoader(lambda entry, show: load_entry(entry, options, show))
         state = ViewerState(settings=DrawSettings(mode=mode), stops=False)
         self.viewer = Viewer(ctx, loader, find=lambda path, *calls: find_entries(path, options, *calls), state=state)
         imgui.get_io().display_size = size

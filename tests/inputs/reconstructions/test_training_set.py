@@ -38,7 +38,7 @@ def dataset(tmp_path: Path, cameras: list[Array], points: Array, write_panorama)
     folder = tmp_path / "set"
     folder.mkdir()
     colors = np.arange(3 * len(points)).reshape(-1, 3).astype(np.uint8)
-    assert write_dataset(folder, views, (), points, colors, lambda *_: None) == 18
+    assert write_dataset(folder, views, (), points, colors) == 18
     return folder
 
 
@@ -125,7 +125,7 @@ def test_one_picture_is_in_memory_at_a_time(
     monkeypatch.setattr(training_set, "write_image", write)
     folder = tmp_path / "set"
     folder.mkdir()
-    write_dataset(folder, [view], (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), lambda *_: None)
+    write_dataset(folder, [view], (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert len(written) == 12
 
 

@@ -14,22 +14,20 @@ from PIL import Image
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.ply import save_ply
 from pansplat.prediction_options import PredictOptions
+from pansplat.system.progress import report_progress
 from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import fit_settings
 from pansplat_viewer.scene.tour import TourScenes
 
 
-def ignore(task: str, done: float) -> None: ...
-
-
 def list_loader_threads() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name.startswith("scene-loader")]
 
 
-def work_forever(entry, progress):
+def work_forever(*_):
     while True:
-        progress("working", 0.5)
+        report_progress("working", 0.5)
         time.sleep(0.001)
 
 
@@ -47,7 +45,7 @@ def test_paths_without_scenes_are_refused(tmp_path):
     (tmp_path / "scene.ply").write_bytes(b"ply\nnot really")
     (entry,) = find_entries(tmp_path / "scene.ply", LoadOptions())
     with pytest.raises(InputError, match=r"scene\.ply"):
-        load_entry(entry, LoadOptions(), ignore)
+        load_entry(entry, LoadOptions())
 
 
 def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
@@ -55,13 +53,13 @@ def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
         save_ply(small_scene, tmp_path / f"{name}.ply")
     entries = find_entries(tmp_path, LoadOptions())
     assert [entry.name for entry in entries] == ["a", "b"]
-    loaded = load_entry(entries[0], LoadOptions(), ignore)
+    loaded = load_entry(entries[0], LoadOptions())
     assert len(loaded.scene.gaussians) == len(small_scene.gaussians)
 
 
 def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_file):
     (entry,) = find_entries(house_file, LoadOptions())
-    first = load_entry(entry, LoadOptions(), ignore)
+    first = load_entry(entry, LoadOptions())
     tour, scenes = first.entry.tour, TourScenes.start(first)
     assert tour.name == "home" and tour.overlaps == house.overlaps and first.is_final
     assert np.allclose(tour.positions, house.positions) and first.entry.views == (0, 1)
@@ -88,37 +86,37 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
     alone = parted_house.panoramas[3]
     tour = replace(parted_house, panoramas=(alone, *parted_house.panoramas[:3]), originals=())
     tour = replace(tour, overlaps={(0, 0): 1.0, (1, 2): 0.4, (2, 3): 0.4})
-    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: tour)
+    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour: tour)
     scene = load_house(TourScenes(tour).make_entry((0,))).scene
     monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, model, **options: scene)
     single = replace(tour, panoramas=(alone,), overlaps={(0, 0): 1.0})
     for each in (tour, single):
-        loaded = load_entry(SceneEntry("house", tour=each), LoadOptions(), ignore)
+        loaded = load_entry(SceneEntry("house", tour=each), LoadOptions())
         assert loaded.entry.views == (0,) and loaded.entry.tour is each and loaded.scene is scene
 
 
 def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_follows(monkeypatch, house, load_house):
     # The walk of the graph that is not connected starts at 0; that of the connected one at 3.
     connected = replace(house, overlaps={(0, 1): 0.13, (1, 2): 0.4, (2, 3): 0.4, (0, 2): 0.4})
-    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: connected)
+    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour: connected)
     asked = []
 
-    def predict(pair, model, *, options, on_predicted, progress):
+    def predict(pair, model, *, options, on_predicted):
         views = tuple(int(view.name[-1]) for view in pair.context)
         asked.append((views, options.refine_seconds, on_predicted is not None))
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
-    first = load_entry(SceneEntry("house", tour=house), LoadOptions(), ignore, lambda loaded: None)
+    first = load_entry(SceneEntry("house", tour=house), LoadOptions(), lambda loaded: None)
     assert first.entry.start == 0 and 0 in first.entry.views and first.entry.tour is connected
     scenes = TourScenes.start(first)
     request = scenes.choose_request(scenes.list_next(None, 0.0), SceneEntry("house", tour=house))
     assert request.views == (0, 1, 2, 3)
-    part = load_entry(request, LoadOptions(), ignore, lambda loaded: None)
+    part = load_entry(request, LoadOptions(), lambda loaded: None)
     assert asked[0] == ((0, 1, 2), 0.0, False), "the first scene is not refined"
     assert asked[1] == ((0, 1, 2, 3), pytest.approx(10.0 * 4 / 3), True)
     assert part.entry.views == request.views and set(part.facts.outlines) <= set(request.views)
-    film = load_entry(SceneEntry("house", tour=house), LoadOptions(), ignore)
+    film = load_entry(SceneEntry("house", tour=house), LoadOptions())
     assert film.entry.views == (0, 1, 2, 3), "a film needs all, so that nothing is predicted twice"
 
 
@@ -145,7 +143,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     scenes = TourScenes(parted_house)
     for views in ((0, 1), (3,)):
-        load_entry(scenes.make_entry(views), LoadOptions(prediction=PredictOptions("pairs")), ignore)
+        load_entry(scenes.make_entry(views), LoadOptions(prediction=PredictOptions("pairs")))
     assert used == ["pairs", "default"]
 
 
@@ -169,7 +167,7 @@ def test_panoramas_are_shown_before_their_poses_are_estimated_but_not_if_these_a
     monkeypatch.setattr("pansplat.poses.files._estimate", estimate)
     for _ in range(2):
         with pytest.warns(InputWarning, match="bare walls"):
-            entries = find_entries(tmp_path, LoadOptions(), ignore, shown.append)
+            entries = find_entries(tmp_path, LoadOptions(), shown.append)
     (early,), (entry, *_) = shown[0], entries
     assert estimates == [[1]] and len(shown) == 1
     assert [view.name for view in early.tour.panoramas] == [view.name for view in entry.tour.panoramas]
@@ -184,8 +182,8 @@ def test_folder_name_is_a_single_valid_name(name, folder):
 
 
 def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
-    def load(entry, progress, show):
-        return work_forever(entry, progress, show) if entry.name == "first" else LoadedScene(entry, small_scene)
+    def load(entry, show):
+        return work_forever(entry, show) if entry.name == "first" else LoadedScene(entry, small_scene)
 
     loader = SceneLoader(load)
     loader.request(SceneEntry("first"))
@@ -201,14 +199,14 @@ def test_a_prediction_has_the_options_and_is_shown_before_the_refined_scene(monk
 
     def predict(pair, **arguments):
         assert arguments["options"] is options.prediction
-        arguments["progress"]("predicting", 0.5)
+        report_progress("predicting", 0.5)
         arguments["on_predicted"](small_scene)
         return small_scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     shown = []
     entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
-    final = load_entry(entry, options, ignore, shown.append)
+    final = load_entry(entry, options, shown.append)
     assert [loaded.is_final for loaded in (*shown, final)] == [False, True]
 
 
@@ -218,6 +216,6 @@ def test_a_fused_tour_is_one_scene_that_is_drawn_jointly(tmp_path, small_scene):
     for joint in (False, True):
         save_ply(replace(small_scene, overlaps=edges, joint=joint), tmp_path / "tour.ply")
         (entry,) = find_entries(tmp_path / "tour.ply", LoadOptions())
-        loaded = load_entry(entry, LoadOptions(), ignore)
+        loaded = load_entry(entry, LoadOptions())
         assert (loaded.entry.tour is None) == joint
         assert fit_settings(DrawSettings(mode="deferred"), loaded.scene).mode == ("joint" if joint else "deferred")

@@ -329,8 +329,8 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
         written.append(file.name)
         complete.append((tmp_path / "tour.mp4").exists())
 
-    film, show = open_tour_film(scenes, load), (lambda task, done: None, show_file)
-    write_flight(film, scenes.get((0, 1)).scene, scenes, tmp_path, 12, None, 0.5, DrawSettings(), *show)
+    film = open_tour_film(scenes, load)
+    write_flight(film, scenes.get((0, 1)).scene, scenes, tmp_path, 12, None, 0.5, DrawSettings(), show_file)
     names = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
     assert written == [*names, "tour.mp4"] and complete == [False] * 4 + [True]
     frames = read_film(tmp_path / "tour.mp4")
@@ -376,7 +376,7 @@ def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house,
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
-    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour, progress: replace(tour, overlaps=house.overlaps))
+    monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour: replace(tour, overlaps=house.overlaps))
     arguments = ["--offscreen", str(tmp_path), "--size", "64x32", "--seconds", "0.5", "--renderer", "cpu"]
     assert run([str(house.folder), *arguments]) == 0
     stills = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
