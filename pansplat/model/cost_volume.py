@@ -44,7 +44,8 @@ from pansplat.model.layers import (
     upsample,
 )
 
-_UNET_MULTIPLE = 4  # a U-Net of three scales halves the map twice
+_UNET_SCALES = 3
+_UNET_MULTIPLE = 2 ** (_UNET_SCALES - 1)
 
 _GROUPS = 8  # of the group normalisation
 _HEAD_CHANNELS = 32  # of one attention head
@@ -211,11 +212,10 @@ class LevelRefinement(nn.Module):
         first: bool,
         compat: Compat,
         precision: Precision,
-        border: Border | None = None,
     ) -> None:
         super().__init__()
         self.compat: Compat = compat
-        border = border or choose_border(compat)
+        border = choose_border(compat)
         inputs = sweep.candidates + sweep.channels + (0 if first else 1) + config.mono_channels
         self.shortcut = nn.Conv2d(inputs, sweep.width, 1)
         self.refine = VolumeRefinement(inputs, sweep.width, border, precision) if config.refinement == "unet" else None
@@ -243,14 +243,14 @@ class LevelRefinement(nn.Module):
 
 
 class VolumeRefinement(nn.Module):
-    """A U-Net between two convolutions; one of five scales, at the size of images, has none after it."""
+    """A U-Net between two convolutions."""
 
-    def __init__(self, inputs: int, width: int, border: Border, precision: Precision, *, scales: int = 3) -> None:
+    def __init__(self, inputs: int, width: int, border: Border, precision: Precision) -> None:
         super().__init__()
         self.entry = PanoramaConv2d(inputs, width, 3, border=border)
-        self.norm = nn.GroupNorm(_GROUPS if scales == 3 else 4, width)
-        self.unet = UNet(width, border, precision, scales=scales)
-        self.exit = PanoramaConv2d(width, width, 3, border=border) if scales == 3 else nn.Identity()
+        self.norm = nn.GroupNorm(_GROUPS, width)
+        self.unet = UNet(width, border, precision)
+        self.exit = PanoramaConv2d(width, width, 3, border=border)
 
     def forward(self, inputs: ViewMaps) -> Float[Tensor, "batch view c height width"]:
         views = inputs.shape[:2]
@@ -308,31 +308,29 @@ def regress_depth(level: int, logits: Volume, candidates: Volume) -> LevelDepth:
 
 
 class UNet(nn.Module):
-    """2-D U-Net over the maps of all views; scale 0 has the input's size, the last scale is the bottleneck.
+    """2-D U-Net of three scales over the maps of all views; scale 0 has the input's size, the last is the bottleneck.
+
+    Each scale is half of the previous one; all maps have the same channels. Attention is at the bottleneck.
 
     Source: PanSplat, section 3.2 (after MVSplat, after the U-Net of latent diffusion).
-
-    Args:
-        channels: of every map.
-        scales: number of map sizes, each half of the previous one; attention is at the last.
     """
 
-    def __init__(self, channels: int, border: Border, precision: Precision = "float32", *, scales: int = 3) -> None:
+    def __init__(self, channels: int, border: Border, precision: Precision = "float32") -> None:
         super().__init__()
-        last = scales - 1
+        last = _UNET_SCALES - 1
         self.stem = PanoramaConv2d(channels, channels, 3, border=border)
         self.encoder = nn.ModuleList(
-            EncoderScale(channels, border, precision, bottleneck=scale == last) for scale in range(scales)
+            EncoderScale(channels, border, precision, bottleneck=scale == last) for scale in range(_UNET_SCALES)
         )
         self.middle = nn.ModuleList(ResBlock(channels, channels, border) for _ in range(2))
         self.decoder = nn.ModuleList(
             DecoderScale(channels, border, precision, bottleneck=scale == last, finest=scale == 0)
-            for scale in range(scales)
+            for scale in range(_UNET_SCALES)
         )
         self.exit = ConvNorm(channels, channels, border=border, bias=True, groups=_GROUPS)
 
     def forward(self, maps: ViewMaps) -> ViewMaps:
-        """Refine the maps of all views; 2^(scales - 1) must divide height and width."""
+        """Refine the maps of all views; `_UNET_MULTIPLE` must divide height and width."""
         views = maps.shape[1]
         x = self.stem(maps.flatten(0, 1))
         skips = [x]
