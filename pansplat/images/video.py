@@ -30,21 +30,14 @@ class VideoFile:
 
     Attributes:
         path: the file.
-        stamps: presentation time of each frame in units of `time_base`, ascending.
-        time_base: seconds.
+        stamps: presentation time of each frame in units of the file, ascending.
         width, height: pixels.
     """
 
     path: Path
     stamps: tuple[int, ...]
-    time_base: Fraction
     width: int
     height: int
-
-    @property
-    def seconds(self) -> list[float]:
-        """Time of each frame since the first frame."""
-        return [float((stamp - self.stamps[0]) * self.time_base) for stamp in self.stamps]
 
     def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
         """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order."""
@@ -111,7 +104,7 @@ def open_video(path: Path | str) -> VideoFile:
                 f"{path}: needed a time for each frame, got {len(stamps)} times for {len(packets)} frames; write it "
                 "again as .mp4 (ffmpeg -i FILE -c:v libx264 -crf 12 video.mp4)."
             )
-        return VideoFile(path, tuple(stamps), stream.time_base, stream.width, stream.height)
+        return VideoFile(path, tuple(stamps), stream.width, stream.height)
 
 
 def _open_container(path: Path) -> Any:

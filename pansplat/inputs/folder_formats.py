@@ -415,24 +415,17 @@ def find_trajectories(folder: Path) -> list[Path]:
     ]
 
 
-def choose_trajectory(folder: Path) -> Path:
-    """The only trajectory file of a folder."""
-    found = find_trajectories(folder)
-    if len(found) != 1:
-        advice = "keep the right one" if found else "add it"
-        raise InputError(
-            f"{folder}: needed one trajectory file (*.kitti, *.tum, poses.txt, frame_trajectory.txt), got "
-            f"{', '.join(path.name for path in found) or 'none'}; {advice}."
-        )
-    return found[0]
-
-
 def read_trajectory_folder(source: Path, folder: Path, convention: str | None = None) -> Collection:
     """The images of a folder, sorted by name, with the poses of its trajectory file: image i has line i.
 
     The number in scale.txt, if there is one, converts the translations to metres.
     """
-    source = choose_trajectory(folder)
+    found = find_trajectories(folder)
+    if len(found) != 1:
+        raise InputError(
+            f"{folder}: needed one trajectory file (*.kitti, *.tum, poses.txt, frame_trajectory.txt), got "
+            f"{', '.join(path.name for path in found)}; keep the right one."
+        )
     expected = source.suffix.lower().lstrip(".")
     if expected == "txt":
         expected = next((kind for kind in ("kitti", "tum") if kind in source.stem.lower()), None)

@@ -17,7 +17,7 @@ from pansplat.system.strict_json import convert, parse_json
 from pansplat.training.augment import Augmentation
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
-DataKind = Literal["room", "panogrf", "360loc", "insta360", "pairs", "triplets"]
+DataKind = Literal["room", "panogrf", "360loc", "pairs", "triplets"]
 NetworkShape = Literal["paper", "small", "tiny"]
 Part = Literal["features", "cost_volume", "heads"]
 Backpropagation = Literal["plain", "one-step", "two-step"]
@@ -30,14 +30,14 @@ class DataConfig:
     """Training data."""
 
     kind: DataKind = "room"
-    """room: a room of boxes in random proportions and colours, no files. panogrf, 360loc, insta360: these data sets.
+    """room: a room of boxes in random proportions and colours, no files. panogrf, 360loc: these data sets.
     pairs: a folder as for `pansplat predict`, with targets. triplets: NAME.json with NAME_0.png ... next to it."""
     root: Path | None = None
     """Folder of the data; not used for room."""
     validation_root: Path | None = None
-    """Folder of the validation data of insta360, pairs and triplets; the same by default."""
+    """Folder of the validation data of pairs and triplets; the same by default."""
     draws: Count = 1000
-    """Random pairs per sequence and epoch, of 360loc and insta360."""
+    """Random pairs per sequence and epoch, of 360loc."""
     training_gap: Literal["uniform", "original"] = "uniform"
     """Frames between the inputs: uniformly random, or always the smallest gap, as in the official code."""
     workers: Annotated[int, Meta(ge=0, le=256)] = 2

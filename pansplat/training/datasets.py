@@ -13,7 +13,7 @@ from pansplat.errors import InputError
 from pansplat.inputs.folders import load_pairs
 from pansplat.training.config import DataConfig
 from pansplat.training.room import RoomTriplets
-from pansplat.training.sequences import BoundedSampler, read_insta360, read_loc360
+from pansplat.training.sequences import BoundedSampler, read_loc360
 from pansplat.training.sources import (
     ConcatSource,
     FixedFramePairs,
@@ -59,14 +59,9 @@ def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSour
     if config.kind in ("pairs", "triplets"):
         read = _read_pairs if config.kind == "pairs" else _read_triplets
         return read(root), read(config.validation_root or root)
-    if config.kind == "360loc":
-        sampler = BoundedSampler(2, 5, config.training_gap)
-        sequences, unseen = read_loc360(root, "train"), read_loc360(root, "val")
-    else:
-        sampler = BoundedSampler(2, 30, config.training_gap)
-        sequences = read_insta360(root)
-        unseen = sequences if config.validation_root is None else read_insta360(config.validation_root)
-    training = RandomFramePairs(sequences, sampler, config.draws)
+    sampler = BoundedSampler(training_gap=config.training_gap)
+    training = RandomFramePairs(read_loc360(root, "train"), sampler, config.draws)
+    unseen = read_loc360(root, "val")
     return training, FixedFramePairs(unseen, lambda count: sampler.evaluation(count, _VALIDATION_DRAWS))
 
 
