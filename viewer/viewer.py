@@ -157,8 +157,7 @@ class Viewer:
     @property
     def right_name(self) -> str | None:
         """What is right of the divider; None if there is nothing."""
-        mono = self.state.settings.stereo == "mono"
-        return self.stage.comparer.describe(self.state) if self.loaded is not None and mono else None
+        return self.stage.comparer.describe(self.state) if self.loaded is not None else None
 
     @property
     def panoramas(self) -> list[str]:
@@ -170,8 +169,6 @@ class Viewer:
     def _find_hotspots(self) -> list[Hotspot]:
         """The places of panoramas in the image, in points of the window, which may have several pixels."""
         camera, fade = self.state.camera, self.stage.fade
-        if self.stage.eye_size != self.stage.size:
-            return []
         size = imgui.get_io().display_size
         points = int(size.x), int(size.y)
         has_arrived = self.tour is not None and fade.parts[fade.front] == self.tour.part
@@ -279,9 +276,8 @@ class Viewer:
             state.target = find_clicked(self.hotspots, (place[0] * points.x, place[1] * points.y))
         if state.target is not None or scene is None or stage.photograph is not None:
             return
-        (width, height), size = stage.size, stage.eye_size
-        pixel = place[0] * width % size[0], place[1] * height % size[1]
-        point = pick_point(scene, *compute_pixel_ray(state.camera, pixel, size), state.settings)
+        pixel = place[0] * stage.size[0], place[1] * stage.size[1]
+        point = pick_point(scene, *compute_pixel_ray(state.camera, pixel, stage.size), state.settings)
         if point is None:
             state.points = []
             state.show_message("no Gaussian there")

@@ -99,7 +99,7 @@ class Render(Computation):
             shots = self._list_shots(scene, poses, path)
             film = self._make_film(scene, source, options, len(shots))
             marks = {
-                "projection": None if layout == "perspective" else "equirect",
+                "panorama": layout != "perspective",
                 "stereo": "top-bottom" if self.stereo else "mono",
                 "unit": scene.frame.unit,
             }

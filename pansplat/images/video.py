@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pansplat.errors import InputError
-from pansplat.images.panorama_metadata import Projection, Stereo, mark_spherical_video
+from pansplat.images.panorama_metadata import Stereo, mark_spherical_video
 from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, require_file
 
@@ -123,7 +123,7 @@ def write_video(
     frames: Iterable[NDArray[np.uint8]],
     fps: float,
     *,
-    panorama: bool | Projection = False,
+    panorama: bool = False,
     stereo: Stereo = "mono",
 ) -> int:
     """Write an MP4 or WebM file atomically and return the number of frames. H.264 or VP9 if PyAV supports it.
@@ -134,8 +134,8 @@ def write_video(
         path: file to write, ending in .mp4 or .webm.
         frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
         fps: frames per second.
-        panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
-            players then show an .mp4 as 360 degrees. A .webm has no such mark.
+        panorama: whether the frames are equirectangular panoramas; players then show an .mp4 as 360 degrees. A .webm
+            has no such mark.
         stereo: arrangement of the eyes in a panorama's frame.
     """
     path = Path(path)
@@ -166,7 +166,7 @@ def write_video(
                 container.mux(packet)
         if path.suffix.lower() == ".mp4":
             if panorama:
-                mark_spherical_video(temporary, "equirect" if panorama is True else panorama, stereo)
+                mark_spherical_video(temporary, stereo)
             with open(temporary, "ab") as file:  # a box that players skip
                 file.write((8 + len(SOFTWARE)).to_bytes(4, "big") + b"free" + SOFTWARE.encode())
     return count

@@ -59,15 +59,13 @@ SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_
 IMAGE_WIDGETS = (
     "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
     "min. opacity", "exact", "3dgs", "black", "grey", "white", "field of view",
-    "off##stereo", "pair##stereo",
     "2##panorama", "##flight",
 )  # fmt: skip
-OF_OPENGL = (*get_args(Preset), "off##stereo", "pair##stereo")  # the processor does not offer them
+OF_OPENGL = get_args(Preset)  # the processor does not offer them
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
     "joint": {"mode": "deferred"},
     "exact": {"preset": "3dgs"},
-    "off##stereo": {"stereo": "side-by-side"},
     "black": {"background": (1.0, 1.0, 1.0)},
 }
 # Widgets whose effect has its own test.
@@ -303,24 +301,6 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
     assert changed_fraction(single, user.read_image()) == 0
     user.slide("weight 1", 0.4)
     assert 0 < user.state.settings.view_weights[1] < 1
-
-
-@opengl
-def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.screenshots.PANORAMA_HEIGHT", 64)
-    user.click("pair##stereo")
-    user.settle()
-    image = user.viewer.stage.slot.image
-    left, right = np.split(np.frombuffer(image.read(), np.float32).reshape(*SIZE[::-1], 4), 2, axis=1)
-    assert np.abs(left - right).max() > 0.1
-    near = user.read_image()
-    user.slide("eye distance", 0.9)
-    assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
-    user.click("360 PNG")
-    with Image.open(user.viewer.screenshots.files[-1]) as file:
-        assert file.size == (128, 128), "the left eye above the right one"
-    user.click("off##stereo")
-    assert "eye distance" not in user.panels.widgets.items
 
 
 CLICKS = [  # in the window of a pair, and what is then true

@@ -159,7 +159,7 @@ def make_app(small_scene, load_house, tmp_path, monkeypatch) -> Iterator[Callabl
     imgui.get_io().display_size = SIZE
     for name in ("viewer.Gui", "viewer.Panels", "ui.stage.Presenter", "ui.stage.PhotographLayer"):
         monkeypatch.setattr(f"pansplat_viewer.{name}", MagicMock())
-    monkeypatch.setattr("pansplat_viewer.ui.stage.create_window_renderer", lambda ctx, choice: NoRenderer())
+    monkeypatch.setattr("pansplat_viewer.ui.stage.create_renderer", lambda ctx, choice: NoRenderer())
     monkeypatch.setattr("pansplat_viewer.viewer.read_input", lambda seconds: replace(apps[-1].events, seconds=seconds))
     yield make
     for app in apps:

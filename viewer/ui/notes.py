@@ -22,8 +22,7 @@ def draw_notes(viewer: Viewer) -> None:
     photographs, camera = viewer.stage.comparer.photographs, viewer.state.camera
     position = np.asarray(camera.position)
     index = photographs.find_stop(position)
-    is_mono = viewer.stage.eye_size == viewer.stage.size
-    if index is None or not is_mono:
+    if index is None:
         return
     size, radius = imgui.get_io().display_size, _RADIUS * imgui.get_style().font_scale_dpi
     black, white = (imgui.color_convert_float4_to_u32((*rgb, 0.85)) for rgb in ((0.0,) * 3, (1.0,) * 3))

@@ -277,22 +277,12 @@ class Panels:
         state, settings = viewer.state, viewer.state.settings
         on_processor = viewer.stage.renderer.stats.renderer == "cpu"
         _draw_row_label("preset")
-        imgui.begin_disabled(on_processor)  # which draws preset exact and one eye only
+        imgui.begin_disabled(on_processor)  # which draws preset exact only
         for preset in get_args(Preset):
             imgui.same_line()
             if self.widgets.radio(preset, settings.preset == preset):
                 settings = replace(settings, preset=preset)
         imgui.end_disabled()
-        _draw_row_label("stereo")
-        imgui.begin_disabled(on_processor)
-        for label, stereo in (("off", "mono"), ("pair", "side-by-side")):
-            imgui.same_line()
-            if self.widgets.radio(f"{label}##stereo", settings.stereo == stereo):
-                settings = replace(settings, stereo=stereo)
-        imgui.end_disabled()
-        if settings.stereo != "mono":
-            distance = self.widgets.slider("eye distance", 1000 * settings.eye_distance, 10.0, 200.0, "%.0f mm")
-            settings = replace(settings, eye_distance=distance / 1000)
         flags = imgui.ColorEditFlags_.no_inputs.value
         changed, background = imgui.color_edit3("background", list(settings.background), flags)
         self.widgets.record("background")

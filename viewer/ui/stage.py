@@ -14,8 +14,9 @@ from jaxtyping import Float
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.cross_fade import CrossFade
+from pansplat_viewer.draw.cpu_renderer import create_renderer
+from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
-from pansplat_viewer.draw.window_renderer import WindowRenderer, create_window_renderer, get_eye_size
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.loader import LoadedScene
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
@@ -69,7 +70,7 @@ class Stage:
         self.last_camera = state.camera
 
     def _create_slot(self) -> SceneSlot:
-        return SceneSlot(create_window_renderer(self._ctx, self._choice))
+        return SceneSlot(create_renderer(self._ctx, self._choice))
 
     def _create_resolution(self) -> AdaptiveResolution:
         pacing = self.renderer.pacing
@@ -81,14 +82,9 @@ class Stage:
         return self.slots[self._scene_slot]
 
     @property
-    def renderer(self) -> WindowRenderer:
+    def renderer(self) -> FrameRenderer:
         """The renderer of `slot`."""
         return self.slot.renderer
-
-    @property
-    def eye_size(self) -> tuple[int, int]:
-        """(width, height) of the image of one eye, pixels."""
-        return get_eye_size(self.size, self._state.settings.stereo)
 
     @property
     def photograph(self) -> int | None:
@@ -206,8 +202,7 @@ class Stage:
                 self.presenter.draw_photograph(photograph, target, state.camera)
             return
         self.image_size = self.size if self.photograph is not None else self.renderer.stats.size
-        is_compared = state.comparing and state.settings.stereo == "mono"
-        right = self.comparer.get_photograph(state, split=state.split) if is_compared else None
+        right = self.comparer.get_photograph(state, split=state.split) if state.comparing else None
         self.presenter.draw(image, target, state.camera, right=right, fading=fading, weight=weight)
 
     def _draw_stop(self) -> tuple[moderngl.Texture | None, moderngl.Texture | None]:
