@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,7 +27,7 @@ from pansplat_viewer.scene.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.scene.settings import DrawSettings, Mode, Preset, RendererChoice
+from pansplat_viewer.scene.settings import DrawSettings, Mode, RendererChoice
 
 if TYPE_CHECKING:
     import moderngl
@@ -61,11 +61,9 @@ class Options:
     reading: ReadOptions = field(default_factory=ReadOptions)
     mode: Mode = "deferred"
     """How the Gaussians of the input views are combined."""
-    preset: Preset = "exact"
-    """Draw Gaussians exactly on each ray and by distance, or as 3DGS does: linearised and by depth (OpenGL only)."""
     renderer: RendererChoice = "auto"
-    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU and for preset 3dgs, and
-    cpu where OpenGL is software."""
+    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, and cpu where OpenGL is
+    software."""
     at: Annotated[float, Meta(ge=0, le=1)] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     device: Device = "auto"
@@ -97,16 +95,7 @@ class Options:
     @property
     def settings(self) -> DrawSettings:
         """The draw settings with which the viewer begins."""
-        return DrawSettings(preset=self.preset, mode=self.mode)
-
-    @property
-    def renderer_choice(self) -> RendererChoice:
-        """`renderer`; the processor does not draw preset 3dgs."""
-        if self.preset == "exact":
-            return self.renderer
-        if self.renderer == "cpu":
-            raise InputError("--preset 3dgs needs OpenGL, got --renderer cpu; use --renderer gl or --preset exact")
-        return "gl"
+        return DrawSettings(mode=self.mode)
 
 
 def run_arguments(args: Sequence[str] | None = None) -> int:
@@ -125,7 +114,6 @@ def run_arguments(args: Sequence[str] | None = None) -> int:
 
 def _run(options: Options) -> int:
     pixels = options.pixels
-    options = replace(options, renderer=options.renderer_choice)
     if options.offscreen is not None:
         require_output_folder("--offscreen", options.offscreen)
     from pansplat.tours.camera_path import read_path

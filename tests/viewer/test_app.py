@@ -98,7 +98,6 @@ def test_without_the_libraries_of_window_and_opengl_a_fly_through_is_written(roo
         (["room.ply", "--size", "4x4"], "WIDTHxHEIGHT"),
         (["room.ply", "--at", "1.5"], "--at: needed a number <= 1"),
         (["room.ply", "--path", "no.json"], "no.json"),
-        (["room.ply", "--preset", "3dgs", "--renderer", "cpu"], "--preset 3dgs needs OpenGL, got --renderer cpu"),
         (["room.ply", "--refine", "-1"], "--refine: needed a number >= 0"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),
     ],
@@ -166,7 +165,6 @@ def test_options_are_passed_on(tmp_path):
     reading, prediction = ReadOptions("world2cam opengl", 0.3, 9.0), PredictOptions("w.safetensors", height=256)
     expected = LoadOptions(reading, prediction)
     assert Options(tmp_path, prediction=prediction, reading=reading).load_options == expected
-    assert Options(tmp_path, preset="3dgs").renderer_choice == "gl"
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 
 

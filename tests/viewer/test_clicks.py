@@ -41,7 +41,7 @@ from pansplat_viewer.scene.loader import (
     SceneLoader,
 )
 from pansplat_viewer.scene.picking import project_point
-from pansplat_viewer.scene.settings import Display, DrawSettings, Preset
+from pansplat_viewer.scene.settings import Display, DrawSettings
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
@@ -58,14 +58,12 @@ SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_
 # Widgets that must change the image, and the settings that give some of them something to change.
 IMAGE_WIDGETS = (
     "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
-    "min. opacity", "exact", "3dgs", "black", "grey", "white", "field of view",
+    "min. opacity", "black", "grey", "white", "field of view",
     "2##panorama", "##flight",
 )  # fmt: skip
-OF_OPENGL = get_args(Preset)  # the processor does not offer them
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
     "joint": {"mode": "deferred"},
-    "exact": {"preset": "3dgs"},
     "black": {"background": (1.0, 1.0, 1.0)},
 }
 # Widgets whose effect has its own test.
@@ -194,15 +192,9 @@ def both(test: Callable[..., None]) -> Callable[..., None]:
     return test
 
 
-def opengl(test: Callable[..., None]) -> Callable[..., None]:
-    """Run a test with OpenGL."""
-    test.renderers = ("gl",)  # type: ignore[attr-defined]
-    return test
-
-
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "label" in metafunc.fixturenames:
-        cases = [("gl" if label in OF_OPENGL else "cpu", label) for label in IMAGE_WIDGETS]
+        cases = [("cpu", label) for label in IMAGE_WIDGETS]
         metafunc.parametrize(("session", "label"), cases, indirect=["session"], scope="module")
     elif "session" in metafunc.fixturenames:
         renderers = getattr(metafunc.function, "renderers", ("cpu",))

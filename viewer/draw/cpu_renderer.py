@@ -173,8 +173,6 @@ class CpuRenderer:
         """See `FrameRenderer`; the texture has 8 bits per channel."""
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
-        if not settings.is_exact:
-            raise InputError(f"the processor draws preset exact, got {settings.preset}; use renderer gl")
         frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
         if (largest := max(frame.size)) > LARGEST_SIDE:
             raise InputError(

@@ -10,7 +10,6 @@ from typing import Literal, get_args
 from pansplat.constants import NEAR
 from pansplat.errors import InputError
 
-Preset = Literal["exact", "3dgs"]
 Mode = Literal["joint", "view", "deferred"]
 Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
@@ -20,7 +19,6 @@ GaussianChoice = tuple[frozenset[int] | None, float]
 """Levels and least opacity of the Gaussians that are drawn."""
 
 _CHOICES = {
-    "preset": Preset,
     "mode": Mode,
     "layout": Layout,
     "display": Display,
@@ -34,9 +32,6 @@ class DrawSettings:
     """Everything that changes the image except the scene, the pose and the size.
 
     Attributes:
-        preset: `exact` has the exact response on each ray, the order of radial distance, and a low-pass filter that
-            conserves energy. `3dgs` has the linearised response, the order of depth along the view axis, and the
-            filter of 3DGS; OpenGL only.
         mode: `joint` draws all Gaussians together. `view` draws those of one context view. `deferred` draws each
             context view separately and blends the images per pixel by distance.
         view_weights: factors of the context views in mode `deferred`, at least 0; views beyond the last one have 1.
@@ -52,7 +47,6 @@ class DrawSettings:
             OpenGL returns the smaller texture, because a GPU enlarges it without cost.
     """
 
-    preset: Preset = "exact"
     mode: Mode = "joint"
     view: int = 0  # the context view of mode `view`
     view_weights: tuple[float, ...] = ()
@@ -96,11 +90,6 @@ class DrawSettings:
         """Whether the colours of the whole scene are shown."""
         is_whole = self.selection == (None, 0.0) and set(self.view_weights) <= {1.0}
         return is_whole and self.display == "color" and self.mode != "view"
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the preset is `exact`."""
-        return self.preset == "exact"
 
     @property
     def splat_colors(self) -> Literal["color", "normals", "levels", "views"]:

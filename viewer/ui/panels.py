@@ -14,7 +14,7 @@ from imgui_bundle import imgui
 
 from pansplat.system.descriptions import describe_count
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.settings import Display, Preset
+from pansplat_viewer.scene.settings import Display
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
     ViewerState,
@@ -275,14 +275,6 @@ class Panels:
 
     def _draw_settings(self, viewer: Viewer) -> None:
         state, settings = viewer.state, viewer.state.settings
-        on_processor = viewer.stage.renderer.stats.renderer == "cpu"
-        _draw_row_label("preset")
-        imgui.begin_disabled(on_processor)  # which draws preset exact only
-        for preset in get_args(Preset):
-            imgui.same_line()
-            if self.widgets.radio(preset, settings.preset == preset):
-                settings = replace(settings, preset=preset)
-        imgui.end_disabled()
         flags = imgui.ColorEditFlags_.no_inputs.value
         changed, background = imgui.color_edit3("background", list(settings.background), flags)
         self.widgets.record("background")

@@ -130,11 +130,6 @@ def test_software_opengl_is_replaced_by_the_processor_unless_chosen(ctx):
         create_renderer(None, "gl")
 
 
-def test_the_preset_3dgs_is_refused(renderer, pose):
-    with pytest.raises(InputError, match="draws preset exact, got 3dgs; use renderer gl"):
-        renderer.render(pose, SIZE, replace(SETTINGS, preset="3dgs"))
-
-
 def test_errors_in_the_worker_are_raised_and_drawing_goes_on(renderer, pose, monkeypatch):
     expected = read_pixels(renderer.render(pose, SIZE, SETTINGS))
     with monkeypatch.context() as patch:
