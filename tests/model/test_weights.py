@@ -203,7 +203,7 @@ def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_ligh
     with pytest.raises(InputError) as caught:
         report.require_complete("odd.ckpt")
     message = str(caught.value)
-    assert message.startswith("odd.ckpt: needed exactly the tensors of the official pansplat, lacked 12 (")
+    assert message.startswith("odd.ckpt: needed exactly the tensors of the official PanSplat, lacked 12 (")
     assert removed[0] in message and ", ...)" in message
     assert "found unknown 2 (encoder.new.weight, losses.2.gaussian_head.new)" in message
 
