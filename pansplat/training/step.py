@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 
 from torch import Tensor, nn
 
@@ -12,7 +11,6 @@ from pansplat.model.heads import AuxiliaryHeads, MatchedViews
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
 from pansplat.training.deferred import LossTerms, Problem, backpropagate, whole_loss
-from pansplat.training.distributed import no_sync
 from pansplat.training.losses import LossWeights, Perceptual, auxiliary_loss, depth_loss, image_loss
 from pansplat.training.network import matching_is_trainable
 from pansplat.training.rendering import TargetRenderer
@@ -21,19 +19,17 @@ LOSS_TERMS: tuple[str, ...] = ("loss", "square", "perceptual", "depth", "auxilia
 """Names of the total loss and its terms."""
 
 
-def accumulate_gradients(step: nn.Module, batches: Sequence[Batch]) -> LossTerms:
+def accumulate_gradients(step: TrainingStep, batches: Sequence[Batch]) -> LossTerms:
     """Add the gradients of the batches' mean loss to the parameters' gradients; returns the mean loss terms.
 
     Args:
-        step: a `TrainingStep`, or one wrapped by `data_parallel`: then the mean over the processes is added.
         batches: batches of one step, one per round of accumulation.
     """
     sums, weight = dict.fromkeys(LOSS_TERMS, 0.0), 1 / len(batches)
-    for number, batch in enumerate(batches, start=1):
-        with no_sync(step) if number < len(batches) else nullcontext():
-            loss, terms = step(batch, weight)
-            if loss.requires_grad:
-                loss.backward()
+    for batch in batches:
+        loss, terms = step(batch, weight)
+        if loss.requires_grad:
+            loss.backward()
         sums = {name: sums[name] + terms[name] / len(batches) for name in LOSS_TERMS}
     return sums
 
