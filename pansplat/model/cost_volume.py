@@ -76,8 +76,6 @@ _HIERARCHY = (
 class CostVolumeConfig:
     """Shape of the cost volume; shipped weights fix all of it."""
 
-    sweep: Literal["hierarchical", "single"] = "hierarchical"
-    """All levels, or the coarsest level only."""
     mono_channels: Annotated[int, Meta(ge=0, le=4096)] = 32
     """Channels of the monocular features; 0 for none."""
     refinement: Literal["unet", "none"] = "unet"
@@ -90,11 +88,6 @@ class CostVolumeConfig:
         first = hierarchy.index(levels[0]) if levels and levels[0] in hierarchy else 0
         if levels != hierarchy[first : first + len(levels)]:
             raise ValueError(f"`levels` must be consecutive ones of {hierarchy}, coarse to fine, got {levels}")
-
-    @property
-    def swept_levels(self) -> tuple[SweepLevel, ...]:
-        """The levels in use, coarse to fine."""
-        return self.levels if self.sweep == "hierarchical" else self.levels[:1]
 
 
 @dataclass(frozen=True)
@@ -149,7 +142,7 @@ class SphericalCostVolume(nn.Module):
         self.compat: Compat = compat
         # Keys are pyramid levels.
         self.levels = nn.ModuleDict()
-        for index, sweep in enumerate(config.swept_levels):
+        for index, sweep in enumerate(config.levels):
             self.levels[str(sweep.level)] = LevelRefinement(
                 sweep, config, first=index == 0, compat=compat, precision=attention_precision
             )
@@ -184,14 +177,14 @@ class SphericalCostVolume(nn.Module):
             )
         bounds = (1 / far, 1 / near)
         regressed: list[LevelDepth] = []
-        for sweep, level_features in zip(self.config.swept_levels, features, strict=False):
+        for sweep, level_features in zip(self.config.levels, features, strict=False):
             height, width = level_features.shape[-2:]
             require_size(height, width, _UNET_MULTIPLE)
             if not regressed:
                 centre, candidates = None, make_first_candidates(bounds, sweep.candidates, (height, width))
             else:
                 centre = upsample(regressed[-1].inverse_depth.detach(), 2, self.compat)
-                intervals = max(1, self.config.swept_levels[0].candidates - 1)
+                intervals = max(1, self.config.levels[0].candidates - 1)
                 step = (bounds[1] - bounds[0]) / intervals / 2 ** len(regressed)
                 candidates = make_candidates_around(centre, step, bounds, sweep.candidates)
             volume = correlate_views(level_features, candidates, cam2world, self.compat)

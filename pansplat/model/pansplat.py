@@ -32,7 +32,7 @@ class PanSplatConfig:
     heads: HeadsConfig = field(default_factory=HeadsConfig)
 
     def __post_init__(self) -> None:
-        swept = self.cost_volume.swept_levels[-1].candidates
+        swept = self.cost_volume.levels[-1].candidates
         if self.heads.candidates != swept:
             raise ValueError(f"`heads.candidates` must be the {swept} of the finest sweep, got {self.heads.candidates}")
         if self.heads.feature_channels != self.features.channels[::-1]:

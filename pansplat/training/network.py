@@ -117,7 +117,7 @@ def trainable_parameters(*modules: nn.Module | None) -> Iterator[nn.Parameter]:
 def build_auxiliary_heads(network: PanSplat) -> AuxiliaryHeads:
     """Randomly initialised heads that predict Gaussians from each level of the cost volume alone; for training only."""
     heads = network.config.heads
-    swept = network.config.cost_volume.swept_levels
+    swept = network.config.cost_volume.levels
     config = HeadsConfig(
         depth="swept",
         layers=2,

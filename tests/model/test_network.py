@@ -111,7 +111,7 @@ def test_predictions_carry_no_gradient(predictor, prediction):
 
 
 def test_the_fingerprint_depends_on_weights_settings_and_compatibility(small_config):
-    other = dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, residual=False))
+    other = dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, depth="swept"))
     predictors = (
         _predictor(small_config),
         _predictor(small_config, seed=1),
