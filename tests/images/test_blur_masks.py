@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import unicodedata
 import warnings
 from collections.abc import Callable
@@ -354,14 +353,6 @@ def _write_faces(folder: Path, color_face: Callable[[str, int], np.ndarray], per
     return folder
 
 
-def _write_strip(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
-    _write_faces(folder / "faces", color_face, person)
-    faces = [np.asarray(Image.open(folder / "faces" / f"hall_{face}.png")) for face in "frblud"]
-    shutil.rmtree(folder / "faces")
-    Image.fromarray(np.concatenate(faces, axis=1)).save(folder / "hall.png")
-    return folder
-
-
 def _write_set(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
     """The faces with poses, as COLMAP and nerfstudio have them, in two places."""
     (folder / "images").mkdir(parents=True)
@@ -402,16 +393,10 @@ def _write_uneven(folder: Path, color_face: Callable[[str, int], np.ndarray], pe
 
 ASSEMBLED = {
     "faces": (_write_faces, "hall_f_blur.png"),
-    "strip": (_write_strip, "hall_Blur.PNG"),
     "nerfstudio": (_write_set, "images/0000_a_front_blur.png"),
     "colmap": (_write_colmap, "images/0000_A_front_BLUR.png"),
     "uneven": (_write_uneven, "images/0000_a_front_blur.png"),
 }
-
-
-def _cover(kind: str) -> np.ndarray:
-    """What the mask of a picture covers."""
-    return np.pad(COVER, ((0, 0), (0, 5 * SIDE))) if kind == "strip" else COVER
 
 
 def _load_first(folder: Path) -> Panorama:
@@ -429,7 +414,7 @@ def test_a_mask_of_a_picture_hides_it_in_its_panorama(
     for person in (1, 2):
         folder = write(tmp_path / f"{person}", color_face, person)
         before = read_panorama(_load_first(folder).image, height)[0]
-        _draw_mask(folder / name, _cover(kind).repeat(scale, axis=0).repeat(scale, axis=1))
+        _draw_mask(folder / name, COVER.repeat(scale, axis=0).repeat(scale, axis=1))
         panorama = _load_first(folder)
         image, shown = read_panorama(panorama.image, height)
         reads.append((image, shown, read_thumbnail(panorama.image, 16)))
@@ -442,7 +427,7 @@ def test_a_mask_of_a_picture_hides_it_in_its_panorama(
     for first, second in zip(*reads, strict=True):
         assert torch.equal(first, second), "what is hidden has no influence"
     before = load_pairs(folder)[0].load_context(height).masks[0]
-    _draw_mask(folder / re.sub("blur", "mask", name, flags=re.IGNORECASE), _cover(kind), kind="mask")
+    _draw_mask(folder / re.sub("blur", "mask", name, flags=re.IGNORECASE), COVER, kind="mask")
     after = load_pairs(folder)[0].load_context(height).masks[0]
     assert before[inside].all() and not after[inside].any() and torch.equal(after[far], before[far])
 
