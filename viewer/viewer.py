@@ -132,7 +132,7 @@ class Viewer:
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
         is_placing = self.placing is not None and self.placing.is_busy
-        return self.moving or self.scenes.is_busy or self.stage.comparer.photographs.is_reading or is_placing
+        return self.moving or self.scenes.is_busy or self.stage.photographs.is_reading or is_placing
 
     @property
     def loaded(self) -> LoadedScene | None:
@@ -153,11 +153,6 @@ class Viewer:
     def pending(self) -> Future[Any] | None:
         """The image that is drawn in the background, if the window changes only when it is finished."""
         return None if self.stage.is_animated(self._clock()) else self.stage.pending
-
-    @property
-    def right_name(self) -> str | None:
-        """What is right of the divider; None if there is nothing."""
-        return self.stage.comparer.describe(self.state) if self.loaded is not None else None
 
     @property
     def panoramas(self) -> list[str]:
@@ -204,7 +199,7 @@ class Viewer:
         advance_path(state, step)
         self.scenes.update()
         if self.loaded is None and self.tour is None:
-            stage.fade_to_photograph(stage.comparer.choose_photograph(state))
+            stage.fade_to_photograph(stage.photographs.find_nearest(np.asarray(state.camera.position)))
         problem = stage.draw(target)
         if problem is not None:
             self.scenes.offer_reduced(problem)
@@ -297,7 +292,7 @@ class Viewer:
 
     def put_note(self, text: str) -> None:
         """State a note at the middle of the image, in place of one that is there; without a text remove that one."""
-        photographs, camera = self.stage.comparer.photographs, self.state.camera
+        photographs, camera = self.stage.photographs, self.state.camera
         index = photographs.find_stop(np.asarray(camera.position))
         if index is None or photographs.panoramas[index].links_at is None:
             self.state.show_message("a note is put at a panorama of a folder; open the folder of this one")

@@ -115,7 +115,7 @@ class Programs:
         return self._compile_pair("screen.vert", "resolve.frag")
 
     def present(self) -> moderngl.Program:
-        """The image, and a photograph next to it, to the screen."""
+        """The image, or a photograph, to the screen."""
         return self._compile_pair("present.vert", "present.frag")
 
     def release(self) -> None:

@@ -19,7 +19,7 @@ _RADIUS = 9.0  # of a mark, pixels at a DPI scale of 1
 
 def draw_notes(viewer: Viewer) -> None:
     """Draw a mark for each note of the panorama at the camera, with its text when the pointer is on it."""
-    photographs, camera = viewer.stage.comparer.photographs, viewer.state.camera
+    photographs, camera = viewer.stage.photographs, viewer.state.camera
     position = np.asarray(camera.position)
     index = photographs.find_stop(position)
     if index is None:
@@ -51,7 +51,7 @@ class NotesSection:
 
     def draw(self, viewer: Viewer) -> None:
         """Draw the field and the buttons, or what to do where there are none."""
-        photographs = viewer.stage.comparer.photographs
+        photographs = viewer.stage.photographs
         if photographs.find_stop(np.asarray(viewer.state.camera.position)) is None:
             draw_wrapped("Go to a panorama to put a note there.", is_disabled=True)
             return
