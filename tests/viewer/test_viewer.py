@@ -508,6 +508,7 @@ def test_the_view_of_a_photograph_is_kept_when_its_scene_is_there(make_app, pair
 
 def test_a_photograph_that_cannot_be_read_is_an_error(app, pair, tmp_path):
     broken = replace(pair.context[0], image=tmp_path / "gone.png")
+    app.state.stops = True
     app.show(SceneEntry("broken", pair=replace(pair, context=(broken, pair.context[1]))))
     app.settle()
     assert "gone.png" in app.viewer.error
