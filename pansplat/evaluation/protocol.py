@@ -3,7 +3,7 @@
 A test set has its name in the paper's tables. Metrics are computed for each target image; the value of a set is their
 unweighted mean.
 
-Source: PanSplat, section 4; docs/official.md, sections 2.1 to 2.5 and 13.
+Source: PanSplat, section 4; docs/official.md, sections 2.1 to 2.4 and 13.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class FramePair:
 
 @dataclass(frozen=True)
 class BoundedSampler:
-    """Chooses two frames with a bounded gap, and targets between them. Source: docs/official.md, section 2.5.
+    """Chooses two frames with a bounded gap, and targets between them. Source: docs/official.md, section 2.4.
 
     Attributes:
         min_gap, max_gap: frames from left to right.

@@ -112,6 +112,7 @@ REFUSED = {
     "render scene.ply -o x.jpg --path walk.json": "--out must end in .mp4, .webm, .png, .exr",
     "render scene.ply -o x.png --pose path.txt": "holds 2 poses",
     "render scene.ply -o x.mp4 --at 0.5": "--at is one position",
+    "render scene.ply -o x.mp4 --pose p.json": "--pose is one position",
     "render room -o x.png --at 1.5": "--at: needed a number <= 1.0, got 1.5",
     "render scene.ply -o x.jpg --depth": "--depth writes a .png",
     "render scene.ply -o x.png --blend mixed": "--blend must be",

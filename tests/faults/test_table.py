@@ -338,7 +338,7 @@ FILES = [
     Fault("a FIFO as a mask", PREDICT, fifo("pair/a_mask.png"), "", 0),
     Fault("a FIFO as weights", WEIGHTS, fifo("weights.safetensors"), "FIFO"),
     Fault("a FIFO as a pose", "render scene.ply -o x.png --pose p.json", fifo("p.json"), "FIFO"),
-    Fault("a FIFO as a trajectory", "render scene.ply -o x.png --pose p.txt", fifo("p.txt"), "FIFO"),
+    Fault("a FIFO as the numbers of a pose", "render scene.ply -o x.png --pose p.txt", fifo("p.txt"), "FIFO"),
     Fault("a FIFO as a pair", "predict fifo -o out.ply", fifo("fifo"), "fifo"),
     Fault("a FIFO as a panorama without a pose", "pose pair/b.png f.png", fifo("f.png"), "FIFO"),
     Fault("a FIFO as a video", "pose f.mp4 -o frames", fifo("f.mp4"), "FIFO"),
