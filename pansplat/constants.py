@@ -20,7 +20,6 @@ OPACITY_CUT = ALPHA_CUT * (1 - 1e-6)  # Gaussians of less opacity are removed be
 KAPPA_MARGIN = 1e-5  # added to kappa, so that bounding boxes contain every pixel that reaches the cut
 MAX_MAGNITUDE = 1e30  # products of larger parameters could overflow
 MAX_SCALE_RATIO = 1e12  # of scale to distance; beyond it the products of docs/rendering.md, section 2, could overflow
-MIN_EIGENVALUE_RATIO = -1e-3  # of a covariance, smallest to largest: bfloat16's rounding stays above it
 MIN_COMPENSATION = 1e-12  # of det B / det B': keeps its root differentiable; below it alpha is always cut
 MIN_EWA_VARIANCE = 1e-12  # pixel^2; the determinant of a needle can round to zero or less
 

@@ -1,9 +1,9 @@
-// The rendered image on the screen, and right of `split` a photograph in the same directions.
+// The rendered image on the screen, or a photograph in the directions of the camera.
 uniform sampler2D image;            // bottom row first
 uniform sampler2D fading;           // the image of another scene, bottom row first
 uniform float weight;               // of `image` against `fading`
-uniform sampler2D right;            // the photograph: equirectangular, top row first
-uniform float split;                // fraction of the width
+uniform sampler2D photograph;       // equirectangular, top row first
+uniform bool shows_photograph;
 uniform vec2 tangent;               // of half the horizontal and vertical field of view
 uniform mat3 camera_to_photo;       // rotation, OpenCV axes
 
@@ -22,9 +22,9 @@ vec3 sample_photograph() {
     vec2 ray = (2.0 * uv - 1.0) * tangent;
     vec3 d = camera_to_photo * vec3(ray.x, -ray.y, 1.0);
     vec2 photo_uv = vec2(atan(d.x, d.z) / (2.0 * PI) + 0.5, atan(d.y, length(d.xz)) / PI + 0.5);
-    return textureLod(right, photo_uv, 0.0).rgb;  // level 0: derivatives have a seam at +-180 degrees
+    return textureLod(photograph, photo_uv, 0.0).rgb;  // level 0: derivatives have a seam at +-180 degrees
 }
 
 void main() {
-    color = vec4(uv.x < split ? sample_image() : sample_photograph(), 1.0);
+    color = vec4(shows_photograph ? sample_photograph() : sample_image(), 1.0);
 }

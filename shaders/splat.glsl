@@ -4,8 +4,7 @@
 uniform mat3 world_to_camera;
 uniform vec3 position;           // camera centre, in the moved frame of the means
 uniform float near;              // smallest radial distance, metres
-uniform bool exact;              // the exact response, order and filter, or those of 3DGS
-uniform float filter_variance;   // e^2 of section 2; of 3DGS, added to the diagonal of the projected covariance
+uniform float filter_variance;   // e^2 of section 2
 uniform vec2 half_size;          // half the image; of one off the optical axis, half the smallest one around both
 uniform float margin;            // added to the quad, for the rounding of the rasteriser
 
@@ -115,31 +114,6 @@ bool set_footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec
     return true;
 }
 
-// Sets the rows and the quad of the linearised response: the projected covariance at the (clamped) mean. `w2`: squared
-// products of two relative scales; `unit`: the rotation. Both give a determinant without cancellation.
-bool set_footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2) {
-    if (n.z <= 0.0 || f.distance * n.z <= EWA_NEAR_FACTOR * near) return false;
-    f.base = n.xy / n.z;
-    vec2 t = clamp(f.base, -EWA_CLAMP * half_size, EWA_CLAMP * half_size);
-    vec3 j_x = vec3(1.0, 0.0, -t.x) / n.z, j_y = vec3(0.0, 1.0, -t.y) / n.z;
-    vec3 x = j_x * axes, y = j_y * axes, normal = cross(j_x, j_y) * unit;
-    float v_xx = dot(x, x), v_xy = dot(x, y), v_yy = dot(y, y);
-    float determinant = dot(w2, normal * normal);
-    determinant += filter_variance * (v_xx + v_yy + filter_variance);
-    v_xx += filter_variance;
-    v_yy += filter_variance;
-    if (!(determinant > 0.0)) return false;
-    float root_y = sqrt(determinant / v_xx);
-    f.a = vec3(0.0, 1.0 / sqrt(v_xx), 0.0);
-    f.b = vec3(0.0, -v_xy / v_xx / root_y, 1.0 / root_y);
-    f.l = vec3(1.0, 0.0, 0.0);
-    f.thickness = 0.0;
-    f.center = f.base;
-    float kappa = 2.0 * log(f.peak / ALPHA_CUT);
-    set_quad(f, kappa * v_xx, kappa * v_xy, kappa * v_yy);
-    return true;
-}
-
 // Returns whether the Gaussian can be visible.
 bool project_gaussian(Gaussian gaussian, out Footprint f) {
     vec3 offset = gaussian.mean - position;
@@ -159,10 +133,8 @@ bool project_gaussian(Gaussian gaussian, out Footprint f) {
     float trace = dot(u_a, u_a) + dot(v_a, v_a);
     float sharp = dot(w2, n_e * n_e);
     float determinant = sharp + e2 * trace + e2 * e2;
-    f.peak = gaussian.opacity;
-    if (exact) f.peak *= sqrt(sharp / determinant);  // the filter conserves energy
+    f.peak = gaussian.opacity * sqrt(sharp / determinant);  // the filter conserves energy
     if (!(f.peak >= ALPHA_CUT)) return false;
-    if (!exact) return set_footprint_ewa(f, axes, unit, n, w2);
 
     float volume = k.x * k.y * k.z;
     float along = e2 * e2 * dot(n_a, n_a) + e2 * dot(w2, u_e * u_e + v_e * v_e) + volume * volume;

@@ -119,12 +119,6 @@ def recipe_weights(recipe: Callable[[str], dict[str, torch.Tensor]]) -> dict[str
 
 
 @pytest.fixture(scope="session")
-def mvsplat_weights(recipe: Callable[[str], dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
-    """The 471 tensors of the official MVSplat baseline without the prefix "encoder."; read-only."""
-    return recipe("mvsplat-512")
-
-
-@pytest.fixture(scope="session")
 def as_lightning() -> Callable[[dict[str, torch.Tensor]], dict[str, object]]:
     """Wrap tensors in a Lightning checkpoint like those of the official training."""
 

@@ -74,15 +74,6 @@ def _state_triplet(folder: Path, names: Names) -> None:
     _write(folder / "map.json", {"c2w": [move(n) for n in range(len(names))]})
 
 
-def _state_kitti(folder: Path, names: Names) -> None:
-    lines = (" ".join(map(str, np.ravel(move(n)[:3]))) for n in range(len(names)))
-    _write(folder / "poses.kitti", "\n".join(lines))
-
-
-def _state_tum(folder: Path, names: Names) -> None:
-    _write(folder / "poses.tum", "\n".join(f"{n} {n} 0 0 0 0 0 1" for n in range(len(names))))
-
-
 def state_nerfstudio(folder: Path, names: Names) -> None:
     frames = [{"file_path": name, "transform_matrix": move(n)} for n, name in enumerate(names)]
     _write(folder / "transforms.json", {"camera_model": "EQUIRECTANGULAR", "frames": frames})
@@ -245,8 +236,6 @@ EXAMPLES = {
     "360Loc": Example("360Loc", state_loc360, "camera_pose.json"),
     "PanoGRF": Example("PanoGRF", _state_panogrf, "b/tran.txt", missing=False),
     "triplet": Example("game maps", _state_triplet, "map.json", missing=False),
-    "KITTI": Example("trajectory", _state_kitti, "poses.kitti", missing=False),
-    "TUM": Example("trajectory", _state_tum, "poses.tum", missing=False),
     "nerfstudio": Example("nerfstudio", state_nerfstudio, "transforms.json"),
     "rigs": Example("nerfstudio", _state_rigs, "transforms.json", is_joined=True),
     "openMVG": Example("openMVG", state_openmvg, "sfm_data.json"),

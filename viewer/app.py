@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,7 +15,7 @@ from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import own_warnings, parse_arguments, print_message, progress_bar
 from pansplat.system.devices import Device, use_device
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
-from pansplat.system.options import EYE_DISTANCE, EyeDistance, check_numbers
+from pansplat.system.options import check_numbers
 from pansplat.system.progress import stage
 from pansplat_viewer.scene.loader import (
     LoadedScene,
@@ -27,16 +27,15 @@ from pansplat_viewer.scene.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.scene.settings import DrawSettings, Mode, Preset, Projection, RendererChoice, Stereo
+from pansplat_viewer.scene.settings import DrawSettings, Mode, RendererChoice
 
 if TYPE_CHECKING:
     import moderngl
 
     from pansplat.tours.camera_path import CameraPath
-    from pansplat_viewer.draw.stereo import ImageFormat
 
 _WRITTEN = "view_*.png", "panorama_*.png", "[0-9]*_*.png", "flythrough.mp4", "tour.mp4"  # offscreen
-_WINDOW_SIZE = 1280, 720  # pixels
+_WINDOW_SIZE, _FILM_SIZE = (1280, 720), (1920, 1080)  # pixels
 _PREDICTION_PART = 0.6  # of the work of a film; the rest is drawing
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
 
@@ -53,36 +52,26 @@ class Options:
     offscreen: Path | None = None
     """Open no window; write film, stills and panorama to this folder."""
     path_file: Annotated[Path | None, tyro.conf.arg(name="path")] = None
-    """A camera path (docs/viewer.md): the window has its key frames; with --out, the film follows it."""
-    out: Path | None = None
-    """Open no window; write the film of --path to this file: .mp4, .webm, or .png or .exr for a numbered sequence."""
+    """A camera path (docs/viewer.md), whose key frames the window has; `pansplat render` draws its film."""
     overwrite: bool = False
-    """With --offscreen or --out: replace files that pansplat did not write, too."""
+    """With --offscreen: replace files that pansplat did not write, too."""
     pair: str | None = None
     """Name or number of the tour, pair or scene to show first if the path holds several; offscreen also "all"."""
     prediction: PredictOptions = field(default_factory=PredictOptions)
     reading: ReadOptions = field(default_factory=ReadOptions)
     mode: Mode = "deferred"
     """How the Gaussians of the input views are combined."""
-    preset: Preset = "exact"
-    """Draw Gaussians exactly on each ray and by distance, or as 3DGS does: linearised and by depth (OpenGL only)."""
     renderer: RendererChoice = "auto"
-    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, for preset 3dgs and for
-    stereo in a window, and cpu where OpenGL is software."""
+    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, and cpu where OpenGL is
+    software."""
     at: Annotated[float, Meta(ge=0, le=1)] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     device: Device = "auto"
     """As that of `pansplat predict`; OpenGL draws on its own card (--renderer)."""
     verbose: bool = False
     """Print what runs where."""
-    projection: Projection = "perspective"
-    """What the frames of --out show: a perspective image, or all directions as a panorama or as six cube faces."""
-    stereo: Stereo = "mono"
-    """Images for two eyes, in the window and in --out: next to each other, or left above right."""
-    ipd: EyeDistance = EYE_DISTANCE
-    """Distance of the eyes, metres."""
     size: str | None = None
-    """Width x height of one eye, pixels (window 1280x720, film 1920x1080; panoramas 2880x1440, cubemaps 2160x1440)."""
+    """Width x height, pixels (window 1280x720, film 1920x1080)."""
     seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """Length of the film (4); of a tour, by default the time at 1 metre per second."""
     fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
@@ -94,18 +83,11 @@ class Options:
     def pixels(self) -> tuple[int, int]:
         """`size` of films and stills as (width, height)."""
         if self.size is None:
-            return self.image_format.default_size
+            return _FILM_SIZE
         match = re.fullmatch(r"(\d{2,5})x(\d{2,5})", self.size.lower())
         if not match or not all(16 <= int(side) <= 16384 for side in match.groups()):
             raise InputError(f"`--size` must be WIDTHxHEIGHT in pixels, 16 to 16384, got {self.size!r}")
         return int(match[1]), int(match[2])
-
-    @property
-    def image_format(self) -> "ImageFormat":
-        """The image format of films and stills: projection and stereo."""
-        from pansplat_viewer.draw.stereo import ImageFormat
-
-        return ImageFormat(self.projection, self.stereo, self.ipd)
 
     @property
     def load_options(self) -> LoadOptions:
@@ -115,16 +97,7 @@ class Options:
     @property
     def settings(self) -> DrawSettings:
         """The draw settings with which the viewer begins."""
-        return DrawSettings(preset=self.preset, mode=self.mode, stereo=self.stereo, eye_distance=self.ipd)
-
-    @property
-    def renderer_choice(self) -> RendererChoice:
-        """`renderer`; the processor does not draw preset 3dgs."""
-        if self.preset == "exact":
-            return self.renderer
-        if self.renderer == "cpu":
-            raise InputError("--preset 3dgs needs OpenGL, got --renderer cpu; use --renderer gl or --preset exact")
-        return "gl"
+        return DrawSettings(mode=self.mode)
 
 
 def run_arguments(args: Sequence[str] | None = None) -> int:
@@ -144,38 +117,25 @@ def run_arguments(args: Sequence[str] | None = None) -> int:
 
 def _run(options: Options) -> int:
     pixels = options.pixels
-    options.image_format.check(pixels, options.preset)
-    options = replace(options, renderer=options.renderer_choice)
-    windowless = options.offscreen is not None and options.stereo != "mono"
-    if options.out is None and (windowless or options.projection != "perspective"):
-        raise InputError("--projection, and --stereo without a window, need --out; give --path and --out FILE")
     if options.offscreen is not None:
         require_output_folder("--offscreen", options.offscreen)
-    from pansplat.export.film import require_film_file
     from pansplat.tours.camera_path import read_path
 
-    if options.out is not None:
-        require_film_file("--out", options.out, options.overwrite)
-        if options.path_file is None or options.offscreen is not None or options.pair == "all":
-            raise InputError("--out needs --path, one scene and no --offscreen; give the file of a camera path")
     path = None if options.path_file is None else read_path(expand_home(options.path_file))
     folder = options.offscreen
-    if folder is None and options.out is None:
+    if folder is None:
         problem = _run_window(options, pixels if options.size else _WINDOW_SIZE, path)
         if problem is None:
             return 0
         if path is None:
             print(f"{problem}: writing a fly-through instead")
         require_output_folder("the folder", Path("renders"))
-    if path is not None and options.out is None:
-        raise InputError("--path without a window needs --out; add --out FILE")
+    if path is not None:
+        raise InputError("--path needs a window; `pansplat render SCENE --path FILE -o film.mp4` draws its film")
     with progress_bar():  # of poses, which take minutes for a tour without them
         entries = find_entries(expand_home(options.path), options.load_options)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)
-    if options.out is not None:
-        _write_film(options, entries[first], options.out.parent, pixels, path)
-        return 0
     chosen = entries if show_all else entries[first : first + 1]
     if len(chosen) < len(entries):
         print(f"{options.path} has {len(entries)} scenes: showing {chosen[0].name}; select with --pair NAME or all")
@@ -193,10 +153,6 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
 
     The window opens when the panoramas are known. Their poses may arrive later.
     """
-    if options.stereo != "mono":
-        if options.renderer == "cpu":
-            raise InputError("--stereo in a window needs OpenGL, got --renderer cpu; use --renderer gl")
-        options = replace(options, renderer="gl")
     from pansplat.tours.camera_path import CameraPath
     from pansplat_viewer.scene.state import ViewerState
 
@@ -262,26 +218,17 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
     return None
 
 
-def _write_film(
-    options: Options,
-    entry: SceneEntry,
-    folder: Path,
-    pixels: tuple[int, int],
-    path: "CameraPath | None" = None,
-) -> None:
-    """Load one entry and write its fly-through to a folder, or the film of a path to `--out`, with a progress bar.
+def _write_film(options: Options, entry: SceneEntry, folder: Path, pixels: tuple[int, int]) -> None:
+    """Load one entry and write its fly-through to a folder, with a progress bar.
 
     Names of scenes and files are printed as soon as they are there.
     """
-    from pansplat.export.film import follow_path, write_film
     from pansplat_viewer.capture import open_film, write_flight
     from pansplat_viewer.draw.cpu_renderer import create_renderer
     from pansplat_viewer.scene.state import fit_settings
     from pansplat_viewer.scene.tour import TourScenes
 
-    out, format_, fps = options.out, options.image_format, options.fps
-    choice = "cpu" if format_.is_omnidirectional else options.renderer
-    ctx = _create_context(choice)  # before the prediction, so that missing OpenGL is reported early
+    ctx = _create_context(options.renderer)  # before the prediction, so that missing OpenGL is reported early
     with progress_bar():
 
         def load(entry: SceneEntry, end: float = 0.0) -> LoadedScene:  # 0: within the frames of the film
@@ -297,19 +244,11 @@ def _write_film(
         loaded = load(entry, _PREDICTION_PART * _find_part(entry))
         scene, tour, settings = loaded.scene, loaded.entry.tour, fit_settings(options.settings, loaded.scene)
         scenes = None if tour is None else TourScenes.start(loaded, options.memory)
-        create = partial(create_renderer, ctx, choice, color_bits=32)
-        with_depth = out is not None and out.suffix.lower() == ".exr"
+        create = partial(create_renderer, ctx, options.renderer, color_bits=32)
+        at = 0.5 if options.at is None else options.at
         try:
-            with open_film(create, loaded, scenes, load, pixels, settings, format_, with_depth=with_depth) as film:
-                if path is not None and out is not None:
-                    shots = follow_path(path, fps, scene, tour)
-                    projection = None if format_.projection == "perspective" else format_.projection
-                    options_of_file = {"projection": projection, "stereo": format_.stereo, "unit": scene.frame.unit}
-                    for file in write_film(out, film, shots, fps, **options_of_file):
-                        show_file(file)
-                else:
-                    at = 0.5 if options.at is None else options.at
-                    write_flight(film, scene, scenes, folder, fps, options.seconds, at, settings, show_file)
+            with open_film(create, loaded, scenes, load, pixels, settings) as film:
+                write_flight(film, scene, scenes, folder, options.fps, options.seconds, at, settings, show_file)
         finally:
             if ctx is not None:
                 ctx.release()

@@ -16,11 +16,9 @@ from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, write
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import write_image
-from pansplat.rendering.image_planes import Layout
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.route import FADE_SECONDS, NEAR_OF_FAR, Route, plan_route
-from pansplat_viewer.draw.frame_renderer import FrameRenderer
-from pansplat_viewer.draw.stereo import ImageFormat, render_image
+from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, make_file_name
 from pansplat_viewer.scene.settings import DrawSettings
@@ -50,9 +48,6 @@ def open_film(
     load: Callable[[SceneEntry], LoadedScene],
     size: tuple[int, int],
     settings: DrawSettings,
-    image_format: ImageFormat,
-    *,
-    with_depth: bool = False,
 ) -> Iterator[Film]:
     """A film of a scene, or of a tour whose scenes are loaded when the camera needs them.
 
@@ -61,15 +56,12 @@ def open_film(
         loaded: the scene, or the first one of the tour.
         scenes: of the tour; None for another scene.
         load: returns the scene of an entry.
-        size: (width, height) of one eye, pixels.
+        size: (width, height), pixels.
         settings: draw settings.
-        image_format: of the frames.
-        with_depth: whether depth is drawn, and no photographs.
     """
     entry, photographs = loaded.entry, None
     source = entry.tour or entry.pair
-    is_plain = settings.shows_scene and image_format.stereo == "mono" and image_format.projection != "cubemap"
-    if source is not None and entry.merged is None and is_plain and not with_depth:
+    if source is not None and entry.merged is None and settings.shows_scene:
         photographs = FilmPhotographs.open(source, loaded.scene)
     if scenes is not None:
         settings = replace(settings, near=NEAR_OF_FAR * scenes.tour.far)
@@ -81,7 +73,7 @@ def open_film(
             renderers[slot].upload(scene)
             uploaded[slot] = scene
         fitted = replace(fit_settings(settings, scene), vertical_fov_degrees=shot.vertical_fov_degrees)
-        return render_image(renderers[slot], shot.pose, size, fitted, image_format, with_depth=with_depth)
+        return render_image(renderers[slot], shot.pose, size, fitted)
 
     def choose(shot: Shot) -> tuple[Scene, int]:
         assert scenes is not None
@@ -93,10 +85,9 @@ def open_film(
         assert shown is not None
         return shown.scene, scenes.part
 
-    layout: Layout = "equirect" if image_format.projection == "equirect" else "pinhole"
     chosen = choose if scenes is not None else lambda shot: (loaded.scene, 0)
     try:
-        yield Film(chosen, draw, layout, (size[1], size[0]), photographs)
+        yield Film(chosen, draw, "pinhole", (size[1], size[0]), photographs)
     finally:
         for renderer in renderers:
             renderer.release()

@@ -303,7 +303,7 @@ class Scenes:
         self.shown, self.tour = life, None
         self._library.keep()
         stage.clear()
-        stage.comparer.photographs.open(entry.panoramas)
+        stage.photographs.open(entry.panoramas)
         self._entered(entry)
         if entry.tour is None:
             enter_scene(state, loaded.scene, at=self._at)
@@ -321,8 +321,8 @@ class Scenes:
 
     def _preview(self, entry: SceneEntry) -> None:
         """Show the photographs of an entry until its scene is there; the camera can turn and fly."""
-        comparer = self._stage.comparer
-        comparer.photographs.open(entry.panoramas)
+        photographs = self._stage.photographs
+        photographs.open(entry.panoramas)
         self._stage.clear()
         self.tour = None
         source = entry.tour or entry.pair
@@ -337,9 +337,9 @@ class Scenes:
         else:
             enter_tour(self._state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
             self.tour = TourScenes(entry.tour)
-        nearest = comparer.choose_photograph(self._state)
+        nearest = photographs.find_nearest(np.asarray(self._state.camera.position))
         if nearest is not None:
-            comparer.photographs.wait(nearest)  # else the first frames are black
+            photographs.wait(nearest)  # else the first frames are black
             self._face_open_view(entry, nearest)
         self._stage.last_camera = self._state.camera
 
@@ -401,7 +401,7 @@ class Scenes:
         shows_scene = stage.photograph is None and stage.fade.parts[stage.fade.front] == tour.part
         if self.shown is None or not (shows_scene and tour.is_inside(position, stage.scene_views)):
             for end in tour.edge:  # that of the other end is read before it is needed
-                stage.comparer.get_photograph(self._state, end)
+                stage.get_photograph(end)
             stage.fade_to_photograph(tour.find_nearest(position), tour.part)
 
     def fly(self, seconds: float, was_playing: bool) -> None:
@@ -421,5 +421,5 @@ class Scenes:
             if state.playing:  # photographs are read before they are shown
                 leg = state.route.leg(state.flight)
                 for node in state.route.walk[leg + 1 : leg + 3]:
-                    self._stage.comparer.get_photograph(state, node)
+                    self._stage.get_photograph(node)
         advance_flight(state, seconds)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from pansplat.images.image_files import write_image
-from pansplat_viewer.draw.cpu_renderer import CpuRenderer
-from pansplat_viewer.draw.stereo import choose_format, render_image
+from pansplat_viewer.draw.frame_renderer import render_image
 from pansplat_viewer.scene.loader import LoadedScene
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.stage import DRAW_ERRORS, Stage, describe_error
@@ -30,7 +28,7 @@ class Screenshots:
         self.files: list[Path] = []
 
     def write(self, loaded: LoadedScene, suffix: str, *, panorama: bool = False) -> None:
-        """Write the image, or the panorama at the camera; in stereo of both eyes, in a panorama the left one above.
+        """Write the image, or the panorama at the camera.
 
         The file is the first of `view_001.png`, `view_002.png`, ... (`panorama_001.png`, ...) that does not exist.
 
@@ -40,30 +38,22 @@ class Screenshots:
             panorama: whether all directions are shown.
         """
         stage, settings = self._stage, self._state.draw_settings
-        image_format = choose_format("equirect" if panorama else "perspective", settings)
-        size = (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT) if panorama else stage.eye_size
-        on_processor = CpuRenderer(None) if image_format.is_omnidirectional else None
+        settings = replace(settings, layout="equirect" if panorama else "pinhole")
+        size = (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT) if panorama else stage.size
         stage.slot.image = None  # the texture will hold the screenshot
         try:
-            image_format.check(size, settings.preset)
-            if on_processor is not None and stage.slot.scene is not None:
-                on_processor.upload(stage.slot.scene)
-            renderer, pose = on_processor or stage.renderer, self._state.camera.cam2world
-            color, depth = render_image(renderer, pose, size, settings, image_format, with_depth=suffix == "exr")
+            pose = self._state.camera.cam2world
+            color, depth = render_image(stage.renderer, pose, size, settings, with_depth=suffix == "exr")
             depth = None if depth is None else loaded.scene.frame.unit * depth
             folder = self._folder / loaded.entry.folder_name
             folder.mkdir(parents=True, exist_ok=True)
             path = _find_free_name(folder, "panorama" if panorama else "view", suffix)
-            marked = panorama and color.shape[1] == 2 * color.shape[0]  # there is no property for stereo
-            write_image(path, np.clip(color, 0, 1), depth=depth, panorama=marked)
+            write_image(path, color, depth=depth, panorama=panorama)
         except (*DRAW_ERRORS, OSError) as error:
             self._show_error(f"no screenshot written: {describe_error(error)}")
         else:
             self.files.append(path)
             self._state.show_message(f"wrote {path}")
-        finally:
-            if on_processor is not None:
-                on_processor.release()
 
 
 def _find_free_name(folder: Path, stem: str, suffix: str) -> Path:

@@ -132,7 +132,7 @@ class Viewer:
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
         is_placing = self.placing is not None and self.placing.is_busy
-        return self.moving or self.scenes.is_busy or self.stage.comparer.photographs.is_reading or is_placing
+        return self.moving or self.scenes.is_busy or self.stage.photographs.is_reading or is_placing
 
     @property
     def loaded(self) -> LoadedScene | None:
@@ -155,12 +155,6 @@ class Viewer:
         return None if self.stage.is_animated(self._clock()) else self.stage.pending
 
     @property
-    def right_name(self) -> str | None:
-        """What is right of the divider; None if there is nothing."""
-        mono = self.state.settings.stereo == "mono"
-        return self.stage.comparer.describe(self.state) if self.loaded is not None and mono else None
-
-    @property
     def panoramas(self) -> list[str]:
         """The names of the input cameras of the scene, or their numbers."""
         scene = self.stage.slot.scene
@@ -170,8 +164,6 @@ class Viewer:
     def _find_hotspots(self) -> list[Hotspot]:
         """The places of panoramas in the image, in points of the window, which may have several pixels."""
         camera, fade = self.state.camera, self.stage.fade
-        if self.stage.eye_size != self.stage.size:
-            return []
         size = imgui.get_io().display_size
         points = int(size.x), int(size.y)
         has_arrived = self.tour is not None and fade.parts[fade.front] == self.tour.part
@@ -207,7 +199,7 @@ class Viewer:
         advance_path(state, step)
         self.scenes.update()
         if self.loaded is None and self.tour is None:
-            stage.fade_to_photograph(stage.comparer.choose_photograph(state))
+            stage.fade_to_photograph(stage.photographs.find_nearest(np.asarray(state.camera.position)))
         problem = stage.draw(target)
         if problem is not None:
             self.scenes.offer_reduced(problem)
@@ -279,9 +271,8 @@ class Viewer:
             state.target = find_clicked(self.hotspots, (place[0] * points.x, place[1] * points.y))
         if state.target is not None or scene is None or stage.photograph is not None:
             return
-        (width, height), size = stage.size, stage.eye_size
-        pixel = place[0] * width % size[0], place[1] * height % size[1]
-        point = pick_point(scene, *compute_pixel_ray(state.camera, pixel, size), state.settings)
+        pixel = place[0] * stage.size[0], place[1] * stage.size[1]
+        point = pick_point(scene, *compute_pixel_ray(state.camera, pixel, stage.size), state.settings)
         if point is None:
             state.points = []
             state.show_message("no Gaussian there")
@@ -301,7 +292,7 @@ class Viewer:
 
     def put_note(self, text: str) -> None:
         """State a note at the middle of the image, in place of one that is there; without a text remove that one."""
-        photographs, camera = self.stage.comparer.photographs, self.state.camera
+        photographs, camera = self.stage.photographs, self.state.camera
         index = photographs.find_stop(np.asarray(camera.position))
         if index is None or photographs.panoramas[index].links_at is None:
             self.state.show_message("a note is put at a panorama of a folder; open the folder of this one")

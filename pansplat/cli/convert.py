@@ -22,7 +22,7 @@ _MAX_NAMES = 2  # in a row of the report
 
 @dataclass(frozen=True)
 class Convert(Writer):
-    """Convert a checkpoint of the official PanSplat (or its MVSplat baseline) to a file of weights.
+    """Convert a checkpoint of the official PanSplat to a file of weights.
 
     No code in the checkpoint is executed. Use the weights with --model.
     """
@@ -54,7 +54,7 @@ def _make_report_table(report: ConversionReport) -> Table:
     """Rows of used, unused (by reason), unknown and missing tensors."""
     from rich.table import Table
 
-    table = Table(title=f"{report.model}: tensors of the checkpoint")
+    table = Table(title="Tensors of the checkpoint")
     table.add_column("")
     table.add_column("count", justify="right")
     table.add_column("such as", overflow="fold")

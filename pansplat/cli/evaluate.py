@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pansplat.inputs.pairs import Pair
 
 _WRITTEN = "results.json", "*/prediction.png", "*/target.png", "*/error.png"
-_WRITTEN_OF_PROTOCOL = "results.json", "table.md", "frame_distance.png", "*/*/*.png"
+_WRITTEN_OF_PROTOCOL = "results.json", "table.md", "*/*/*.png"
 _HEIGHT = 512  # pixels, of the paper's panoramas
 _PROTOCOL_WIDTH = 150  # characters of a protocol's tables if there is no terminal
 
@@ -53,12 +53,10 @@ class LpipsChoice:
 class ProtocolChoice:
     """The paper's evaluations, instead of folders of pairs."""
 
-    protocol: (
-        Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"] | None
-    ) = None
-    """One table (or figure) of the paper, on the data sets that --data holds; missing ones are listed."""
+    protocol: Literal["m3d", "narrow", "replica", "residential", "360loc"] | None = None
+    """One table of the paper, on the data sets that --data holds; missing ones are listed."""
     data: Path | None = None
-    """Folder that holds the data sets, for --protocol: png_render_test_* or pano_grf/, 360Loc/, insta360/."""
+    """Folder that holds the data sets, for --protocol: png_render_test_* or pano_grf/, 360Loc/."""
     models: tuple[str, ...] = ()
     """More predictors for the table of --protocol: `sweep`, or files of weights."""
     limit: Count | None = None
@@ -156,7 +154,7 @@ class Evaluate(Computation):
             console.print(table)
         for note in report_notes(result):
             console.print(note, markup=False, soft_wrap=True)
-        print(", ".join(str(path) for path in (self.out / "results.json", *written)))
+        print(f"{self.out / 'results.json'}, {written}")
         return 0
 
     def _protocol_data(self) -> Path:

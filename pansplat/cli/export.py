@@ -91,11 +91,11 @@ class _FloorPlan:
 class _Mesh:
     """For a mesh."""
 
-    suffixes: ClassVar = (".obj",)
-    files: ClassVar = "a mesh (.obj, or .glb with --mesh)"
+    suffixes: ClassVar = ()
+    files: ClassVar = "a mesh (a .glb with --mesh)"
 
     mesh: bool = False
-    """Write a .glb of triangles with the photographs as textures. An .obj always has them."""
+    """Write a .glb of triangles with the photographs as textures."""
     triangles: Count | None = None
     """Largest number of triangles, 2,000,000 by default."""
     whole: bool = False
@@ -104,12 +104,11 @@ class _Mesh:
     def write(self, export: Export) -> None:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
-        from pansplat.export.mesh_files import name_mesh_files, remove_old_meshes, save_mesh
+        from pansplat.export.mesh_files import remove_old_meshes, save_mesh
         from pansplat.tours.doll_house import find_rooms
         from pansplat.tours.facts import TourFacts
         from pansplat.tours.graph import make_graph, select_views
 
-        require_replaceable("--out", name_mesh_files(export.out, 1), export.overwrite)  # before the prediction
         scene, changes, photographs = export.open()
 
         def load(view: int) -> Tensor:
@@ -131,15 +130,12 @@ class _Mesh:
                 )
         if not meshes:
             raise InputError(f"{export.path}: needed surfaces in rooms, got none; --whole keeps all of them")
+        require_replaceable("--out", meshes, export.overwrite)
         for file, mesh in meshes.items():
-            require_replaceable("--out", name_mesh_files(file, len(mesh.parts)), export.overwrite)
-        for file, mesh in meshes.items():
-            files = save_mesh(mesh, file)
-            size = sum(written.stat().st_size for written in files)
-            beside = f" and {len(files) - 1} files beside it" if len(files) > 1 else ""
+            save_mesh(mesh, file)
             count, names = len(mesh.parts), ", ".join(part.name for part in mesh.parts)
             whose = names if file != export.out else describe_count(count, "panorama")
-            print(f"{file}{beside}: {mesh.num_triangles:,} triangles of {whose}, {size / 1e6:.1f} MB")
+            print(f"{file}: {mesh.num_triangles:,} triangles of {whose}, {file.stat().st_size / 1e6:.1f} MB")
         remove_old_meshes(export.out, meshes)
         if len(meshes) > 1:
             print(
@@ -336,14 +332,14 @@ class _Photographs:
 class Export(Computation):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
     web page (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan
-    with straight walls and areas (.svg, .png, .dxf), as textured triangles (.obj, .glb with --mesh), or as a folder
+    with straight walls and areas (.svg, .png, .dxf), as textured triangles (.glb with --mesh), or as a folder
     to train further from (--training-set): cube faces, poses and points for COLMAP, nerfstudio, gsplat and brush."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg, .dxf or .png
-    for a floor plan; .obj for a mesh. A folder, without a suffix, for a web page with photographs of their own
+    for a floor plan. A folder, without a suffix, for a web page with photographs of their own
     resolution, which are loaded as they are needed; a new one with --training-set for cube faces with poses, and with
     --photos for the photographs of a tour."""
     degree: Annotated[int, Meta(ge=0, le=4)] | None = None

@@ -27,8 +27,8 @@ class Pose(Computation):
     paths: Positional[tuple[Path, ...]]
     """A folder of panoramas, a web tour, or two or more files; or a 360-degree video."""
     out: OptionalOut = None
-    """File to write: poses.json, or a trajectory .tum or .kitti. Without it, only the table is shown. For a video, a
-    folder for the key frames and their poses.json."""
+    """The poses.json to write. Without it, only the table is shown. For a video, a folder for the key frames and their
+    poses.json."""
     camera_height: Positive = CAMERA_HEIGHT
     """Mean height of the cameras over the floor, metres; it sets the scale."""
     baseline: tuple[str, str, float] | None = None
@@ -39,7 +39,7 @@ class Pose(Computation):
     def run(self) -> int:
         """Estimate, print the table and write the file."""
         from pansplat.inputs.folders import VIDEO_FILES, list_unposed
-        from pansplat.poses.files import SUFFIXES, estimate_panoramas, require_mergeable, write_poses
+        from pansplat.poses.files import estimate_panoramas, require_mergeable, write_poses
         from pansplat.poses.key_frames import extract_key_frames
 
         if not self.paths:
@@ -52,7 +52,7 @@ class Pose(Computation):
             require_output_folder("--out", out)
             out = out / "poses.json"
         elif out is not None:
-            require_output_file("--out", out, SUFFIXES)
+            require_output_file("--out", out, (".json",))
         panoramas = [] if is_video else list_unposed(self.paths)
         if not is_video and len(panoramas) < 2:
             raise InputError(f"{self.paths[0]}: needed two or more panoramas, got {len(panoramas)}; add the others.")

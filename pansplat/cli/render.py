@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _VIDEO_SUFFIXES = (".mp4", ".webm")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 _VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # pixels
-_MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
+_MAX_MATRIX = 4096  # bytes of a file with the 16 numbers of a matrix
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ class Render(Computation):
     """Camera position between the first (0) and the last (1) input camera, or on the flight through a tour of several
     parts; 0.5 by default."""
     pose: Path | None = None
-    """File with the camera pose: a JSON matrix (cam2world, OpenCV axes, metres), 16 numbers, or a KITTI or TUM
-    trajectory, which a video follows."""
+    """File with the camera pose of an image: a JSON matrix (cam2world, OpenCV axes, metres), or 16 numbers."""
     path_file: Annotated[Path | None, arg(name="path")] = None
     """File of a camera path (docs/viewer.md), which the film follows; a .png or .exr becomes a numbered sequence."""
     layout: Literal["equirect", "cubemap", "perspective"] | None = None
@@ -86,30 +85,25 @@ class Render(Computation):
         from pansplat.tours.camera_path import read_path
 
         self._refuse_invalid_arguments()
-        poses = None if self.pose is None else read_poses(self.pose)
+        pose = None if self.pose is None else read_pose(self.pose)
         path = None if self.path_file is None else read_path(expand_home(self.path_file))
-        if poses is not None and len(poses) > 1 and not self._is_film:
-            raise InputError(
-                f"{self.pose} holds {len(poses)} poses; write an .mp4 or .webm, or keep one pose in the file"
-            )
         with stage(0.5 if self._is_film else 1.0):
             scene, source = self.prediction.open(self.path)
-        poses = None if poses is None else [scene.frame.localize(pose) for pose in poses]
         layout = self.layout or ("perspective" if self._is_film and not self.stereo else "equirect")
         options = self._render_options(layout, self.height or self._choose_height(layout, scene))
         size = f"{options['size'][1]}x{options['size'][0] * (2 if self.stereo else 1)}"
         if self._is_film:
-            shots = self._list_shots(scene, poses, path)
+            shots = self._list_shots(scene, path)
             film = self._make_film(scene, source, options, len(shots))
             marks = {
-                "projection": None if layout == "perspective" else "equirect",
+                "panorama": layout != "perspective",
                 "stereo": "top-bottom" if self.stereo else "mono",
                 "unit": scene.frame.unit,
             }
             write_film(self.out, film, shots, self.fps, **marks)
             print(f"{self.out}: {describe_count(len(shots), 'frame')} of {size}, {layout}")
             return 0
-        pose = self._pose_between_cameras(scene) if poses is None else poses[0]
+        pose = self._pose_between_cameras(scene) if pose is None else scene.frame.localize(pose)
         with torch.no_grad():
             image = pipeline.make_renderer(scene, "image", 1, **options)(pose)
         panorama = layout != "perspective" and not self.stereo  # GPano has no property for stereo
@@ -147,8 +141,9 @@ class Render(Computation):
             raise InputError(f"{' and '.join(given)} set the camera; give one of them")
         if self.depth and self.path_file is not None:
             raise InputError("--depth writes one image; write the film of --path as .exr, which holds depth")
-        if self.at is not None and self._is_film:
-            raise InputError("--at is one position, a video moves through all; write a .png, or leave out --at")
+        for name in ("--at", "--pose"):
+            if name in given and self._is_film:
+                raise InputError(f"{name} is one position, a video moves; write a .png, or leave out {name}")
         if self.stereo and self.layout not in (None, "equirect"):
             raise InputError(f"--stereo is for panoramas of --layout equirect, got {self.layout}; leave out --layout")
         self._parse_blend()
@@ -174,18 +169,16 @@ class Render(Computation):
         fraction, route = 0.5 if self.at is None else self.at, _plan_flight(scene)
         return scene.pose_between(fraction) if route is None else torch.from_numpy(route.pose(fraction))
 
-    def _list_shots(self, scene: Scene, poses: list[Tensor] | None, path: CameraPath | None) -> list[Shot]:
-        """The frames of a film: of a path, of poses, or of the flight through all input cameras."""
-        from pansplat.export.film import Shot, follow_path, list_flight
+    def _list_shots(self, scene: Scene, path: CameraPath | None) -> list[Shot]:
+        """The frames of a film: of a path, or of the flight through all input cameras."""
+        from pansplat.export.film import follow_path, list_flight
         from pansplat.geometry.path import fly_pose
         from pansplat.tours.graph import make_graph
 
         if path is not None:
             return follow_path(path, self.fps, scene, make_graph(scene) if scene.overlaps else None)
-        if poses is not None:
-            return [Shot(pose.numpy(), self.fov, number / self.fps) for number, pose in enumerate(poses)]
         if not len(scene.cam2world):
-            raise InputError(f"{self.path} has no input cameras to fly between; give a trajectory with --pose")
+            raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
         flight = _plan_flight(scene) or (lambda fraction: fly_pose(scene.cam2world, fraction).numpy())
         return list_flight(flight, self.fps, self.fov, self.seconds)
 
@@ -231,9 +224,9 @@ def _plan_flight(scene: Scene) -> Route | None:
     return plan_route(tour, tour.plan_walk()) if max(tour.parts) else None
 
 
-def read_poses(path: Path) -> list[Tensor]:
-    """Poses of a file (a JSON matrix, 16 numbers, a KITTI or TUM trajectory): cam2world, OpenCV axes."""
-    from pansplat.inputs.poses import parse_convention, read_trajectory, rigid_matrix, to_cam2world
+def read_pose(path: Path) -> Tensor:
+    """The pose of a file (a JSON matrix, or 16 numbers): cam2world, OpenCV axes."""
+    from pansplat.inputs.poses import parse_convention, parse_numbers, rigid_matrix, to_cam2world
     from pansplat.system.strict_json import read_json
 
     if path.suffix.lower() == ".json":
@@ -242,15 +235,6 @@ def read_poses(path: Path) -> list[Tensor]:
         if isinstance(content, dict):
             convention = parse_convention(content.get("convention", convention), path)
             content = content.get("cam2world", content.get("pose"))
-        return [to_cam2world(rigid_matrix(content, str(path)), convention)]
-    try:
-        text = read_file(path, "a readable file of numbers", limit=1 << 30).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: needed a readable file of numbers, got '{error}'") from error
-    try:
-        numbers = [float(word) for word in text[:_MAX_MATRIX].replace(",", " ").split()]
-    except ValueError:
-        numbers = []  # comments or file names, which the trajectory reader handles
-    if len(numbers) == 16 and len(text) < _MAX_MATRIX:
-        return [rigid_matrix([numbers[i : i + 4] for i in (0, 4, 8, 12)], str(path))]
-    return list(read_trajectory(path).poses)
+        return to_cam2world(rigid_matrix(content, str(path)), convention)
+    text = read_file(path, "a readable file of numbers", limit=_MAX_MATRIX).decode("utf-8-sig", errors="replace")
+    return rigid_matrix(parse_numbers(text.replace(",", " "), 16, path).reshape(4, 4).tolist(), str(path))

@@ -1,7 +1,7 @@
 """Compile the numba kernels of rasteriser, viewer and sweep into numba's cache: `python -m pansplat.cli.warm_up`.
 
-setup.sh runs this once, so that later commands do not compile them. Kernels of PanSplat and MVSplat are compiled by
-the first call that uses them.
+setup.sh runs this once, so that later commands do not compile them. Kernels of PanSplat are compiled by the
+first call that uses them.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A test set has its name in the paper's tables. Metrics are computed for each target image; the value of a set is their
 unweighted mean.
 
-Source: PanSplat, section 4; docs/official.md, sections 2.1 to 2.5 and 13.
+Source: PanSplat, section 4; docs/official.md, sections 2.1 to 2.4 and 13.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -33,24 +33,15 @@ from pansplat.model.network import NetworkPredictor
 from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor
 from pansplat.system.progress import stage
-from pansplat.training.sequences import (
-    BoundedSampler,
-    FramePair,
-    FrameSequence,
-    read_frame_pair,
-    read_insta360,
-    read_loc360,
-)
+from pansplat.training.sequences import BoundedSampler, ImageSequence, read_frame_pair, read_loc360
 from pansplat.training.sources import TripletSet, panogrf_folder, read_panogrf
 
-LOC360, INSTA360 = "360Loc", "Insta360"
+LOC360 = "360Loc"
 
 _SUBFOLDERS = {  # possible locations of a data set in the given folder
     "panogrf": (".", "pano_grf", "datasets/pano_grf"),
     LOC360: (".", "360Loc", "datasets/360Loc"),
-    INSTA360: (".", "insta360", "datasets/insta360"),
 }
-_SAMPLERS = {LOC360: BoundedSampler(2, 5), INSTA360: BoundedSampler(2, 30)}
 
 
 @dataclass(frozen=True)
@@ -99,44 +90,23 @@ def _read_triplet(triplets: TripletSet, index: int, height: int) -> Sample:
     return Sample(pair.name, pair.load_context(height), pair.load_targets(height))
 
 
-def find_sequence_set(root: Path, name: str, pairs_per_sequence: int = 100) -> EvaluationSet:
-    """`LOC360` or `INSTA360`: pairs spread evenly over each sequence; all frames from one to the other are targets."""
-    sequences, missing = find_sequences(root, name)
-    return EvaluationSet(name, tuple(_make_cases(sequences, _SAMPLERS[name], pairs_per_sequence)), missing)
+def find_loc360_set(root: Path, pairs_per_sequence: int = 100) -> EvaluationSet:
+    """Pairs spread evenly over the sequences of the test location; all frames from one to the other are targets."""
+    for subfolder in _SUBFOLDERS[LOC360]:
+        if (root / subfolder / "atrium").is_dir():
+            sequences = read_loc360(root / subfolder, "test")
+            return EvaluationSet(LOC360, tuple(_make_cases(sequences, pairs_per_sequence)))
+    expected = root / "360Loc" / "atrium"
+    return EvaluationSet(
+        LOC360, missing=f"{LOC360}: needed {expected} (with camera_pose.json and image/ in mapping/*360*)"
+    )
 
 
-def make_frame_distance_set(sequences: Sequence[FrameSequence], gap: int, pairs_per_sequence: int) -> EvaluationSet:
-    """Pairs of frames `gap` apart, spread evenly over each sequence; the middle frame is the target."""
-    long_enough = [sequence for sequence in sequences if len(sequence.poses) > gap]
-    cases = tuple(_make_cases(long_enough, BoundedSampler(gap, gap), pairs_per_sequence, middle=True))
-    missing = "" if cases else f"{gap} frames apart: needed a sequence of more than {gap} frames"
-    return EvaluationSet(f"{gap} frames", cases, missing)
-
-
-def find_sequences(root: Path, name: str) -> tuple[Sequence[FrameSequence], str]:
-    """The sequences of `LOC360` (its test location) or `INSTA360`, and a message if there are none."""
-    for subfolder in _SUBFOLDERS[name]:
-        folder = root / subfolder
-        if name == LOC360 and (folder / "atrium").is_dir():
-            return read_loc360(folder, "test"), ""
-        if name == INSTA360 and (any(folder.glob("*.mp4")) or any(folder.glob("*/*.mp4"))):
-            return read_insta360(folder), ""
-    if name == LOC360:
-        return [], f"{name}: needed {root / '360Loc' / 'atrium'} (with camera_pose.json and image/ in mapping/*360*)"
-    return [], f"{name}: needed {root / 'insta360' / 'VID_*'} (with video.mp4 and frame_trajectory.txt)"
-
-
-def _make_cases(
-    sequences: Sequence[FrameSequence], sampler: BoundedSampler, pairs_per_sequence: int, *, middle: bool = False
-) -> list[EvaluationCase]:
-    cases = []
+def _make_cases(sequences: Sequence[ImageSequence], pairs_per_sequence: int) -> Iterator[EvaluationCase]:
     for sequence in sequences:
-        for pair in sampler.evaluation(len(sequence.poses), pairs_per_sequence):
-            if middle:
-                pair = FramePair(pair.left, pair.right, (pair.targets[len(pair.targets) // 2],))
+        for pair in BoundedSampler().evaluation(len(sequence.poses), pairs_per_sequence):
             name = f"{sequence.name}-{pair.left:06d}-{pair.right:06d}"
-            cases.append(EvaluationCase(name, functools.partial(read_frame_pair, sequence, pair)))
-    return cases
+            yield EvaluationCase(name, functools.partial(read_frame_pair, sequence, pair))
 
 
 Blend = Literal["joint", "deferred"]
@@ -197,7 +167,7 @@ def measure_depth(context: Views, scene: Scene, depth: Float[Tensor, "view _ _"]
     return depth_errors(depth * unit, context.depths * unit, context.near * unit, context.far * unit)
 
 
-ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"]
+ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc"]
 
 # By protocol: name of the set in the table, its PanoGRF kind, and metres from an input to the middle view.
 _PANOGRF: dict[str, tuple[tuple[str, str, float], ...]] = {
@@ -205,7 +175,6 @@ _PANOGRF: dict[str, tuple[tuple[str, str, float], ...]] = {
     "narrow": (("M3D 0.2 m", "m3d", 0.1), ("M3D 0.5 m", "m3d", 0.25)),
     "replica": (("Replica 1.0 m", "replica", 0.5),),
     "residential": (("Residential 0.3 m", "residential", 0.15),),
-    "ablation": (("M3D 1.0 m", "m3d", 0.5),),
 }
 _DEPTH_SET = "M3D 1.0 m"  # the official code measures depth on this set only
 
@@ -218,15 +187,13 @@ class ProtocolOptions:
         height: of the resized panoramas, pixels; the paper's is 512.
         limit: largest number of cases of a set, spread evenly; None for all, as in the paper.
         image_cases: number of cases whose images are written, for each set.
-        pairs_per_sequence: number of pairs of a sequence, for 360Loc and Insta360.
-        gaps: distances of the inputs in frames, for the frame-distance figure.
+        pairs_per_sequence: number of pairs of a sequence, for 360Loc.
     """
 
     height: int = 512
     limit: int | None = None
     image_cases: int = 8
     pairs_per_sequence: int = 100
-    gaps: tuple[int, ...] = (4, 8, 12, 16, 20, 24, 28, 32)
 
 
 _METRICS = ("psnr", "ws_psnr", "ssim", "lpips", "abs_rel", "sq_rel", "rmse", "gaussians")
@@ -304,15 +271,7 @@ def find_sets(protocol: ProtocolName, root: Path, options: ProtocolOptions) -> l
         raise InputError(f"{root}: needed the folder that holds the test data, got no such folder; check --data.")
     if protocol in _PANOGRF:
         return [find_panogrf_set(root, *kind, options.height) for kind in _PANOGRF[protocol]]
-    if protocol in ("360loc", "insta360"):
-        return [find_sequence_set(root, LOC360 if protocol == "360loc" else INSTA360, options.pairs_per_sequence)]
-    sequences, missing = find_sequences(root, INSTA360)
-    if not sequences:
-        sequences, other_missing = find_sequences(root, LOC360)
-        missing = f"{missing}; or {other_missing}"
-    if not sequences:
-        return [EvaluationSet("frame distance", missing=missing)]
-    return [make_frame_distance_set(sequences, gap, options.pairs_per_sequence) for gap in options.gaps]
+    return [find_loc360_set(root, options.pairs_per_sequence)]
 
 
 def run_protocol(

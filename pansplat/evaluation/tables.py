@@ -1,8 +1,4 @@
-"""The paper's tables with our rows, the frame-distance figure, and the files of an evaluation.
-
-The numbers of the paper are in paper.json. The code of its figure on Insta360 is not public: ours uses the middle frame
-of pairs spread evenly over the sequences.
-"""
+"""The paper's tables with our rows, and the file of an evaluation. The numbers of the paper are in paper.json."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from matplotlib.figure import Figure
 from rich.table import Table
 
 from pansplat.evaluation.protocol import ProtocolResult
@@ -20,7 +15,6 @@ from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE
 
 _METRICS = {  # titles and formats
-    "gaussians": ("Gaussians", ",.0f"),
     "psnr": ("PSNR", ".2f"),
     "ws_psnr": ("WS-PSNR", ".2f"),
     "ssim": ("SSIM", ".3f"),
@@ -70,36 +64,8 @@ def read_paper_tables() -> dict[str, PaperTable]:
     return tables
 
 
-def frame_distance_curves(result: ProtocolResult, metric: str) -> dict[str, list[tuple[int, float]]]:
-    """By method, the frame distances and the values of the metric."""
-    lines: dict[str, list[tuple[int, float]]] = {}
-    for row in result.means():
-        if metric in row.values:
-            lines.setdefault(row.case["method"], []).append((int(row.case["set"].split()[0]), row.values[metric]))
-    return {method: sorted(line) for method, line in lines.items()}
-
-
-def plot_frame_distance(result: ProtocolResult, path: Path) -> None:
-    """Write the figure: a panel for WS-PSNR, and one for LPIPS if it was measured."""
-    metrics = ["ws_psnr", *(["lpips"] if result.lpips else [])]
-    figure = Figure(figsize=(5.5 * len(metrics), 4), layout="constrained")
-    panels = figure.subplots(1, len(metrics), squeeze=False)[0]
-    for axes, metric in zip(panels, metrics, strict=True):
-        for method, line in frame_distance_curves(result, metric).items():
-            axes.plot(*zip(*line, strict=True), marker="o", label=method)
-        unit = ", dB" if metric == "ws_psnr" else f" ({result.lpips}), lower is better"
-        axes.set(xlabel="frames between the inputs", ylabel=_METRICS[metric][0] + unit)
-        axes.grid(alpha=0.25)
-    panels[0].legend(fontsize=8)
-    with replacing(path) as partial:
-        figure.savefig(partial, dpi=110, metadata={"Software": "pansplat"})
-
-
 def list_tables(result: ProtocolResult) -> list[PaperTable]:
-    """The paper's tables for the evaluation; a table without the paper's rows for the frame-distance figure."""
-    if result.protocol == "frame-distance":
-        sets = tuple(dict.fromkeys(row.case["set"] for row in result.rows))
-        return [PaperTable("The frame in the middle, by frames between the inputs", sets, ("ws_psnr",))]
+    """The paper's tables for the evaluation."""
     tables = read_paper_tables()
     with_depth = result.protocol == "m3d" and any("rmse" in row.values for row in result.rows)
     return [tables[result.protocol], *([tables["depth"]] if with_depth else [])]
@@ -134,8 +100,8 @@ def report_notes(result: ProtocolResult) -> list[str]:
     return lines
 
 
-def write_report(result: ProtocolResult, out: Path) -> list[Path]:
-    """Write table.md, and frame_distance.png for that protocol; return the paths."""
+def write_report(result: ProtocolResult, out: Path) -> Path:
+    """Write table.md; return its path."""
     ours = our_rows(result)
     tables = [markdown_table(table.title, table.columns, table.rows, ours) for table in list_tables(result)]
     with replacing(out / "table.md") as partial:
@@ -143,8 +109,4 @@ def write_report(result: ProtocolResult, out: Path) -> list[Path]:
             "\n".join([f"<!-- {SOFTWARE} -->", *tables, *(f"* {note}" for note in report_notes(result))]) + "\n",
             encoding="utf-8",
         )
-    written = [out / "table.md"]
-    if result.protocol == "frame-distance":
-        plot_frame_distance(result, out / "frame_distance.png")
-        written.append(out / "frame_distance.png")
-    return written
+    return out / "table.md"

@@ -22,7 +22,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import level_axes
 from pansplat.images.image_files import write_image
-from pansplat.images.panorama_metadata import Projection, Stereo
+from pansplat.images.panorama_metadata import Stereo
 from pansplat.images.video import VIDEO_SUFFIXES, write_video
 from pansplat.inputs.pairs import Pair
 from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
@@ -258,7 +258,7 @@ def write_film(
     shots: Sequence[Shot],
     fps: float,
     *,
-    projection: Projection | None = None,
+    panorama: bool = False,
     stereo: Stereo = "mono",
     unit: float = 1.0,
     show: Callable[[int, Image], None] = lambda number, color: None,
@@ -271,7 +271,7 @@ def write_film(
         film: draws the frames.
         shots: the frames.
         fps: frames per second.
-        projection: of frames of all directions.
+        panorama: whether the frames are panoramas.
         stereo: arrangement of the eyes.
         unit: of depth, see `pansplat.geometry.world.WorldFrame`.
         show: called with the number and the colours of each frame.
@@ -286,12 +286,12 @@ def write_film(
 
     if file.suffix.lower() in VIDEO_SUFFIXES:
         images = ((color.clip(0, 1) * 255 + 0.5).astype(np.uint8) for color, _ in draw())
-        write_video(file, images, fps, panorama=projection or False, stereo=stereo)
+        write_video(file, images, fps, panorama=panorama, stereo=stereo)
         return [file]
     files = [name_frame(file, number) for number in range(len(shots))]
-    is_panorama = (projection, stereo) == ("equirect", "mono")
+    is_marked = panorama and stereo == "mono"  # GPano has no property for stereo
     for path, (color, depth) in zip(files, draw(), strict=True):
-        write_image(path, color, depth=None if depth is None else depth * unit, panorama=is_panorama)
+        write_image(path, color, depth=None if depth is None else depth * unit, panorama=is_marked)
     return files
 
 

@@ -1,10 +1,10 @@
-"""Textured triangles, and their files: Wavefront .obj with .mtl and .jpg beside it, and binary glTF (.glb).
+"""Textured triangles, and their files: binary glTF (.glb), with y up.
 
-Both have y up, as programs expect. Triangles are seen from the side of the camera that showed them: a program that
+Triangles are seen from the side of the camera that showed them: a program that
 culls back faces, as glTF specifies for these materials, shows rooms from outside without the ceiling or wall in front.
 
 Source: the glTF 2.0 specification, sections 3.7 (geometry), 3.8 (textures), 3.9 (materials), and its extension
-KHR_materials_unlit, because the light is in the photographs; Wavefront Technologies, Object Files (.obj).
+KHR_materials_unlit, because the light is in the photographs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 
@@ -28,10 +27,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.gltf import write_glb
 from pansplat.gaussians.scene_files import Y_UP
 from pansplat.geometry.world import USER_FRAME, WorldFrame
-from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, is_written
-
-MESH_SUFFIXES = (".obj", ".glb")
 
 _QUALITY = 92  # of textures
 _HEAD = 1 << 16  # bytes in which a further file states the first one
@@ -80,63 +76,30 @@ class Mesh:
         return sum(len(part.triangles) for part in self.parts)
 
 
-def name_mesh_files(path: Path, parts: int) -> list[Path]:
-    """The files of a mesh of some number of parts, the named one first."""
-    if path.suffix.lower() != ".obj":
-        return [path]
-    stem = re.sub(r"[^\w-]+", "_", path.stem, flags=re.ASCII) or "scene"  # readers split lines at spaces
-    return [path, *(path.with_name(f"{stem}{end}") for end in (".mtl", *(f"_{n}.jpg" for n in range(parts))))]
-
-
-def save_mesh(mesh: Mesh, path: Path) -> tuple[Path, ...]:
-    """Write a mesh in the format of the suffix, each file atomically, and return the files, the named one first.
-
-    Textures show only what triangles need of them: the rest has the colours around it. Further textures of the file
-    before are removed.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in MESH_SUFFIXES:
-        raise InputError(f"cannot write {path}: a mesh must end in {' or '.join(MESH_SUFFIXES)}; rename it")
+def save_mesh(mesh: Mesh, path: Path) -> None:
+    """Write a mesh atomically. Textures show only what triangles need of them: the rest has the colours around it."""
+    if path.suffix.lower() != ".glb":
+        raise InputError(f"cannot write {path}: a mesh must end in .glb; rename it")
     if not mesh.num_triangles:
         raise InputError(f"cannot write {path}: needed one or more triangles, got none; give a scene with surfaces")
-    files = name_mesh_files(path, len(mesh.parts))
-    old = _list_written_files(path)
-    (_save_obj if suffix == ".obj" else _save_glb)(mesh, *files)
-    _remove(set(old) - set(files))
-    return tuple(files)
+    _save_glb(mesh, path)
 
 
 def remove_old_meshes(path: Path, kept: Collection[Path]) -> None:
-    """Remove what an earlier mesh of this name has in further files, which state that name, other than those kept."""
+    """Remove the further files of an earlier mesh of this name, which state that name, other than those kept."""
     name = re.compile(rf"{re.escape(path.stem)}_\d+{re.escape(path.suffix)}")
     for file in path.parent.iterdir():
         if name.fullmatch(file.name) and file not in kept and is_written(file):
             with open(file, "rb") as stream:
                 is_part = _state_part(path.name).encode() in stream.read(_HEAD)
             if is_part:
-                _remove(_list_written_files(file))
+                with suppress(OSError):
+                    file.unlink()
 
 
 def _state_part(name: str) -> str:
-    """What a further file states about the first one, in JSON or a comment."""
+    """What a further file states about the first one, in JSON."""
     return json.dumps({"part_of": name}, separators=(",", ":"))[1:-1]
-
-
-def _list_written_files(path: Path) -> list[Path]:
-    """The files of a mesh that pansplat wrote earlier: the named one, the materials, and the textures they name."""
-    files = [path]
-    if path.suffix.lower() == ".obj":
-        materials = name_mesh_files(path, 0)[1]
-        text = materials.read_text("utf-8", "replace") if is_written(materials) else ""
-        textures = re.findall(rf"^map_Kd ({re.escape(materials.stem)}_\d+\.jpg)$", text, re.MULTILINE)
-        files += [materials, *map(path.with_name, textures)]
-    return [file for file in files if is_written(file)]
-
-
-def _remove(files: Iterable[Path]) -> None:
-    for file in files:
-        with suppress(OSError):
-            file.unlink()
 
 
 def _encode_texture(part: MeshPart) -> bytes:
@@ -175,27 +138,6 @@ def _fill_unused(
         filled = cv2.resize(filled, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
         np.divide(color.reshape(filled.shape), weight[..., None], out=filled, where=weight[..., None] > 0)
     return np.where(used[..., None], texture, np.rint(filled).astype(np.uint8))
-
-
-def _save_obj(mesh: Mesh, path: Path, materials: Path, *images: Path) -> None:
-    described, first = [f"# {SOFTWARE}\n"], 1
-    for number, (part, image) in enumerate(zip(mesh.parts, images, strict=True)):
-        with replacing(image) as partial:
-            partial.write_bytes(_encode_texture(part))
-        described.append(f"newmtl view_{number}\nKd 1 1 1\nillum 0\nmap_Kd {image.name}\n")
-    with replacing(materials) as partial:
-        partial.write_text("\n".join(described), encoding="utf-8")
-    with replacing(path) as partial, open(partial, "w", encoding="utf-8", newline="\n") as file:
-        part = f"; {_state_part(mesh.part_of)}" if mesh.part_of else ""
-        file.write(f"# {SOFTWARE}; metres, y up{part}\nmtllib {materials.name}\n")
-        for number, part in enumerate(mesh.parts):
-            file.write(f"o view_{number}\nusemtl view_{number}\n")
-            places = mesh.frame.globalize_places(torch.from_numpy(part.positions)) @ Y_UP
-            np.savetxt(file, places.numpy(), "v %.4f %.4f %.4f")
-            np.savetxt(file, part.uv * (1, -1) + (0, 1), "vt %.6f %.6f")  # v up
-            corners = np.repeat(part.triangles + first, 2, axis=1)  # position and texture have one number
-            np.savetxt(file, corners, "f %d/%d %d/%d %d/%d")
-            first += len(part.positions)
 
 
 def _save_glb(mesh: Mesh, path: Path) -> None:

@@ -4,7 +4,7 @@ The faces of pansplat.rendering have pixel centres at half-integers. The faces o
 the first and the last pixel of a row lie on the cube's edges, as in the training of the monocular network.
 
 Source: PanSplat, section 3.4; face order and axes of the official renderer (docs/official.md, section 10.1); strips:
-docs/official.md, sections 2.4 and 5; Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550.
+docs/official.md, sections 2.3 and 5; Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550.
 """
 
 import math

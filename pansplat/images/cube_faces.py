@@ -1,18 +1,15 @@
-"""Cube faces among the pictures of a folder: six files of one name, and pictures that hold all six faces."""
+"""Cube faces among the pictures of a folder: six files of one name."""
 
 from __future__ import annotations
 
-import itertools
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
-
 from pansplat.errors import InputError, InputWarning
-from pansplat.images.cube_images import MAX_SIZE, CubeImage, CubeLevel, measure_seams
-from pansplat.images.image_files import read_pixels, read_size, require_complete, require_two_to_one
+from pansplat.images.cube_images import MAX_SIZE, CubeImage, CubeLevel
+from pansplat.images.image_files import read_size, require_complete
 
 # Endings of file names for each face, in the order front, right, back, left, up, down. The axes are those of OpenGL's
 # cube maps: seen from inside, +x is to the right of +z.
@@ -25,27 +22,6 @@ _ENDINGS = (
     ("posz", "posx", "negz", "negx", "posy", "negy"),
 )
 _SEPARATED = re.compile(r"(?:(.*?)[_\-. ])?([A-Za-z]+)", re.DOTALL)
-
-# Orders of the faces in a row, a column, or two rows or columns: Pannellum and Pano2VR, krpano, OpenGL and FFmpeg,
-# V-Ray, Marzipano.
-# Source: https://pannellum.org/documentation/reference/; https://krpano.com/docu/xml/#image.cubestrip;
-# https://ffmpeg.org/ffmpeg-filters.html#v360; https://www.marzipano.net/reference/ImageUrlSource.html
-_ORDERS = ("frblud", "lfrbud", "rludfb", "rludbf", "bdflru")
-_GRIDS = ((1, 6), (6, 1), (2, 3), (3, 2))  # rows, columns
-
-# Crosses: row and column of the faces front, right, back, left, up, down, and their quarter turns.
-_CROSSES = {
-    (3, 4): (
-        ((1, 1, 0), (1, 2, 0), (1, 3, 0), (1, 0, 0), (0, 1, 0), (2, 1, 0)),
-        ((1, 0, 0), (1, 1, 0), (1, 2, 0), (1, 3, 0), (0, 0, 0), (2, 0, 0)),
-    ),
-    (4, 3): (((1, 1, 0), (1, 2, 0), (3, 1, 2), (1, 0, 0), (0, 1, 0), (2, 1, 0)),),
-}
-
-_SMALL = 64  # largest size of a face whose edges are compared, pixels
-_MAX_SEAM = 3.0  # difference across the edges over that inside
-_SEAM_NOISE = 2.0  # grey values
-_MAX_RATIO = 0.5  # of the difference to that of faces in a wrong order; above it everything fits everything
 
 
 def group_faces(images: Sequence[Path]) -> tuple[dict[str, CubeImage], list[Path]]:
@@ -135,58 +111,3 @@ def find_gap(level: CubeLevel, folder: Path) -> str | None:
         except InputError:
             return f"{file} is damaged"
     return None
-
-
-def read_picture(image: Path) -> Path | CubeImage:
-    """A 2:1 picture as it is, or the cube in a picture that holds all six faces; an error for another picture."""
-    width, height = read_size(image)
-    if width == 2 * height:
-        require_complete(image)
-        return image
-    layout = find_layout(image)
-    if layout is None:
-        require_two_to_one(image, width, height)
-    return layout
-
-
-def find_layout(image: Path) -> CubeImage | None:
-    """The cube in a picture that holds all six faces; None if it is another picture.
-
-    The proportions give the arrangement, and the edges of the faces give their order. The edges must fit, because
-    photographs have such proportions, too.
-    """
-    width, height = read_size(image)
-    grids = [grid for grid in (*_GRIDS, *_CROSSES) if width * grid[0] == height * grid[1] and width % grid[1] == 0]
-    if not grids or width // grids[0][1] > MAX_SIZE:
-        return None
-    (grid,) = grids
-    pixels = read_pixels(image)
-    rows, columns = grid
-    side = min(_SMALL, width // columns)
-    small = cv2.resize(pixels, (columns * side, rows * side), interpolation=cv2.INTER_AREA)
-    levels = [
-        CubeLevel(width // columns, width // columns, 6 * (image.name,), grid, cells) for cells in _list_cells(grid)
-    ]
-    faces = [level.read(image.parent, lambda _: small) for level in levels]
-    seams = [measure_seams(six) for six in faces]
-    best = min(range(len(levels)), key=lambda n: seams[n][0])
-    across, inside = seams[best]
-    wrong, _ = measure_seams([*faces[best][1:], faces[best][0]])
-    if across > _MAX_SEAM * inside + _SEAM_NOISE or across >= _MAX_RATIO * wrong:
-        return None
-    return CubeImage(image.parent, (levels[best],))
-
-
-def strip_level(image: str, size: int, order: str) -> CubeLevel:
-    """A column of six faces in a picture; `order` holds the letters of the faces from the top."""
-    cells = tuple((order.index(face), 0, 0) for face in _ORDERS[0])
-    return CubeLevel(size, size, 6 * (image,), (6, 1), cells)
-
-
-def _list_cells(grid: tuple[int, int]) -> Iterator[tuple[tuple[int, int, int], ...]]:
-    if grid in _CROSSES:
-        yield from _CROSSES[grid]
-        return
-    places = list(itertools.product(range(grid[0]), range(grid[1])))
-    for order in _ORDERS:
-        yield tuple((*places[order.index(face)], 0) for face in _ORDERS[0])

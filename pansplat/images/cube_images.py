@@ -54,15 +54,13 @@ class CubeLevel:
         size: along a face, pixels.
         tile: along a tile, pixels; tiles of the last row and column may be smaller.
         faces: paths relative to the cube's folder, with `ROW` and `COLUMN` for tiles.
-        grid: rows and columns of a picture that holds all faces; (1, 1) otherwise.
-        cells: for such a picture, row, column and quarter turns (clockwise, that turn the face upright) of each face.
+        rows: of the faces in a picture that holds all of them in a column; empty otherwise.
     """
 
     size: int
     tile: int
     faces: tuple[str, ...]
-    grid: tuple[int, int] = (1, 1)
-    cells: tuple[tuple[int, int, int], ...] = ()
+    rows: tuple[int, ...] = ()
 
     def list_files(self) -> Iterator[str]:
         """Relative paths of all pictures."""
@@ -76,12 +74,9 @@ class CubeLevel:
 
     def read(self, folder: Path, decode: Decode) -> list[UInt8[Array, "size size 3"]]:
         """Read the six faces of the cube."""
-        if self.cells:
-            picture = decode(folder / self.faces[0])
-            rows, columns = self.grid
-            size = min(picture.shape[0] // rows, picture.shape[1] // columns)
-            cut = (picture[r * size : (r + 1) * size, c * size : (c + 1) * size] for r, c, _ in self.cells)
-            return [np.rot90(face, -turns).copy() for face, (*_, turns) in zip(cut, self.cells, strict=True)]
+        if self.rows:
+            faces = np.split(decode(folder / self.faces[0]), 6)
+            return [np.ascontiguousarray(faces[row]) for row in self.rows]
         return [self._read_face(face, folder, decode) for face in self.faces]
 
     def _read_face(self, face: str, folder: Path, decode: Decode) -> UInt8[Array, "size size 3"]:
@@ -172,12 +167,9 @@ def read_cube(path: Path) -> CubeImage:
 
 
 def _read_level(content: dict[str, Any]) -> CubeLevel:
-    cells = tuple((int(row), int(column), int(turns)) for row, column, turns in content["cells"])
-    rows, columns = content["grid"]
-    level = CubeLevel(
-        int(content["size"]), int(content["tile"]), tuple(map(str, content["faces"])), (int(rows), int(columns)), cells
-    )
-    if not (0 < level.size <= MAX_SIZE and level.tile > 0 and len(level.faces) == 6 and len(cells) in (0, 6)):
+    faces, rows = tuple(map(str, content["faces"])), tuple(map(int, content["rows"]))
+    level = CubeLevel(int(content["size"]), int(content["tile"]), faces, rows)
+    if not (0 < level.size <= MAX_SIZE and level.tile > 0 and len(faces) == 6 and sorted(rows) in ([], [*range(6)])):
         raise ValueError
     return level
 
@@ -256,17 +248,3 @@ def _pad_faces(faces: list[UInt8[Array, "size size 3"]]) -> list[UInt8[Array, "s
             result[rows, columns] = cv2.remap(faces[other], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         padded.append(result)
     return padded
-
-
-def measure_seams(faces: list[UInt8[Array, "size size 3"]]) -> tuple[float, float]:
-    """Mean differences of grey values across the cube's edges, and between the two outermost pixels inside the faces.
-
-    Both are alike if the faces fit each other.
-    """
-    across, inside = [], []
-    for padded in _pad_faces(faces):
-        for turns in range(4):
-            outer, edge, inner = np.rot90(padded, turns)[_PAD - 1 : _PAD + 2, _PAD:-_PAD].astype(np.float32)
-            across.append(np.abs(outer - edge).mean())
-            inside.append(np.abs(edge - inner).mean())
-    return float(np.mean(across)), float(np.mean(inside))

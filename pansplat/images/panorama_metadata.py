@@ -24,15 +24,13 @@ from typing import Literal
 
 from PIL import Image
 
-Projection = Literal["equirect", "cubemap"]
-Stereo = Literal["mono", "top-bottom", "side-by-side"]
+Stereo = Literal["mono", "top-bottom"]
 
 _PACKETS = "xmp", "XML:com.adobe.xmp"  # where Pillow stores the packet, by the file's format
 _TAG = re.compile(r"(?<!/)GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)")
 _SHAPE_TOLERANCE = 0.01  # of the proportions that the tags state
 _SPHERICAL_V1 = uuid.UUID("ffcc8263-f855-4a93-8814-587a02521fdd").bytes
-_STEREO_V1 = {"mono": "mono", "top-bottom": "top-bottom", "side-by-side": "left-right"}
-_STEREO_V2 = {"mono": b"\0", "top-bottom": b"\1", "side-by-side": b"\2"}
+_STEREO_V2 = {"mono": b"\0", "top-bottom": b"\1"}
 _RDF = (
     '<?xml version="1.0"?><rdf:SphericalVideo xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" '
     'xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">'
@@ -152,14 +150,12 @@ def find_crop(tags: dict[str, str], width: int, height: int) -> Crop | None:
     return Crop(rows, min(round(left * scale), 2 * rows - width), min(round(top * scale), rows - height), degrees)
 
 
-def mark_spherical_video(path: Path, projection: Projection = "equirect", stereo: Stereo = "mono") -> None:
-    """Add the metadata of a film of all directions to an MP4 file with one track, and with `moov` before `mdat`.
+def mark_spherical_video(path: Path, stereo: Stereo = "mono") -> None:
+    """Add the metadata of a film of panoramas to an MP4 file with one track, and with `moov` before `mdat`.
 
     Args:
         path: the film.
-        projection: "cubemap" is three columns and two rows of faces: right left up, down front back. Version 1 of the
-            metadata cannot state it.
-        stereo: arrangement of the eyes in a frame; the left eye is at the top, or on the left.
+        stereo: arrangement of the eyes in a frame; the left eye is at the top.
 
     Raises:
         ValueError: there is no `moov` box.
@@ -174,22 +170,20 @@ def mark_spherical_video(path: Path, projection: Projection = "equirect", stereo
                 target.write(header + file.read(int.from_bytes(header[:4], "big") - 8))
                 header = file.read(8)
             movie = file.read(int.from_bytes(header[:4], "big") - 8)
-            growth = len(_mark_movie(movie, 0, projection, stereo)) - len(movie)
-            target.write(_box(b"moov", _mark_movie(movie, growth, projection, stereo)))
+            growth = len(_mark_movie(movie, 0, stereo)) - len(movie)
+            target.write(_box(b"moov", _mark_movie(movie, growth, stereo)))
             shutil.copyfileobj(file, target, 1 << 24)
         os.replace(marked, path)
     finally:
         marked.unlink(missing_ok=True)
 
 
-def _mark_movie(content: bytes, shift: int, projection: Projection, stereo: Stereo) -> bytes:
+def _mark_movie(content: bytes, shift: int, stereo: Stereo) -> bytes:
     """The content of the `moov` box with the metadata; chunk offsets grow by `shift`."""
 
     def mark_track(track: bytes) -> bytes:
         track = _edit(track, b"mdia", b"minf", b"stbl", change=mark_samples)
-        if projection != "equirect":
-            return track
-        return track + _box(b"uuid", _SPHERICAL_V1 + _RDF.format(stereo=_STEREO_V1[stereo]).encode())
+        return track + _box(b"uuid", _SPHERICAL_V1 + _RDF.format(stereo=stereo).encode())
 
     def mark_samples(table: bytes) -> bytes:
         table = _edit(table, b"stsd", change=mark_entry)
@@ -205,7 +199,7 @@ def _mark_movie(content: bytes, shift: int, projection: Projection, stereo: Ster
     def mark_entry(description: bytes) -> bytes:
         size, kind = struct.unpack_from(">I4s", description, 8)
         entry = description[16 : 8 + size]
-        boxes = _box(b"st3d", bytes(4) + _STEREO_V2[stereo]) + _SPHERICAL_V2[projection]
+        boxes = _box(b"st3d", bytes(4) + _STEREO_V2[stereo]) + _SPHERICAL_V2
         return description[:8] + _box(kind, entry + boxes) + description[8 + size :]
 
     return _edit(content, b"trak", change=mark_track)
@@ -234,7 +228,4 @@ def _make_projection(content: bytes) -> bytes:
     return _box(b"sv3d", _box(b"svhd", bytes(4) + b"pansplat\0") + _box(b"proj", header + content))
 
 
-_SPHERICAL_V2 = {
-    "equirect": _make_projection(_box(b"equi", bytes(4) + bytes(16))),  # not cropped
-    "cubemap": _make_projection(_box(b"cbmp", bytes(4) + bytes(8))),  # layout 0, no padding
-}
+_SPHERICAL_V2 = _make_projection(_box(b"equi", bytes(4) + bytes(16)))  # not cropped

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pansplat.errors import InputError
-from pansplat.images.panorama_metadata import Projection, Stereo, mark_spherical_video
+from pansplat.images.panorama_metadata import Stereo, mark_spherical_video
 from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, require_file
 
@@ -30,21 +30,14 @@ class VideoFile:
 
     Attributes:
         path: the file.
-        stamps: presentation time of each frame in units of `time_base`, ascending.
-        time_base: seconds.
+        stamps: presentation time of each frame in units of the file, ascending.
         width, height: pixels.
     """
 
     path: Path
     stamps: tuple[int, ...]
-    time_base: Fraction
     width: int
     height: int
-
-    @property
-    def seconds(self) -> list[float]:
-        """Time of each frame since the first frame."""
-        return [float((stamp - self.stamps[0]) * self.time_base) for stamp in self.stamps]
 
     def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
         """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order."""
@@ -111,7 +104,7 @@ def open_video(path: Path | str) -> VideoFile:
                 f"{path}: needed a time for each frame, got {len(stamps)} times for {len(packets)} frames; write it "
                 "again as .mp4 (ffmpeg -i FILE -c:v libx264 -crf 12 video.mp4)."
             )
-        return VideoFile(path, tuple(stamps), stream.time_base, stream.width, stream.height)
+        return VideoFile(path, tuple(stamps), stream.width, stream.height)
 
 
 def _open_container(path: Path) -> Any:
@@ -130,7 +123,7 @@ def write_video(
     frames: Iterable[NDArray[np.uint8]],
     fps: float,
     *,
-    panorama: bool | Projection = False,
+    panorama: bool = False,
     stereo: Stereo = "mono",
 ) -> int:
     """Write an MP4 or WebM file atomically and return the number of frames. H.264 or VP9 if PyAV supports it.
@@ -141,8 +134,8 @@ def write_video(
         path: file to write, ending in .mp4 or .webm.
         frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
         fps: frames per second.
-        panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
-            players then show an .mp4 as 360 degrees. A .webm has no such mark.
+        panorama: whether the frames are equirectangular panoramas; players then show an .mp4 as 360 degrees. A .webm
+            has no such mark.
         stereo: arrangement of the eyes in a panorama's frame.
     """
     path = Path(path)
@@ -173,7 +166,7 @@ def write_video(
                 container.mux(packet)
         if path.suffix.lower() == ".mp4":
             if panorama:
-                mark_spherical_video(temporary, "equirect" if panorama is True else panorama, stereo)
+                mark_spherical_video(temporary, stereo)
             with open(temporary, "ab") as file:  # a box that players skip
                 file.write((8 + len(SOFTWARE)).to_bytes(4, "big") + b"free" + SOFTWARE.encode())
     return count

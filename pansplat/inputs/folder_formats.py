@@ -30,7 +30,6 @@ from pansplat.inputs.pairs import (
     ViewGroup,
     find_mask,
     list_names,
-    list_panorama_files,
     too_many_panoramas,
 )
 from pansplat.inputs.photographs import list_further, with_further
@@ -38,8 +37,6 @@ from pansplat.inputs.placements import Placement, is_by_hand, judge, read_reject
 from pansplat.inputs.poses import (
     parse_convention,
     parse_numbers,
-    read_number,
-    read_trajectory,
     rigid_matrix,
     to_cam2world,
 )
@@ -380,7 +377,7 @@ def read_triplet(source: Path, folder: Path, convention: str | None = None) -> C
     return Collection(source, folder, tuple(panoramas), (((0, last), tuple(range(1, last))),), name=source.stem)
 
 
-# Sequences of frames: a 360Loc camera_pose.json (docs/official.md, section 2.2), or a KITTI or TUM trajectory.
+# Sequences of frames: a 360Loc camera_pose.json (docs/official.md, section 2.2).
 
 
 def read_loc360_sequence(source: Path, folder: Path, convention: str | None = None) -> Collection:
@@ -400,55 +397,3 @@ def read_loc360_sequence(source: Path, folder: Path, convention: str | None = No
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, {frame!r}"), convention)
         panoramas.append(Panorama(image.stem, image, cam2world, find_mask(image, folder)))
     return with_further(Collection(source, folder, tuple(panoramas), ordered=True, far=FAR_SEQUENCE))
-
-
-def find_trajectories(folder: Path) -> list[Path]:
-    """The trajectory files of a folder: *.kitti, *.tum, poses.txt, *trajectory*.txt."""
-    return [
-        path
-        for path in sorted(folder.iterdir())
-        if path.is_file()
-        and (
-            path.suffix.lower() in (".kitti", ".tum")
-            or (path.suffix.lower() == ".txt" and ("trajectory" in path.stem.lower() or path.stem.lower() == "poses"))
-        )
-    ]
-
-
-def choose_trajectory(folder: Path) -> Path:
-    """The only trajectory file of a folder."""
-    found = find_trajectories(folder)
-    if len(found) != 1:
-        advice = "keep the right one" if found else "add it"
-        raise InputError(
-            f"{folder}: needed one trajectory file (*.kitti, *.tum, poses.txt, frame_trajectory.txt), got "
-            f"{', '.join(path.name for path in found) or 'none'}; {advice}."
-        )
-    return found[0]
-
-
-def read_trajectory_folder(source: Path, folder: Path, convention: str | None = None) -> Collection:
-    """The images of a folder, sorted by name, with the poses of its trajectory file: image i has line i.
-
-    The number in scale.txt, if there is one, converts the translations to metres.
-    """
-    source = choose_trajectory(folder)
-    expected = source.suffix.lower().lstrip(".")
-    if expected == "txt":
-        expected = next((kind for kind in ("kitti", "tum") if kind in source.stem.lower()), None)
-    scale = read_number(folder / "scale.txt") if (folder / "scale.txt").is_file() else 1.0
-    trajectory = read_trajectory(source, convention, expected, scale)
-    images: list[Path] = []
-    for sub in _IMAGE_FOLDERS:
-        images = images or (list_panorama_files(folder / sub) if (folder / sub).is_dir() else [])
-    if len(images) != len(trajectory.poses):
-        raise InputError(
-            f"{source}: needed one pose per image ({len(images)} images), got {len(trajectory.poses)} "
-            f"{trajectory.kind.upper()} poses; keep only the images that were tracked, in order, or "
-            "use poses.json."
-        )
-    panoramas = tuple(
-        Panorama(image.stem, image, pose, find_mask(image, folder))
-        for image, pose in zip(images, trajectory.poses, strict=True)
-    )
-    return Collection(source, folder, panoramas, ordered=True, far=FAR_SEQUENCE)

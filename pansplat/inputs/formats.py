@@ -55,7 +55,6 @@ POSED = (
     Format("360Loc", _named(own.CAMERA_POSES), own.read_loc360_sequence),
     Format("PanoGRF", own.find_panogrf, own.read_panogrf_scene, own.list_panogrf_files),
     TRIPLETS,
-    Format("trajectory", own.find_trajectories, own.read_trajectory_folder),
     Format("nerfstudio", _named(nerfstudio.FILE), _reconstruction(nerfstudio.read_nerfstudio)),
     Format("openMVG", _named(openmvg.FILE), _reconstruction(openmvg.read_openmvg)),
     Format("OpenSfM", _named(opensfm.FILE), _reconstruction(opensfm.read_opensfm)),

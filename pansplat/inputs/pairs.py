@@ -33,7 +33,7 @@ from pansplat.system.files import require_text
 from pansplat.system.options import CAMERA_HEIGHT
 
 NEAR, FAR = 0.45, 10.0  # metres; depth range of the official indoor data (docs/official.md, section 2.1)
-FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, sections 2.2 and 2.3)
+FAR_SEQUENCE = 50.0  # metres; for halls (docs/official.md, section 2.2)
 
 MAX_CONTEXT = 64  # context panoramas of a pair
 

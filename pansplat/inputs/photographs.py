@@ -13,9 +13,9 @@ from typing import Any
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
-from pansplat.images.cube_faces import group_faces, read_picture
+from pansplat.images.cube_faces import group_faces
 from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
-from pansplat.images.image_files import is_two_to_one, list_pictures
+from pansplat.images.image_files import is_two_to_one, list_pictures, require_panorama
 from pansplat.images.rig_images import RIG_SUFFIX
 from pansplat.inputs.pairs import MAX_NAMES, Collection, Link, Note, Panorama, list_panorama_files
 from pansplat.inputs.web_tours.entries import (
@@ -40,13 +40,14 @@ def find_photographs(folder: Path) -> list[Path]:
 
 
 def read_photographs(source: Path, folder: Path, convention: str | None = None) -> Collection:
-    """The panoramas among the pictures of a folder, sorted by name, or that of a picture, which may hold cube faces.
+    """The panoramas among the pictures of a folder, sorted by name, or that of a picture.
 
     Pictures that pansplat rendered count only if there are no other panoramas. Warns about pictures that are left out.
     """
     del convention
     if source != folder:
-        view = make_panorama(source.stem, read_picture(source), folder)
+        require_panorama(source)
+        view = make_panorama(source.stem, source, folder)
         return Collection(source, folder, name=view.name, unposed=(view,))
     every = list_panorama_files(folder)
     rendered = [image for image in every if is_written(image)]
@@ -137,7 +138,8 @@ def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama]
     for image in rest:
         name = image.stem if repeated[image.stem] == 1 and image.stem not in cubes else image.name.replace(".", "_")
         try:
-            pictures[name] = read_picture(image)
+            require_panorama(image)
+            pictures[name] = image
         except InputError as error:
             problems.append(str(error))
     return [make_panorama(name, pictures[name], folder) for name in sorted(pictures)], problems

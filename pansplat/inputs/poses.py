@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.geometry.pose import invert_pose, orthonormal_error, rotations_from_quats
+from pansplat.geometry.pose import invert_pose, orthonormal_error
 from pansplat.geometry.world import MAX_POSITION
 from pansplat.system.files import read_file
 
@@ -29,22 +29,10 @@ _DIRECTIONS = {
     "world2cam": r"world[ _-]?(2|to)[ _-]?cam(era)?|\bw2c\b",
 }
 _AXES = {"opencv": r"opencv|colmap", "opengl": r"opengl|habitat|blender|nerf"}
-_MAX_NUMBERS_BYTES, _MAX_TEXT_BYTES = 1 << 16, 1 << 30  # of a text file with one number, and of a trajectory
+_MAX_NUMBER_BYTES = 1 << 16  # of a text file with one number
 _EXACT = 1e-9  # error of a rotation that is kept
 _RIGID_TOLERANCE = 1e-2  # for files with 4 to 6 decimals; errors of wrong matrices are far larger
 _OPENGL_TO_OPENCV = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
-
-
-class Trajectory(NamedTuple):
-    """Poses of a trajectory file.
-
-    Attributes:
-        kind: "kitti" or "tum".
-        poses: in file order; cam2world, OpenCV axes, metres.
-    """
-
-    kind: str
-    poses: tuple[Float[Tensor, "4 4"], ...]
 
 
 def parse_convention(text: str | None, source: Path | str) -> str:
@@ -114,12 +102,12 @@ def _describe_error(matrix: Float[Tensor, "4 4"], error: float) -> str:
     return f"a 3x3 part that is no rotation (R R' differs from 1 by {error:.3g}); check the order of the numbers."
 
 
-def _nearest_rigid(matrices: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The matrices with their 3x3 parts replaced by the nearest rotations; removes the rounding errors of files."""
-    u, _, vt = torch.linalg.svd(matrices[..., :3, :3])
-    rigid = matrices.clone()
-    rigid[..., :3, :3] = u @ vt
-    rigid[..., 3, :] = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
+def _nearest_rigid(matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """The matrix with its 3x3 part replaced by the nearest rotation; removes the rounding errors of files."""
+    u, _, vt = torch.linalg.svd(matrix[:3, :3])
+    rigid = matrix.clone()
+    rigid[:3, :3] = u @ vt
+    rigid[3] = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
     return rigid
 
 
@@ -139,7 +127,7 @@ def from_cam2world(matrix: Float[Tensor, "4 4"], convention: str) -> Float[Tenso
 
 def read_number(path: Path) -> float:
     """The one positive number in a text file, such as a scale."""
-    text = read_file(path, limit=_MAX_NUMBERS_BYTES).decode(errors="replace").strip()
+    text = read_file(path, limit=_MAX_NUMBER_BYTES).decode(errors="replace").strip()
     try:
         number = float(text)
     except ValueError:
@@ -158,100 +146,3 @@ def parse_numbers(text: str, count: int, source: object) -> Float[Tensor, "count
     if values.size != count:
         raise InputError(f"{source}: needed {count} numbers, got {values.size}; correct it.")
     return torch.from_numpy(values)
-
-
-def read_trajectory(
-    path: Path, convention: str | None = None, expected: str | None = None, scale: float = 1.0
-) -> Trajectory:
-    """Poses of a KITTI (12 numbers per line) or TUM (8 numbers per line) trajectory file.
-
-    KITTI: rows of a 3x4 matrix. TUM: timestamp tx ty tz qx qy qz qw. Both are cam2world with OpenCV axes by default.
-    Empty lines and lines that start with # are skipped.
-
-    Args:
-        path: text file; numbers separated by spaces or commas.
-        convention: one of `CONVENTIONS`; overrides the default.
-        expected: "kitti" or "tum" to refuse the other format; None to accept both.
-        scale: metres per unit of the file.
-    """
-    rows = _number_rows(path)
-    if not rows:
-        raise InputError(f"{path}: needed one pose per line, got an empty file; export the trajectory again.")
-    count = len(rows[0][1])
-    kind = {12: "kitti", 8: "tum"}.get(count)
-    if kind is None:
-        raise InputError(
-            f"{path}, line {rows[0][0]}: needed 12 numbers (KITTI: 3x4 matrix) or 8 (TUM: timestamp, "
-            f"translation, quaternion), got {count}; export the trajectory in one of these formats."
-        )
-    if expected is not None and kind != expected:
-        formats = {"kitti": "KITTI (12 numbers per line)", "tum": "TUM (8 numbers per line)"}
-        raise InputError(
-            f"{path}: needed {formats[expected]} according to its name, got {formats[kind]}; "
-            f"rename it to {path.stem}.{kind}, or convert it."
-        )
-    ragged = next(((line, numbers) for line, numbers in rows if len(numbers) != count), None)
-    if ragged is not None:
-        raise InputError(
-            f"{path}, line {ragged[0]}: needed {count} numbers as in the other lines, got {len(ragged[1])}; "
-            "correct the line."
-        )
-    lines, numbers = [line for line, _ in rows], torch.from_numpy(np.array([row for _, row in rows], np.float64))
-    matrices = _kitti_matrices(numbers) if kind == "kitti" else _tum_matrices(numbers, lines, path)
-    cam2world = to_cam2world(_rigid_matrices(matrices, lines, path), convention or "cam2world opencv")
-    cam2world[:, :3, 3] *= scale
-    return Trajectory(kind, cam2world.unbind())
-
-
-def _rigid_matrices(matrices: Float[Tensor, "n 4 4"], lines: list[int], path: Path) -> Float[Tensor, "n 4 4"]:
-    """`rigid_matrix` of many matrices at once; those that are not exactly rigid are checked one by one."""
-    rotations = matrices[:, :3, :3]
-    gram = rotations @ rotations.transpose(1, 2) - torch.eye(3, dtype=torch.float64)
-    error = torch.where(torch.linalg.det(rotations) > 0, gram.abs().amax(dim=(1, 2)), torch.inf)
-    suspect = ~((error <= _RIGID_TOLERANCE) & (matrices[:, :3, 3].abs().amax(dim=1) <= MAX_POSITION))
-    for index in suspect.nonzero()[:1, 0].tolist():
-        rigid_matrix(matrices[index].tolist(), f"{path}, line {lines[index]}")
-    inexact = error > _EXACT
-    matrices[inexact] = _nearest_rigid(matrices[inexact])
-    return matrices
-
-
-def _number_rows(path: Path) -> list[tuple[int, list[float]]]:
-    """Line number (from 1) and numbers of each line that is neither empty nor a comment."""
-    rows = []
-    try:
-        lines = read_file(path, "a readable text file", limit=_MAX_TEXT_BYTES).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: needed a readable text file, got '{error}'; check it.") from error
-    for number, line in enumerate(lines, start=1):
-        words = line.replace(",", " ").split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            rows.append((number, [float(word) for word in words]))
-        except ValueError as error:
-            raise InputError(
-                f"{path}, line {number}: needed numbers, got {line[:60]!r}; correct or remove it."
-            ) from error
-    return rows
-
-
-def _kitti_matrices(numbers: Float[Tensor, "n 12"]) -> Float[Tensor, "n 4 4"]:
-    """Matrices of rows of 3x4 numbers."""
-    matrices = torch.eye(4, dtype=torch.float64).repeat(len(numbers), 1, 1)
-    matrices[:, :3] = numbers.reshape(-1, 3, 4)
-    return matrices
-
-
-def _tum_matrices(numbers: Float[Tensor, "n 8"], lines: list[int], path: Path) -> Float[Tensor, "n 4 4"]:
-    """Matrices of rows of a timestamp, tx ty tz, and qx qy qz qw."""
-    norm = torch.linalg.vector_norm(numbers[:, 4:], dim=1)
-    for index in (~((norm - 1).abs() < _RIGID_TOLERANCE)).nonzero()[:1, 0].tolist():
-        raise InputError(
-            f"{path}, line {lines[index]}: needed a unit quaternion qx qy qz qw as the last four numbers, got length "
-            f"{float(norm[index]):.4g}; check the order of the columns."
-        )
-    matrices = torch.eye(4, dtype=torch.float64).repeat(len(numbers), 1, 1)
-    matrices[:, :3, :3] = rotations_from_quats(numbers[:, [7, 4, 5, 6]])
-    matrices[:, :3, 3] = numbers[:, 1:4]
-    return matrices

@@ -44,7 +44,8 @@ from pansplat.model.layers import (
     upsample,
 )
 
-_UNET_MULTIPLE = 4  # a U-Net of three scales halves the map twice
+_UNET_SCALES = 3
+_UNET_MULTIPLE = 2 ** (_UNET_SCALES - 1)
 
 _GROUPS = 8  # of the group normalisation
 _HEAD_CHANNELS = 32  # of one attention head
@@ -75,8 +76,6 @@ _HIERARCHY = (
 class CostVolumeConfig:
     """Shape of the cost volume; shipped weights fix all of it."""
 
-    sweep: Literal["hierarchical", "single"] = "hierarchical"
-    """All levels, or the coarsest level only."""
     mono_channels: Annotated[int, Meta(ge=0, le=4096)] = 32
     """Channels of the monocular features; 0 for none."""
     refinement: Literal["unet", "none"] = "unet"
@@ -89,11 +88,6 @@ class CostVolumeConfig:
         first = hierarchy.index(levels[0]) if levels and levels[0] in hierarchy else 0
         if levels != hierarchy[first : first + len(levels)]:
             raise ValueError(f"`levels` must be consecutive ones of {hierarchy}, coarse to fine, got {levels}")
-
-    @property
-    def swept_levels(self) -> tuple[SweepLevel, ...]:
-        """The levels in use, coarse to fine."""
-        return self.levels if self.sweep == "hierarchical" else self.levels[:1]
 
 
 @dataclass(frozen=True)
@@ -148,7 +142,7 @@ class SphericalCostVolume(nn.Module):
         self.compat: Compat = compat
         # Keys are pyramid levels.
         self.levels = nn.ModuleDict()
-        for index, sweep in enumerate(config.swept_levels):
+        for index, sweep in enumerate(config.levels):
             self.levels[str(sweep.level)] = LevelRefinement(
                 sweep, config, first=index == 0, compat=compat, precision=attention_precision
             )
@@ -183,14 +177,14 @@ class SphericalCostVolume(nn.Module):
             )
         bounds = (1 / far, 1 / near)
         regressed: list[LevelDepth] = []
-        for sweep, level_features in zip(self.config.swept_levels, features, strict=False):
+        for sweep, level_features in zip(self.config.levels, features, strict=False):
             height, width = level_features.shape[-2:]
             require_size(height, width, _UNET_MULTIPLE)
             if not regressed:
                 centre, candidates = None, make_first_candidates(bounds, sweep.candidates, (height, width))
             else:
                 centre = upsample(regressed[-1].inverse_depth.detach(), 2, self.compat)
-                intervals = max(1, self.config.swept_levels[0].candidates - 1)
+                intervals = max(1, self.config.levels[0].candidates - 1)
                 step = (bounds[1] - bounds[0]) / intervals / 2 ** len(regressed)
                 candidates = make_candidates_around(centre, step, bounds, sweep.candidates)
             volume = correlate_views(level_features, candidates, cam2world, self.compat)
@@ -211,11 +205,10 @@ class LevelRefinement(nn.Module):
         first: bool,
         compat: Compat,
         precision: Precision,
-        border: Border | None = None,
     ) -> None:
         super().__init__()
         self.compat: Compat = compat
-        border = border or choose_border(compat)
+        border = choose_border(compat)
         inputs = sweep.candidates + sweep.channels + (0 if first else 1) + config.mono_channels
         self.shortcut = nn.Conv2d(inputs, sweep.width, 1)
         self.refine = VolumeRefinement(inputs, sweep.width, border, precision) if config.refinement == "unet" else None
@@ -243,14 +236,14 @@ class LevelRefinement(nn.Module):
 
 
 class VolumeRefinement(nn.Module):
-    """A U-Net between two convolutions; one of five scales, at the size of images, has none after it."""
+    """A U-Net between two convolutions."""
 
-    def __init__(self, inputs: int, width: int, border: Border, precision: Precision, *, scales: int = 3) -> None:
+    def __init__(self, inputs: int, width: int, border: Border, precision: Precision) -> None:
         super().__init__()
         self.entry = PanoramaConv2d(inputs, width, 3, border=border)
-        self.norm = nn.GroupNorm(_GROUPS if scales == 3 else 4, width)
-        self.unet = UNet(width, border, precision, scales=scales)
-        self.exit = PanoramaConv2d(width, width, 3, border=border) if scales == 3 else nn.Identity()
+        self.norm = nn.GroupNorm(_GROUPS, width)
+        self.unet = UNet(width, border, precision)
+        self.exit = PanoramaConv2d(width, width, 3, border=border)
 
     def forward(self, inputs: ViewMaps) -> Float[Tensor, "batch view c height width"]:
         views = inputs.shape[:2]
@@ -308,31 +301,29 @@ def regress_depth(level: int, logits: Volume, candidates: Volume) -> LevelDepth:
 
 
 class UNet(nn.Module):
-    """2-D U-Net over the maps of all views; scale 0 has the input's size, the last scale is the bottleneck.
+    """2-D U-Net of three scales over the maps of all views; scale 0 has the input's size, the last is the bottleneck.
+
+    Each scale is half of the previous one; all maps have the same channels. Attention is at the bottleneck.
 
     Source: PanSplat, section 3.2 (after MVSplat, after the U-Net of latent diffusion).
-
-    Args:
-        channels: of every map.
-        scales: number of map sizes, each half of the previous one; attention is at the last.
     """
 
-    def __init__(self, channels: int, border: Border, precision: Precision = "float32", *, scales: int = 3) -> None:
+    def __init__(self, channels: int, border: Border, precision: Precision = "float32") -> None:
         super().__init__()
-        last = scales - 1
+        last = _UNET_SCALES - 1
         self.stem = PanoramaConv2d(channels, channels, 3, border=border)
         self.encoder = nn.ModuleList(
-            EncoderScale(channels, border, precision, bottleneck=scale == last) for scale in range(scales)
+            EncoderScale(channels, border, precision, bottleneck=scale == last) for scale in range(_UNET_SCALES)
         )
         self.middle = nn.ModuleList(ResBlock(channels, channels, border) for _ in range(2))
         self.decoder = nn.ModuleList(
             DecoderScale(channels, border, precision, bottleneck=scale == last, finest=scale == 0)
-            for scale in range(scales)
+            for scale in range(_UNET_SCALES)
         )
         self.exit = ConvNorm(channels, channels, border=border, bias=True, groups=_GROUPS)
 
     def forward(self, maps: ViewMaps) -> ViewMaps:
-        """Refine the maps of all views; 2^(scales - 1) must divide height and width."""
+        """Refine the maps of all views; `_UNET_MULTIPLE` must divide height and width."""
         views = maps.shape[1]
         x = self.stem(maps.flatten(0, 1))
         skips = [x]

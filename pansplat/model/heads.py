@@ -31,7 +31,6 @@ from pansplat.geometry.pose import multiply_quats, quats_from_rotations
 from pansplat.model.cost_volume import Depths, LevelDepth
 from pansplat.model.layers import Compat, Factor, Images, PerView, Poses, Precision, Size, autocast_convolutions
 from pansplat.model.tiles import (
-    Lattice,
     Margins,
     Tile,
     Window,
@@ -68,16 +67,8 @@ class AdapterConfig:
 
 @dataclass(frozen=True)
 class HeadsConfig:
-    """Shape of the heads; the switches are the paper's ablations."""
+    """Shape of the heads."""
 
-    lattice: Lattice = "fibonacci"
-    """Positions of the Gaussians: evenly distributed on the sphere, or one per pixel."""
-    levels: Literal["pyramid", "single"] = "pyramid"
-    """Heads on all levels, or on the finest only."""
-    emitted: Literal["all", "finest"] = "all"
-    """Levels that emit Gaussians; with "finest", the maps of coarser levels are only inputs of finer levels."""
-    residual: bool = True
-    """Whether a level reads the coarser level's map and adds to it."""
     depth: Literal["refined", "swept"] = "refined"
     """Depth and opacity from logits of the head, or the depth and confidence of the cost volume."""
     feature_channels: Annotated[tuple[Size, ...], Meta(max_length=16)] = (128, 96, 64, 32)
@@ -142,14 +133,12 @@ class LevelHead(nn.Module):
         self.config = config
         self.compat: Compat = compat
         hidden = 2 * config.outputs
-        last = hidden if config.lattice == "fibonacci" else config.outputs
-        widths = [inputs, *[hidden] * (config.layers - 1), last]
+        widths = [inputs, *[hidden] * config.layers]
         padding = 1 if compat == "official" else 0
         self.convs = nn.ModuleList(
             nn.Conv2d(before, after, 3, padding=padding) for before, after in itertools.pairwise(widths)
         )
-        # On a pixel lattice the map contains the outputs of each point.
-        self.linear = nn.Linear(hidden, config.outputs) if config.lattice == "fibonacci" else nn.Identity()
+        self.linear = nn.Linear(hidden, config.outputs)
 
     def forward(self, inputs: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 hidden h w"]:
         kind = inputs[0].device.type
@@ -180,7 +169,7 @@ class LevelHead(nn.Module):
             colored: whether to add the colour of the image to the harmonics.
         """
         config, compat = self.config, self.compat
-        uv = make_lattice_uv(config.lattice, height, exact=compat == "fixed")
+        uv = make_lattice_uv(height, exact=compat == "fixed")
         uv = uv[tile.contains(uv)].to(refined.device)
         outputs = self.linear(sample_window(refined, window, height, uv))
         sizes = (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters)
@@ -198,7 +187,7 @@ class LevelHead(nn.Module):
             opacities = torch.sigmoid(sample_resized(view.confidence[None])[:, 0])
         return adapt_gaussians(
             parameters,
-            move_points(uv, offsets, config.lattice, height),
+            move_points(uv, offsets, height),
             1 / inverse_depths.clamp(1 / view.far, 1 / view.near),
             opacities,
             view.cam2world,
@@ -223,13 +212,10 @@ class GaussianHeads(nn.Module):
         self.config = config
         self.compat: Compat = compat
         self.precision: Precision = precision
-        chained = config.levels == "pyramid" and config.residual
-        self.margins = Margins.of(config.layers, compat, chained=chained)
-        map_channels = (2 if config.lattice == "fibonacci" else 1) * config.outputs
-        first = len(config.feature_channels) - 1 if config.levels == "single" else 0
+        self.margins = Margins.of(config.layers, compat, chained=True)
         self.levels = nn.ModuleList(
-            LevelHead(3 + channels + config.candidates + (map_channels if chained and index > 0 else 0), config, compat)
-            for index, channels in enumerate(config.feature_channels[first:])
+            LevelHead(3 + channels + config.candidates + (2 * config.outputs if index > 0 else 0), config, compat)
+            for index, channels in enumerate(config.feature_channels)
         )
 
     def forward(self, matched: MatchedViews, *, tiles: int = 1) -> list[Gaussians]:
@@ -270,18 +256,14 @@ class GaussianHeads(nn.Module):
         return [height >> level for level in range(len(self.levels) - 1, -1, -1)]
 
     def make_points(self, height: int) -> list[Float[Tensor, "n 2"]]:
-        """Normalised panorama coordinates of the lattice points of each emitting level, coarse to fine."""
-        heights = self.compute_heights(height)
-        if self.config.emitted == "finest":
-            heights = heights[-1:]
-        return [make_lattice_uv(self.config.lattice, rows, exact=self.compat == "fixed") for rows in heights]
+        """Normalised panorama coordinates of the lattice points of each level, coarse to fine."""
+        return [make_lattice_uv(rows, exact=self.compat == "fixed") for rows in self.compute_heights(height)]
 
     def _lift_view(self, view: ViewInputs, tile: Tile) -> list[Gaussians]:
-        """Compute one view's Gaussians inside a tile, by emitting level, coarse to fine."""
+        """Compute one view's Gaussians inside a tile, by level, coarse to fine."""
         gaussians, coarser = [], None
         heights = self.compute_heights(view.image.shape[-2])
-        features = view.features[-len(heights) :]
-        for index, (head, height, feature) in enumerate(zip(self.levels, heights, features, strict=True)):
+        for index, (head, height, feature) in enumerate(zip(self.levels, heights, view.features, strict=True)):
             window = tile.window(height)
             input_window = window.expand(self.margins.input)
             inputs = [
@@ -294,16 +276,14 @@ class GaussianHeads(nn.Module):
                 refined = head(inputs).to(feature.dtype)
             if coarser is not None:
                 refined = refined + _crop_border(coarser, self.margins.input - self.margins.output)
-            coarser = refined if self.config.residual else None
-            level = len(heights) - 1 - index
-            if level == 0 or self.config.emitted == "all":
-                # Only the coarsest level adds its harmonics to the colour of the image.
-                output_window = window.expand(self.margins.output)
-                gaussians.append(
-                    head.decode_gaussians(
-                        refined[0], output_window, tile, view, height=height, level=level, colored=index == 0
-                    )
+            coarser, level = refined, len(heights) - 1 - index
+            # Only the coarsest level adds its harmonics to the colour of the image.
+            output_window = window.expand(self.margins.output)
+            gaussians.append(
+                head.decode_gaussians(
+                    refined[0], output_window, tile, view, height=height, level=level, colored=index == 0
                 )
+            )
         return gaussians
 
     def _require_divisible(self, height: int, tiles: int) -> None:

@@ -9,7 +9,7 @@ faces up and down in two orientations and averages them, so that half a turn of 
 Both modes keep two properties of the training: faces have zero padding, and whole rows of the panorama belong to the
 faces up and down.
 
-Source: Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550; docs/official.md, sections 2.4 and 5.
+Source: Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550; docs/official.md, sections 2.3 and 5.
 """
 
 from __future__ import annotations

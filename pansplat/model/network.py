@@ -17,10 +17,8 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas, uv_from_directions
 from pansplat.geometry.world import require_working_world
-from pansplat.model.base import Network
-from pansplat.model.heads import TileGaussians, merge_tiles
+from pansplat.model.heads import MatchedViews, TileGaussians, merge_tiles
 from pansplat.model.layers import Compat, Precision, require_views
-from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import (
     CHECKPOINT_SUFFIXES,
@@ -29,7 +27,6 @@ from pansplat.model.weights import (
     config_from_dict,
     convert_tensors,
     load_weights,
-    match_tensors,
     pack_weights,
     read_checkpoint,
     require_shapes,
@@ -40,10 +37,6 @@ from pansplat.system.devices import choose_device, note_full_card
 from pansplat.system.progress import report_progress
 from pansplat.system.source_hash import hash_sources
 
-_NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
-    "pansplat": (PanSplat, PanSplatConfig),
-    "mvsplat": (MVSplat, MVSplatConfig),
-}
 _UNTILED_HEIGHT = 512  # above, the number of tiles along each side doubles with the height
 _MULTIPLE = 32  # divides the working height: levels, windows and their shifts
 _MATCHING_FRACTION = 0.4  # of the prediction time, for the progress report
@@ -61,7 +54,7 @@ class NetworkPredictor:
     min_views = 2
     """Number of panoramas below which nothing is predicted; 1 if a predictor states none."""
 
-    def __init__(self, name: str, network: Network, *, tiles: int | None = None) -> None:
+    def __init__(self, name: str, network: PanSplat, *, tiles: int | None = None) -> None:
         self.name = name
         network.eval()
         self.network = network
@@ -77,8 +70,9 @@ class NetworkPredictor:
     @functools.cached_property
     def fingerprint(self) -> str:
         """Hash of weights, settings and source code, so that a cached prediction is never outdated."""
-        precisions = [getattr(self.network, name, None) for name in ("precision", "attention_precision")]
-        settings = (self.network.config, self.network.compat, *precisions, self.tiles, hash_sources(__name__))
+        network = self.network
+        precisions = (network.precision, network.attention_precision)
+        settings = (network.config, network.compat, *precisions, self.tiles, hash_sources(__name__))
         digest = hashlib.blake2b(repr(settings).encode(), digest_size=8)
         for name, tensor in sorted(self.network.state_dict().items()):
             digest.update(name.encode())
@@ -183,7 +177,7 @@ class NetworkPredictor:
         far: float | Tensor,
         masks: Tensor | None,
         tiles: int,
-    ) -> Any:
+    ) -> MatchedViews:
         """Check and match the views of one item, for a number of tiles along each side."""
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
@@ -195,7 +189,7 @@ class NetworkPredictor:
         near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
         return self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views)
 
-    def _lift(self, matched: Any, tiles: int) -> Iterator[TileGaussians]:
+    def _lift(self, matched: MatchedViews, tiles: int) -> Iterator[TileGaussians]:
         report_progress("making Gaussians", _MATCHING_FRACTION)
         for done, part in enumerate(self.network.lift_gaussians(matched, tiles=tiles), start=1):
             yield part
@@ -277,8 +271,7 @@ def load_predictor(
 def convert_checkpoint(content: Mapping[str, object], source: object) -> WeightsFile:
     """The content of a weights file from that of an official checkpoint; an InputError for a modified model."""
     tensors = convert_tensors(content, source)
-    model = match_tensors(content, source).model
-    weights = pack_weights(model, _NETWORKS[model][1](), tensors, compat="official")
+    weights = pack_weights(PanSplat.model, PanSplatConfig(), tensors, compat="official")
     require_shapes(tensors, build_empty_network(weights, "official", source).state_dict(), source)
     return weights
 
@@ -303,7 +296,7 @@ def has_bfloat16() -> bool:
     return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
-def build_network(weights: WeightsFile, compat: Compat, source: object, **choices: Any) -> Network:
+def build_network(weights: WeightsFile, compat: Compat, source: object, **choices: Any) -> PanSplat:
     """Build the network of a weights file, in eval mode.
 
     Args:
@@ -322,16 +315,13 @@ def build_empty_network(
     *,
     precision: Precision = "float32",
     attention_precision: Precision = "float32",
-) -> Network:
+) -> PanSplat:
     """The network on the meta device, without memory for weights; an InputError if the settings fit none."""
-    if weights.model not in _NETWORKS:
-        raise InputError(f"{source}: needed weights of {' or '.join(_NETWORKS)}, got weights of {weights.model!r}")
-    kind, config_kind = _NETWORKS[weights.model]
-    if kind is MVSplat and precision != "float32":
-        raise InputError(f"{source}: a {weights.model} network runs in float32 only, got precision {precision!r}")
-    choices = {"attention_precision": attention_precision} | ({"precision": precision} if kind is PanSplat else {})
-    return build_on_meta(
-        lambda: kind(config_from_dict(config_kind, weights.config, f"{source}: config"), compat, **choices),
-        weights.model,
-        source,
-    )
+    if weights.model != PanSplat.model:
+        raise InputError(f"{source}: needed weights of {PanSplat.model}, got weights of {weights.model!r}")
+
+    def build() -> PanSplat:
+        config = config_from_dict(PanSplatConfig, weights.config, f"{source}: config")
+        return PanSplat(config, compat, precision=precision, attention_precision=attention_precision)
+
+    return build_on_meta(build, weights.model, source)

@@ -9,14 +9,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from pansplat.model.base import Network
-from pansplat.model.cost_volume import CostVolumeConfig, SphericalCostVolume
+from pansplat.gaussians.scene import Gaussians
+from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
-from pansplat.model.heads import GaussianHeads, HeadsConfig, MatchedViews, TileGaussians
+from pansplat.model.heads import GaussianHeads, HeadsConfig, MatchedViews, TileGaussians, merge_tiles
 from pansplat.model.layers import Compat, Images, PerView, Poses, Precision, autocast_convolutions, resize
 from pansplat.model.mono_depth import MonocularDepth
+from pansplat.model.weights import ModelName
 
 MATCHING_HEIGHT = 512
 """Largest height of the images for feature matching; the heads read them at full size."""
@@ -31,7 +32,7 @@ class PanSplatConfig:
     heads: HeadsConfig = field(default_factory=HeadsConfig)
 
     def __post_init__(self) -> None:
-        swept = self.cost_volume.swept_levels[-1].candidates
+        swept = self.cost_volume.levels[-1].candidates
         if self.heads.candidates != swept:
             raise ValueError(f"`heads.candidates` must be the {swept} of the finest sweep, got {self.heads.candidates}")
         if self.heads.feature_channels != self.features.channels[::-1]:
@@ -41,16 +42,35 @@ class PanSplatConfig:
             )
 
 
-class PanSplat(Network):
+@dataclass(frozen=True)
+class Prediction:
+    """Output of the network.
+
+    Attributes:
+        gaussians: one set for each batch item, labelled with level and view.
+        matched: intermediate features and depths.
+    """
+
+    gaussians: list[Gaussians]
+    matched: MatchedViews
+
+    @property
+    def depths(self) -> Depths:
+        """Depth of each view at the swept levels, coarse to fine."""
+        return self.matched.depths
+
+
+class PanSplat(nn.Module):
     """Feature pyramid, monocular depth, spherical cost volume, residual Gaussian heads.
 
     Args:
-        compat: see `Network`.
+        compat: "official" computes the numbers of the official code with its defects; "fixed" corrects them.
         precision: number type of all convolutions; depths, correlations and positions are not affected.
         attention_precision: number type that attention rounds to; bfloat16 in the official code.
     """
 
-    model = "pansplat"
+    model: ModelName = "pansplat"
+    """Name in files of weights."""
 
     def __init__(
         self,
@@ -86,6 +106,16 @@ class PanSplat(Network):
     ) -> Iterator[TileGaussians]:
         """Yield the Gaussians tile by tile to bound memory; see `GaussianHeads.iterate_tiles`."""
         return self.heads.iterate_tiles(matched, tiles=tiles, only=only)
+
+    def forward(self, images: Images, cam2world: Poses, near: PerView, far: PerView, *, tiles: int = 1) -> Prediction:
+        """Predict from posed panoramas.
+
+        Args:
+            near, far: bounds of the depth, metres.
+            tiles: tiles along each side of the panorama.
+        """
+        matched = self.match_views(images, cam2world, near, far)
+        return Prediction(merge_tiles(list(self.lift_gaussians(matched, tiles=tiles)), self.compat), matched)
 
     def _resize_for_matching(self, images: Images) -> Float[Tensor, "batch view 3 h w"]:
         if images.shape[-2] <= MATCHING_HEIGHT:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Integer
@@ -24,17 +23,16 @@ from pansplat.geometry.equirect import pad_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, official_fibonacci_uv
 from pansplat.model.layers import Compat
 
-Lattice = Literal["fibonacci", "pixel"]
 _MIN_COS_LATITUDE = 0.01  # limits the width of a pixel in longitude at the poles
 
 
 @functools.lru_cache(maxsize=16)
 @torch.inference_mode(False)  # calls with gradients also use the cached tensor
-def make_lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Float[Tensor, "n 2"]:
+def make_lattice_uv(height: int, *, exact: bool = True) -> Float[Tensor, "n 2"]:
     """Normalised panorama coordinates of a level's lattice points, float64.
 
-    A Fibonacci lattice covers the sphere evenly and starts at the bottom pole. The pixel lattice is in row-major order.
-    The result is cached: do not change it in place.
+    A Fibonacci lattice covers the sphere evenly and starts at the bottom pole. The result is cached: do not change it
+    in place.
 
     Args:
         height: rows of the level's map.
@@ -42,27 +40,16 @@ def make_lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Flo
 
     Source: PanSplat, section 3.3.
     """
-    if lattice == "pixel":
-        v, u = torch.meshgrid(
-            (torch.arange(height, dtype=torch.float64) + 0.5) / height,
-            (torch.arange(2 * height, dtype=torch.float64) + 0.5) / (2 * height),
-            indexing="ij",
-        )
-        return torch.stack((u, v), dim=-1).reshape(-1, 2)
     count = lattice_size(2 * height)
     return uv_from_directions(fibonacci_directions(count)) if exact else official_fibonacci_uv(count)
 
 
-def move_points(
-    uv: Float[Tensor, "n 2"], raw_offsets: Float[Tensor, "n 2"], lattice: Lattice, height: int
-) -> Float[Tensor, "n 2"]:
+def move_points(uv: Float[Tensor, "n 2"], raw_offsets: Float[Tensor, "n 2"], height: int) -> Float[Tensor, "n 2"]:
     """Move points by at most half a map pixel in each direction; they may cross the seam or a pole.
 
-    On a Fibonacci lattice a pixel has one arc length at all latitudes, so it is wider in longitude near the poles.
+    A pixel has one arc length at all latitudes, so it is wider in longitude near the poles.
     """
-    width = torch.full_like(uv[:, 0], 2 * height)
-    if lattice == "fibonacci":
-        width = width * torch.sin(uv[:, 1] * math.pi).clamp_min(_MIN_COS_LATITUDE)
+    width = 2 * height * torch.sin(uv[:, 1] * math.pi).clamp_min(_MIN_COS_LATITUDE)
     pixel = torch.stack((1 / width, torch.full_like(width, 1 / height)), dim=-1)
     return uv.to(raw_offsets) + (torch.sigmoid(raw_offsets) - 0.5) * pixel.to(raw_offsets)
 

@@ -4,7 +4,7 @@ A weights file is a .safetensors file with four metadata entries: `pansplat_form
 name), `config` (its architecture, JSON) and `compat` (the mode of its training). Checkpoints are read without executing
 code in them. Conversion is strict: a tensor that is missing, unknown or not finite is an error.
 
-Source: docs/official.md, sections 3 to 8, 15 and 16.
+Source: docs/official.md, sections 3 to 8 and 15.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CHECKPOINT_SUFFIXES = (".ckpt", ".pt", ".pth")
 WEIGHTS_SUFFIXES = (".safetensors", *CHECKPOINT_SUFFIXES)
 COMPATS: dict[str, Compat] = {"official": "official", "fixed": "fixed"}
 
-ModelName = Literal["pansplat", "mvsplat", "depth", "depth_sharpening"]
+ModelName = Literal["pansplat", "depth", "depth_sharpening"]
 
 _T = TypeVar("_T")
 _Layer = tuple[str, str, tuple[str, ...]]  # official name, our name, tensors
@@ -48,6 +48,8 @@ _FULL = ("weight", "bias")
 _BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
 _PREFIX = "encoder."  # of the network's tensors in a Lightning checkpoint
 _AUXILIARY_PREFIX = "losses.2.gaussian_head."
+_GRID_HEIGHTS = {f"mono_depth.c2e.{scale}.sample_grid": 512 >> scale for scale in (5, 4, 3, 2, 1)}
+"""Heights of the panoramas of the stored lookup grids, which are recomputed here."""
 _MAX_NAMES = 4  # in an error message
 
 
@@ -245,14 +247,12 @@ class ConversionReport:
     """How the tensors of an official checkpoint are converted.
 
     Attributes:
-        model: name of the network.
         used: our name of each tensor that is used, by official name.
         unused: official names of tensors that are not used, by reason.
         unexpected: names that are not official.
         missing: official names that the checkpoint lacks.
     """
 
-    model: ModelName
     used: dict[str, str]
     unused: dict[str, list[str]]
     unexpected: list[str]
@@ -267,7 +267,7 @@ class ConversionReport:
             problems.append(f"found unknown {_join_names(self.unexpected)}")
         if problems:
             raise InputError(
-                f"{source}: needed exactly the tensors of the official {self.model}, {' and '.join(problems)}; "
+                f"{source}: needed exactly the tensors of the official PanSplat, {' and '.join(problems)}; "
                 "use the checkpoint of an unmodified model"
             )
 
@@ -284,7 +284,7 @@ def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, 
     state = get_state_dict(content, str(source))
     _require_official_grids(state, source)
     tensors = {}
-    for name, ours in map_official_names(report.model).items():
+    for name, ours in map_official_names().items():
         tensor = state[_PREFIX + name]
         tensor = tensor.squeeze(-1) if tensor.ndim == 3 else tensor  # 1-D convolutions are linear layers here
         if tensor.is_floating_point():
@@ -296,11 +296,11 @@ def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, 
 
 
 def match_tensors(content: Mapping[str, object], source: object) -> ConversionReport:
-    """Match the tensors of an official checkpoint with ours; an InputError if they belong to neither network."""
+    """Match the tensors of an official checkpoint with ours; an InputError if they are of another network."""
     state = get_state_dict(content, str(source))
-    model = _detect_model(state, source)
-    expected = {_PREFIX + name: ours for name, ours in map_official_names(model).items()}
-    grids = {_PREFIX + name for name in _list_grid_heights(model)}
+    _require_pansplat(state, source)
+    expected = {_PREFIX + name: ours for name, ours in map_official_names().items()}
+    grids = {_PREFIX + name for name in _GRID_HEIGHTS}
     auxiliary = {_AUXILIARY_PREFIX + name for name in _list_auxiliary_names()}
     unused = {
         "recomputed grids": sorted(grids & state.keys()),
@@ -308,7 +308,6 @@ def match_tensors(content: Mapping[str, object], source: object) -> ConversionRe
         "training state": sorted(key for key in content if key != "state_dict"),
     }
     return ConversionReport(
-        model=model,
         used={name: ours for name, ours in expected.items() if name in state},
         unused={reason: names for reason, names in unused.items() if names},
         unexpected=[name for name in state if name not in expected.keys() | grids | auxiliary],
@@ -316,17 +315,12 @@ def match_tensors(content: Mapping[str, object], source: object) -> ConversionRe
     )
 
 
-def map_official_names(model: ModelName) -> dict[str, str]:
+def map_official_names() -> dict[str, str]:
     """Map the official name, without the prefix "encoder.", of each tensor that is used to our name.
 
     The official code counts stages from coarse to fine; our levels are the paper's, where 0 is the finest.
     """
-    if model == "mvsplat":
-        parts = (_mvsplat(),)
-    else:
-        transformer = _transformer("backbone.transformer", "features.transformer")
-        parts = (_feature_pyramid(), transformer, _mono_depth(), _cost_volume(), _heads())
-    layers = itertools.chain.from_iterable(parts)
+    layers = itertools.chain(_feature_pyramid(), _transformer(), _mono_depth(), _cost_volume(), _heads())
     return {f"{official}.{tensor}": f"{ours}.{tensor}" for official, ours, tensors in layers for tensor in tensors}
 
 
@@ -353,13 +347,6 @@ def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]
         raise InputError(f"{source}: its tensors do not fit the network: {'; '.join(problems)}; use another file")
 
 
-def _list_grid_heights(model: ModelName) -> dict[str, int]:
-    """Map the names of the stored lookup grids, which are recomputed here, to the heights of their panoramas."""
-    if model == "mvsplat":
-        return {}
-    return {f"mono_depth.c2e.{scale}.sample_grid": 512 >> scale for scale in (5, 4, 3, 2, 1)}
-
-
 def _list_auxiliary_names() -> Iterator[str]:
     for stage in range(3):
         for layer in (f"to_gaussians_list.{stage}.0", f"to_gaussians_list.{stage}.2", f"gaussians_mlp_list.{stage}.0"):
@@ -369,7 +356,7 @@ def _list_auxiliary_names() -> Iterator[str]:
 
 def _require_official_grids(state: Mapping[str, Tensor], source: object) -> None:
     """Check that stored lookup grids equal the computed ones."""
-    for name, height in _list_grid_heights("pansplat").items():
+    for name, height in _GRID_HEIGHTS.items():
         if _PREFIX + name not in state:
             continue
         stored = state[_PREFIX + name]
@@ -379,15 +366,13 @@ def _require_official_grids(state: Mapping[str, Tensor], source: object) -> None
             raise InputError(f"{source}: needed the official grid in {name}, got another; use an unmodified model")
 
 
-def _detect_model(state: Mapping[str, Tensor], source: object) -> ModelName:
+def _require_pansplat(state: Mapping[str, Tensor], source: object) -> None:
     if any(name.startswith("encoder.gaussian_head.") for name in state):
-        return "pansplat"
+        return
+    names = _join_names(list(state)) if state else "none"
     if any(name.startswith("encoder.backbone.backbone.") for name in state):
-        return "mvsplat"
-    raise InputError(
-        f"{source}: needed a checkpoint of the official PanSplat or its MVSplat baseline, got tensors "
-        f"{_join_names(list(state)) if state else 'none'}"
-    )
+        names = f"{names} of its MVSplat baseline, which has no Gaussian heads"
+    raise InputError(f"{source}: needed a checkpoint of the official PanSplat, got tensors {names}; use another file")
 
 
 def _join_names(names: Sequence[str]) -> str:
@@ -418,7 +403,8 @@ def _feature_pyramid() -> Iterator[_Layer]:
     yield from _pair("backbone.decoder", "features.decoder", laterals, _FULL)
 
 
-def _transformer(official: str, ours: str) -> Iterator[_Layer]:
+def _transformer() -> Iterator[_Layer]:
+    official, ours = "backbone.transformer", "features.transformer"
     projections = {"q_proj": "query", "k_proj": "key", "v_proj": "value", "merge": "merge"}
     for block in range(6):
         old, new = f"{official}.layers.{block}", f"{ours}.blocks.{block}"
@@ -462,18 +448,18 @@ def _resnet18(official: str, ours: str) -> Iterator[_Layer]:
 def _cost_volume() -> Iterator[_Layer]:
     for stage in range(3):
         official, ours = "depth_predictor", f"cost_volume.levels.{3 - stage}"
-        yield from _refinement(f"{official}.corr_refine_nets.{stage}", f"{ours}.refine", scales=3)
+        yield from _refinement(f"{official}.corr_refine_nets.{stage}", f"{ours}.refine")
         yield f"{official}.regressor_residuals.{stage}", f"{ours}.shortcut", _FULL
         yield from _pair(f"{official}.depth_heads.{stage}", f"{ours}.head", {"0": "0", "2": "2"}, _FULL)
 
 
-def _refinement(official: str, ours: str, scales: int) -> Iterator[_Layer]:
+def _refinement(official: str, ours: str) -> Iterator[_Layer]:
     yield from _pair(official, ours, {"0": "entry", "1": "norm", "4": "exit"}, _FULL)
-    yield from _unet(f"{official}.3", f"{ours}.unet", scales)
+    yield from _unet(f"{official}.3", f"{ours}.unet")
 
 
-def _unet(official: str, ours: str, scales: int) -> Iterator[_Layer]:
-    last = scales - 1
+def _unet(official: str, ours: str) -> Iterator[_Layer]:
+    scales, last = 3, 2
     yield f"{official}.input_blocks.0.0", f"{ours}.stem", _FULL
     for scale in range(scales):
         yield from _res_block(f"{official}.input_blocks.{2 * scale + 1}.0", f"{ours}.encoder.{scale}.block")
@@ -510,30 +496,3 @@ def _heads() -> Iterator[_Layer]:
         old, new = f"gaussian_head.to_gaussians_list.{stage}", f"heads.levels.{stage}"
         yield from _pair(old, f"{new}.convs", {"0": "0", "2": "1", "4": "2"}, _FULL)
         yield f"gaussian_head.gaussians_mlp_list.{stage}.0", f"{new}.linear", _FULL
-
-
-def _mvsplat() -> Iterator[_Layer]:
-    yield from _mvsplat_encoder()
-    yield from _transformer("backbone.transformer", "features.transformer")
-    official, ends = "depth_predictor", {"0": "0", "2": "2"}
-    yield from _refinement(f"{official}.corr_refine_net", "depth.refine", scales=3)
-    yield f"{official}.regressor_residual", "depth.shortcut", _FULL
-    yield from _pair(f"{official}.depth_head_lowres", "depth.head", ends, _FULL)
-    yield f"{official}.upsampler.0", "upsampler", _FULL
-    yield f"{official}.proj_feature", "project", _FULL
-    yield from _pair(f"{official}.refine_unet", "refine", {"0": "entry", "1": "norm"}, _FULL)
-    yield from _unet(f"{official}.refine_unet.3", "refine.unet", scales=5)
-    yield from _pair(f"{official}.to_gaussians", "to_gaussians", ends, _FULL)
-    yield from _pair(f"{official}.to_disparity", "to_depth", ends, _FULL)
-
-
-def _mvsplat_encoder() -> Iterator[_Layer]:
-    official, ours = "backbone.backbone", "features.encoder"
-    yield f"{official}.conv1", f"{ours}.stem", _BARE
-    for stage in range(3):
-        for block in (0, 1):
-            old, new = f"{official}.layer{stage + 1}.{block}", f"{ours}.blocks.{2 * stage + block}"
-            yield from _pair(old, new, {"conv1": "conv1", "conv2": "conv2"}, _BARE)
-        if stage > 0:
-            yield f"{official}.layer{stage + 1}.0.downsample.0", f"{ours}.blocks.{2 * stage}.shortcut.0", _FULL
-    yield f"{official}.conv2", f"{ours}.exit", _FULL

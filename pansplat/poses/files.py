@@ -11,10 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from pansplat.errors import InputError, InputWarning
-from pansplat.geometry.pose import quats_from_rotations
 from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import is_assembled, read_thumbnail
 from pansplat.inputs.content import hash_pixels
@@ -32,58 +29,40 @@ from pansplat.poses.pose_file import (
     make_pose_content,
     make_world,
 )
-from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import require_replaceable
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 
-SUFFIXES = (".json", ".tum", ".kitti")
 _KIND = "poses"  # of entries of the store
 
 
 def require_mergeable(path: Path, images: Sequence[Path], *, overwrite: bool) -> None:
     """Check, before the estimate, the file that `write_poses` is to write; it need not exist."""
-    if path.suffix.lower() == ".json":
-        names = set(name_pictures(path, images).values())
-        if path.exists() and not (names and names <= find_kept(read_pose_content(path), path, names)):
-            return
+    names = set(name_pictures(path, images).values())
+    if path.exists() and not (names and names <= find_kept(read_pose_content(path), path, names)):
+        return
     require_replaceable("--out", [path], overwrite)
 
 
 def write_poses(estimate: PoseEstimate, path: Path, *, overwrite: bool = False) -> None:
-    """Write the poses as a poses.json, or those of the largest group in the TUM or KITTI format by the suffix.
+    """Write the poses as a poses.json.
 
     Names in a poses.json are relative to its folder; each group is a world. If the file exists, the poses are merged
-    into it (`pansplat.poses.edit.merge_estimate`), and it stays as NAME.bak. A trajectory has one line for each
-    panorama of the largest group, in the order of the names; the timestamps of TUM are the panoramas' numbers.
+    into it (`pansplat.poses.edit.merge_estimate`), and it stays as NAME.bak.
     """
-    if path.suffix.lower() == ".json":
-        names = name_pictures(path, estimate.images)
-        content, kept = make_pose_content(estimate, names), []
-        if path.exists():
-            content, kept = merge_estimate(path, estimate, names, overwrite=overwrite)
-        if kept:
-            warnings.warn(
-                f"{path} keeps its poses of {list_first(kept)}: pansplat did not write all poses of their world; "
-                "`--overwrite` replaces them.",
-                InputWarning,
-                stacklevel=2,
-            )
-        write_pose_file(path, content)
-        return
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: needed a name ending in {', '.join(SUFFIXES)}, got {path.suffix!r}; rename it.")
-    lines = []
-    for image, pose in sorted(estimate.poses.items()):
-        if path.suffix.lower() == ".kitti":
-            numbers = list(pose[:3].reshape(-1))
-        else:
-            w, x, y, z = quats_from_rotations(torch.from_numpy(pose[:3, :3])).tolist()
-            numbers = [float(estimate.images.index(image)), *pose[:3, 3], x, y, z, w]
-        lines.append(" ".join(f"{number:.9g}" for number in numbers))
-    with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", "utf-8")
+    names = name_pictures(path, estimate.images)
+    content, kept = make_pose_content(estimate, names), []
+    if path.exists():
+        content, kept = merge_estimate(path, estimate, names, overwrite=overwrite)
+    if kept:
+        warnings.warn(
+            f"{path} keeps its poses of {list_first(kept)}: pansplat did not write all poses of their world; "
+            "`--overwrite` replaces them.",
+            InputWarning,
+            stacklevel=2,
+        )
+    write_pose_file(path, content)
 
 
 def estimate_panoramas(

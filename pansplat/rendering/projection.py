@@ -21,11 +21,9 @@ from pansplat.constants import (
     MAX_MAGNITUDE,
     MAX_SCALE_RATIO,
     MIN_COMPENSATION,
-    MIN_EIGENVALUE_RATIO,
     MIN_EWA_VARIANCE,
     OPACITY_CUT,
 )
-from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import evaluate_harmonics
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
@@ -44,48 +42,29 @@ class Selection:
     """The Gaussians to project, and the number of the others.
 
     Attributes:
-        covariances: of the same Gaussians, if given in place of scales and quats.
         total: number of Gaussians before the selection.
         dropped: number of Gaussians that are not finite.
         near: number of Gaussians nearer than `near`.
     """
 
     gaussians: Gaussians
-    covariances: Float[Tensor, "n 3 3"] | None
     total: int
     dropped: int
     near: int
 
 
-def select_drawable(
-    gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, pose: Float[Tensor, "4 4"], options: RasterOptions
-) -> Selection:
+def select_drawable(gaussians: Gaussians, pose: Float[Tensor, "4 4"], options: RasterOptions) -> Selection:
     """Select Gaussians before any arithmetic, so that the gradients of all others are exactly zero."""
     radius = _compute_radius(gaussians, pose)
     close = radius < options.near
-    usable = _are_usable(gaussians, covariances, radius, close)
+    usable = _are_usable(gaussians, radius, close)
     dropped = len(gaussians) - int(usable.sum())
-    if options.strict and dropped:
-        raise InputError(not_finite_message(gaussians, covariances, pose, options))
     close &= usable
     keep = usable & ~close & (gaussians.opacities.detach() >= OPACITY_CUT)
     total, near = len(gaussians), int(close.sum())
     if not bool(keep.all()):
         gaussians = gaussians.select(keep)
-        covariances = None if covariances is None else covariances[keep]
-    return Selection(gaussians, covariances, total, dropped, near)
-
-
-def not_finite_message(
-    gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, pose: Float[Tensor, "4 4"], options: RasterOptions
-) -> str:
-    """Error message with the number of Gaussians that are not finite."""
-    radius = _compute_radius(gaussians, pose)
-    wrong = torch.nonzero(~_are_usable(gaussians, covariances, radius, radius < options.near))[:, 0]
-    return (
-        f"`gaussians` must hold only finite numbers, got {len(wrong)} of {len(gaussians)} that do not (the first is "
-        f"number {int(wrong[0])}); remove them, or render with strict=False to leave them out"
-    )
+    return Selection(gaussians, total, dropped, near)
 
 
 @torch.no_grad()
@@ -94,31 +73,13 @@ def _compute_radius(gaussians: Gaussians, pose: Tensor) -> Float[Tensor, "n"]:
 
 
 @torch.no_grad()
-def _are_usable(gaussians: Gaussians, covariances: Tensor | None, radius: Tensor, close: Tensor) -> Bool[Tensor, "n"]:
-    return _are_finite(gaussians, covariances) & (close | _have_valid_shapes(gaussians, covariances, radius))
-
-
-def _are_finite(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None) -> Bool[Tensor, "n"]:
-    """Which Gaussians have finite numbers only, small enough for their products."""
-    shape = (gaussians.scales, gaussians.quats) if covariances is None else (covariances,)
+def _are_usable(gaussians: Gaussians, radius: Tensor, close: Tensor) -> Bool[Tensor, "n"]:
+    """Which Gaussians have finite numbers only, small enough for their products, and are not too large."""
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    for field in (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics):
+    for name in ("means", "scales", "quats", "opacities", "harmonics"):
+        field = getattr(gaussians, name)
         keep &= (field.detach().abs() < MAX_MAGNITUDE).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
-    return keep
-
-
-def _have_valid_shapes(
-    gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, radius: Float[Tensor, "n"]
-) -> Bool[Tensor, "n"]:
-    """Which Gaussians are not too large for their distance, with a positive semidefinite covariance."""
-    if covariances is None:
-        return gaussians.scales.detach().double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius
-    relative = covariances.detach().double() / radius.square()[:, None, None]
-    largest = relative.diagonal(dim1=1, dim2=2).amax(dim=1)
-    # Rounding to float32 or less can make the smallest variance of a disc slightly negative.
-    finite = torch.where(torch.isfinite(relative), relative, 0)
-    smallest = torch.linalg.eigvalsh(0.5 * (finite + finite.transpose(1, 2)))[:, 0]
-    return (largest <= MAX_SCALE_RATIO**2) & (smallest >= MIN_EIGENVALUE_RATIO * largest)
+    return keep & (close | (gaussians.scales.detach().double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius))
 
 
 # --- projection: Gaussians in the axes of one camera ---
@@ -148,7 +109,6 @@ class ProjectedGaussians(NamedTuple):
 
 def project_gaussians(
     gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
     cam2world: Float[Tensor, "4 4"],
     *,
     filter_variance: float,
@@ -159,14 +119,12 @@ def project_gaussians(
 
     Args:
         gaussians: selected by `select_drawable`.
-        covariances: in place of the Gaussians' scales and quats, square metres.
         cam2world: float64.
         filter_variance: e^2, added across the ray, radians^2.
         compensate: lower the opacity so that the filter does not add energy.
         exact: compute the rows of the exact kernel.
     """
-    shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
-    fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
+    fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, gaussians.quats, gaussians.scales)
     options: Any = dict(cam2world=cam2world, filter_variance=filter_variance, compensate=compensate, exact=exact)
     project = functools.partial(_project_chunk, **options)
     needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*fields, cam2world))
@@ -180,25 +138,23 @@ def _project_chunk(
     means: Float[Tensor, "n 3"],
     opacities: Float[Tensor, "n"],
     harmonics: Float[Tensor, "n k channel"],
-    *shape: Tensor,
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    *,
     cam2world: Float[Tensor, "4 4"],
     filter_variance: float,
     compensate: bool,
     exact: bool,
 ) -> ProjectedGaussians:
-    """Project one chunk of `project_gaussians`; `shape` is the quats and scales, or the covariances."""
+    """Project one chunk of `project_gaussians`."""
     dtype = means.dtype
     offset = means.double() - cam2world[:3, 3]
     radius = torch.linalg.vector_norm(offset, dim=1)
     world_direction = offset / radius[:, None]
     direction = world_direction @ cam2world[:3, :3]
     colours = evaluate_harmonics(harmonics, world_direction.to(dtype))
-    world2cam = cam2world[:3, :3].T
     frame = torch.stack((*tangent_frame(direction), direction), dim=1)
-    if len(shape) == 2:
-        unfiltered = _shape_from_axes(world2cam @ rotations_from_quats(shape[0].double()), shape[1], radius, frame)
-    else:
-        unfiltered = _shape_from_covariance(world2cam @ shape[0].double() @ world2cam.T, radius, frame)
+    unfiltered = _find_shape(cam2world[:3, :3].T @ rotations_from_quats(quats.double()), scales, radius, frame)
     outer = direction[:, :, None] * direction[:, None, :]
     covariance = unfiltered.covariance + filter_variance * (
         torch.eye(3, dtype=torch.float64, device=means.device) - outer
@@ -241,7 +197,7 @@ class _Shape(NamedTuple):
     det: Float[Tensor, "n"]
 
 
-def _shape_from_axes(
+def _find_shape(
     rotation: Float[Tensor, "n 3 3"],
     scales: Float[Tensor, "n 3"],
     radius: Float[Tensor, "n"],
@@ -261,26 +217,6 @@ def _shape_from_axes(
         radial_variance=(size.square() * cosine2).sum(dim=1),
         mixed=(minors2 * (1 - cosine2)).sum(dim=1),
         det=size.square().prod(dim=1),
-    )
-
-
-def _shape_from_covariance(
-    covariance: Float[Tensor, "n 3 3"], radius: Float[Tensor, "n"], frame: Float[Tensor, "n 3 3"]
-) -> _Shape:
-    """Compute the shape from covariances in camera axes; minors that rounding made negative are set to zero."""
-    c = 0.5 * (covariance + covariance.transpose(1, 2)) / radius.square()[:, None, None]
-    turned = frame @ c @ frame.transpose(1, 2)
-    uu, vv, nn = turned.diagonal(dim1=1, dim2=2).unbind(1)
-    uv, un, vn = turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2]
-    det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
-    return _Shape(
-        covariance=c,
-        in_frame=turned,
-        det_across=(uu * vv - uv * uv).clamp_min(0),
-        trace_across=(uu + vv).clamp_min(0),
-        radial_variance=nn.clamp_min(0),
-        mixed=(nn * (uu + vv) - un * un - vn * vn).clamp_min(0),
-        det=det.clamp_min(0),
     )
 
 

@@ -44,7 +44,6 @@ class RasterOptions:
         order: sort by distance, or by depth along each image plane's optical axis as 3DGS does.
         lowpass: "angular" conserves energy; "3dgs" adds 0.3 pixel^2.
         near: Gaussians whose mean is nearer are not rasterised, metres.
-        strict: raise an error for Gaussians that are not finite, instead of dropping them.
         stitching: of cube faces, "seamless", or "official" with the borders of the official code.
     """
 
@@ -52,7 +51,6 @@ class RasterOptions:
     order: Order = "radial"
     lowpass: Lowpass = "angular"
     near: float = NEAR
-    strict: bool = False
     stitching: Stitching = "seamless"
 
     def __post_init__(self) -> None:
@@ -125,13 +123,12 @@ class RasterSums:
 class RasterBackend(Protocol):
     """Signature of a backend's `rasterize_planes`.
 
-    Differentiable in the pose, in `covariances` and in all floating-point fields of the Gaussians.
+    Differentiable in the pose and in all floating-point fields of the Gaussians.
     """
 
     def __call__(
         self,
         gaussians: Gaussians,
-        covariances: Float[Tensor, "n 3 3"] | None,
         pose: Float[Tensor, "4 4"],
         planes: list[ImagePlane],
         options: RasterOptions,
@@ -140,7 +137,6 @@ class RasterBackend(Protocol):
 
         Args:
             gaussians: float32 or float64.
-            covariances: world covariances in place of scales and rotations, square metres.
             pose: cam2world, float64, rigid.
             planes: of one size and focal length; a panorama with an eye offset is the only one.
             options: `stitching` is not used.
@@ -201,13 +197,11 @@ def rasterize(
     face_size: int | None = None,
     eye_offset: float = 0.0,
     background: Sequence[float] | Float[Tensor, "channel"] = (0.0, 0.0, 0.0),
-    covariances: Float[Tensor, "n 3 3"] | None = None,
     backend: Backend = "auto",
     kernel: Kernel = "ray",
     order: Order = "radial",
     lowpass: Lowpass = "angular",
     near: float = NEAR,
-    strict: bool = False,
     stitching: Stitching = "seamless",
 ) -> Rendering:
     """Rasterise Gaussians as one camera sees them.
@@ -224,15 +218,14 @@ def rasterize(
         eye_offset: of layout "equirect": radius of the viewing circle of omni-directional stereo, metres, half the
             distance of the eyes. Positive for the right eye, negative for the left. The gradients are those of "torch".
         background: one number for each channel; the default is black for any number of channels.
-        covariances: world covariances in place of those of `scales` and `quats`, square metres.
         backend: "torch" is the reference, "numba" is fast on a CPU (kernel "ray" only), "triton" on CUDA; "auto"
             chooses the fastest available for the kernel and the Gaussians' type and device.
-        kernel, order, lowpass, near, strict, stitching: see `RasterOptions`.
+        kernel, order, lowpass, near, stitching: see `RasterOptions`.
 
     Returns:
         The image, in the Gaussians' type.
     """
-    options = RasterOptions(kernel, order, lowpass, near, strict, stitching)
+    options = RasterOptions(kernel, order, lowpass, near, stitching)
     _check_arguments(size, layout, vertical_fov_degrees, face_size, eye_offset, backend, options)
     device = gaussians.means.device
     pose = torch.as_tensor(cam2world, device=device).double()
@@ -244,7 +237,6 @@ def rasterize(
         )
     if gaussians.means.dtype not in (torch.float32, torch.float64):
         gaussians = gaussians.to(dtype=torch.float32)
-    covariances = _convert_covariances(covariances, gaussians)
     background_color = _convert_background(background, gaussians)
     planes = image_planes(
         layout,
@@ -254,7 +246,7 @@ def rasterize(
         eye_offset=eye_offset,
         device=device,
     )
-    result = _select_backend(backend, gaussians, options.kernel)(gaussians, covariances, pose, planes, options)
+    result = _select_backend(backend, gaussians, options.kernel)(gaussians, pose, planes, options)
     sums = result.sums.squeeze(0)
     if layout == "cubemap":
         sums = stitch_faces(result.sums, size, stitching=options.stitching)
@@ -315,18 +307,6 @@ def _check_arguments(
             "stitching 'official' needs layout='cubemap' and a 2:1 panorama with a height that is a multiple of 4, "
             f"got layout={layout!r} and size {tuple(size)}; use stitching='seamless'"
         )
-
-
-def _convert_covariances(given: Tensor | None, gaussians: Gaussians) -> Tensor | None:
-    """Convert covariances to the Gaussians' type."""
-    if given is None:
-        return None
-    if tuple(given.shape) != (len(gaussians), 3, 3):
-        raise InputError(
-            f"`covariances` must have shape ({len(gaussians)}, 3, 3), one matrix for each Gaussian, got "
-            f"{tuple(given.shape)}"
-        )
-    return given.to(gaussians.means)
 
 
 def _convert_background(given: Sequence[float] | Tensor, gaussians: Gaussians) -> Float[Tensor, "channel"] | None:

@@ -71,15 +71,14 @@ class TilePixels:
 @one_thread()
 def rasterize_planes(
     gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
     pose: Float[Tensor, "4 4"],
     planes: list[ImagePlane],
     options: RasterOptions,
 ) -> RasterSums:
     """Rasterise with torch operations; see `pansplat.rendering.rasterize.RasterBackend`."""
     if planes[0].eye_offset:
-        return _rasterize_columns(gaussians, covariances, pose, planes[0], options)
-    chosen, projected = _select_and_project(gaussians, covariances, pose, planes[0], options)
+        return _rasterize_columns(gaussians, pose, planes[0], options)
+    chosen, projected = _select_and_project(gaussians, pose, planes[0], options)
     sums, visible, intersections = zip(*(_rasterize_plane(projected, plane, options) for plane in planes), strict=True)
     info = RasterInfo(chosen.total, chosen.dropped, chosen.near, sum(visible), sum(intersections))
     return RasterSums(torch.stack(sums), info)
@@ -87,16 +86,14 @@ def rasterize_planes(
 
 def _select_and_project(
     gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
     pose: Float[Tensor, "4 4"],
     plane: ImagePlane,
     options: RasterOptions,
 ) -> tuple[Selection, ProjectedGaussians]:
     """The drawable Gaussians, and their projection from a camera."""
-    chosen = select_drawable(gaussians, covariances, pose.detach(), options)
+    chosen = select_drawable(gaussians, pose.detach(), options)
     projected = project_gaussians(
         chosen.gaussians,
-        chosen.covariances,
         pose,
         filter_variance=options.filter_variance(plane.pixel_angle),
         compensate=options.compensate,
@@ -107,7 +104,6 @@ def _select_and_project(
 
 def _rasterize_columns(
     gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
     pose: Float[Tensor, "4 4"],
     plane: ImagePlane,
     options: RasterOptions,
@@ -115,10 +111,10 @@ def _rasterize_columns(
     """Rasterise each column of a panorama from its own eye: section 9, literally; kernel "ray" only."""
     (height, width), directions = plane.size, plane.directions()
     columns, visible, intersections = [], 0, 0
-    counted, _ = _select_and_project(gaussians, covariances, pose, plane, options)
+    counted, _ = _select_and_project(gaussians, pose, plane, options)
     for column, eye in enumerate(plane.column_eyes()):
         moved = torch.cat((pose[:, :3], (pose[:, 3] + pose[:, :3] @ eye)[:, None]), dim=1)
-        _, projected = _select_and_project(gaussians, covariances, moved, plane, options)
+        _, projected = _select_and_project(gaussians, moved, plane, options)
         footprints, boxes = compute_footprints(projected, plane, options)
         # A box may wrap around: count the columns from its left edge on.
         after_left = torch.remainder(column + 0.5 - boxes[:, 0], width)

@@ -1,4 +1,4 @@
-"""The `pansplat-train` command. `python -m pansplat.training` runs it too, for torchrun."""
+"""The `pansplat-train` command; `python -m pansplat.training` runs it too."""
 
 from __future__ import annotations
 
@@ -24,18 +24,13 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 def _train(config: TrainConfig) -> int:
     from pansplat.system.files import require_output_folder
-    from pansplat.training.distributed import ProcessGroup
     from pansplat.training.trainer import Trainer
 
     config.check()
     require_output_folder("--out", config.out)
-    processes = ProcessGroup()
     with own_warnings():
-        try:
-            trainer = Trainer(config, processes)
-            return 0 if trainer.train() else trainer.stop.status
-        finally:
-            processes.destroy()
+        trainer = Trainer(config)
+        return 0 if trainer.train() else trainer.stop.status
 
 
 def parse(argv: Sequence[str] | None = None) -> TrainConfig:

@@ -17,8 +17,8 @@ from pansplat.system.strict_json import convert, parse_json
 from pansplat.training.augment import Augmentation
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
-DataKind = Literal["room", "panogrf", "360loc", "insta360", "pairs", "triplets"]
-NetworkShape = Literal["paper", "small", "tiny", "mvsplat"]
+DataKind = Literal["room", "panogrf", "360loc", "pairs", "triplets"]
+NetworkShape = Literal["paper", "small", "tiny"]
 Part = Literal["features", "cost_volume", "heads"]
 Backpropagation = Literal["plain", "one-step", "two-step"]
 Style = Literal["panorama", "cubemap", "original"]
@@ -30,14 +30,14 @@ class DataConfig:
     """Training data."""
 
     kind: DataKind = "room"
-    """room: a room of boxes in random proportions and colours, no files. panogrf, 360loc, insta360: these data sets.
+    """room: a room of boxes in random proportions and colours, no files. panogrf, 360loc: these data sets.
     pairs: a folder as for `pansplat predict`, with targets. triplets: NAME.json with NAME_0.png ... next to it."""
     root: Path | None = None
     """Folder of the data; not used for room."""
     validation_root: Path | None = None
-    """Folder of the validation data of insta360, pairs and triplets; the same by default."""
+    """Folder of the validation data of pairs and triplets; the same by default."""
     draws: Count = 1000
-    """Random pairs per sequence and epoch, of 360loc and insta360."""
+    """Random pairs per sequence and epoch, of 360loc."""
     training_gap: Literal["uniform", "original"] = "uniform"
     """Frames between the inputs: uniformly random, or always the smallest gap, as in the official code."""
     workers: Annotated[int, Meta(ge=0, le=256)] = 2
@@ -51,7 +51,7 @@ class NetworkConfig:
     """The network that is trained."""
 
     shape: NetworkShape = "paper"
-    """The paper's network, smaller ones with the same stages but no monocular network, or the MVSplat baseline."""
+    """The paper's network, or smaller ones with the same stages but no monocular network."""
     compat: Compat = "fixed"
     """Whether to train with the defects of the official code ("official") or without them."""
     precision: Precision = "float32"
@@ -86,7 +86,7 @@ class OptimizerConfig:
 
     steps: Count = 1000
     batch_size: Annotated[int, Meta(ge=1, le=4096)] = 2
-    """Samples per step, process and round of accumulation."""
+    """Samples per step and round of accumulation."""
     accumulate: Annotated[int, Meta(ge=1, le=4096)] = 1
     """Rounds of gradient accumulation per step."""
     rate: Annotated[float, Meta(gt=0, le=1e3)] = 2e-4
@@ -155,10 +155,6 @@ class TrainConfig:
             raise InputError(
                 f"--data.kind {self.data.kind} needs --data.root, the folder that holds the data, got none."
             )
-        if self.network.auxiliary and self.network.shape == "mvsplat":
-            raise InputError("--network.auxiliary needs a hierarchical cost volume, which the mvsplat baseline lacks.")
-        if self.network.frozen and self.network.shape == "mvsplat":
-            raise InputError("--network.frozen names parts of PanSplat, got the mvsplat baseline; remove the option.")
 
 
 _CHANGEABLE = ("out", "device", "checkpoint", "validation")
@@ -245,7 +241,7 @@ def _loc360_preset(
         loss=_WITHOUT_DEPTH,
         data=DataConfig(kind="360loc", draws=draws, workers=10, augmentation=None, training_gap="original"),
         network=network,
-        memory=replace(memory, mixing="by_view" if network.shape == "paper" else "joint"),
+        memory=replace(memory, mixing="by_view"),
         optimizer=OptimizerConfig(steps=max(1, epochs * steps_per_epoch), batch_size=batch),
     )
 
@@ -264,8 +260,6 @@ def _small_preset(
         checkpoint=CheckpointConfig(every=every),
     )
 
-
-_MVSPLAT = NetworkConfig(shape="mvsplat")
 
 _PRESETS: dict[str, tuple[str, TrainConfig]] = {
     "tiny": (
@@ -303,18 +297,6 @@ _PRESETS: dict[str, tuple[str, TrainConfig]] = {
     "pansplat-2048-360loc": (
         "heads only, 2048x4096, from pansplat-1024-360loc",
         _loc360_preset(2048, 1, 100, 10, NetworkConfig(frozen=_FROZEN), _TILED_4X4),
-    ),
-    "mvsplat-256": (
-        "the baseline on Matterport3D, 256x512",
-        _matterport_preset(256, 6, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN),
-    ),
-    "mvsplat-512": (
-        "the baseline on Matterport3D, 512x1024",
-        _matterport_preset(512, 1, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN),
-    ),
-    "mvsplat-512-360loc": (
-        "the baseline on 360Loc, 512x1024, from mvsplat-512",
-        _loc360_preset(512, 1, 5, 1000, _MVSPLAT, _PLAIN),
     ),
 }
 

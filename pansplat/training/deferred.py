@@ -19,6 +19,7 @@ Source: PanSplat, section 3.4 (deferred backpropagation); docs/official.md, sect
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -28,8 +29,7 @@ from jaxtyping import Float, Integer
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.model.base import Network
-from pansplat.model.heads import TileGaussians, merge_tiles
+from pansplat.model.heads import MatchedViews, TileGaussians, merge_tiles
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.rendering import ImagePart, TargetRenderer
 
@@ -37,7 +37,7 @@ LossTerms = dict[str, float]
 """Values of the terms of a loss, by name, before their weights."""
 ImageLoss = Callable[[Tensor], tuple[Tensor, LossTerms]]
 """From images (batch target 3 height width) to a loss and its terms."""
-MatchLoss = Callable[[Any], tuple["Tensor | None", LossTerms]]
+MatchLoss = Callable[[MatchedViews], tuple["Tensor | None", LossTerms]]
 """From the matching results of the network (depths and features) to a loss, None if there is none, and its terms."""
 
 
@@ -61,7 +61,7 @@ class Problem:
 
 
 def whole_loss(
-    problem: Problem, network: Network, renderer: TargetRenderer, *, tiles: int = 1, matching_is_trainable: bool = True
+    problem: Problem, network: PanSplat, renderer: TargetRenderer, *, tiles: int = 1, matching_is_trainable: bool = True
 ) -> tuple[Float[Tensor, ""], LossTerms]:
     """The loss with its whole graph, and its terms.
 
@@ -77,7 +77,7 @@ def whole_loss(
 
 def backpropagate(
     problem: Problem,
-    network: Network,
+    network: PanSplat,
     renderer: TargetRenderer,
     *,
     method: Literal["one-step", "two-step"],
@@ -110,7 +110,7 @@ def backpropagate(
     if match_loss is not None and match_loss.requires_grad:
         (weight * match_loss).backward()
     for number, tile in enumerate(tiled):
-        for item, view in _items_and_views(network, problem.images):
+        for item, view in itertools.product(*map(range, problem.images.shape[:2])):
             gaussians = _lift_tile(network, maps.leaves, item, view, tiles, number)
             _backpropagate_gaussians(gaussians, tile.gaussians[item], view)
         tile.gaussians.clear()  # frees memory for the next tile
@@ -118,7 +118,7 @@ def backpropagate(
     return (loss + _zero_if_none(match_loss)).detach(), terms | match_terms
 
 
-def _match(problem: Problem, network: Network, matching_is_trainable: bool) -> Any:
+def _match(problem: Problem, network: PanSplat, matching_is_trainable: bool) -> MatchedViews:
     with torch.set_grad_enabled(matching_is_trainable):
         return network.match_views(problem.images, problem.cam2world, problem.near, problem.far)
 
@@ -235,25 +235,16 @@ class TiledGaussians:
         return torch.argsort(torch.cat(places))
 
 
-def _items_and_views(
-    network: Network, images: Float[Tensor, "batch view 3 height width"]
-) -> list[tuple[int, int | None]]:
-    """Items and views that are lifted separately. In the baseline the views of an item depend on each other (None)."""
-    views = range(images.shape[1]) if isinstance(network, PanSplat) else [None]
-    return [(item, view) for item in range(len(images)) for view in views]
-
-
-def _lift_tile(network: Network, matched: Any, item: int, view: int | None, tiles: int, number: int) -> Gaussians:
+def _lift_tile(network: PanSplat, matched: MatchedViews, item: int, view: int, tiles: int, number: int) -> Gaussians:
     """The Gaussians of one item, view and tile, with a graph; in the same order as in the whole tile."""
-    views = slice(None) if view is None else slice(view, view + 1)
-    maps = _map_tensors(matched, lambda tensor: tensor[item : item + 1, views])
+    maps = _map_tensors(matched, lambda tensor: tensor[item : item + 1, view : view + 1])
     (tile,) = network.lift_gaussians(maps, tiles=tiles, only=[number] if tiles > 1 else None)
     return tile.gaussians[0]
 
 
-def _backpropagate_gaussians(gaussians: Gaussians, leaves: Gaussians, view: int | None) -> None:
+def _backpropagate_gaussians(gaussians: Gaussians, leaves: Gaussians, view: int) -> None:
     """Backpropagate the gradients of a tile's leaves through the graph of its recomputed Gaussians."""
-    rows = slice(None) if view is None else leaves.views == view
+    rows = leaves.views == view
     tensors, gradients = [], []
     for name in _float_fields(gaussians):
         gradient = getattr(leaves, name).grad

@@ -42,11 +42,10 @@ class Loader:
     Args:
         source: the samples; sent to the workers once.
         height: height of the panoramas, pixels.
-        batch_size: samples per batch and process.
+        batch_size: samples per batch.
         seed: seed of the order and of the samples' random numbers.
         workers: processes that read; 0 to read in this process.
         augmentation: None for no augmentation.
-        rank, world_size: index of this process, and number of processes in distributed training.
 
     Attributes:
         skipped: by message, the number of times that an unreadable sample was skipped. The first time it warns.
@@ -61,18 +60,13 @@ class Loader:
         seed: int = 0,
         workers: int = 0,
         augmentation: Augmentation | None = None,
-        rank: int = 0,
-        world_size: int = 1,
     ) -> None:
         if len(source) == 0:
             raise InputError("needed at least one sample, got an empty source; give other data.")
-        if batch_size < 1 or workers < 0 or not 0 <= rank < world_size:
-            raise InputError(
-                f"needed batch_size >= 1, workers >= 0 and 0 <= rank < world_size, got {batch_size}, {workers}, {rank} "
-                f"and {world_size}."
-            )
+        if batch_size < 1 or workers < 0:
+            raise InputError(f"needed batch_size >= 1 and workers >= 0, got {batch_size} and {workers}.")
         self.reader = _Reader(source, height, seed, augmentation)
-        self.batch_size, self.workers, self.rank, self.world_size = batch_size, workers, rank, world_size
+        self.batch_size, self.workers = batch_size, workers
         self.skipped: Counter[str] = Counter()
 
     def batches(self, step: int = 0) -> Iterator[Batch]:
@@ -94,7 +88,7 @@ class Loader:
 
     def _positions(self, step: int) -> Iterable[list[int]]:
         for number in itertools.count(step):
-            first = (number * self.world_size + self.rank) * self.batch_size
+            first = number * self.batch_size
             yield list(range(first, first + self.batch_size))
 
     def _count(self, skipped: Iterable[Skipped]) -> None:

@@ -1,4 +1,4 @@
-"""Logs of a training run: CSV tables, their plot, TensorBoard files, and the progress on the terminal."""
+"""Logs of a training run: CSV tables, their plot, and the progress on the terminal."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -97,27 +95,6 @@ def _running_means(values: list[float]) -> list[float]:
         window = values[max(0, end - width) : end]
         means.append(sum(window) / len(window))
     return means
-
-
-class TensorBoardLog:
-    """TensorBoard files; does nothing if the package is not installed."""
-
-    def __init__(self, folder: Path) -> None:
-        self._writer: Any = None
-        if find_spec("tensorboard") is not None:
-            from torch.utils.tensorboard import SummaryWriter
-
-            self._writer = SummaryWriter(str(folder))
-
-    def add(self, step: int, values: Mapping[str, float], group: str) -> None:
-        """Write the values of a step as `group/name`."""
-        if self._writer is not None:
-            for name, value in values.items():
-                self._writer.add_scalar(f"{group}/{name}", value, step)
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
 
 
 class ProgressDisplay:

@@ -9,11 +9,9 @@ import torch
 from torch import nn
 
 from pansplat.errors import InputError
-from pansplat.model.base import Network
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
 from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
 from pansplat.model.heads import AdapterConfig, AuxiliaryHeads, HeadsConfig
-from pansplat.model.mvsplat import MVSplat
 from pansplat.model.network import convert_checkpoint, require_precision
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import (
@@ -51,24 +49,21 @@ def _small_config(
     )
 
 
-def build_network(config: NetworkConfig, seed: int) -> Network:
+def build_network(config: NetworkConfig, seed: int) -> PanSplat:
     """The network with the weights of `config.init`, or with random weights from the seed; frozen parts are frozen."""
     require_precision(config.precision)
     initial = None if config.init is None else read_weights(config.init)
     torch.manual_seed(seed)
-    if config.shape == "mvsplat":
-        network = MVSplat(compat=config.compat, attention_precision=config.attention_precision)
-    else:
-        network = PanSplat(
-            network_config(config.shape),
-            config.compat,
-            precision=config.precision,
-            attention_precision=config.attention_precision,
-        )
+    network = PanSplat(
+        network_config(config.shape),
+        config.compat,
+        precision=config.precision,
+        attention_precision=config.attention_precision,
+    )
     if initial is not None:
         require_shapes(initial.tensors, network.state_dict(), config.init)
         network.load_state_dict(initial.tensors, strict=True)
-    elif isinstance(network, PanSplat) and network.mono_depth is not None:
+    elif network.mono_depth is not None:
         raise InputError(
             "--network.init: needed weights of the monocular network, which is not trained, got none; give an official "
             "checkpoint or a file of `pansplat convert`, or train --network.shape small, which has none."
@@ -85,7 +80,7 @@ def read_weights(path: Path) -> WeightsFile:
     return extract_weights(content, path) if is_training_state(content) else convert_checkpoint(content, path)
 
 
-def write_weights(path: Path, network: Network, state: dict[str, torch.Tensor] | None = None) -> None:
+def write_weights(path: Path, network: PanSplat, state: dict[str, torch.Tensor] | None = None) -> None:
     """Write the network's weights, or another state of it, as a .safetensors for `--model`."""
     tensors = dict(network.state_dict() if state is None else state)
     save_weights(path, pack_weights(network.model, network.config, tensors, compat=network.compat))
@@ -119,11 +114,10 @@ def trainable_parameters(*modules: nn.Module | None) -> Iterator[nn.Parameter]:
             yield from (p for p in module.parameters() if p.requires_grad)
 
 
-def build_auxiliary_heads(network: Network) -> AuxiliaryHeads:
+def build_auxiliary_heads(network: PanSplat) -> AuxiliaryHeads:
     """Randomly initialised heads that predict Gaussians from each level of the cost volume alone; for training only."""
-    assert isinstance(network, PanSplat)
     heads = network.config.heads
-    swept = network.config.cost_volume.swept_levels
+    swept = network.config.cost_volume.levels
     config = HeadsConfig(
         depth="swept",
         layers=2,

@@ -215,7 +215,6 @@ def find_visible_gaussians(
     for start in range(0, len(gaussians), _CHUNK):
         projected = project_gaussians(
             _without_colours(gaussians, slice(start, start + _CHUNK)),
-            None,
             pose,
             filter_variance=options.filter_variance(regions[0].plane.pixel_angle),
             compensate=options.compensate,

@@ -22,7 +22,7 @@ from pansplat.inputs.folder_formats import find_panogrf, find_triplets, read_pan
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Sample
 from pansplat.system.files import expand_home
-from pansplat.training.sequences import BoundedSampler, FramePair, FrameSequence, Stage, read_frame_pair
+from pansplat.training.sequences import BoundedSampler, FramePair, ImageSequence, Stage, read_frame_pair
 
 TRAINING_SETS = (("m3d", 0.5),)
 TEST_SETS = (
@@ -132,7 +132,7 @@ def _read_pair(pair: Pair, height: int, count: int | None, seed: int) -> Sample:
 class RandomFramePairs:
     """Random frame pairs for training; `draws` per sequence make an epoch."""
 
-    sequences: Sequence[FrameSequence]
+    sequences: Sequence[ImageSequence]
     sampler: BoundedSampler
     draws: int = 1000
 
@@ -153,7 +153,7 @@ class FixedFramePairs:
         choose: from a number of frames to frame pairs, such as `BoundedSampler().evaluation`.
     """
 
-    def __init__(self, sequences: Sequence[FrameSequence], choose: Callable[[int], Sequence[FramePair]]) -> None:
+    def __init__(self, sequences: Sequence[ImageSequence], choose: Callable[[int], Sequence[FramePair]]) -> None:
         self.pairs = [(sequence, pair) for sequence in sequences for pair in choose(len(sequence.poses))]
 
     def __len__(self) -> int:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
-from typing import Any
 
 from torch import Tensor, nn
 
 from pansplat.inputs.views import Batch
-from pansplat.model.base import Network
-from pansplat.model.heads import AuxiliaryHeads
+from pansplat.model.heads import AuxiliaryHeads, MatchedViews
+from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
 from pansplat.training.deferred import LossTerms, Problem, backpropagate, whole_loss
-from pansplat.training.distributed import no_sync
 from pansplat.training.losses import LossWeights, Perceptual, auxiliary_loss, depth_loss, image_loss
 from pansplat.training.network import matching_is_trainable
 from pansplat.training.rendering import TargetRenderer
@@ -22,19 +19,17 @@ LOSS_TERMS: tuple[str, ...] = ("loss", "square", "perceptual", "depth", "auxilia
 """Names of the total loss and its terms."""
 
 
-def accumulate_gradients(step: nn.Module, batches: Sequence[Batch]) -> LossTerms:
+def accumulate_gradients(step: TrainingStep, batches: Sequence[Batch]) -> LossTerms:
     """Add the gradients of the batches' mean loss to the parameters' gradients; returns the mean loss terms.
 
     Args:
-        step: a `TrainingStep`, or one wrapped by `data_parallel`: then the mean over the processes is added.
         batches: batches of one step, one per round of accumulation.
     """
     sums, weight = dict.fromkeys(LOSS_TERMS, 0.0), 1 / len(batches)
-    for number, batch in enumerate(batches, start=1):
-        with no_sync(step) if number < len(batches) else nullcontext():
-            loss, terms = step(batch, weight)
-            if loss.requires_grad:
-                loss.backward()
+    for batch in batches:
+        loss, terms = step(batch, weight)
+        if loss.requires_grad:
+            loss.backward()
         sums = {name: sums[name] + terms[name] / len(batches) for name in LOSS_TERMS}
     return sums
 
@@ -49,7 +44,7 @@ class TrainingStep(nn.Module):
 
     def __init__(
         self,
-        network: Network,
+        network: PanSplat,
         auxiliary: AuxiliaryHeads | None,
         perceptual: Perceptual | None,
         weights: LossWeights,
@@ -79,7 +74,7 @@ class TrainingStep(nn.Module):
             )
             return loss.total, {"square": loss.square.item(), "perceptual": loss.perceptual.item()}
 
-        def match_terms(matched: Any) -> tuple[Tensor | None, LossTerms]:
+        def match_terms(matched: MatchedViews) -> tuple[Tensor | None, LossTerms]:
             terms: LossTerms = {}
             losses: list[Tensor] = []
             if (depth := self._depth_loss(batch, matched)) is not None:
@@ -101,7 +96,7 @@ class TrainingStep(nn.Module):
             loss, terms = backpropagate(problem, self.network, renderer, method=method, weight=weight, **options)
         return weight * loss, {**dict.fromkeys(LOSS_TERMS, 0.0), **terms, "loss": loss.item()}
 
-    def _depth_loss(self, batch: Batch, matched: Any) -> Tensor | None:
+    def _depth_loss(self, batch: Batch, matched: MatchedViews) -> Tensor | None:
         if batch.depths is None or not self.weights.depth:
             return None
         return depth_loss(
@@ -114,7 +109,7 @@ class TrainingStep(nn.Module):
             masks=None if bool(batch.masks.all()) else batch.masks,
         )
 
-    def _auxiliary_loss(self, batch: Batch, matched: Any, renderer: TargetRenderer) -> Tensor | None:
+    def _auxiliary_loss(self, batch: Batch, matched: MatchedViews, renderer: TargetRenderer) -> Tensor | None:
         if self.auxiliary is None:
             return None
         images = [

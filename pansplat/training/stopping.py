@@ -15,7 +15,7 @@ class StopRequest:
 
     Attributes:
         requested: set by a signal, or by the run itself.
-        status: 128 + the number of the signal: SIGINT if another process received it. 0 if the run set it.
+        status: 128 + the number of the signal.
     """
 
     def __init__(self) -> None:

@@ -26,9 +26,8 @@ from pansplat.system.strict_json import convert, parse_json
 from pansplat.training.checkpoint import load_latest, restore, restore_optimizer, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
 from pansplat.training.datasets import load_sources
-from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel
 from pansplat.training.loader import Loader
-from pansplat.training.logs import CsvTable, ProgressDisplay, TensorBoardLog, plot_run
+from pansplat.training.logs import CsvTable, ProgressDisplay, plot_run
 from pansplat.training.losses import choose_perceptual
 from pansplat.training.network import (
     build_auxiliary_heads,
@@ -50,11 +49,10 @@ _COLUMNS = (*LOSS_TERMS, "rate", "gradient_norm", "seconds")
 
 @dataclass(frozen=True)
 class _Logs:
-    """The log files of a run, which the first process writes."""
+    """The log files of a run."""
 
     steps: CsvTable
     scores: CsvTable
-    board: TensorBoardLog
 
     @staticmethod
     def open(folder: Path, config: TrainConfig, step: int, validation_step: int) -> _Logs:
@@ -64,12 +62,17 @@ class _Logs:
         return _Logs(
             CsvTable(folder / "log.csv", _COLUMNS, step),
             CsvTable(folder / "validation.csv", ("height", *MEASURES), validation_step),
-            TensorBoardLog(folder / "tensorboard"),
         )
 
     def close(self) -> None:
-        for log in (self.steps, self.scores, self.board):
+        for log in (self.steps, self.scores):
             log.close()
+
+
+def _choose_device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda needs a CUDA device that torch can use, got none; use --device cpu.")
+    return torch.device("cpu" if name == "cpu" or not torch.cuda.is_available() else "cuda")
 
 
 class Trainer:
@@ -77,57 +80,50 @@ class Trainer:
 
     Args:
         config: the settings.
-        processes: the processes that train together.
         silent: print nothing.
     """
 
-    def __init__(self, config: TrainConfig, processes: ProcessGroup | None = None, *, silent: bool = False) -> None:
+    def __init__(self, config: TrainConfig, *, silent: bool = False) -> None:
         config.check()
-        self.config, self.processes = config, processes or ProcessGroup()
-        self.silent = silent or not self.processes.is_first
-        self.device = self.processes.device(config.device)
-        self.processes.initialize(self.device)
+        self.config, self.silent = config, silent
+        self.device = _choose_device(config.device)
         self.folder = config.out / "checkpoints"
         self.network = build_network(config.network, config.seed).to(self.device)
-        convert_sync_batch_norm(self.network, self.processes)
         self.auxiliary = build_auxiliary_heads(self.network).to(self.device) if config.network.auxiliary else None
         parameters = list(trainable_parameters(self.network, self.auxiliary))
         self.optimizer = torch.optim.Adam(parameters, lr=config.optimizer.rate)
         self.average = ExponentialMovingAverage(self.network, config.optimizer.ema) if config.optimizer.ema else None
         perceptual = choose_perceptual(config.perceptual, device=self.device)
-        training_step = TrainingStep(self.network, self.auxiliary, perceptual, config.loss, config.memory)
+        self._training_step = TrainingStep(self.network, self.auxiliary, perceptual, config.loss, config.memory)
         self.perceptual_name = getattr(perceptual, "name", "none")
         self.step = 0
         latest = load_latest(self.folder, self._restore)
         self.resumed_from = None if latest is None else latest[0]
-        self._training_step = data_parallel(training_step, self.processes)
         self.stop = StopRequest()
 
     def train(self) -> bool:
         """Train the remaining steps. Returns whether all were done; a signal ends the run earlier."""
-        out, total, is_first = self.config.out, self.config.optimizer.steps, self.processes.is_first
+        out, total = self.config.out, self.config.optimizer.steps
         out.mkdir(parents=True, exist_ok=True)
         validation_step = 0 if self.resumed_from is None else self.step + 1
-        logs = _Logs.open(out, self.config, self.step, validation_step) if is_first else None
+        logs = _Logs.open(out, self.config, self.step, validation_step)
         saved_at = time.monotonic()
         try:
             with ProgressDisplay(self.step, total, silent=self.silent) as progress, self.stop.on_signal(progress):
                 progress.print(self._describe())
                 if self.resumed_from is not None:
                     progress.print(f"resuming from {self.resumed_from}")
-                elif self.config.validation.every and logs is not None:
+                elif self.config.validation.every:
                     self._validate(logs, progress)  # the untrained network, for comparison
                 for batches in self._batches():
                     began = time.perf_counter()
                     values = self._optimize(batches)
                     values["seconds"] = time.perf_counter() - began
-                    if logs is not None:
-                        logs.steps.add(self.step, values)
-                        logs.board.add(self.step, values, "training")
+                    logs.steps.add(self.step, values)
                     self.step += 1
                     progress.update(self.step, values["loss"], values["seconds"])
-                    stopped = self.processes.any(self.stop.requested)
-                    if self._is_due(self.config.validation.every) and logs is not None and not stopped:
+                    stopped = self.stop.requested
+                    if self._is_due(self.config.validation.every) and not stopped:
                         self._validate(logs, progress)
                     is_overdue = time.monotonic() - saved_at > 60 * self.config.checkpoint.minutes
                     if self._is_due(self.config.checkpoint.every) or is_overdue or stopped or self.step == total:
@@ -138,15 +134,12 @@ class Trainer:
                         return False
                 self._finish(progress)
         finally:
-            if logs is not None:
-                logs.close()
+            logs.close()
         return True
 
     def save(self) -> None:
         """Write a checkpoint and delete old ones."""
-        if self.processes.is_first:
-            save_checkpoint(self.folder, self.step, self._state(), keep=self.config.checkpoint.keep)
-        self.processes.barrier()
+        save_checkpoint(self.folder, self.step, self._state(), keep=self.config.checkpoint.keep)
 
     def _batches(self) -> Iterator[list[Batch]]:
         """The batches of each remaining step, one per round of accumulation."""
@@ -166,8 +159,6 @@ class Trainer:
             seed=self.config.seed,
             workers=self.config.data.workers,
             augmentation=self.config.data.augmentation,
-            rank=self.processes.rank,
-            world_size=self.processes.count,
         )
 
     def _optimize(self, batches: list[Batch]) -> dict[str, float]:
@@ -181,16 +172,16 @@ class Trainer:
         terms = accumulate_gradients(self._training_step, batches)
         parameters = list(trainable_parameters(self.network, self.auxiliary))
         norm = float(torch.nn.utils.clip_grad_norm_(parameters, settings.clip))
-        if self.processes.any(not (math.isfinite(terms["loss"]) and math.isfinite(norm))):
+        if not (math.isfinite(terms["loss"]) and math.isfinite(norm)):
             self._raise_not_finite(batches, terms["loss"], norm)
         self.optimizer.step()
         if self.average is not None:
             self.average.update(self.network, self.step)
-        return {**self.processes.mean(terms), "rate": rate, "gradient_norm": norm}
+        return {**terms, "rate": rate, "gradient_norm": norm}
 
     def _raise_not_finite(self, batches: list[Batch], loss: float, norm: float) -> None:
         """Save the batches and weights of a step whose loss or gradient is not finite, and raise an InputError."""
-        path = self.config.out / f"not_finite_{self.step:08d}_{self.processes.rank}.pt"
+        path = self.config.out / f"not_finite_{self.step:08d}.pt"
         self.config.out.mkdir(parents=True, exist_ok=True)
         fields = [{**vars(batch), "names": list(batch.names)} for batch in batches]
         with replacing(path, failures=(RuntimeError,)) as partial:
@@ -217,7 +208,6 @@ class Trainer:
                 name=f"step_{self.step:08d}",
             )
         logs.scores.add(self.step, {"height": height, **measures})
-        logs.board.add(self.step, measures, "validation")
         plot_run(self.config.out)
         progress.print(f"step {self.step}: {describe_measures(measures)}, mean of {settings.samples} samples")
 
@@ -235,11 +225,9 @@ class Trainer:
             self.network.load_state_dict(weights)
 
     def _finish(self, progress: ProgressDisplay) -> None:
-        if self.processes.is_first:
-            path = self.config.out / "model.safetensors"
-            write_weights(path, self.network, None if self.average is None else self.average.state)
-            progress.print(f"done: {path}; use it with `pansplat predict PAIR -o scene.ply --model {path}`")
-        self.processes.barrier()
+        path = self.config.out / "model.safetensors"
+        write_weights(path, self.network, None if self.average is None else self.average.state)
+        progress.print(f"done: {path}; use it with `pansplat predict PAIR -o scene.ply --model {path}`")
 
     def _is_due(self, every: int) -> bool:
         return bool(every) and (self.step % every == 0 or self.step == self.config.optimizer.steps)
@@ -284,5 +272,5 @@ class Trainer:
             f"{self.config.network.shape}: {count:,} trainable parameters, "
             f"{self.config.data.kind} at {', '.join(f'{h}x{2 * h}' for h in self.config.heights)}, "
             f"perceptual loss {self.perceptual_name}, "
-            f"{self.processes.count} process(es), from step {self.step} of {self.config.optimizer.steps}{duration}"
+            f"from step {self.step} of {self.config.optimizer.steps}{duration}"
         )

@@ -14,8 +14,8 @@ from pansplat.errors import InputError
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.images.image_files import write_image
 from pansplat.inputs.views import Sample, collate
-from pansplat.model.base import Network
 from pansplat.model.heads import merge_tiles
+from pansplat.model.pansplat import PanSplat
 from pansplat.training.rendering import TargetRenderer
 from pansplat.training.sources import SampleSource
 
@@ -25,7 +25,7 @@ MEASURES = ("psnr", "ws_psnr", "ssim", "depth_error")
 
 @torch.no_grad()
 def validate(
-    network: Network,
+    network: PanSplat,
     source: SampleSource,
     renderer: TargetRenderer,
     *,
@@ -63,7 +63,9 @@ def describe_measures(measures: dict[str, float]) -> str:
     return text if math.isnan(error) else f"{text}, relative depth error {100 * error:.1f} %"
 
 
-def _measure(network: Network, sample: Sample, renderer: TargetRenderer, tiles: int) -> tuple[dict[str, float], Tensor]:
+def _measure(
+    network: PanSplat, sample: Sample, renderer: TargetRenderer, tiles: int
+) -> tuple[dict[str, float], Tensor]:
     """Measures of a sample's first target, without the error of depth if no depth is known; and its rendering."""
     parameter = next(network.parameters())
     batch = collate([sample]).to(parameter.device, parameter.dtype)

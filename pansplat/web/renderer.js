@@ -189,7 +189,6 @@ export class Renderer {
     gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
     gl.uniform3fv(places.position, position);
     gl.uniform1f(places.near, HEADER.near);
-    gl.uniform1i(places.exact, 1);
     gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal[0] * focal[1]));
     gl.uniform2f(places.half_size, Math.abs(x) + w, Math.abs(y) + h);
     gl.uniform4f(places.window, x, y, w, h);

@@ -12,8 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from pansplat.cli import run
-from pansplat.model.feature_pyramid import TransformerConfig
-from pansplat.model.mvsplat import MVSplat, MVSplatConfig
+from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import load
 from pansplat.prediction_options import PredictOptions
@@ -22,10 +21,10 @@ from pansplat_viewer.scene.loader import LoadOptions, find_entries, load_entry
 
 @pytest.fixture(scope="module")
 def content(
-    mvsplat_weights: dict[str, Tensor], as_lightning: Callable[[dict[str, Tensor]], dict[str, object]]
+    recipe_weights: dict[str, Tensor], as_lightning: Callable[[dict[str, Tensor]], dict[str, object]]
 ) -> dict[str, object]:
-    """A checkpoint of the baseline, which is the smaller network."""
-    return as_lightning(mvsplat_weights)
+    """A checkpoint of the network."""
+    return as_lightning(recipe_weights)
 
 
 @pytest.fixture(scope="module")
@@ -42,20 +41,26 @@ def conversion(content: dict[str, object], tmp_path_factory: pytest.TempPathFact
 def test_the_report_counts_every_tensor(conversion: tuple[Path, Path, str]) -> None:
     lines = [line.split("│") for line in conversion[2].splitlines() if line.startswith("│")]
     counts = {cells[1].strip(): cells[2].strip() for cells in lines}
-    assert counts == {"used": "471", "left out: training state": "5", "unknown": "0", "missing": "0"}
+    assert counts == {
+        "used": "988",
+        "left out: recomputed grids": "5",
+        "left out: training state": "5",
+        "unknown": "0",
+        "missing": "0",
+    }
 
 
 def test_converted_weights_have_their_model_and_compat(conversion: tuple[Path, Path, str]) -> None:
     weights = load_weights(conversion[1])
-    assert (weights.model, weights.compat, len(weights.tensors)) == ("mvsplat", "official", 471)
-    assert weights.config["candidates"] == 128
+    assert (weights.model, weights.compat, len(weights.tensors)) == ("pansplat", "official", 988)
+    assert weights.config["heads"]["candidates"] == 32
 
 
-def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room) -> None:
+def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room, small_config: PanSplatConfig) -> None:
     room, weights = write_room(tmp_path / "room"), tmp_path / "small.safetensors"
     torch.manual_seed(0)
-    config = MVSplatConfig(channels=16, candidates=8, width=32, transformer=TransformerConfig(channels=16, blocks=1))
-    save_weights(weights, pack_weights("mvsplat", config, MVSplat(config).state_dict(), compat="official"))
+    tensors = PanSplat(small_config, "official").state_dict()
+    save_weights(weights, pack_weights("pansplat", small_config, tensors, compat="official"))
 
     def run_on_room(command: str, out: Path, *arguments: str) -> None:
         assert run([command, str(room), "-o", str(out), "--model", str(weights), *arguments]) == 0
@@ -65,8 +70,8 @@ def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room) ->
         out = tmp_path / f"{compat}.ply"
         run_on_room("predict", out, "--height", "64", "--compat", compat)
         scenes[compat] = load(out)
-    assert scenes["trained"].model == "mvsplat"
-    assert len(scenes["trained"].gaussians) == 2 * 2 * 64**2
+    assert scenes["trained"].model == "pansplat"
+    assert set(scenes["trained"].gaussians.levels.tolist()) == {0, 1, 2, 3}
     assert not torch.allclose(scenes["fixed"].gaussians.means, scenes["trained"].gaussians.means)
     run_on_room("render", tmp_path / "image.png", "--predict-height", "64", "--height", "16", "--refine", "0")
     with Image.open(tmp_path / "image.png") as image:
@@ -83,13 +88,13 @@ def test_a_mismatched_checkpoint_is_reported_before_it_is_refused(
     content: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state = dict(content["state_dict"])  # type: ignore[call-overload]
-    del state["encoder.backbone.backbone.conv1.weight"]
+    del state["encoder.backbone.encoder.conv00.conv.weight"]
     state["encoder.extra"] = torch.zeros(1)
     torch.save(content | {"state_dict": state}, tmp_path / "odd.ckpt")
     assert run(["convert", str(tmp_path / "odd.ckpt"), "-o", str(tmp_path / "m.safetensors")]) == 2
     out, err = capsys.readouterr()
-    assert "encoder.extra" in out and "encoder.backbone.backbone.conv1.weight" in out
-    assert "lacked 1 (encoder.backbone.backbone.conv1.weight) and found unknown 1 (encoder.extra)" in err
+    assert "encoder.extra" in out and "encoder.backbone.encoder.conv00.conv.weight" in out
+    assert "lacked 1 (encoder.backbone.encoder.conv00.conv.weight) and found unknown 1 (encoder.extra)" in err
     assert not (tmp_path / "m.safetensors").exists()
 
 

@@ -33,7 +33,6 @@ COMMANDS = {
     "points.ply": [*EXPORT, "{room}", "--points"],
     "page.html": [*EXPORT, "{room}"],
     "plan.png": [*EXPORT, "{room}"],
-    "mesh.obj": [*EXPORT, "{room}", *COARSE],
     "mesh.glb": [*EXPORT, "{room}", "--mesh", *COARSE],
 }
 
@@ -60,23 +59,6 @@ def test_a_file_of_the_user_needs_overwrite_and_our_own_does_not(
     assert run([*command, "-o", str(file), "--overwrite"]) == 0
     assert is_written(file)
     assert run([*command, "-o", str(file)]) == 0, "pansplat wrote it"
-
-
-def test_files_beside_a_mesh_are_checked_before_the_first_is_written(
-    room: Path, tmp_path: Path, refusal: Callable[..., str]
-) -> None:
-    out = tmp_path / "my_house" / "house.obj"
-    for name in ("house_0.jpg", "house_1.jpg", "house.mtl"):
-        own = write_own(out.with_name(name))
-        assert f"got {own}, which pansplat did not write" in refusal(*EXPORT, room, *COARSE, "-o", out)
-        assert list(out.parent.iterdir()) == [own] and own.read_bytes() == OWN
-        own.unlink()
-    write_own(out.with_name("house_0.jpg"))
-    write_own(out.with_name("house_2.jpg"))
-    assert run([*EXPORT, str(room), *COARSE, "-o", str(out), "--overwrite"]) == 0
-    assert all(is_written(out.with_name(name)) for name in ("house.obj", "house.mtl", "house_0.jpg", "house_1.jpg"))
-    assert out.with_name("house_2.jpg").read_bytes() == OWN, "two panoramas have two textures"
-    assert run([*EXPORT, str(room), *COARSE, "-o", str(out)]) == 0
 
 
 def test_the_folder_of_a_split_page_keeps_files_of_the_user(scene: Path, tmp_path: Path) -> None:

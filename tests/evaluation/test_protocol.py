@@ -11,31 +11,18 @@ from PIL import Image
 from pansplat.errors import InputError
 from pansplat.evaluation.metrics import ws_psnr
 from pansplat.evaluation.protocol import (
-    INSTA360,
-    LOC360,
     ProtocolOptions,
-    find_sequence_set,
-    find_sequences,
+    find_loc360_set,
     find_sets,
     list_methods,
     run_protocol,
 )
 from pansplat.evaluation.results import markdown_table
-from pansplat.evaluation.tables import (
-    frame_distance_curves,
-    list_tables,
-    our_rows,
-    read_paper_tables,
-    report_notes,
-    rich_tables,
-    write_report,
-)
-from pansplat.images.video import write_video
+from pansplat.evaluation.tables import read_paper_tables, report_notes, rich_tables, write_report
 from pansplat.model.network import NetworkPredictor
-from pansplat.system.files import is_written
 
 HEIGHT = 32
-OPTIONS = ProtocolOptions(HEIGHT, pairs_per_sequence=3, gaps=(2, 4))
+OPTIONS = ProtocolOptions(HEIGHT, pairs_per_sequence=3)
 RADIUS = 2.0  # metres
 
 
@@ -88,17 +75,6 @@ def write_loc360(root: Path, frames: int = 7) -> Path:
     return folder
 
 
-def write_insta360(root: Path, frames: int) -> Path:
-    folder = root / "insta360" / "VID_0001"
-    folder.mkdir(parents=True)
-    images = (np.full((HEIGHT, 2 * HEIGHT, 3), 5 * frame + 20, np.uint8) for frame in range(frames))
-    write_video(folder / "video.mp4", images, 24.0)
-    lines = [f"1 0 0 {0.1 * frame} 0 1 0 0 0 0 1 0" for frame in range(frames)]
-    (folder / "frame_trajectory.txt").write_text("\n".join(lines))
-    (folder / "scale.txt").write_text("2.0")
-    return folder
-
-
 @pytest.fixture
 def methods(sphere_predictor):
     """The methods of a predictor of Gaussians on a sphere of 2 m around each camera."""
@@ -108,7 +84,7 @@ def methods(sphere_predictor):
 def test_the_papers_values_are_plausible_and_the_sets_of_a_protocol_are_those_of_its_table(
     tmp_path: Path,
 ) -> None:
-    ranges = {"psnr": (10, 40), "ws_psnr": (10, 40), "gaussians": (1e5, 1e7)}
+    ranges = {"psnr": (10, 40), "ws_psnr": (10, 40)}
     tables = read_paper_tables()
     for protocol, table in tables.items():
         if protocol != "depth":
@@ -118,8 +94,8 @@ def test_the_papers_values_are_plausible_and_the_sets_of_a_protocol_are_those_of
             for name, value in row.values.items():
                 low, high = ranges.get(name.split()[-1], (0, 1))
                 assert low < value < high, (row.get("method"), name)
-    page = markdown_table("", tables["ablation"].columns, tables["ablation"].rows)
-    assert "| Base | 1,049,000 | 27.07 |" in page and "| without monocular depth | - | 28.84 | - | - |" in page
+    page = markdown_table("", tables["narrow"].columns, tables["narrow"].rows)
+    assert "| PanSplat | 32.88 | - | - | 31.42 | - | - |" in page
 
 
 def test_missing_data_and_a_missing_root_are_named(tmp_path: Path, methods) -> None:
@@ -128,10 +104,8 @@ def test_missing_data_and_a_missing_root_are_named(tmp_path: Path, methods) -> N
     for distance in ("0.5", "0.75", "1.0"):
         folder = f"png_render_test_1024x512_seq_len_3_m3d_dist_{distance}"
         assert str(tmp_path / "pano_grf" / folder) in str(error.value)
-    for protocol, folder in (("360loc", "atrium"), ("insta360", "VID_*"), ("frame-distance", "VID_*")):
-        with pytest.raises(InputError) as error:
-            run_protocol(protocol, tmp_path, methods(), tmp_path / "out", options=OPTIONS)
-        assert folder in str(error.value)
+    with pytest.raises(InputError, match=r"360Loc: needed .*atrium"):
+        run_protocol("360loc", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="needed the folder that holds the test data"):
         find_sets("m3d", tmp_path / "nowhere", OPTIONS)
@@ -149,33 +123,12 @@ def test_data_is_found_in_the_official_folders(tmp_path: Path, inside: str) -> N
 def test_pairs_of_a_sequence_are_spread_evenly(tmp_path: Path) -> None:
     """docs/official.md, section 2.5: the inputs of 360Loc are three frames apart."""
     write_loc360(tmp_path, frames=7)
-    found = find_sequence_set(tmp_path, LOC360, pairs_per_sequence=3)
+    found = find_loc360_set(tmp_path, pairs_per_sequence=3)
     names = [case.name[-13:] for case in found.cases]
     assert names == ["000000-000003", "000001-000004", "000003-000006"]
     sample = found.cases[1].read(HEIGHT)
     assert sample.context.names == ("0001", "0004")
     assert sample.targets.names == ("0001", "0002", "0003", "0004")
-
-
-def test_inputs_of_insta360_are_sixteen_frames_apart(tmp_path: Path) -> None:
-    """docs/official.md, section 2.5: all 17 frames from the left input to the right one are targets."""
-    write_insta360(tmp_path, frames=20)
-    (found,) = find_sets("insta360", tmp_path, OPTIONS)
-    assert [case.name for case in found.cases] == [f"VID_0001-{i:06d}-{i + 16:06d}" for i in (0, 1, 3)]
-    sample = found.cases[2].read(HEIGHT)
-    assert len(sample.targets.images) == 17
-    assert float(sample.targets.cam2world[16, 0, 3]) == pytest.approx(2 * 0.1 * 19)
-    assert float(sample.targets.images[16].mean()) == pytest.approx((5 * 19 + 20) / 255, abs=0.02)
-
-
-def test_the_target_of_the_frame_distance_is_the_middle_frame(tmp_path: Path) -> None:
-    write_loc360(tmp_path, frames=7)
-    by_gap = find_sets("frame-distance", tmp_path, OPTIONS)
-    assert [found.name for found in by_gap] == ["2 frames", "4 frames"]
-    sample = by_gap[1].cases[0].read(HEIGHT)
-    assert sample.context.names == ("0000", "0004") and sample.targets.names == ("0002",)
-    sequences, missing = find_sequences(tmp_path, INSTA360)
-    assert not sequences and "VID_*" in missing
 
 
 def test_the_value_of_a_set_is_the_mean_over_its_images_which_are_written(tmp_path: Path, methods) -> None:
@@ -246,28 +199,12 @@ def test_limited_cases_are_spread_over_the_set(tmp_path: Path, methods) -> None:
 def test_the_report_has_the_papers_rows_ours_and_the_missing_sets(tmp_path: Path, methods) -> None:
     write_triplets(tmp_path, "m3d_dist_0.5", scenes=1)
     result = run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
-    (path,) = write_report(result, tmp_path / "out")
+    path = write_report(result, tmp_path / "out")
     page = path.read_text()
     assert "| PanoGRF | 27.12 |" in page and "**ours, sphere + deferred blending**" in page
     assert f"**{result.means()[0].get('ws_psnr'):.2f}**" in page
     assert "m3d_dist_0.75" in page and "m3d_dist_1.0" in page and "M3D 1.0 m: 1 image" in page
     assert f"{HEIGHT}x{2 * HEIGHT}" in page
-
-
-def test_the_figure_has_a_line_for_each_method(tmp_path: Path, sphere_predictor) -> None:
-    write_loc360(tmp_path, frames=7)
-    predictor = sphere_predictor()
-    both = [*list_methods(predictor, "frame-distance", "joint"), *list_methods(predictor, "frame-distance", "deferred")]
-    result = run_protocol("frame-distance", tmp_path, both, tmp_path / "out", options=OPTIONS)
-    lines = frame_distance_curves(result, "ws_psnr")
-    assert {method: [gap for gap, _ in line] for method, line in lines.items()} == {m.name: [2, 4] for m in both}
-    written = write_report(result, tmp_path / "out")
-    assert all(map(is_written, written))
-    assert {path.name for path in written} == {"table.md", "frame_distance.png"}
-    with Image.open(tmp_path / "out" / "frame_distance.png") as figure:
-        assert figure.size[0] > 300
-    (layout,) = list_tables(result)
-    assert layout.sets == ("2 frames", "4 frames") and all(row.get("2 frames ws_psnr") for row in our_rows(result))
 
 
 @pytest.mark.shared

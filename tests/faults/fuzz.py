@@ -31,7 +31,7 @@ from panorama_formats import EXAMPLES, Example, write_room
 from PIL import Image
 
 from pansplat.cache import CachedScene, _is_valid
-from pansplat.cli.render import read_poses
+from pansplat.cli.render import read_pose
 from pansplat.errors import InputError
 from pansplat.gaussians.gltf import load_glb, save_glb
 from pansplat.gaussians.ply import load_ply
@@ -105,8 +105,7 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
         Image.fromarray(random_image).save(folder / name)
     write_image(folder / "image.exr", random_image)
     Image.fromarray(np.full((8, 16), 999, np.uint16)).save(folder / "depth.png")
-    (folder / "path.kitti").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0.5 0 1 0 0 0 0 1 0\n")
-    (folder / "path.tum").write_text("0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0 1\n")
+    (folder / "pose.txt").write_text("1 0 0 0.5 0 1 0 0 0 0 1 0 0 0 0 1\n")
     (folder / "pose.json").write_text(json.dumps({"convention": "cam2world opencv", "pose": np.eye(4).tolist()}))
     torch.save(
         {
@@ -146,9 +145,8 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
         "scene.glb": (folder / "scene.glb", load_glb),
         "poses.json": (pair / "poses.json", read_pair),
         "pairs.json": (pair / "pairs.json", read_pair),
-        "path.kitti": (folder / "path.kitti", read_poses),
-        "path.tum": (folder / "path.tum", read_poses),
-        "pose.json": (folder / "pose.json", read_poses),
+        "pose.txt": (folder / "pose.txt", read_pose),
+        "pose.json": (folder / "pose.json", read_pose),
         **{
             f"room {name}": make_example(folder / f"room{number}", example)
             for number, (name, example) in enumerate(EXAMPLES.items())

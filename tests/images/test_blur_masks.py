@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import unicodedata
 import warnings
 from collections.abc import Callable
@@ -31,7 +30,7 @@ from pansplat.inputs.reconstructions.colmap import write_colmap
 from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
 from pansplat.poses.files import _hash_inputs
 from pansplat.system.store import hash_parts
-from pansplat.training.sequences import LOCATIONS, read_loc360, read_video_folder
+from pansplat.training.sequences import LOCATIONS, read_loc360
 
 HEIGHT = 64
 HIDDEN = np.zeros((HEIGHT, 2 * HEIGHT), bool)
@@ -217,25 +216,21 @@ def test_a_mask_is_a_mask_in_any_case(tmp_path: Path, name: str, is_posed: bool)
 
 
 @pytest.mark.parametrize("name", ["mask.PNG", "Mask.png"])
-def test_the_mask_of_a_folder_is_one_in_any_case(tmp_path: Path, name: str, write_trajectory: Callable) -> None:
-    folders = [_write_pair(tmp_path / "pair", 1), write_trajectory(tmp_path / "walk")]
+def test_the_mask_of_a_folder_is_one_in_any_case(tmp_path: Path, name: str) -> None:
+    folders = [_write_pair(tmp_path / "pair", 1), _write_sequence(tmp_path / "walk")]
     for folder in folders:
         _draw_mask(folder / name, kind="mask")
         assert torch.equal(load_pairs(folder)[0].load_context(HEIGHT).masks[0], torch.from_numpy(~HIDDEN)), folder
 
 
-@pytest.fixture
-def write_trajectory() -> Callable[[Path], Path]:
-    """Write two frames in images/ with the poses of a trajectory."""
-
-    def write(folder: Path) -> Path:
-        for number in (0, 1):
-            _write(folder / "images" / f"{number}.png", number, None)
-        (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
-        (folder / "scale.txt").write_text("1")
-        return folder
-
-    return write
+def _write_sequence(folder: Path) -> Path:
+    """Two frames in image/ with the poses of 360Loc."""
+    poses = {f"{number}.png": np.eye(4).tolist() for number in (0, 1)}
+    poses["1.png"][0][3] = 1.0
+    for number, name in enumerate(poses):
+        _write(folder / "image" / name, number, None)
+    (folder / "camera_pose.json").write_text(json.dumps(poses))
+    return folder
 
 
 NEAR_LEFT = r"did you mean (\S*/)?left_"
@@ -312,18 +307,13 @@ def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
             Pose((folder,) if source == "pose folder" else (folder / "left.png", mask, folder / "right.png")).run()
 
 
-@pytest.mark.parametrize("command", ["pose", "training"])
 @pytest.mark.parametrize("name", ["walk_blur.png", "Walk_Mask.PNG"])
-def test_a_mask_of_a_video_is_refused(tmp_path: Path, command: str, name: str) -> None:
+def test_a_mask_of_a_video_is_refused(tmp_path: Path, name: str) -> None:
     frame = np.zeros((64, 128, 3), np.uint8)
     write_video(tmp_path / "walk.mp4", iter([frame, frame]), 30)
-    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
     _draw_mask(tmp_path / name)
     with pytest.raises(InputError, match=rf"{name}: needed the name of a panorama before .* got '{name}'"):
-        if command == "pose":
-            Pose((tmp_path / "walk.mp4",), tmp_path / "frames").run()
-        else:
-            read_video_folder(tmp_path)
+        Pose((tmp_path / "walk.mp4",), tmp_path / "frames").run()
 
 
 def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:
@@ -351,14 +341,6 @@ def _write_faces(folder: Path, color_face: Callable[[str, int], np.ndarray], per
         if face == "f":
             pixels[COVER] = np.random.default_rng(person).integers(0, 255, (int(COVER.sum()), 3), dtype=np.uint8)
         Image.fromarray(pixels).save(folder / f"hall_{face}.png")
-    return folder
-
-
-def _write_strip(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
-    _write_faces(folder / "faces", color_face, person)
-    faces = [np.asarray(Image.open(folder / "faces" / f"hall_{face}.png")) for face in "frblud"]
-    shutil.rmtree(folder / "faces")
-    Image.fromarray(np.concatenate(faces, axis=1)).save(folder / "hall.png")
     return folder
 
 
@@ -402,16 +384,10 @@ def _write_uneven(folder: Path, color_face: Callable[[str, int], np.ndarray], pe
 
 ASSEMBLED = {
     "faces": (_write_faces, "hall_f_blur.png"),
-    "strip": (_write_strip, "hall_Blur.PNG"),
     "nerfstudio": (_write_set, "images/0000_a_front_blur.png"),
     "colmap": (_write_colmap, "images/0000_A_front_BLUR.png"),
     "uneven": (_write_uneven, "images/0000_a_front_blur.png"),
 }
-
-
-def _cover(kind: str) -> np.ndarray:
-    """What the mask of a picture covers."""
-    return np.pad(COVER, ((0, 0), (0, 5 * SIDE))) if kind == "strip" else COVER
 
 
 def _load_first(folder: Path) -> Panorama:
@@ -429,7 +405,7 @@ def test_a_mask_of_a_picture_hides_it_in_its_panorama(
     for person in (1, 2):
         folder = write(tmp_path / f"{person}", color_face, person)
         before = read_panorama(_load_first(folder).image, height)[0]
-        _draw_mask(folder / name, _cover(kind).repeat(scale, axis=0).repeat(scale, axis=1))
+        _draw_mask(folder / name, COVER.repeat(scale, axis=0).repeat(scale, axis=1))
         panorama = _load_first(folder)
         image, shown = read_panorama(panorama.image, height)
         reads.append((image, shown, read_thumbnail(panorama.image, 16)))
@@ -442,7 +418,7 @@ def test_a_mask_of_a_picture_hides_it_in_its_panorama(
     for first, second in zip(*reads, strict=True):
         assert torch.equal(first, second), "what is hidden has no influence"
     before = load_pairs(folder)[0].load_context(height).masks[0]
-    _draw_mask(folder / re.sub("blur", "mask", name, flags=re.IGNORECASE), _cover(kind), kind="mask")
+    _draw_mask(folder / re.sub("blur", "mask", name, flags=re.IGNORECASE), COVER, kind="mask")
     after = load_pairs(folder)[0].load_context(height).masks[0]
     assert before[inside].all() and not after[inside].any() and torch.equal(after[far], before[far])
 

@@ -1,12 +1,11 @@
-"""Cube faces are recognised by the names of files, and by the proportions and edges of a picture."""
+"""Cube faces are recognised by the names of files."""
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
 
-from pansplat.images.cube_faces import find_gap, find_layout, group_faces
+from pansplat.images.cube_faces import find_gap, group_faces
 from pansplat.images.cube_images import CubeLevel, write_cube
 from pansplat.images.image_files import read_panorama
 
@@ -71,39 +70,3 @@ def test_a_gap_of_a_level_is_a_missing_or_damaged_tile(tmp_path: Path, write_til
     assert find_gap(level, tmp_path) == "40/l/1_2.jpg is damaged"
     tile.unlink()
     assert find_gap(level, tmp_path) == "40/l/1_2.jpg is missing"
-
-
-LAYOUTS = {
-    "row, Pannellum": ["frblud"],
-    "row, krpano": ["lfrbud"],
-    "row, OpenGL": ["rludfb"],
-    "row, V-Ray": ["rludbf"],
-    "column, Marzipano": list("bdflru"),
-    "column, Pano2VR": list("frblud"),
-    "two rows, FFmpeg": ["rlu", "dfb"],
-    "two rows, Pannellum": ["frb", "lud"],
-    "two columns": ["fr", "bl", "ud"],
-    "cross": [" u  ", "lfrb", " d  "],
-    "cross, front first": ["u   ", "frbl", "d   "],
-    "cross upright": [" u ", "lfr", " d ", " B "],
-}
-
-
-@pytest.mark.parametrize("rows", LAYOUTS.values(), ids=LAYOUTS)
-def test_a_picture_of_six_faces_is_a_cube(tmp_path: Path, rows: list[str], color_face, check_colors) -> None:
-    faces = {face: color_face(face, 32) for face in "frblud"}
-    faces |= {"B": np.rot90(faces["b"], 2), " ": np.zeros_like(faces["f"])}
-    picture = np.concatenate([np.concatenate([faces[face] for face in row], axis=1) for row in rows])
-    Image.fromarray(picture).save(tmp_path / "all.png")
-    cube = find_layout(tmp_path / "all.png")
-    assert cube is not None and cube.height == 64
-    check_colors(read_panorama(write_cube(cube, tmp_path, "all"), 64)[0])
-
-
-@pytest.mark.parametrize("size", [(96, 64), (64, 96), (96, 72), (72, 96), (192, 32), (32, 192)])
-def test_an_ordinary_photograph_is_no_cube(tmp_path: Path, size: tuple[int, int]) -> None:
-    width, height = size
-    y, x = np.meshgrid(np.linspace(0, 255, height), np.linspace(0, 255, width), indexing="ij")
-    for pixels in (np.stack((x, y, 255 - y), axis=-1), np.full((height, width, 3), 90)):
-        Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / "photo.png")
-        assert find_layout(tmp_path / "photo.png") is None

@@ -15,7 +15,6 @@ from pansplat.images.cube_images import (
     CubeImage,
     CubeLevel,
     equirect_from_faces,
-    measure_seams,
     write_cube,
 )
 from pansplat.images.image_files import read_height, read_panorama, read_pixels, read_thumbnail
@@ -105,10 +104,3 @@ def test_other_content_is_refused(tmp_path: Path, content: object) -> None:
     (tmp_path / "x.cube.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"x\.cube\.json: needed a"):
         read_height(tmp_path / "x.cube.json")
-
-
-def test_seams_show_faces_in_a_wrong_order(color_face) -> None:
-    across, inside = measure_seams([color_face(face, 64) for face in "frblud"])
-    assert across < 2 * inside
-    across, inside = measure_seams([color_face(face, 64) for face in "rfblud"])
-    assert across > 5 * inside

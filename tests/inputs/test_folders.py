@@ -209,14 +209,6 @@ def test_360loc_sequences_pair_consecutive_frames(tmp_path: Path) -> None:
     assert pairs[0].far == 50
 
 
-@pytest.mark.parametrize("name", ["poses.txt", "frame_trajectory.txt", "a.kitti"])
-def test_trajectory_lines_are_the_poses_of_the_sorted_images(tmp_path: Path, name: str) -> None:
-    _sequence(tmp_path)
-    lines = [" ".join(map(str, np.array(_pose(i))[:3].ravel())) for i in range(3)]
-    (tmp_path / name).write_text("\n".join(lines))
-    assert [_centres(pair) for pair in load_pairs(tmp_path)] == [[0, 1], [1, 2]]
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [

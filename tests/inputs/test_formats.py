@@ -334,13 +334,6 @@ def test_lists_that_lead_out_of_their_folder_are_refused(room: Path, state: Stat
         read(room)
 
 
-def test_two_trajectories_of_one_folder_are_refused(room: Path) -> None:
-    for kind in ("KITTI", "TUM"):
-        EXAMPLES[kind].state(room, NAMES)
-    with pytest.raises(InputError, match=r"needed one trajectory file .*, got poses\.kitti, poses\.tum; keep"):
-        read(room)
-
-
 def test_whole_paths_inside_of_the_folder_are_read(room: Path) -> None:
     write_picture(room / "c" / "c.png")
     names = [str(room / "a.png"), str(room / "c" / ".." / "b.png"), "c/c.png"]

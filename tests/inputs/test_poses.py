@@ -1,14 +1,13 @@
 """Every convention gives the same camera, and invalid poses are refused with the reason."""
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.geometry.pose import quats_from_rotations, rotations_from_quats
-from pansplat.inputs.poses import CONVENTIONS, parse_convention, read_trajectory, rigid_matrix, to_cam2world
+from pansplat.geometry.pose import rotations_from_quats
+from pansplat.inputs.poses import CONVENTIONS, parse_convention, rigid_matrix, to_cam2world
 
 _QUAT = torch.tensor((0.7, 0.3, -0.5, 0.4), dtype=torch.float64)
 
@@ -98,55 +97,3 @@ def _changed(**entries: float) -> list:
 def test_matrices_that_are_not_rigid_are_refused_with_the_reason(values, message: str) -> None:
     with pytest.raises(InputError, match=f"^poses.json, 'a.png': .*{message}"):
         rigid_matrix(values, "poses.json, 'a.png'")
-
-
-def _kitti(poses: list[torch.Tensor]) -> str:
-    return "\n".join(" ".join(f"{x:.9f}" for x in pose[:3].flatten()) for pose in poses) + "\n"
-
-
-def _tum(poses: list[torch.Tensor]) -> str:
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for i, pose in enumerate(poses):
-        w, x, y, z = quats_from_rotations(pose[:3, :3]).tolist()
-        lines.append(" ".join(f"{n:.9f}" for n in (0.1 * i, *pose[:3, 3].tolist(), x, y, z, w)))
-    return "\n".join(lines)
-
-
-@pytest.mark.parametrize("convention", [None, *CONVENTIONS])
-@pytest.mark.parametrize(("kind", "text"), [("kitti", _kitti), ("tum", _tum)])
-def test_read_trajectories_equal_written_ones(tmp_path: Path, kind: str, text, convention: str | None) -> None:
-    poses = [torch.eye(4, dtype=torch.float64), _pose()]
-    (tmp_path / "a.txt").write_text(text([_in_convention(pose, convention or CONVENTIONS[0]) for pose in poses]))
-    read = read_trajectory(tmp_path / "a.txt", convention)
-    assert read.kind == kind
-    assert (torch.stack(read.poses) - torch.stack(poses)).abs().max() < 1e-8
-
-
-@pytest.mark.parametrize(
-    ("text", "expected", "message"),
-    [
-        (
-            _tum([_pose()]),
-            "kitti",
-            r"needed KITTI \(12 numbers per line\) according to its name, got TUM .* rename it to a\.tum",
-        ),
-        (_kitti([_pose()]), "tum", "needed TUM .* got KITTI"),
-        ("1 " * 17, None, "line 1: needed 12 numbers .* or 8 .*got 17"),
-        ("", None, "empty file"),
-        ("frame one\n", None, "line 1: needed numbers, got 'frame one'"),
-        (_kitti([_pose()]) + "1 2 3\n", None, "line 2: needed 12 numbers as in the other lines, got 3"),
-        ("0 1 2 3 0 0 0 0", None, "needed a unit quaternion .*got length 0"),
-        ("0 1 2 3 5 0 0 1", None, "needed a unit quaternion .*check the order"),
-        ("1 0 0 0 0 1 0 0 0 0 9 0", None, "line 1: needed a rigid pose"),
-        *(
-            (f"1 0 0 {x} 0 1 0 0 0 0 1 0", None, "line 1: needed a (rigid pose|position)")
-            for x in ("1e30", "1e400", "nan")
-        ),
-        ("0 1e30 0 0 0 0 0 1", None, "line 1: needed a position of at most"),
-        ("0 0 0 0 1e200 0 0 1e200", None, "needed a unit quaternion"),
-    ],
-)
-def test_invalid_trajectories_are_refused(tmp_path: Path, text: str, expected: str | None, message: str) -> None:
-    (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(InputError, match=message):
-        read_trajectory(tmp_path / "a.txt", expected=expected)

@@ -1,4 +1,4 @@
-"""Spherical cost volume and U-Net: agreement with the official code, candidates, ablations, symmetries, hard cases."""
+"""Spherical cost volume and U-Net: agreement with the official code, candidates, symmetries, hard cases."""
 
 import math
 from dataclasses import replace
@@ -60,12 +60,12 @@ def test_each_view_is_correlated_with_the_mean_of_the_others():
         assert torch.allclose(result[:, view], (others[0] + others[1]) / 2, atol=1e-12)
 
 
-# Symmetries, ablations, gradients
+# Symmetries, shapes, gradients
 
 
 def test_scaling_the_world_scales_the_depth_of_a_single_level(randomize):
     # Finer levels also read the centre, in 1 / metres.
-    network = randomize(SphericalCostVolume(replace(_SMALL, sweep="single"), "fixed"))
+    network = randomize(SphericalCostVolume(replace(_SMALL, levels=_SMALL.levels[:1]), "fixed"))
     features, poses, near, far, mono = _inputs()
     scaled = poses.clone()
     scaled[..., :3, 3] *= 7
@@ -80,15 +80,13 @@ def test_depths_lie_within_the_bounds(small):
     assert all((level.confidence >= 1 / 6).all() and (level.confidence <= 1).all() for level in depths.levels)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"sweep": "single"}, {"mono_channels": 0}, {"refinement": "none"}, {"levels": _SMALL.levels[:1]}]
-)
-def test_each_ablation_runs(randomize, changes):
+@pytest.mark.parametrize("changes", [{"mono_channels": 0}, {"refinement": "none"}, {"levels": _SMALL.levels[:1]}])
+def test_each_shape_runs(randomize, changes):
     config = replace(_SMALL, **changes)
     network = randomize(SphericalCostVolume(config, "fixed"))
     features, poses, near, far, mono = _inputs()
     depths = network(features, poses, near, far, mono if config.mono_channels else None)
-    assert len(depths.levels) == len(network.levels) == (2 if config.swept_levels == _SMALL.levels else 1)
+    assert len(depths.levels) == len(network.levels) == len(config.levels)
     assert any("unet" in name for name, _ in network.named_parameters()) == (config.refinement == "unet")
 
 

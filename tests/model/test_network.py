@@ -16,9 +16,7 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import lattice_size
-from pansplat.model.feature_pyramid import TransformerConfig
 from pansplat.model.heads import TileGaussians
-from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.network import (
     NetworkPredictor,
     build_empty_network,
@@ -34,7 +32,6 @@ from pansplat.pipeline import load_model
 from pansplat.sweep.guided_sweep import default_weights
 from pansplat.system.progress import show_progress
 
-SMALL_MVSPLAT = MVSplatConfig(channels=16, candidates=8, width=32, transformer=TransformerConfig(channels=16, blocks=2))
 _PER_VIEW = sum(lattice_size(128 >> level) for level in range(4))
 
 
@@ -118,7 +115,7 @@ def test_predictions_carry_no_gradient(predictor, prediction):
 
 
 def test_the_fingerprint_depends_on_weights_settings_and_compatibility(small_config):
-    other = dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, residual=False))
+    other = dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, depth="swept"))
     predictors = (
         _predictor(small_config),
         _predictor(small_config, seed=1),
@@ -211,11 +208,11 @@ def test_out_of_a_cards_memory_the_processor_streams_the_tiles_that_are_left(
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def file(tmp_path: Path, small_config: PanSplatConfig) -> Path:
     """Weights of a small network that was trained with compat="fixed"."""
     torch.manual_seed(3)
     path = tmp_path / "small.safetensors"
-    save_weights(path, pack_weights("mvsplat", SMALL_MVSPLAT, MVSplat(SMALL_MVSPLAT).state_dict(), compat="fixed"))
+    save_weights(path, pack_weights("pansplat", small_config, PanSplat(small_config).state_dict(), compat="fixed"))
     return path
 
 
@@ -230,13 +227,14 @@ def test_weights_load_with_the_compat_of_their_training_by_default(file: Path) -
     assert _network_of(load_model(file, compat="official")).compat == "official"
 
 
-def test_a_loaded_network_predicts_as_the_saved_one(file: Path) -> None:
+def test_a_loaded_network_predicts_as_the_saved_one(file: Path, small_config: PanSplatConfig) -> None:
     torch.manual_seed(3)
-    saved = NetworkPredictor("mvsplat", MVSplat(SMALL_MVSPLAT))
+    saved = NetworkPredictor("pansplat", PanSplat(small_config))
     loaded = load_predictor(file)
-    assert loaded.name == "mvsplat"
+    assert loaded.name == "pansplat"
     assert loaded.fingerprint == saved.fingerprint
-    assert torch.equal(loaded(*_inputs(), 0.5, 10.0).means, saved(*_inputs(), 0.5, 10.0).means)
+    means, expected = (predictor(*_inputs(), 0.5, 10.0).means for predictor in (loaded, saved))
+    assert torch.allclose(means, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_compat_and_precision_change_the_fingerprint(file: Path) -> None:
@@ -258,9 +256,9 @@ def test_loading_draws_no_random_numbers_and_fills_every_tensor(file: Path) -> N
 
 
 def test_a_checkpoint_and_its_converted_file_load_equally(
-    tmp_path: Path, mvsplat_weights: dict[str, Tensor], as_lightning: Callable[[dict[str, Tensor]], dict[str, object]]
+    tmp_path: Path, recipe_weights: dict[str, Tensor], as_lightning: Callable[[dict[str, Tensor]], dict[str, object]]
 ) -> None:
-    content = as_lightning(mvsplat_weights)
+    content = as_lightning(recipe_weights)
     torch.save(content, tmp_path / "original.ckpt")
     save_weights(tmp_path / "converted.safetensors", convert_checkpoint(content, "original.ckpt"))
     first, second = load_model(tmp_path / "original.ckpt"), load_model(tmp_path / "converted.safetensors")
@@ -268,18 +266,16 @@ def test_a_checkpoint_and_its_converted_file_load_equally(
     assert first.fingerprint == second.fingerprint
 
 
-def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> None:
-    tensors = MVSplat(SMALL_MVSPLAT).state_dict()
-    good = pack_weights("mvsplat", SMALL_MVSPLAT, tensors, compat="fixed")
+def test_files_that_fit_no_network_are_refused(small_config: PanSplatConfig, unchecked: None) -> None:
+    tensors = PanSplat(small_config).state_dict()
+    good = pack_weights("pansplat", small_config, tensors, compat="fixed")
+    wider = good.config | {"features": good.config["features"] | {"transformer": {"channels": 32, "blocks": 2}}}
     odd: list[tuple[WeightsFile, str]] = [
-        (
-            dataclasses.replace(good, model="splatter"),
-            "needed weights of pansplat or mvsplat, got weights of 'splatter'",
-        ),
+        (dataclasses.replace(good, model="mvsplat"), "needed weights of pansplat, got weights of 'mvsplat'"),
         (dataclasses.replace(good, config={"channels": 16}), r"x: config: needed the settings of this version"),
-        (dataclasses.replace(good, config=good.config | {"transformer": 3}), "transformer: needed an object"),
+        (dataclasses.replace(good, config=good.config | {"features": 3}), "features: needed an object"),
         (dataclasses.replace(good, tensors=tensors | {"new": torch.zeros(1)}), r"found unknown 1 \(new\)"),
-        (dataclasses.replace(good, config=good.config | {"width": 64}), r"got \d+ \(depth\.shortcut\.weight"),
+        (dataclasses.replace(good, config=wider), r"got \d+ \(features\.transformer"),
     ]
     for weights, message in odd:
         with pytest.raises(InputError, match=message):

@@ -1,4 +1,4 @@
-"""With converted weights, each stage of both networks equals the official code, in its standard deviations."""
+"""With converted weights, each stage of the network equals the official code, in its standard deviations."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.feature_pyramid import encode_positions, make_shift_mask
-from pansplat.model.heads import compute_harmonics_rotation
-from pansplat.model.mvsplat import MVSplat
-from pansplat.model.weights import convert_tensors
 
 pytestmark = pytest.mark.shared
 ROUNDED = 5e-2
@@ -85,41 +82,6 @@ def test_pansplat_with_bfloat16_attention(run_official: Callable, golden: Callab
     assert len(errors) == 9 + 24 and max(errors.values()) < ROUNDED, errors
     for ours, exact in zip(run.outputs["cost_volume"].depth, run_official().outputs["cost_volume"].depth, strict=True):
         assert error(ours, exact) > 2e-3, "attention is rounded"
-
-
-@torch.no_grad()
-def test_mvsplat(mvsplat_weights: dict, as_lightning: Callable, golden: Callable, error: Callable) -> None:
-    truth = golden("mvsplat_64x128_fp32attn")
-    network = MVSplat(compat="official").eval()
-    network.load_state_dict(convert_tensors(as_lightning(mvsplat_weights), "recipe"))
-    inputs: dict[str, Tensor] = {}
-    outputs: dict[str, Tensor] = {}
-    for name in ("features.transformer", "depth.refine.entry", "refine", "to_depth"):
-
-        def keep(_: object, given: tuple, output: Tensor, name: str = name) -> None:
-            inputs[name] = given[0]
-            outputs[name] = torch.cat((outputs[name], output)) if name in outputs else output
-
-        network.get_submodule(name).register_forward_hook(keep)
-    output = network(*(truth[f"in.{name}"] for name in ("image", "extrinsics", "near", "far")))
-    found = {f"transformer.{view}": outputs["features.transformer"][:, view] for view in range(2)}
-    found |= {"unet_in": inputs["depth.refine.entry"], "logits": output.depths.levels[-1].logits[0]}
-    found |= {"refine_sub": outputs["refine"][..., ::2, ::2], "to_disparity": outputs["to_depth"]}
-    gaussians, relative = output.gaussians[0], {}
-    # The fixture's harmonics are in the axes of docs/official.md, section 10.3.
-    to_world = compute_harmonics_rotation(torch.eye(3, dtype=torch.float64), "official")
-    for view in range(2):
-        part = gaussians.select(gaussians.views == view)
-        found |= {f"g.v{view}.{name}": getattr(part, name) for name in ("means", "opacities", "scales")}
-        found[f"g.v{view}.harmonics_dc"] = part.harmonics[:, 0]
-        # Relative to each one: the largest has 12 standard deviations, and its rounding depends on the processor.
-        covariances = truth[f"g.v{view}.covariances"].flatten(1)
-        difference = (part.covariances.flatten(1) - covariances).norm(dim=1)
-        relative[f"covariances {view}"] = float((difference / covariances.norm(dim=1)).max())
-        theirs = rotate_harmonics(truth[f"g.v{view}.harmonics_sub"].transpose(-1, -2).double(), to_world)
-        relative[f"harmonics {view}"] = error(part.harmonics[:: 8192 // len(theirs)].double(), theirs)
-    errors = relative | {name: error(tensor, truth[name]) for name, tensor in found.items()}
-    assert max(errors.values()) < 2e-4, errors
 
 
 def test_parts_that_no_stage_shows_alone(golden: Callable) -> None:

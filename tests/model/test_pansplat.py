@@ -53,11 +53,7 @@ def test_rotating_the_world_rotates_the_prediction(network, prediction, make_inp
     assert torch.allclose(after.opacities, before.opacities, atol=1e-8)
 
 
-def test_rolling_panoramas_and_turning_poses_by_half_a_turn_keeps_the_scene(small, make_inputs):
-    """With a Gaussian at each pixel, so that both predictions have the same points."""
-    torch.manual_seed(0)
-    heads = dataclasses.replace(small.heads, lattice="pixel", emitted="finest")
-    network = PanSplat(dataclasses.replace(small, heads=heads), "fixed").double().eval()
+def test_rolling_panoramas_and_turning_poses_by_half_a_turn_rolls_the_depth(network, make_inputs):
     images, poses, near, far = make_inputs(32)
     half_turn = torch.diag(torch.tensor((-1.0, 1.0, -1.0, 1.0), dtype=torch.float64))
     with torch.no_grad():
@@ -65,9 +61,6 @@ def test_rolling_panoramas_and_turning_poses_by_half_a_turn_keeps_the_scene(smal
         after = network(images.roll(32, dims=-1), poses @ half_turn, near, far)
     for a, b in zip(after.depths.depth, before.depths.depth, strict=True):
         assert torch.allclose(a, b.roll(b.shape[-1] // 2, dims=-1), atol=1e-9)
-    for name in ("means", "scales", "opacities"):
-        a, b = (getattr(output.gaussians[0], name).unflatten(0, (2, 32, 64)) for output in (after, before))
-        assert torch.allclose(a, b.roll(32, dims=2), atol=1e-9)
 
 
 # Views, sizes, configurations
@@ -113,7 +106,7 @@ def test_the_order_of_the_views_does_not_matter_and_batch_items_are_independent(
 
 
 def test_heads_read_the_candidates_of_a_single_swept_level(small, make_inputs):
-    single = dataclasses.replace(small.cost_volume, sweep="single")
+    single = dataclasses.replace(small.cost_volume, levels=small.cost_volume.levels[:1])
     with pytest.raises(ValueError, match=r"`heads\.candidates` must be the 8 of the finest sweep, got 4"):
         dataclasses.replace(small, cost_volume=single)
     heads = dataclasses.replace(small.heads, candidates=8)

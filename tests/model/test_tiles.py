@@ -31,8 +31,8 @@ def test_an_official_window_wraps_columns_and_has_zero_rows(height):
 
 
 def test_points_move_at_most_half_a_pixel_of_their_latitude():
-    uv = make_lattice_uv("fibonacci", 32)
-    moved = move_points(uv, torch.full_like(uv, 50.0), "fibonacci", 32) - uv
+    uv = make_lattice_uv(32)
+    moved = move_points(uv, torch.full_like(uv, 50.0), 32) - uv
     assert torch.allclose(moved[:, 1], torch.full_like(moved[:, 1], 0.5 / 32))
     arc = moved[:, 0] * 64 * torch.sin(uv[:, 1] * math.pi)
     inner = (uv[:, 1] - 0.5).abs() < 0.49
@@ -43,7 +43,7 @@ def test_points_move_at_most_half_a_pixel_of_their_latitude():
 def test_a_lattice_cached_in_inference_mode_serves_gradients():
     make_lattice_uv.cache_clear()
     with torch.inference_mode():
-        make_lattice_uv("fibonacci", 8)
+        make_lattice_uv(8)
     offsets = torch.zeros(lattice_size(16), 2, dtype=torch.float64, requires_grad=True)
-    (move_points(make_lattice_uv("fibonacci", 8), offsets, "fibonacci", 8) ** 2).sum().backward()
+    (move_points(make_lattice_uv(8), offsets, 8) ** 2).sum().backward()
     assert offsets.grad is not None and bool(torch.isfinite(offsets.grad).all())

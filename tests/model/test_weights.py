@@ -203,14 +203,16 @@ def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_ligh
     with pytest.raises(InputError) as caught:
         report.require_complete("odd.ckpt")
     message = str(caught.value)
-    assert message.startswith("odd.ckpt: needed exactly the tensors of the official pansplat, lacked 12 (")
+    assert message.startswith("odd.ckpt: needed exactly the tensors of the official PanSplat, lacked 12 (")
     assert removed[0] in message and ", ...)" in message
     assert "found unknown 2 (encoder.new.weight, losses.2.gaussian_head.new)" in message
 
 
 def test_checkpoints_of_other_models_are_refused(as_lightning: Wrap) -> None:
-    with pytest.raises(InputError, match=r"official PanSplat or its MVSplat baseline, got tensors 1 \(encoder.fc\)"):
+    with pytest.raises(InputError, match=r"official PanSplat, got tensors 1 \(encoder.fc\); use another"):
         match_tensors(as_lightning({"fc": torch.zeros(1)}), "x")
+    with pytest.raises(InputError, match=r"got tensors 1 \(.*\) of its MVSplat baseline, which has no Gaussian heads"):
+        match_tensors(as_lightning({"backbone.backbone.conv1.weight": torch.zeros(1)}), "x")
     with pytest.raises(InputError, match="got tensors none"):
         match_tensors(as_lightning({}), "x")
 
@@ -223,17 +225,18 @@ def test_a_changed_grid_is_refused(recipe_weights: dict[str, Tensor], as_lightni
         convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name][:, :, :4]}), "x")
 
 
-def test_values_that_are_not_finite_are_refused(mvsplat_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
-    name = "backbone.backbone.conv2.bias"
-    broken = mvsplat_weights[name].clone()
+def test_values_that_are_not_finite_are_refused(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
+    name = "backbone.decoder.inner1.bias"
+    broken = recipe_weights[name].clone()
     broken[3] = torch.nan
     with pytest.raises(InputError, match=f"got NaN or infinity in {name}"):
-        convert_tensors(as_lightning(mvsplat_weights | {name: broken}), "x")
+        convert_tensors(as_lightning(recipe_weights | {name: broken}), "x")
 
 
-def test_half_precision_weights_become_float32(mvsplat_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
-    tensors = convert_tensors(as_lightning({name: tensor.half() for name, tensor in mvsplat_weights.items()}), "x")
-    assert {tensor.dtype for tensor in tensors.values()} == {torch.float32}
+def test_half_precision_weights_become_float32(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
+    name = "gaussian_head.gaussians_mlp_list.0.0.bias"
+    tensors = convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name].half()}), "x")
+    assert {tensor.dtype for tensor in tensors.values()} == {torch.float32, torch.int64}
 
 
 def test_wrong_shapes_are_named() -> None:

@@ -17,7 +17,6 @@ import torch
 import pansplat
 from pansplat.cli import run
 from pansplat.errors import InputError
-from pansplat.inputs.poses import read_trajectory
 from pansplat.poses import estimate as estimate_module
 from pansplat.poses.axes import SceneAxes
 from pansplat.poses.dense import Surroundings
@@ -86,12 +85,6 @@ def test_written_poses_are_read_back(estimate: PoseEstimate, photographs: Path, 
         assert np.allclose(panorama.cam2world.numpy(), estimate.poses[panorama.image], atol=1e-8)
     (group,) = estimate.groups
     assert (pair.near, pair.far) == pytest.approx((group.near, group.far), abs=1e-3)
-    for suffix in ("tum", "kitti"):
-        write_poses(estimate, tmp_path / f"poses.{suffix}")
-        trajectory = read_trajectory(tmp_path / f"poses.{suffix}")
-        assert trajectory.kind == suffix
-        for read, pose in zip(trajectory.poses, estimate.poses.values(), strict=True):
-            assert np.allclose(read.numpy(), pose, atol=1e-6)
 
 
 @pytest.mark.slow

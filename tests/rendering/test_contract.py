@@ -38,7 +38,7 @@ INTERPRETED = ("one, equirect", "small, cubemap ewa angular z", "inside", "stack
 
 
 def list_cases() -> Iterator[tuple[str, Case]]:
-    """The scenes, and how they are drawn: options of `rasterize`, and `slack`, `fields`, `pose`, `by_covariance`."""
+    """The scenes, and how they are drawn: options of `rasterize`, and `slack`, `fields`, `pose`."""
 
     def noise(*shape: int, seed: int = 0) -> Tensor:
         return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -63,7 +63,6 @@ def list_cases() -> Iterator[tuple[str, Case]]:
             large = {"size": (50, 70) if layout == "pinhole" else (40, 80), "lowpass": lowpass}
             yield f"crowd, {layout} {kernel} {lowpass}", (crowd, way | large)
         yield f"one, {layout}{' ewa' * (kernel == 'ewa')}", (one, {"layout": layout, "kernel": kernel})
-        yield f"covariances, {layout} {kernel}", (make_scene(10, scale=0.6), way | {"by_covariance": True, "slack": 4})
     for count in (1, 2, 32):
         yield f"{count} channels", (change(small, harmonics=channels.harmonics[..., :count]), {})
     for degree in range(5):
@@ -183,7 +182,7 @@ def test_images_and_gradients_equal_the_dense_renderers(case: str, render: Rende
 def check(render: Renderer, scene: Gaussians, options: dict[str, Any]) -> None:
     """Assert that a backend's image, counts and gradients equal those of the dense renderer."""
     options = {"size": render.size, **options}
-    chosen = {name: options.pop(name, None) for name in ("pose", "slack", "fields", "by_covariance", "metre")}
+    chosen = {name: options.pop(name, None) for name in ("pose", "slack", "fields", "metre")}
     pose = ORIGIN if chosen["pose"] is None else chosen["pose"]
     slack, metre = chosen["slack"] or 1.0, chosen["metre"] or 1.0
     background = torch.linspace(0.2, 0.9, scene.harmonics.shape[2], dtype=torch.float64)
@@ -201,8 +200,7 @@ def check(render: Renderer, scene: Gaussians, options: dict[str, Any]) -> None:
         return Rendering(color, alpha, depth), (close == 0).detach()
 
     def draw(given: Gaussians, camera: Tensor, ground: Tensor) -> tuple[Rendering, None]:
-        covariances = given.covariances if chosen["by_covariance"] else None
-        return render(given, camera, background=ground, covariances=covariances, **options), None
+        return render(given, camera, background=ground, **options), None
 
     images, gradients, shown = [], [], None
     for function, given in ((draw_truth, rounded.to(dtype=torch.float64)), (draw, rounded)):

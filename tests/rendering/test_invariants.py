@@ -78,8 +78,6 @@ def test_a_number_that_is_not_finite_drops_only_its_gaussian(field: str, render:
         for name in FIELDS:
             found, reference = getattr(poisoned, name).grad, getattr(clean, name).grad
             assert not found[2].any() and torch.equal(found[rest], reference), (name, poison)
-        with pytest.raises(InputError, match=r"1 of 6 that do not .*number 2.*strict=False"):
-            render(poisoned, POSE, strict=True)
 
 
 def test_scales_far_larger_than_the_distance_are_dropped_and_far_smaller_ones_vanish(render: Renderer) -> None:
@@ -90,34 +88,6 @@ def test_scales_far_larger_than_the_distance_are_dropped_and_far_smaller_ones_va
         assert torch.equal(got.color, render(scene.select(torch.tensor([1]))).color)
         for name, gradient in find_gradients(render, scene).items():
             assert torch.isfinite(gradient).all() and (name == "pose" or not gradient[0].any())
-
-
-BROKEN = {
-    "negative": [[0.1, 0, 0], [0, -0.1, 0], [0, 0, 0.1]],
-    "indefinite": [[0.1, 0.3, 0], [0.3, 0.1, 0], [0, 0, 0.1]],
-    "not finite": [[math.nan] * 3] * 3,
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_matrices_that_are_not_covariances_are_dropped_and_counted(name: str, render: Renderer) -> None:
-    scene = make_spheres([(0, 0, 2.0), (0.5, 0, 2.0), (-0.5, 0, 2.0)], 0.3)
-    good, rest = scene.covariances, torch.tensor([0, 2])
-    expected = render(scene.select(rest), covariances=good[rest].to(render.dtype))
-    matrix = torch.tensor(BROKEN[name], dtype=torch.float64)
-    covariances = torch.stack((good[0], matrix, good[2])).to(render.dtype).requires_grad_()
-    inputs = make_leaves(scene.to(dtype=render.dtype))
-    got = render(inputs, covariances=covariances)
-    assert got.info is not None and got.info.dropped == 1
-    assert torch.equal(got.color, expected.color)
-    measure_loss(got).backward()
-    for gradient in (covariances.grad, inputs.means.grad, inputs.opacities.grad):
-        assert torch.isfinite(gradient).all() and not gradient[1].any() and gradient[0].any()
-    with pytest.raises(InputError, match=r"1 of 3 .*number 1"):
-        render(scene, covariances=covariances.detach(), strict=True)
-    rounded = torch.diag(torch.tensor((0.09, 0.09, -1e-7), dtype=torch.float64))[None]  # a disc
-    got = render(make_spheres((0, 0, 2.0), 0.3), covariances=rounded)
-    assert got.info is not None and got.info.dropped == 0 and float(got.alpha.max()) > 0.05
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -172,13 +142,12 @@ def draw_options(draw) -> dict:
         "vertical_fov_degrees": draw(st.sampled_from((0.1, 60.0, 90.0, 179.0))),
         "face_size": draw(st.sampled_from((None, 1, 2, 5))),
         "stitching": draw(st.sampled_from(("seamless", "seamless", "official"))),
-        "strict": draw(st.sampled_from((False, False, False, True))),
     }
 
 
 @st.composite
-def draw_scene(draw) -> tuple[Gaussians, Tensor | None]:
-    """A few Gaussians, with or without covariances, with some extreme numbers."""
+def draw_scene(draw) -> Gaussians:
+    """A few Gaussians with some extreme numbers."""
     count, channels, degree = draw(st.integers(0, 6)), draw(st.sampled_from((1, 3, 4))), draw(st.integers(0, 4))
     generator = torch.Generator().manual_seed(draw(st.integers(0, 1000)))
     fields = {
@@ -188,17 +157,14 @@ def draw_scene(draw) -> tuple[Gaussians, Tensor | None]:
         "opacities": torch.rand(count, generator=generator),
         "harmonics": torch.randn(count, (degree + 1) ** 2, channels, generator=generator),
     }
-    factor = torch.randn(count, 3, 3, generator=generator)
-    fields["covariances"] = 0.1 * factor @ factor.transpose(1, 2)
     for _ in range(draw(st.integers(0, 4)) if count else 0):
-        flat = fields[draw(st.sampled_from((*FIELDS, "covariances")))].view(-1)
+        flat = fields[draw(st.sampled_from(FIELDS))].view(-1)
         flat[draw(st.integers(0, len(flat) - 1))] = draw(st.sampled_from(EXTREMES) | st.floats(width=32))
-    covariances = fields.pop("covariances")
     label = torch.zeros(count, dtype=torch.int64)
-    return Gaussians(**fields, levels=label, views=label), covariances if draw(st.booleans()) else None
+    return Gaussians(**fields, levels=label, views=label)
 
 
-DISTANT = make_spheres([0.0, -0.3, 1e12], opacity=1e29), None
+DISTANT = make_spheres([0.0, -0.3, 1e12], opacity=1e29)
 """Its gradients were not finite."""
 
 
@@ -206,17 +172,13 @@ DISTANT = make_spheres([0.0, -0.3, 1e12], opacity=1e29), None
 @settings(QUIET, max_examples=60)
 @given(scene=draw_scene(), options=draw_options())
 @example(scene=DISTANT, options={**PINHOLE, "size": (1, 14), "vertical_fov_degrees": 0.1})
-def test_extreme_numbers_give_finite_images_and_gradients(
-    render: Renderer, scene: tuple[Gaussians, Tensor | None], options: dict
-) -> None:
+def test_extreme_numbers_give_finite_images_and_gradients(render: Renderer, scene: Gaussians, options: dict) -> None:
     if render.interpreted:
         options = {**options, "size": (3, 6), "face_size": 3}
-    inputs, covariances = make_leaves(scene[0].to(dtype=render.dtype)), scene[1]
-    if covariances is not None:
-        covariances = covariances.to(render.dtype).requires_grad_()
+    inputs = make_leaves(scene.to(dtype=render.dtype))
     pose, channels = ORIGIN.clone().requires_grad_(), inputs.harmonics.shape[2]
     try:
-        got = render(inputs, pose, covariances=covariances, background=(0.5,) * channels, **options)
+        got = render(inputs, pose, background=(0.5,) * channels, **options)
     except InputError:
         return
     assert got.color.shape == (channels, *options["size"])
@@ -225,7 +187,7 @@ def test_extreme_numbers_give_finite_images_and_gradients(
     assert float(alpha.min()) >= 0 and float(alpha.max()) <= 1 and float(got.depth.detach().min()) >= 0
     if got.color.requires_grad:
         (got.color.sum() + got.alpha.sum() + (got.depth * got.alpha).sum()).backward()
-    for name, leaf in {**vars(inputs), "covariances": covariances, "pose": pose}.items():
+    for name, leaf in {**vars(inputs), "pose": pose}.items():
         assert leaf is None or leaf.grad is None or torch.isfinite(leaf.grad).all(), name
 
 

@@ -1,4 +1,4 @@
-"""The function `rasterize`: arguments, channels, covariances, rotations, layouts and torch.compile."""
+"""The function `rasterize`: arguments, channels, rotations, layouts and torch.compile."""
 
 import dataclasses
 import math
@@ -40,13 +40,6 @@ def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
         ({**official, "size": (8, 12)}, "'official' needs layout='cubemap' and a 2:1 panorama"),
         ({**official, "size": (8, 16), "layout": "equirect"}, "'official' needs layout='cubemap' and a 2:1 panorama"),
         ({"background": (0.1, 0.2)}, r"`background` must hold 3 numbers, .* got \(2,\)"),
-        *(
-            (
-                {"covariances": torch.zeros(shape)},
-                r"`covariances` must have shape \(2, 3, 3\), one matrix for each Gaussian, got",
-            )
-            for shape in ((3, 3, 3), (2, 3), (2, 2, 2), (1, 2, 3, 3))
-        ),
     ]
     for options, message in cases:
         with pytest.raises(InputError, match=message):
@@ -80,17 +73,6 @@ def test_the_default_background_is_black_for_any_number_of_channels(make_scene, 
         one = dataclasses.replace(scene, harmonics=torch.zeros(3, 1, channels, dtype=torch.float64))
         got = rasterize(one, pose, size=(4, 8))
         assert torch.allclose(got.color, 0.5 * got.alpha.expand(channels, 4, 8), rtol=0, atol=1e-12)
-
-
-# --- covariances in place of scales and quaternions ---
-
-
-def test_each_entry_of_a_symmetric_pair_gets_half_the_gradient(make_scene, pose):
-    scene = make_scene(6, scale=0.4, degree=0)
-    covariances = scene.covariances.clone().requires_grad_()
-    rasterize(scene, pose, size=(8, 16), covariances=covariances).color.sum().backward()
-    assert covariances.grad is not None and covariances.grad.any()
-    assert torch.allclose(covariances.grad, covariances.grad.transpose(1, 2), rtol=0, atol=1e-12)
 
 
 # --- torch.compile ---

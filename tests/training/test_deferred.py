@@ -8,9 +8,7 @@ import pytest
 import torch
 
 from pansplat.inputs.views import Batch
-from pansplat.model.feature_pyramid import TransformerConfig
-from pansplat.model.heads import AdapterConfig, AuxiliaryHeads
-from pansplat.model.mvsplat import MVSplat, MVSplatConfig
+from pansplat.model.heads import AuxiliaryHeads
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
 from pansplat.training.losses import LossWeights, Structure
@@ -19,7 +17,7 @@ from pansplat.training.step import TrainingStep, accumulate_gradients
 
 
 def gradients(
-    network: PanSplat | MVSplat, memory: MemoryConfig, *batches: Batch, auxiliary: AuxiliaryHeads | None = None
+    network: PanSplat, memory: MemoryConfig, *batches: Batch, auxiliary: AuxiliaryHeads | None = None
 ) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
     """Gradients by parameter, and the loss terms."""
     network.zero_grad()
@@ -93,22 +91,3 @@ def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(micro: Callab
     found, separate = gradients(network, memory, make_batch(0), make_batch(1))
     assert_equal_gradients(found, expected)
     assert separate == pytest.approx(joint, rel=1e-9)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.slow
-def test_deferred_gradients_of_the_baseline_equal_plain_ones(make_batch: Callable) -> None:
-    network, batch = micro_mvsplat(), make_batch(0, 1)
-    expected, loss = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
-    assert expected.keys() == {name for name, _ in network.named_parameters()}
-    for method in ("one-step", "two-step"):
-        found, deferred_loss = gradients(network, MemoryConfig(method, 2, "cubemap"), batch)  # has one tile in any case
-        assert deferred_loss == pytest.approx(loss, rel=1e-9)
-        assert_equal_gradients(found, expected)
-
-
-def micro_mvsplat() -> MVSplat:
-    torch.manual_seed(3)
-    transformer = TransformerConfig(8, 1)
-    config = MVSplatConfig(8, candidates=4, width=32, transformer=transformer, adapter=AdapterConfig(degree=0))
-    return MVSplat(config).double()

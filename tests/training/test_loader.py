@@ -60,14 +60,6 @@ def test_batches_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     assert not _equal(_take(Loader(source, **(options | {"seed": 2})), 3), alone)
 
 
-def test_ranks_get_consecutive_parts_of_each_batch(tmp_path: Path) -> None:
-    source = _triplets(tmp_path, 8)
-    whole = _take(Loader(source, height=8, batch_size=4), 2)
-    parts = [_take(Loader(source, height=8, batch_size=2, rank=rank, world_size=2), 2) for rank in range(2)]
-    for batch, first, second in zip(whole, *parts, strict=True):
-        assert batch.names == first.names + second.names
-
-
 def test_unreadable_samples_are_skipped_counted_and_named(tmp_path: Path) -> None:
     source = _triplets(tmp_path, 6)
     (tmp_path / "2_1.png").write_bytes(b"")

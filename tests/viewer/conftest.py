@@ -156,7 +156,6 @@ def _rasterize_reference(
         size=size[::-1],
         layout="pinhole" if settings.layout == "pinhole" else panorama,
         vertical_fov_degrees=settings.vertical_fov_degrees,
-        **({} if settings.is_exact else {"kernel": "ewa", "order": "z", "lowpass": "3dgs"}),
         background=settings.background,
         near=settings.near,
     )
@@ -202,13 +201,13 @@ def assert_matches() -> Callable[..., None]:
 def assert_reference(make_renderer, reference, assert_matches) -> Callable[..., None]:
     """Checks that OpenGL and the processor render a scene as the reference does, perhaps another one, `drawn`.
 
-    The processor draws panoramas directly, and the preset exact only.
+    The processor draws panoramas directly.
     """
 
     def check(
         scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings, drawn: Scene | None = None
     ) -> None:
-        for name, panorama in (("gl", "cubemap"), ("cpu", "equirect"))[: 2 if settings.is_exact else 1]:
+        for name, panorama in (("gl", "cubemap"), ("cpu", "equirect")):
             renderer = make_renderer(scene, name)
             assert_matches(
                 renderer, cam2world, settings, reference(drawn or scene, cam2world, size, settings, panorama)

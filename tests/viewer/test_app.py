@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pansplat.cli import run as run_command
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
-from pansplat.system.files import is_written
 from pansplat_viewer import run
 from pansplat_viewer.app import Options
 from pansplat_viewer.capture import STILLS, compute_flight_pose
@@ -99,15 +97,7 @@ def test_without_the_libraries_of_window_and_opengl_a_fly_through_is_written(roo
         (["room.ply", "--size", "huge"], "WIDTHxHEIGHT"),
         (["room.ply", "--size", "4x4"], "WIDTHxHEIGHT"),
         (["room.ply", "--at", "1.5"], "--at: needed a number <= 1"),
-        (["room.ply", "--out", "film.mp4"], "--out needs --path"),
-        (["room.ply", "--path", "no.json", "--out", "film.mp4"], "no.json"),
-        (["room.ply", "--path", "no.json", "--out", "film.gif"], "film.gif"),
-        (["room.ply", "--projection", "equirect"], "--projection, and --stereo without a window, need --out"),
-        (["room.ply", "--projection", "equirect", "--size", "64x64"], "must be 2:1 for projection equirect"),
-        (["room.ply", "--projection", "cubemap", "--size", "64x32"], "must be 3:2, of an even height"),
-        (["room.ply", "--preset", "3dgs", "--renderer", "cpu"], "--preset 3dgs needs OpenGL, got --renderer cpu"),
-        (["room.ply", "--stereo", "side-by-side", "--renderer", "cpu"], "--stereo in a window needs OpenGL"),
-        (["room.ply", "--ipd", "0"], "--ipd: needed a number > 0"),
+        (["room.ply", "--path", "no.json"], "no.json"),
         (["room.ply", "--refine", "-1"], "--refine: needed a number >= 0"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),
     ],
@@ -137,23 +127,12 @@ def test_verbose_says_what_runs_where(write_room, tmp_path, capsys, monkeypatch)
     assert "note: " not in capsys.readouterr().err
 
 
-def test_the_film_of_a_path_has_a_frame_for_each_time(room):
-    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.5)]
-    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
-    arguments = ["--renderer", "cpu", "--size", "64x48", "--fps", "10", "--path", "walk.json", "--out"]
-    assert run([str(room), *arguments, "walk.mp4"]) == 0
-    with av.open("walk.mp4") as film:
-        assert [round(10 * frame.time) for frame in film.decode(video=0)] == list(range(6))
-    assert run([str(room), *arguments, "walk.exr"]) == 0
-    assert [path.name for path in sorted(Path().glob("*.exr"))] == [f"walk_{i:04d}.exr" for i in range(6)]
-
-
 @pytest.mark.parametrize("arguments", [[], ["--offscreen", "out"]])
-def test_a_path_without_a_window_and_a_file_for_its_film_is_refused(room, capsys, arguments):
+def test_a_path_without_a_window_is_refused(room, capsys, arguments):
     frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.5)]
     Path("walk.json").write_text(json.dumps({"key_frames": frames}))
     assert run([str(room), "--path", "walk.json", "--size", "64x32", "--seconds", "0.2", *arguments]) == 2
-    assert "--path without a window needs --out" in capsys.readouterr().err
+    assert "--path needs a window; `pansplat render SCENE --path FILE" in capsys.readouterr().err
     assert not Path("renders").exists() and not Path("out").exists(), "nothing is written"
 
 
@@ -164,13 +143,9 @@ def test_a_path_without_a_window_and_a_file_for_its_film_is_refused(room, capsys
         ("out/flythrough.mp4", ["--offscreen", "out"]),
         ("out/room/panorama_050.png", ["--offscreen", "out", "--pair", "all"]),
         ("out/03_Attic.png", ["--offscreen", "out"]),
-        ("walk.mp4", ["--path", "walk.json", "--out", "walk.mp4"]),
-        ("walk_0003.png", ["--path", "walk.json", "--out", "walk.PNG"]),
     ],
 )
 def test_a_file_of_the_user_needs_overwrite(room, capsys, name, arguments):
-    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.5)]
-    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
     own = Path(name)
     own.parent.mkdir(parents=True, exist_ok=True)
     own.write_bytes(b"of the user")
@@ -178,18 +153,6 @@ def test_a_file_of_the_user_needs_overwrite(room, capsys, name, arguments):
     printed = capsys.readouterr()
     assert f"got {own}, which pansplat did not write; choose another name, or replace them with --ov" in printed.err
     assert own.read_bytes() == b"of the user" and len(list(own.parent.iterdir())) <= 3, "nothing is written"
-
-
-def test_the_film_of_a_path_replaces_the_one_before_and_with_overwrite_any_file(room):
-    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.1)]
-    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
-    command = [str(room), "--renderer", "cpu", "--size", "64x48", "--fps", "20", "--path", "walk.json", "--out"]
-    for name in ("walk.mp4", "walk.png"):
-        written = Path("walk.mp4" if name == "walk.mp4" else "walk_0001.png")
-        written.write_bytes(b"of the user")
-        assert run([*command, name]) == 2
-        assert run([*command, name, "--overwrite"]) == run([*command, name]) == 0
-        assert is_written(written)
 
 
 @pytest.mark.gl
@@ -213,7 +176,6 @@ def test_options_are_passed_on(tmp_path):
     reading, prediction = ReadOptions("world2cam opengl", 0.3, 9.0), PredictOptions("w.safetensors", height=256)
     expected = LoadOptions(reading, prediction)
     assert Options(tmp_path, prediction=prediction, reading=reading).load_options == expected
-    assert Options(tmp_path, preset="3dgs").renderer_choice == "gl"
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 
 
@@ -232,17 +194,3 @@ def test_a_scene_without_cameras_is_orbited(small_scene):
         ahead = middle - pose[:3, 3]
         assert np.allclose(pose[:3, 2], ahead / np.linalg.norm(ahead), atol=1e-6)
     assert np.allclose(poses[0], poses[-1]) and not np.allclose(poses[0], poses[2])
-
-
-@pytest.mark.parametrize("name", ["room", "house_file"])
-def test_pansplat_render_draws_the_film_that_the_viewer_draws(name, request):
-    """Of a pair and, with its fades, of a tour: within two steps of 8 bits, by which the renderers differ."""
-    places = ((0, 0, 0.1), (0, 0, 1.5), (0.7, 0, 1.6))
-    frames = [{"seconds": t, "position": places[t], "direction": [t, 0.2, 1 + t]} for t in range(3)]
-    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
-    scene, options = str(request.getfixturevalue(name)), ["--path", "walk.json", "--fps", "4"]
-    assert run([scene, *options, "--renderer", "cpu", "--size", "64x36", "--out", "seen.png"]) == 0
-    assert run_command(["render", scene, *options, "--height", "36", "-o", "drawn.png"]) == 0
-    for number in range(9):
-        with Image.open(f"seen_{number:04d}.png") as seen, Image.open(f"drawn_{number:04d}.png") as drawn:
-            assert np.abs(np.asarray(seen).astype(int) - np.asarray(drawn)).max() <= 2, number

@@ -41,7 +41,7 @@ from pansplat_viewer.scene.loader import (
     SceneLoader,
 )
 from pansplat_viewer.scene.picking import project_point
-from pansplat_viewer.scene.settings import Display, DrawSettings, Preset
+from pansplat_viewer.scene.settings import Display, DrawSettings
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
@@ -58,21 +58,17 @@ SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_
 # Widgets that must change the image, and the settings that give some of them something to change.
 IMAGE_WIDGETS = (
     "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
-    "min. opacity", "exact", "3dgs", "black", "grey", "white", "field of view",
-    "off##stereo", "pair##stereo",
+    "min. opacity", "black", "grey", "white", "field of view",
     "2##panorama", "##flight",
 )  # fmt: skip
-OF_OPENGL = (*get_args(Preset), "off##stereo", "pair##stereo")  # the processor does not offer them
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
     "joint": {"mode": "deferred"},
-    "exact": {"preset": "3dgs"},
-    "off##stereo": {"stereo": "side-by-side"},
     "black": {"background": (1.0, 1.0, 1.0)},
 }
 # Widgets whose effect has its own test.
 OTHER_WIDGETS = {
-    "pair", "path", "Open", "Reload", "Photographs", "1##panorama", "Fly", "photograph right of a line",
+    "pair", "path", "Open", "Reload", "Photographs", "1##panorama", "Fly",
     "Notes", "note", "Put at the middle", "Remove",
     "Film", "PNG", "EXR + depth", "360 PNG", "Add key frame", "time", "path file", "Save", "Load",
     "Expert", "fly", "orbit", "Reset", "speed", *get_args(Display), "background", "coarser while moving",
@@ -196,15 +192,9 @@ def both(test: Callable[..., None]) -> Callable[..., None]:
     return test
 
 
-def opengl(test: Callable[..., None]) -> Callable[..., None]:
-    """Run a test with OpenGL."""
-    test.renderers = ("gl",)  # type: ignore[attr-defined]
-    return test
-
-
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "label" in metafunc.fixturenames:
-        cases = [("gl" if label in OF_OPENGL else "cpu", label) for label in IMAGE_WIDGETS]
+        cases = [("cpu", label) for label in IMAGE_WIDGETS]
         metafunc.parametrize(("session", "label"), cases, indirect=["session"], scope="module")
     elif "session" in metafunc.fixturenames:
         renderers = getattr(metafunc.function, "renderers", ("cpu",))
@@ -268,7 +258,7 @@ def test_every_widget_has_a_test_and_fits_without_scrolling(user):
 
 
 def test_a_percent_sign_of_a_note_is_shown_once(user):
-    photographs, camera, io = user.viewer.stage.comparer.photographs, user.state.camera, imgui.get_io()
+    photographs, camera, io = user.viewer.stage.photographs, user.state.camera, imgui.get_io()
     position = np.asarray(camera.position)
     index = photographs.find_stop(position)
     note = Note(0.32, -0.3, "50 % wool")
@@ -305,24 +295,6 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
     assert 0 < user.state.settings.view_weights[1] < 1
 
 
-@opengl
-def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.screenshots.PANORAMA_HEIGHT", 64)
-    user.click("pair##stereo")
-    user.settle()
-    image = user.viewer.stage.slot.image
-    left, right = np.split(np.frombuffer(image.read(), np.float32).reshape(*SIZE[::-1], 4), 2, axis=1)
-    assert np.abs(left - right).max() > 0.1
-    near = user.read_image()
-    user.slide("eye distance", 0.9)
-    assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
-    user.click("360 PNG")
-    with Image.open(user.viewer.screenshots.files[-1]) as file:
-        assert file.size == (128, 128), "the left eye above the right one"
-    user.click("off##stereo")
-    assert "eye distance" not in user.panels.widgets.items
-
-
 CLICKS = [  # in the window of a pair, and what is then true
     ("slide speed 0.5", "state.speed > 1 and camera == home"),
     ("click Fly", "state.playing"),
@@ -342,9 +314,6 @@ CLICKS = [  # in the window of a pair, and what is then true
     ("key tab", "not panels.widgets.items"),
     ("key tab; key h", "changed > 0.1"),
     ("key h; key escape", "changed == 0 and not state.quit"),
-    ("stick gamepad_l_stick_up", "camera.position[2] > 0"),
-    ("stick gamepad_r_stick_right", "camera.yaw_radians > 0"),
-    ("stick gamepad_l_stick_up; key gamepad_face_right", "camera == home"),
     ("open pair 20 36", "viewer.library.current == 1"),
     ("open background 60 60; point 500 880", "max(state.settings.background) > 0"),
 ]
@@ -375,13 +344,9 @@ def test_the_state_after_clicks_and_keys_of_imgui(user):
                 user.click_at(*numbers)
             elif kind == "key":
                 user.press(getattr(imgui.Key, words[0]))
-            elif kind == "wheel":
+            else:
                 io.add_mouse_wheel_event(0, *numbers)
                 user.draw_frames(2)
-            else:
-                for value in (0.8, 0.0):
-                    io.add_key_analog_event(getattr(imgui.Key, words[0]), value > 0, value)
-                    user.draw_frames(2)
         names = {"state": user.state, "viewer": user.viewer, "panels": user.panels, "home": user.state.home}
         names |= {"camera": user.state.camera}
         if "changed" in expected:
@@ -507,47 +472,14 @@ def test_rendering_at_an_input_camera_looks_like_its_photograph(user, pair):
     state = user.state
     for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
         state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
-        state.comparing = False
+        state.stops = False
         rendered = user.read_image()
-        state.comparing, state.split = True, 0.0
+        state.stops = True
+        user.draw_frames(20)  # the photograph of the panorama at which the camera stands fades in
         photograph = user.read_image()
         assert np.abs(rendered - photograph).mean() < 4
         assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "not mirrored"
         assert np.abs(rendered - photograph[::-1]).mean() > 8, "not upside down"
-
-
-def assert_split(rendered: np.ndarray, compared: np.ndarray, split: float, right: float = 0.5) -> None:
-    """Asserts that both are equal left of the divider, and differ in a fraction `right` of the pixels right of it."""
-    column = round(split * SIZE[0]) - IMAGE[1].start
-    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) == 0
-    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) > right
-
-
-@both
-def test_a_drag_moves_the_divider_between_rendering_and_photograph(user):
-    rendered, camera = user.read_image(), user.state.camera
-    user.click("photograph right of a line")
-    user.state.split = 0.75
-    assert_split(rendered, user.read_image(), 0.75, right=0.9)
-    user.drag((0.75 * SIZE[0], 300), (0.75 * SIZE[0] + 60, 300))
-    assert user.state.split == pytest.approx(0.75 + 60 / SIZE[0]) and user.state.camera == camera
-    assert_split(rendered, user.read_image(), user.state.split, right=0.9)
-    user.press(imgui.Key.c)
-    assert not user.state.comparing and changed_fraction(rendered, user.read_image()) == 0
-
-
-def test_the_photograph_of_the_comparison_is_chosen_in_a_list(user):
-    user.state.comparing, user.state.photograph = True, 1
-    user.draw_frames(2)
-    comparer = user.viewer.stage.comparer
-    assert user.viewer.right_name == "photograph b.png" and comparer.measure_distance(user.state) == pytest.approx(0.5)
-    user.click("Go")
-    assert user.state.camera.position == pytest.approx((0, 0, 0.5)) and user.state.camera.yaw_radians == 0
-    assert comparer.measure_distance(user.state) == pytest.approx(0)
-    user.click("photographs")
-    left, _, _, bottom = user.panels.widgets.items["photographs"]
-    user.click_at(left + 20, bottom + 12)
-    assert user.state.photograph is None, "the nearest one"
 
 
 def test_each_display_is_another_image(user):
@@ -633,7 +565,7 @@ def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
 
 def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):
     scene, state = user.read_image(), user.state
-    user.viewer.stage.comparer.photographs.wait(0)
+    user.viewer.stage.photographs.wait(0)
     user.click("photographs at panoramas")
     user.draw_frames(1, 1 / 60)
     fading = user.read_screen()
@@ -675,7 +607,7 @@ def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair,
     user.load = lambda entry, show: LoadedScene(entry, other)
     user.viewer.show([SceneEntry("large", pair=pair)], 0)
     user.draw_until(
-        lambda: user.viewer.stage.slot.scene is other and user.viewer.stage.comparer.photographs._textures, "photograph"
+        lambda: user.viewer.stage.slot.scene is other and user.viewer.stage.photographs._textures, "photograph"
     )
     user.draw_frames(1)
     assert user.viewer.pending is not None and user.viewer.busy and user.viewer.error is None
@@ -828,11 +760,12 @@ def match_photograph(user: User, node: int) -> float:
     """The mean difference of the screen from a photograph in the direction of the camera."""
     user.draw_frames(3, SETTLE_AFTER)
     shown = user.read_screen()
-    user.state.comparing, user.state.split, user.state.photograph = True, 0.0, node
-    user.draw_frames(3)
-    difference = np.abs(user.read_screen() - shown).mean()
-    user.state.comparing, user.state.photograph = False, None
-    return float(difference)
+    stage = user.viewer.stage
+    stage.photographs.wait(node)
+    photograph = stage.get_photograph(node)
+    assert photograph is not None
+    stage.presenter.draw_photograph(photograph, user.target, user.state.camera)
+    return float(np.abs(user.read_screen() - shown).mean())
 
 
 # --- poses by hand ---

@@ -160,7 +160,7 @@ def make_app(small_scene, load_house, tmp_path, monkeypatch) -> Iterator[Callabl
     imgui.get_io().display_size = SIZE
     for name in ("viewer.Gui", "viewer.Panels", "ui.stage.Presenter", "ui.stage.PhotographLayer"):
         monkeypatch.setattr(f"pansplat_viewer.{name}", MagicMock())
-    monkeypatch.setattr("pansplat_viewer.ui.stage.create_window_renderer", lambda ctx, choice: NoRenderer())
+    monkeypatch.setattr("pansplat_viewer.ui.stage.create_renderer", lambda ctx, choice: NoRenderer())
     monkeypatch.setattr("pansplat_viewer.viewer.read_input", lambda seconds: replace(apps[-1].events, seconds=seconds))
     yield make
     for app in apps:
@@ -244,7 +244,6 @@ ROWS = [  # at the first of two panoramas, which are 0.5 m apart
     ("press escape", "state.quit"),
     ("press q", "not state.quit"),
     ("press q ctrl", "state.quit and camera == home"),
-    ("press c", "state.comparing and viewer.right_name == 'photograph a.png'"),
     ("press k", "len(state.path) == 1"),
     ("press p", "viewer.screenshots.files[-1].suffix == '.png'"),
     ("press p shift", "viewer.screenshots.files[-1].suffix == '.exr'"),
@@ -271,7 +270,7 @@ def act(app: App, text: str) -> None:
             app.frame(**{kind: numbers[0] if kind == "scroll" else numbers})
 
 
-RESET = ("orbiting", "playing", "flight", "overlay", "help", "quit", "comparing", "path", "points")
+RESET = ("orbiting", "playing", "flight", "overlay", "help", "quit", "path", "points")
 
 
 def test_the_state_of_the_window_after_what_a_user_does(app):
@@ -510,16 +509,10 @@ def test_the_view_of_a_photograph_is_kept_when_its_scene_is_there(make_app, pair
 
 def test_a_photograph_that_cannot_be_read_is_an_error(app, pair, tmp_path):
     broken = replace(pair.context[0], image=tmp_path / "gone.png")
+    app.state.stops = True
     app.show(SceneEntry("broken", pair=replace(pair, context=(broken, pair.context[1]))))
-    app.press("c")
     app.settle()
     assert "gone.png" in app.viewer.error
-
-
-def test_a_scene_without_photographs_has_no_comparison_with_one(app):
-    app.show(SceneEntry("no photographs"))
-    app.press("c")
-    assert app.viewer.right_name is None
 
 
 # --- screenshots, paths and films ---
@@ -595,7 +588,7 @@ def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     app = make_app()
     app.viewer.show([SceneEntry(house.name, tour=house)], 0, house.folder)
     app.settle()
-    photographs, file = app.viewer.stage.comparer.photographs, house.folder / "links.json"
+    photographs, file = app.viewer.stage.photographs, house.folder / "links.json"
     app.state.camera = replace(app.state.camera, yaw_radians=0.4, pitch_radians=0.2)
     app.viewer.put_note("  sofa\nof 1960 ")
     app.state.camera = replace(app.state.camera, yaw_radians=-1.0)
@@ -712,8 +705,6 @@ def test_a_file_of_a_tour_is_flown_along_its_edges(make_app, house_file):
     app.state.target = 3
     app.fly(0.5)
     assert app.node == 3 and np.allclose(app.viewer.stage.slot.scene.cam2world, app.state.context[2:])
-    app.press("c")
-    assert app.viewer.right_name is None, "there are no photographs"
 
 
 def test_a_link_leads_to_a_panorama_without_a_place_and_the_scene_before_stays(make_app, parted_house):

@@ -175,10 +175,6 @@ class CpuRenderer:
         """See `FrameRenderer`; the texture has 8 bits per channel."""
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
-        if not settings.is_exact:
-            raise InputError(f"the processor draws preset exact, got {settings.preset}; use renderer gl")
-        if settings.stereo != "mono":
-            raise InputError(f"the processor draws one eye of a window, got {settings.stereo}; use renderer gl")
         frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
         if (largest := max(frame.size)) > LARGEST_SIDE:
             raise InputError(
@@ -343,7 +339,7 @@ class CpuRenderer:
     def _rasterize_panorama(self, frame: Frame, groups: _Groups) -> Layers:
         """Rasterise a panorama, with a ray for each pixel."""
         settings = frame.settings
-        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), 0.0, settings.eye_offset)
+        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), 0.0)
         return self._find_scene(settings).rasterize(
             np.asarray(frame.position),
             plane,

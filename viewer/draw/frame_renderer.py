@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -27,9 +28,14 @@ class Pacing:
 
 
 class FrameRenderer(Protocol):
-    """Draws images of one scene: `SplatRenderer` (OpenGL), `CpuRenderer`, and `StereoRenderer` over the first."""
+    """Draws images of one scene: `SplatRenderer` (OpenGL) and `CpuRenderer`."""
 
     pacing: Pacing
+
+    @property
+    def pending(self) -> Future[Any] | None:
+        """The image that is drawn in the background."""
+        ...
 
     @property
     def stats(self) -> FrameStats:
@@ -72,6 +78,13 @@ class FrameRenderer(Protocol):
             first image of a scene, and without a context.
         """
 
+    def has_faces(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings) -> bool:
+        """Whether the cube faces that the camera reads were drawn in the background."""
+        ...
+
+    def draw_faces(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings) -> None:
+        """Draw the cube faces of a position for the next turn in the background, if the renderer does that."""
+
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""
         ...
@@ -82,3 +95,17 @@ class FrameRenderer(Protocol):
 
     def release(self) -> None:
         """Stop the threads and free every GL object."""
+
+
+def render_image(
+    renderer: FrameRenderer,
+    cam2world: Float[np.ndarray, "4 4"],
+    size: tuple[int, int],
+    settings: DrawSettings,
+    *,
+    with_depth: bool = False,
+) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
+    """Draw an image for a file: colour in [0, 1], and radial depth in metres; see `FrameRenderer.render`."""
+    renderer.render(cam2world, size, replace(settings, cached=False), wait=True)
+    color = np.clip(renderer.read_color()[..., :3], 0.0, 1.0)
+    return color, renderer.read_depth() if with_depth else None

@@ -190,9 +190,9 @@ class LayerPainter:
         return self._selections[key]
 
 
-def compute_filter_variance(settings: DrawSettings, focal: float) -> float:
+def compute_filter_variance(focal: float) -> float:
     """Variance of the low-pass filter (docs/rendering.md, section 2), in image-plane units squared."""
-    return FILTER_VARIANCE["angular" if settings.is_exact else "3dgs"] / (focal * focal)
+    return FILTER_VARIANCE["angular"] / (focal * focal)
 
 
 class SplatRasterizer:
@@ -257,8 +257,7 @@ class SplatRasterizer:
         self._set_uniforms(camera, place, settings)
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
-        seen = splats.cull(camera, selected, compute_filter_variance(settings, camera.focal), bounded=settings.is_exact)
-        drawn = self._draw_in_order(splats.sort_back_to_front(camera, seen, by_depth=not settings.is_exact))
+        drawn = self._draw_in_order(splats.find_back_to_front(camera, selected, compute_filter_variance(camera.focal)))
         self._ctx.enable_only(moderngl.NOTHING)
         return drawn
 
@@ -282,8 +281,7 @@ class SplatRasterizer:
             world_to_camera=np.ascontiguousarray(camera.rotation, dtype=np.float32).tobytes(),
             position=camera.position,
             near=settings.near,
-            exact=settings.is_exact,
-            filter_variance=compute_filter_variance(settings, camera.focal),
+            filter_variance=compute_filter_variance(camera.focal),
             half_size=camera.half_size,
             margin=0.02 / camera.focal,
         )

@@ -114,12 +114,8 @@ class Programs:
         """The sum of layers to the image."""
         return self._compile_pair("screen.vert", "resolve.frag")
 
-    def arrange(self) -> moderngl.Program:
-        """The images of two eyes to one image."""
-        return self._compile_pair("screen.vert", "arrange.frag")
-
     def present(self) -> moderngl.Program:
-        """The image, and a photograph next to it, to the screen."""
+        """The image, or a photograph, to the screen."""
         return self._compile_pair("present.vert", "present.frag")
 
     def release(self) -> None:

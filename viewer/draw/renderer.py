@@ -10,7 +10,8 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import Literal
+from concurrent.futures import Future
+from typing import Any, Literal
 
 import moderngl
 import numpy as np
@@ -51,6 +52,7 @@ class SplatRenderer:
         stats: counts and times of the last frame.
     """
 
+    pending: Future[Any] | None = None  # nothing is drawn in the background
     pacing = Pacing(min_size=(1, 1), settle_seconds=SETTLE_AFTER, turn_ms=BUDGET_MS, waits_while_moving=False)
 
     def __init__(self, ctx: moderngl.Context, *, color_bits: Literal[16, 32] | None = None) -> None:
@@ -81,20 +83,11 @@ class SplatRenderer:
         # Settings and milliseconds on the processor of the frame that `_timer` has measured.
         self._unread: tuple[DrawSettings, float] | None = None
 
-    def create_sibling(self) -> SplatRenderer:
-        """A renderer with a copy of this scene on the GPU."""
-        sibling = SplatRenderer(self._ctx, color_bits=self._targets.color_bits)
-        if self._splats is not None:
-            sibling._upload(self._splats)
-        return sibling
-
     prepare = staticmethod(Splats.from_scene)
 
     def upload(self, scene: Scene, prepared: Splats | None = None) -> None:
         """Replace the scene on the GPU."""
-        self._upload(prepared or self.prepare(scene))
-
-    def _upload(self, splats: Splats) -> None:
+        splats = prepared or self.prepare(scene)
         try:
             painter = self._create_painter(splats)
         except MemoryError:
@@ -130,8 +123,6 @@ class SplatRenderer:
         """See `FrameRenderer`; without `wait`, a worker thread sorts, and the GPU draws while the caller goes on."""
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
-        if settings.eye_offset:
-            raise InputError("OpenGL does not draw omni-directional stereo; use `CpuRenderer`")
         before = self._read_times()
         start = time.perf_counter()
         bound = self._ctx.fbo
@@ -160,6 +151,13 @@ class SplatRenderer:
         if elapsed == 0:  # some drivers of macOS do not measure: wait for the end of each frame from now on
             self._timer = None
         return FrameStats(frame_ms=max(milliseconds, elapsed, waited), timed=settings)
+
+    def has_faces(self, *_: object) -> bool:
+        """See `FrameRenderer`; OpenGL draws a face when it is read."""
+        return False
+
+    def draw_faces(self, *_: object) -> None:
+        """See `FrameRenderer`; draws nothing."""
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""

@@ -189,32 +189,17 @@ class SortedSplats:
     colors: Float[np.ndarray, "n 4"] | None
     milliseconds: float = 0.0  # time of sorting and colours
 
-    def cull(
-        self, camera: Pinhole, selected: Bool[np.ndarray, "n"], filter_variance: float, *, bounded: bool
-    ) -> Bool[np.ndarray, "n"]:
-        """Return which of the selected splats can touch the camera's image; conservative.
-
-        A splat is bounded by a ball of its reach, widened by the low-pass filter. The linearised response of preset
-        `3dgs` is not `bounded` by it: then only splats behind the camera are culled.
-        """
-        normals = camera.compute_side_normals() if bounded else camera.rotation[:, 2][None]
-        selection = Selection(normals, math.sqrt(filter_variance) if bounded else 0.0)
-        labels = np.where(selected, np.int16(0), np.int16(NO_LAYER))
-        balls = self.splats.balls if bounded else self.splats.balls * np.array([[1], [1], [1], [0], [1]], np.float32)
-        _, marks, _ = mark_in_view(balls, np.asarray(camera.position), selection, labels)
-        return marks != NO_LAYER
-
-    def sort_back_to_front(
-        self, camera: Pinhole, seen: Bool[np.ndarray, "n"], *, by_depth: bool
+    def find_back_to_front(
+        self, camera: Pinhole, selected: Bool[np.ndarray, "n"], filter_variance: float
     ) -> UInt[np.ndarray, "m"]:
-        """Return the indices of the seen splats, farthest first, by distance, or by depth along the camera's axis."""
-        if not by_depth:
-            return self.order[seen[self.order]][::-1]
-        indices = np.flatnonzero(seen).astype(np.uint32)
-        forward = camera.rotation[:, 2]
-        depth = self.splats.means[indices] @ forward.astype(np.float32)
-        depth -= np.float32(forward @ np.asarray(camera.position))
-        return indices[radix_argsort(depth)][::-1]
+        """Return the indices of the selected splats that can touch the camera's image, farthest first; conservative.
+
+        A splat is bounded by a ball of its reach, widened by the low-pass filter.
+        """
+        selection = Selection(camera.compute_side_normals(), math.sqrt(filter_variance))
+        labels = np.where(selected, np.int16(0), np.int16(NO_LAYER))
+        _, marks, _ = mark_in_view(self.splats.balls, np.asarray(camera.position), selection, labels)
+        return self.order[(marks != NO_LAYER)[self.order]][::-1]
 
 
 def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:

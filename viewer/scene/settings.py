@@ -9,25 +9,19 @@ from typing import Literal, get_args
 
 from pansplat.constants import NEAR
 from pansplat.errors import InputError
-from pansplat.system.options import EYE_DISTANCE
 
-Preset = Literal["exact", "3dgs"]
 Mode = Literal["joint", "view", "deferred"]
 Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
-Projection = Literal["perspective", "equirect", "cubemap"]
-Stereo = Literal["mono", "side-by-side", "top-bottom"]
 Display = Literal["color", "depth", "opacity", "normals", "levels", "views"]
 
 GaussianChoice = tuple[frozenset[int] | None, float]
 """Levels and least opacity of the Gaussians that are drawn."""
 
 _CHOICES = {
-    "preset": Preset,
     "mode": Mode,
     "layout": Layout,
     "display": Display,
-    "stereo": Stereo,
 }
 SCALAR_MAPS: dict[Display, str] = {"depth": "turbo", "opacity": "viridis"}
 """Displays of one number a pixel, and their colour maps."""
@@ -38,9 +32,6 @@ class DrawSettings:
     """Everything that changes the image except the scene, the pose and the size.
 
     Attributes:
-        preset: `exact` has the exact response on each ray, the order of radial distance, and a low-pass filter that
-            conserves energy. `3dgs` has the linearised response, the order of depth along the view axis, and the
-            filter of 3DGS; OpenGL only.
         mode: `joint` draws all Gaussians together. `view` draws those of one context view. `deferred` draws each
             context view separately and blends the images per pixel by distance.
         view_weights: factors of the context views in mode `deferred`, at least 0; views beyond the last one have 1.
@@ -51,10 +42,6 @@ class DrawSettings:
             axes of the Gaussians, towards their camera, with 0.5 + 0.5 (x, y, z) of the world as RGB; `levels` and
             `views`, a colour for each label.
         display_max: of `depth` and `opacity`, the number with the last colour of the map; the first is 0.
-        eye_offset: of layout `equirect`: radius of the viewing circle of omni-directional stereo, metres; negative for
-            the left eye. `CpuRenderer` only.
-        stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, or the left above the
-            right.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
             camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
             would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
@@ -62,7 +49,6 @@ class DrawSettings:
             OpenGL returns the smaller texture, because a GPU enlarges it without cost.
     """
 
-    preset: Preset = "exact"
     mode: Mode = "joint"
     view: int = 0  # the context view of mode `view`
     view_weights: tuple[float, ...] = ()
@@ -75,9 +61,6 @@ class DrawSettings:
     near: float = NEAR  # Gaussians whose mean is nearer than this radial distance, metres, are not drawn
     vertical_fov_degrees: float = 90.0  # of layout `pinhole`, in (0, 180)
     layout: Layout = "pinhole"  # `pinhole`, or `equirect`, which OpenGL stitches from six cube faces
-    eye_offset: float = 0.0
-    stereo: Stereo = "mono"
-    eye_distance: float = EYE_DISTANCE  # metres
     cached: bool = False
     scale: float = 1.0
 
@@ -97,14 +80,8 @@ class DrawSettings:
             raise InputError(f"`display_max` must be a positive number, got {self.display_max}")
         if not 0 < self.near < math.inf:
             raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
-        if self.eye_offset and (self.layout, self.preset) != ("equirect", "exact"):
-            raise InputError(
-                f"omni-directional stereo needs layout equirect and preset exact, got {self.layout} and {self.preset}"
-            )
         if not 0 < self.scale <= 1:
             raise InputError(f"`scale` must be in (0, 1], got {self.scale}")
-        if not abs(self.eye_offset) < math.inf:
-            raise InputError(f"`eye_offset` must be a distance in metres, got {self.eye_offset}")
 
     @property
     def selection(self) -> GaussianChoice:
@@ -113,14 +90,9 @@ class DrawSettings:
 
     @property
     def shows_scene(self) -> bool:
-        """Whether the colours of the whole scene are shown, to one eye."""
+        """Whether the colours of the whole scene are shown."""
         is_whole = self.selection == (None, 0.0) and set(self.view_weights) <= {1.0}
-        return is_whole and self.display == "color" and self.mode != "view" and self.stereo == "mono"
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the preset is `exact`."""
-        return self.preset == "exact"
+        return is_whole and self.display == "color" and self.mode != "view"
 
     @property
     def splat_colors(self) -> Literal["color", "normals", "levels", "views"]:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.draw.window_renderer import WindowRenderer
+from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.scene.background import BackgroundWorker
 from pansplat_viewer.scene.settings import DrawSettings
 
@@ -42,7 +42,7 @@ class SceneSlot:
         image: the last image; None if it has to be drawn again, or if the first one is not finished.
     """
 
-    def __init__(self, renderer: WindowRenderer) -> None:
+    def __init__(self, renderer: FrameRenderer) -> None:
         """The slot is empty."""
         self.renderer = renderer
         self.scene: Scene | None = None

@@ -49,9 +49,6 @@ class ViewerState:
     playing: bool = False  # whether this flight goes on
     overlay: bool = True
     help: bool = False
-    comparing: bool = False  # whether a photograph is shown right of the divider at `split` (fraction of the width)
-    split: float = 0.5
-    photograph: int | None = None  # number of the photograph of the comparison; None is the nearest one
     refined: bool = True  # whether the refined scene is shown, where there is one, or the prediction
     stops: bool = True  # whether the photograph is shown where the camera stands at a panorama
     adaptive: bool = True  # whether the resolution is lowered while the camera moves
@@ -103,7 +100,7 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     state.camera = state.home = replace(camera, distance=_measure_distance(scene, 50))
     if before is not None:
         state.camera = replace(before, distance=state.home.distance)
-    state.depth_max, state.photograph = _measure_distance(scene, 98), None
+    state.depth_max = _measure_distance(scene, 98)
     choose_display(state, state.settings.display)
 
 

@@ -19,11 +19,10 @@ _RADIUS = 9.0  # of a mark, pixels at a DPI scale of 1
 
 def draw_notes(viewer: Viewer) -> None:
     """Draw a mark for each note of the panorama at the camera, with its text when the pointer is on it."""
-    photographs, camera = viewer.stage.comparer.photographs, viewer.state.camera
+    photographs, camera = viewer.stage.photographs, viewer.state.camera
     position = np.asarray(camera.position)
     index = photographs.find_stop(position)
-    is_mono = viewer.stage.eye_size == viewer.stage.size
-    if index is None or not is_mono:
+    if index is None:
         return
     size, radius = imgui.get_io().display_size, _RADIUS * imgui.get_style().font_scale_dpi
     black, white = (imgui.color_convert_float4_to_u32((*rgb, 0.85)) for rgb in ((0.0,) * 3, (1.0,) * 3))
@@ -52,7 +51,7 @@ class NotesSection:
 
     def draw(self, viewer: Viewer) -> None:
         """Draw the field and the buttons, or what to do where there are none."""
-        photographs = viewer.stage.comparer.photographs
+        photographs = viewer.stage.photographs
         if photographs.find_stop(np.asarray(viewer.state.camera.position)) is None:
             draw_wrapped("Go to a panorama to put a note there.", is_disabled=True)
             return

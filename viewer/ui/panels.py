@@ -14,7 +14,7 @@ from imgui_bundle import imgui
 
 from pansplat.system.descriptions import describe_count
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.settings import Display, Preset
+from pansplat_viewer.scene.settings import Display
 from pansplat_viewer.scene.state import (
     KEY_SECONDS,
     ViewerState,
@@ -49,17 +49,6 @@ from pansplat_viewer.window.preferences import Theme
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
-_HANDLE = (
-    imgui.WindowFlags_.no_decoration.value
-    | imgui.WindowFlags_.no_background.value
-    | imgui.WindowFlags_.no_move.value
-    | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_docking.value
-    | imgui.WindowFlags_.no_focus_on_appearing.value
-    | imgui.WindowFlags_.no_bring_to_front_on_focus.value
-    | imgui.WindowFlags_.no_nav.value
-)
-
 
 class Panels:
     """Draws all panels of the window.
@@ -87,8 +76,6 @@ class Panels:
             self._draw_main_panel(viewer)
             if stats.total and self._is_expert:
                 draw_stats(state, stats, viewer.frame_ms, viewer.stage.image_size)
-        if viewer.right_name is not None:
-            self._draw_divider(state)
         if stats.total:
             draw_legend(state)
         if state.overlay and state.points:
@@ -129,13 +116,13 @@ class Panels:
             section("Photographs", partial(self._draw_photographs, viewer))
         if viewer.tour is not None:
             section("Plan", partial(self._draw_plan, viewer, viewer.tour))
-        if viewer.library.notes or len(viewer.stage.comparer.photographs):
+        if viewer.library.notes or len(viewer.stage.photographs):
             section("Notes", partial(self._draw_notes, viewer))
         section("Film", partial(self._draw_film, viewer))
         self._is_expert = section("Expert", partial(self._draw_expert, viewer), opened=False)
 
     def _draw_photographs(self, viewer: Viewer) -> None:
-        """Draw where the camera can go, the comparison, and the states of estimated poses."""
+        """Draw where the camera can go, and the states of estimated poses."""
         state, placing = viewer.state, viewer.placing
         if state.tour is None:  # whose plan has a list
             self._draw_panoramas(state, viewer.panoramas)
@@ -147,8 +134,6 @@ class Panels:
         if flight != state.flight:
             state.playing = False
             fly_to(state, flight)
-        if len(viewer.stage.comparer.photographs):
-            self._draw_comparison(viewer)
         if placing is not None and placing.is_listed:
             opened = any(view.placement.state != "placed" for view in placing.panoramas)
             self.widgets.section("Poses", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
@@ -180,7 +165,7 @@ class Panels:
 
     def _draw_notes(self, viewer: Viewer) -> None:
         """Draw the note at the middle of the image, and what was not used of the folder."""
-        if len(viewer.stage.comparer.photographs):
+        if len(viewer.stage.photographs):
             self.notes.draw(viewer)
         for note in viewer.library.notes:
             draw_wrapped(note, is_disabled=True)
@@ -275,24 +260,6 @@ class Panels:
 
     def _draw_settings(self, viewer: Viewer) -> None:
         state, settings = viewer.state, viewer.state.settings
-        on_processor = viewer.stage.renderer.stats.renderer == "cpu"
-        _draw_row_label("preset")
-        imgui.begin_disabled(on_processor)  # which draws preset exact and one eye only
-        for preset in get_args(Preset):
-            imgui.same_line()
-            if self.widgets.radio(preset, settings.preset == preset):
-                settings = replace(settings, preset=preset)
-        imgui.end_disabled()
-        _draw_row_label("stereo")
-        imgui.begin_disabled(on_processor)
-        for label, stereo in (("off", "mono"), ("pair", "side-by-side")):
-            imgui.same_line()
-            if self.widgets.radio(f"{label}##stereo", settings.stereo == stereo):
-                settings = replace(settings, stereo=stereo)
-        imgui.end_disabled()
-        if settings.stereo != "mono":
-            distance = self.widgets.slider("eye distance", 1000 * settings.eye_distance, 10.0, 200.0, "%.0f mm")
-            settings = replace(settings, eye_distance=distance / 1000)
         flags = imgui.ColorEditFlags_.no_inputs.value
         changed, background = imgui.color_edit3("background", list(settings.background), flags)
         self.widgets.record("background")
@@ -346,24 +313,6 @@ class Panels:
             chosen = self.widgets.slider("range", largest, 1.0, 1000.0, form, logarithmic=True)
             state.settings = replace(state.settings, display_max=chosen)
 
-    def _draw_comparison(self, viewer: Viewer) -> None:
-        state, comparer = viewer.state, viewer.stage.comparer
-        state.comparing = self.widgets.check("photograph right of a line", state.comparing)
-        if not state.comparing:
-            return
-        chosen = 0 if state.photograph is None else state.photograph + 1
-        changed, chosen = imgui.combo("##photograph", chosen, ["nearest photograph", *comparer.photographs.names])
-        self.widgets.record("photographs")
-        if changed:
-            state.photograph = chosen - 1 if chosen else None
-        imgui.same_line()
-        distance = comparer.measure_distance(state)
-        imgui.begin_disabled(distance == 0)
-        if self.widgets.button(f"Go {distance:.2f} m###Go"):
-            viewer.queue(comparer.go_to_photograph, state)
-        self.widgets.record("Go")
-        imgui.end_disabled()
-
     def _draw_window(self, viewer: Viewer) -> None:
         for theme in get_args(Theme):
             if self.widgets.radio(theme, viewer.preferences.theme == theme):
@@ -371,26 +320,6 @@ class Panels:
             imgui.same_line()
         if self.widgets.button("Default layout"):
             viewer.queue(viewer.gui.reset_layout)
-
-    def _draw_divider(self, state: ViewerState) -> None:
-        """Draw the line between both sides of a comparison; a drag moves it."""
-        size, half = imgui.get_io().display_size, 5.0 * imgui.get_style().font_scale_dpi
-        x = min(max(state.split, 0.0), 1.0) * size.x
-        color = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 0.9))
-        imgui.get_background_draw_list().add_line((x, 0), (x, size.y), color, 2.0)
-        imgui.set_next_window_pos((x - half, 0))
-        imgui.set_next_window_size((2 * half, size.y))
-        imgui.push_style_var(imgui.StyleVar_.window_padding.value, (0.0, 0.0))
-        imgui.push_style_var(imgui.StyleVar_.window_min_size.value, (1.0, 1.0))
-        imgui.begin("##divider", None, _HANDLE)
-        imgui.invisible_button("handle", (2 * half, size.y))
-        self.widgets.record("divider")
-        if imgui.is_item_hovered() or imgui.is_item_active():
-            imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
-        if imgui.is_item_active():
-            state.split = min(max(state.split + imgui.get_io().mouse_delta.x / size.x, 0.0), 1.0)
-        imgui.end()
-        imgui.pop_style_var(2)
 
     def _draw_progress(self, viewer: Viewer, name: str, task: str, fraction: float) -> None:
         """Draw the progress of a load."""

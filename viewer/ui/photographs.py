@@ -43,11 +43,6 @@ class Photographs:
         return self._panoramas
 
     @property
-    def names(self) -> list[str]:
-        """The labels of all photographs."""
-        return [panorama.label for panorama in self._panoramas]
-
-    @property
     def is_reading(self) -> bool:
         """Whether a photograph is being read."""
         return any(not reading.done() for reading in self._reading.values())

@@ -1,4 +1,4 @@
-"""What the window shows: scenes and photographs that fade into each other, and a comparison with a photograph."""
+"""What the window shows: scenes and photographs that fade into each other."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from jaxtyping import Float
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.cross_fade import CrossFade
+from pansplat_viewer.draw.cpu_renderer import create_renderer
+from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
-from pansplat_viewer.draw.window_renderer import WindowRenderer, create_window_renderer, get_eye_size
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.loader import LoadedScene
 from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
 from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot
 from pansplat_viewer.scene.state import ViewerState, adapt_settings, fit_settings
 from pansplat_viewer.scene.tour import StopFade
-from pansplat_viewer.ui.compare import Comparer
-from pansplat_viewer.ui.presenter import PhotographLayer, Presenter
+from pansplat_viewer.ui.photographs import Photographs
+from pansplat_viewer.ui.presenter import PhotographLayer, PosedPhotograph, Presenter
 
 DRAW_ERRORS = (InputError, MemoryError, moderngl.Error)
 _CENTER_REACHES = 4, 16, 64  # pixels around the image centre
@@ -38,7 +39,7 @@ class Stage:
         fade: what is shown, and what it fades from.
         stop: the photograph over the scene while the camera stands at a panorama.
         preparer: converts large scenes.
-        comparer: the photographs.
+        photographs: of the scene.
         resolution: of the frames.
         size: of the window, pixels.
         image_size: of the rendered image, pixels; smaller than the window while the camera moves.
@@ -58,7 +59,7 @@ class Stage:
         self.fade, self.stop = CrossFade(), StopFade()
         self.preparer = ScenePreparer(self.renderer.prepare)
         self.presenter = Presenter(ctx)
-        self.comparer = Comparer(ctx, show_error)
+        self.photographs = Photographs(ctx)
         self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
         self._stop_layer, self._cut_layer = PhotographLayer(self.presenter), PhotographLayer(self.presenter)
         self._stop_camera = state.camera  # of the last frame before a cut
@@ -69,7 +70,7 @@ class Stage:
         self.last_camera = state.camera
 
     def _create_slot(self) -> SceneSlot:
-        return SceneSlot(create_window_renderer(self._ctx, self._choice))
+        return SceneSlot(create_renderer(self._ctx, self._choice))
 
     def _create_resolution(self) -> AdaptiveResolution:
         pacing = self.renderer.pacing
@@ -81,14 +82,9 @@ class Stage:
         return self.slots[self._scene_slot]
 
     @property
-    def renderer(self) -> WindowRenderer:
+    def renderer(self) -> FrameRenderer:
         """The renderer of `slot`."""
         return self.slot.renderer
-
-    @property
-    def eye_size(self) -> tuple[int, int]:
-        """(width, height) of the image of one eye, pixels."""
-        return get_eye_size(self.size, self._state.settings.stereo)
 
     @property
     def photograph(self) -> int | None:
@@ -161,8 +157,19 @@ class Stage:
         """Start to fade to a photograph; what is shown stays while it is read."""
         self.fade.compute_weight(self._state.now)
         slot = None if index is None else self.fade.choose_slot(index)
-        if index is not None and slot is not None and self.comparer.get_photograph(self._state, index) is not None:
+        if index is not None and slot is not None and self.get_photograph(index) is not None:
             self.fade.show(slot, index, self._state.now, part)
+
+    def get_photograph(self, index: int) -> PosedPhotograph | None:
+        """A photograph; None while it is read, and if it cannot be, which is shown as an error once."""
+        if index >= len(self.photographs):
+            return None
+        try:
+            texture = self.photographs.get(index)
+        except InputError as problem:
+            self._show_error(str(problem))
+            return None
+        return None if texture is None else PosedPhotograph(texture, self.photographs.pose(index))
 
     # --- frames ---
 
@@ -199,30 +206,29 @@ class Stage:
             image, fading, weight = stop, below, self.stop.weight
         self._record_time(plan, milliseconds)
         if image is None:
-            photograph = self.comparer.get_photograph(state)
+            nearest = self.photographs.find_nearest(np.asarray(state.camera.position))
+            photograph = None if nearest is None else self.get_photograph(nearest)
             if photograph is None:
                 self._draw_background(target)
             else:
                 self.presenter.draw_photograph(photograph, target, state.camera)
             return
         self.image_size = self.size if self.photograph is not None else self.renderer.stats.size
-        is_compared = state.comparing and state.settings.stereo == "mono"
-        right = self.comparer.get_photograph(state, split=state.split) if is_compared else None
-        self.presenter.draw(image, target, state.camera, right=right, fading=fading, weight=weight)
+        self.presenter.draw(image, target, fading=fading, weight=weight)
 
     def _draw_stop(self) -> tuple[moderngl.Texture | None, moderngl.Texture | None]:
         """The photograph of the panorama at which the camera stands, or stood until now, and the one before a cut."""
         state, fade = self._state, self.fade
         index = self._find_stop()
-        photograph = None if index is None else self.comparer.get_photograph(state, index)
+        photograph = None if index is None else self.get_photograph(index)
         was_shown = fade.compute_weight(state.now) < 1 and fade.contents[1 - fade.front] == index
         self.stop.update(None if photograph is None else index, state.now, at_once=was_shown)
         if self.stop.weight <= 0 or self.stop.index is None:
             return None, None
-        photograph = photograph if self.stop.index == index else self.comparer.get_photograph(state, self.stop.index)
+        photograph = photograph if self.stop.index == index else self.get_photograph(self.stop.index)
         if photograph is None:
             return None, None
-        before = None if self.stop.before is None else self.comparer.get_photograph(state, self.stop.before)
+        before = None if self.stop.before is None else self.get_photograph(self.stop.before)
         if before is None:
             self._stop_camera = state.camera
         below = before and self._cut_layer.draw(before, self._stop_camera, self.size)
@@ -231,10 +237,10 @@ class Stage:
     def _find_stop(self) -> int | None:
         """The panorama at which the camera stands, if its scene is shown as it is."""
         state, settings = self._state, self._state.settings
-        is_whole = settings.shows_scene and not state.comparing and self.photograph is None
+        is_whole = settings.shows_scene and self.photograph is None
         if not (state.stops and is_whole):
             return None
-        return self.comparer.photographs.find_stop(np.asarray(state.camera.position))
+        return self.photographs.find_stop(np.asarray(state.camera.position))
 
     def _plan_resolution(self) -> ResolutionPlan:
         """The plan of the frame, from the movement since the last one."""
@@ -256,7 +262,7 @@ class Stage:
         state, content, pose = self._state, self.fade.contents[slot], self.fade.poses[slot]
         pose = state.camera.cam2world if pose is None else pose
         if isinstance(content, int):
-            photograph = self.comparer.get_photograph(state, content)
+            photograph = self.get_photograph(content)
             if photograph is None:
                 return None, 0.0
             return self._layers[slot].draw(photograph, cameras.move_to_pose(state.camera, pose), self.size), 0.0
@@ -296,7 +302,7 @@ class Stage:
         for layer in (*self._layers, self._stop_layer, self._cut_layer):
             layer.release()
         self.presenter.release()
-        self.comparer.release()
+        self.photographs.release()
         for slot in self.slots:
             slot.renderer.release()
 

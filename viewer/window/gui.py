@@ -42,7 +42,6 @@ class Gui:
         io = imgui.get_io()
         io.set_ini_filename("")  # write no imgui.ini into the current folder
         io.config_flags |= imgui.ConfigFlags_.docking_enable.value
-        io.backend_flags |= imgui.BackendFlags_.has_gamepad.value  # else imgui drops its keys
         io.config_windows_move_from_title_bar_only = True
         style = imgui.get_style()
         style.window_rounding = style.frame_rounding = style.grab_rounding = 4.0

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 FLY_SPEED = 1.0  # metres per second
 FAST, SLOW = 4.0, 0.2
-TURN_SPEED = 2.0  # of a gamepad's stick, radians per second
 _CLICK_PIXELS = 3.0  # a longer way of the pointer with the button down is a drag
 ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
 
@@ -31,7 +30,6 @@ class Input:
     Attributes:
         drag: pointer movement over the image with the left button held, pixels (right, down).
         click: place of a click on the image without a drag, as fractions of width and height; None without a click.
-        sticks: of a gamepad, -1 to 1: fly right, up and forward, turn right and up.
     """
 
     seconds: float = 1 / 60  # since the last frame
@@ -42,7 +40,6 @@ class Input:
     scroll: float = 0.0  # wheel steps; positive is scrolling up
     height: int = 720  # of the window, pixels
     click: tuple[float, float] | None = None
-    sticks: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 Action = Callable[["Viewer", Input], None]
@@ -127,7 +124,6 @@ KEYS = (
     KeyRow(
         ", .", "step along the flight (placing: turn)", {",": _change(step_flight, -1), ".": _change(step_flight, 1)}
     ),
-    KeyRow("C", "compare with the nearest photograph", {"c": _toggle("comparing")}),
     KeyRow("B", "before or after the refinement", {"b": _toggle("refined")}),
     KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
     KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),
@@ -142,33 +138,6 @@ _ACTIONS = {key: action for row in KEYS for key, action in row.actions.items()}
 _IMGUI_NAMES = {",": "comma", ".": "period"} | {name: f"{name}_arrow" for name in ("up", "down", "left", "right")}
 _IMGUI_NAMES |= {digit: f"_{digit}" for digit in "123456789"}
 
-_BUTTONS = {
-    "gamepad_face_down": "space",
-    "gamepad_face_up": "v",
-    "gamepad_face_right": "r",
-    "gamepad_start": "tab",
-    "gamepad_dpad_left": ",",
-    "gamepad_dpad_right": ".",
-    "gamepad_l1": "alt",
-    "gamepad_r1": "shift",
-}
-_STICKS = (
-    ("gamepad_l_stick_right", "gamepad_l_stick_left"),
-    ("gamepad_r2", "gamepad_l2"),
-    ("gamepad_l_stick_up", "gamepad_l_stick_down"),
-    ("gamepad_r_stick_right", "gamepad_r_stick_left"),
-    ("gamepad_r_stick_up", "gamepad_r_stick_down"),
-)
-
-
-def _read_sticks() -> tuple[float, ...]:
-    from imgui_bundle import imgui
-
-    def read(name: str) -> float:
-        return float(imgui.internal.get_key_data(getattr(imgui.Key, name)).analog_value)
-
-    return tuple(read(positive) - read(negative) for positive, negative in _STICKS)
-
 
 def read_input(seconds: float) -> Input:
     """Return this frame's input from imgui, without the events that a panel captures."""
@@ -178,7 +147,6 @@ def read_input(seconds: float) -> Input:
     held: set[str] = set()
     pressed: set[str] = set()
     keys = [] if io.want_text_input else [(name, _IMGUI_NAMES.get(name, name)) for name in _ACTIONS]
-    keys += [(name, button) for button, name in _BUTTONS.items()]
     for name, key in keys:
         value = getattr(imgui.Key, key.replace(" ", "_"))
         if imgui.is_key_down(value):
@@ -201,7 +169,7 @@ def read_input(seconds: float) -> Input:
         if imgui.is_mouse_released(0) and max(abs(moved_since_click.x), abs(moved_since_click.y)) < _CLICK_PIXELS:
             click = place
     height = int(io.display_size.y)
-    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click, _read_sticks())
+    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click)
 
 
 def apply_input(viewer: Viewer, events: Input) -> None:
@@ -229,17 +197,12 @@ def _move_camera(state: ViewerState, events: Input) -> None:
         ),
         dtype=float,
     )
-    axes += events.sticks[:3]
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
-    turn = np.array(events.sticks[3:]) * TURN_SPEED * events.seconds
-    if turn.any() and not state.orbiting:
-        camera = cameras.turn(camera, *turn)
     if state.orbiting:
         pixels = ORBIT_KEY_PIXELS * events.seconds * factor * events.height / 1000
-        across = axes[:2] + events.sticks[3:]
-        if across.any():
-            camera = cameras.orbit(camera, (-across[0] * pixels, across[1] * pixels), events.height)
+        if axes[:2].any():
+            camera = cameras.orbit(camera, (-axes[0] * pixels, axes[1] * pixels), events.height)
         if axes[2]:
             camera = cameras.dolly(camera, axes[2] * 6 * events.seconds * factor)
         if any(events.drag):

@@ -23,14 +23,6 @@ _IDLE_SECONDS = 0.1  # between frames when nothing moves; so that a prediction g
 _PENDING_SECONDS = 0.05  # between frames while an image is drawn in the background; so that it gets the CPU
 
 
-_BUTTONS = (
-    ("face_down", "A"), ("face_right", "B"), ("face_left", "X"), ("face_up", "Y"), ("l1", "LEFT_BUMPER"),
-    ("r1", "RIGHT_BUMPER"), ("start", "START"), ("dpad_left", "DPAD_LEFT"), ("dpad_right", "DPAD_RIGHT"),
-)  # fmt: skip
-_AXES = (("l_stick", "LEFT"), ("r_stick", "RIGHT"))
-_DEAD_ZONE = 0.15  # of a stick
-
-
 class NoWindowError(Exception):
     """No window can be opened; the message has the reason, in one line."""
 
@@ -63,7 +55,6 @@ class Window:
             raise NoWindowError(f"glfw cannot be loaded ({error})") from error
         self._glfw = glfw
         self.dropped: list[Path] = []
-        self._had_gamepad = False
         self._handle = self._create(title, size)
         self.scale_changed = False
         self._glfw.set_drop_callback(self._handle, self._drop)
@@ -121,44 +112,8 @@ class Window:
             raise ContextLostError("the graphics card was reset")
 
     def new_frame(self) -> None:
-        """Send size, pointer, keys and gamepad to imgui."""
+        """Send size, pointer and keys to imgui."""
         imgui.backends.glfw_new_frame()
-        imgui.get_io().backend_flags |= imgui.BackendFlags_.has_gamepad.value  # glfw's backend clears it
-        self._send_gamepad()
-
-    def _send_gamepad(self) -> None:
-        """Send the first gamepad's buttons and sticks to imgui, as keys with a value of 0 to 1."""
-        glfw, io = self._glfw, imgui.get_io()
-        state = glfw.get_gamepad_state(0) if glfw.joystick_is_gamepad(0) else None
-        if state is None and not self._had_gamepad:
-            return
-        self._had_gamepad = state is not None
-
-        def send(name: str, value: float) -> None:
-            io.add_key_analog_event(getattr(imgui.Key, f"gamepad_{name}"), value > 0, max(value, 0.0))
-
-        for name, button in _BUTTONS:
-            pressed = state is not None and state.buttons[getattr(glfw, f"GAMEPAD_BUTTON_{button}")]
-            send(name, 1.0 if pressed else 0.0)
-        for name, side in _AXES:
-            for axis, low, high in (("X", "left", "right"), ("Y", "up", "down")):
-                value = state.axes[getattr(glfw, f"GAMEPAD_AXIS_{side}_{axis}")] if state is not None else 0.0
-                value = value if abs(value) > _DEAD_ZONE else 0.0
-                send(f"{name}_{low}", -value)
-                send(f"{name}_{high}", value)
-        for name, side in (("l2", "LEFT"), ("r2", "RIGHT")):
-            value = state.axes[getattr(glfw, f"GAMEPAD_AXIS_{side}_TRIGGER")] if state is not None else -1.0
-            send(name, 0.5 + 0.5 * value if value > 2 * _DEAD_ZONE - 1 else 0.0)
-
-    @property
-    def gamepad_moves(self) -> bool:
-        """Whether a stick or button of the gamepad is used."""
-        glfw = self._glfw
-        state = glfw.get_gamepad_state(0) if glfw.joystick_is_gamepad(0) else None
-        if state is None:
-            return False
-        sticks = [state.axes[axis] for axis in range(4)] + [state.axes[axis] + 1 for axis in (4, 5)]
-        return any(abs(value) > _DEAD_ZONE for value in sticks) or any(state.buttons[i] for i in range(15))
 
     def attach_gui(self) -> None:
         """Send the window's events to imgui; call after imgui's context is created."""
@@ -229,9 +184,9 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
     while not (viewer.state.quit or window.closing):
         before = time.perf_counter()
         visible = window.is_visible
-        has_input = before < active_until or window.gamepad_moves or viewer.gui.has_input
+        has_input = before < active_until or viewer.gui.has_input
         moving = visible and (viewer.moving or has_input)
-        pending = viewer.pending if visible and not window.gamepad_moves else None
+        pending = viewer.pending if visible else None
         if pending is not None:
             pending.add_done_callback(lambda _: window.wake())
             window.wait(_PENDING_SECONDS)

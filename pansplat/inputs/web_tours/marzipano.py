@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.images.cube_faces import find_gap, strip_level
+from pansplat.images.cube_faces import find_gap
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
 from pansplat.images.image_files import read_size, require_complete
 from pansplat.inputs.pairs import Link, Note
@@ -42,7 +42,7 @@ from pansplat.system.strict_json import convert
 _DATA = "data.js"
 _FILES = "app-files"  # folder in the archive of the Tool
 _FACES = "frblud"
-_PREVIEW = "bdflru"
+_PREVIEW = tuple("bdflru".index(face) for face in _FACES)  # rows of the faces in a preview
 _ASSIGNMENT = re.compile(r"(?<![\w$])[A-Za-z_$][\w$]*\s*=\s*(?=\{)")
 _SHOWN = 30  # characters of a file in a message
 _UNNAMED = "Project Title"  # of a project whose author gave no name
@@ -121,7 +121,7 @@ def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[Cube
     if not best and (folder / preview).is_file():
         width, height = read_size(folder / preview)
         require_complete(folder / preview)
-        best = [strip_level(preview, width, _PREVIEW)] if height == 6 * width else []
+        best = [CubeLevel(width, width, 6 * (preview,), _PREVIEW)] if height == 6 * width else []
     gap = gap or f"{base} is missing"
     if not best:
         raise InputError(f"needed all tiles of a level, but {gap}; copy or export the tour again")

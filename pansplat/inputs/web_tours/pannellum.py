@@ -22,8 +22,9 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.images.cube_faces import find_gap, read_picture, require_faces
+from pansplat.images.cube_faces import find_gap, require_faces
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
+from pansplat.images.image_files import require_panorama
 from pansplat.inputs.pairs import Link, Note
 from pansplat.inputs.web_tours.entries import (
     MAX_BYTES,
@@ -193,14 +194,15 @@ def _base(scene: Mapping[str, Any]) -> list[Any]:
     return [scene["basePath"]] if scene.get("basePath") else []
 
 
-def _read_equirect(scene: Mapping[str, Any], folder: Path) -> Path | CubeImage:
+def _read_equirect(scene: Mapping[str, Any], folder: Path) -> Path:
     image = folder / locate(folder, *_base(scene), scene.get("panorama"))
     spans = [
         convert(scene.get(name, whole), Number, name, strict=False) for name, whole in (("haov", 360), ("vaov", 180))
     ]
     if spans != [360, 180]:
         raise InputError(f"needed a picture of 360 x 180 degrees, got {spans[0]:g} x {spans[1]:g} (haov, vaov)")
-    return read_picture(image)
+    require_panorama(image)
+    return image
 
 
 def _read_cube_map(scene: Mapping[str, Any], folder: Path) -> CubeImage:

@@ -32,7 +32,6 @@ from pansplat.rendering.cpu.tiling import (
 )
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.projection import not_finite_message
 from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
 
 
@@ -46,7 +45,6 @@ class _PlaneState(NamedTuple):
 
 def rasterize_planes(
     gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
     pose: Float[Tensor, "4 4"],
     planes: list[ImagePlane],
     options: RasterOptions,
@@ -71,8 +69,8 @@ def rasterize_planes(
     harmonics = gaussians.harmonics.to(torch.float32)
     has_grad = any(tensor.requires_grad for tensor in (*tensors, harmonics, pose)) and torch.is_grad_enabled()
     by_depth = options.order == "z" and not planes[0].is_panorama
-    if covariances is not None or by_depth or (planes[0].eye_offset and has_grad):  # too rare for kernels of their own
-        return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
+    if by_depth or (planes[0].eye_offset and has_grad):  # too rare for kernels of their own
+        return reference.rasterize_planes(gaussians, pose, planes, options)
     groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
     parts = []
     for group in groups:
@@ -82,8 +80,6 @@ def rasterize_planes(
     if harmonics.shape[2] != 3:
         colors = torch.cat([part[:, :3] for part in parts], dim=1)[:, : harmonics.shape[2]]
         sums = torch.cat((colors, parts[0][:, 3:]), dim=1)
-    if options.strict and statistics.dropped:
-        raise InputError(not_finite_message(gaussians, None, pose, options))
     info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
     return RasterSums(sums.to(gaussians.means.dtype), info)
 

@@ -37,7 +37,6 @@ _SORTING_BYTES = 40  # for each intersection of the band that is being sorted
 
 def rasterize_planes(
     gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
     pose: Float[Tensor, "4 4"],
     planes: list[ImagePlane],
     options: RasterOptions,
@@ -45,11 +44,11 @@ def rasterize_planes(
     """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`."""
     device = gaussians.means.device
     _check_device(device)
-    if planes[0].eye_offset or covariances is not None:  # too rare for kernels of their own
-        return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
+    if planes[0].eye_offset:  # too rare for kernels of their own
+        return reference.rasterize_planes(gaussians, pose, planes, options)
     # Triton launches on torch's current device, not on that of its arguments.
     with torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext():
-        chosen = select_drawable(gaussians, None, pose.detach(), options)
+        chosen = select_drawable(gaussians, pose.detach(), options)
         projected = project_gaussians(
             chosen.gaussians,
             pose,

@@ -58,10 +58,10 @@ def _assert_same_bits(run, expected):
 def test_a_number_that_is_unusable_in_one_channel_drops_the_gaussian_in_all(make_colored_scene, pose):
     scene = make_colored_scene(channels=5)
     scene.harmonics[::3, 0, 4] = torch.nan
-    drawn = rasterize_planes(scene, None, pose, _planes("pinhole"), RasterOptions())
+    drawn = rasterize_planes(scene, pose, _planes("pinhole"), RasterOptions())
     kept = scene.select(torch.arange(len(scene)) % 3 > 0)
     assert drawn.info.dropped == len(scene) - len(kept) > 0
-    assert torch.equal(drawn.sums, rasterize_planes(kept, None, pose, _planes("pinhole"), RasterOptions()).sums)
+    assert torch.equal(drawn.sums, rasterize_planes(kept, pose, _planes("pinhole"), RasterOptions()).sums)
 
 
 def test_bands_change_no_bit_of_the_sums(scene, pose, monkeypatch):
@@ -92,7 +92,7 @@ def test_the_number_of_threads_changes_no_bit(layout, make_colored_scene, pose):
 
 
 def test_without_grad_nothing_is_saved(scene, pose):
-    arguments = None, pose, _planes("pinhole"), RasterOptions()
+    arguments = pose, _planes("pinhole"), RasterOptions()
     plain = rasterize_planes(scene, *arguments)
     scene.means.requires_grad_()
     recorded = rasterize_planes(scene, *arguments)

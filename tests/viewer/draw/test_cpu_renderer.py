@@ -131,12 +131,6 @@ def test_software_opengl_is_replaced_by_the_processor_unless_chosen(ctx):
         create_renderer(None, "gl")
 
 
-def test_the_preset_3dgs_and_two_eyes_are_refused(renderer, pose):
-    for name, value, message in (("preset", "3dgs", "preset exact"), ("stereo", "side-by-side", "one eye of a window")):
-        with pytest.raises(InputError, match=f"draws {message}, got {value}; use renderer gl"):
-            renderer.render(pose, SIZE, replace(SETTINGS, **{name: value}))
-
-
 def test_errors_in_the_worker_are_raised_and_drawing_goes_on(renderer, pose, monkeypatch):
     expected = read_pixels(renderer.render(pose, SIZE, SETTINGS))
     with monkeypatch.context() as patch:

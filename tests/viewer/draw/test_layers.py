@@ -69,7 +69,7 @@ def test_narrow_field_of_view_is_drawn_directly(make_renderer, random_scene, pos
 def test_kept_layers_follow_every_setting(make_renderer, random_scene, pose):
     scene = random_scene(size=0.1)
     renderer, fresh = make_renderer(scene), make_renderer(scene, slot=1)
-    changes = {"preset": "3dgs", "mode": "view", "levels": frozenset({1, 2}), "opacity_threshold": 0.5, "near": 1.9}
+    changes = {"mode": "view", "levels": frozenset({1, 2}), "opacity_threshold": 0.5, "near": 1.9}
     for (name, value), settings in itertools.product(changes.items(), STORAGES):
         before = render_image(renderer, pose, settings)
         changed = replace(settings, **{name: value})

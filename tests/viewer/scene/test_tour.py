@@ -19,7 +19,6 @@ from pansplat.tours.route import FADE_SECONDS, plan_route
 from pansplat_viewer import run
 from pansplat_viewer.capture import find_nearest_frames, open_film, write_flight
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
-from pansplat_viewer.draw.stereo import ImageFormat
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.loader import SceneEntry
 from pansplat_viewer.scene.settings import DrawSettings
@@ -277,8 +276,8 @@ def open_tour_film(load_house) -> Iterator[Callable[..., Film]]:
 
         def open_one(scenes: TourScenes, load: Callable = load_house, size: tuple[int, int] = (64, 36)) -> Film:
             first, settings = load_house(scenes.make_entry(scenes.views)), DrawSettings(mode="deferred")
-            options = scenes, load, size, settings, ImageFormat()
-            return stack.enter_context(open_film(lambda: CpuRenderer(None), first, *options, with_depth=True))
+            settings = replace(settings, opacity_threshold=1e-6)  # without photographs
+            return stack.enter_context(open_film(lambda: CpuRenderer(None), first, scenes, load, size, settings))
 
         yield open_one
 

@@ -5,9 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
-import glfw
 import pytest
-from imgui_bundle import imgui
 
 from pansplat_viewer import app
 from pansplat_viewer.scene.loader import SceneEntry
@@ -17,7 +15,7 @@ from pansplat_viewer.window.window import ContextLostError, Window, _run_loop
 
 def make_window(**values: object) -> Mock:
     """A window of 64x32 pixels, in front of which nothing happens."""
-    values = {"is_visible": True, "gamepad_moves": False, "scale_changed": False, "dropped": [], **values}
+    values = {"is_visible": True, "scale_changed": False, "dropped": [], **values}
     return Mock(spec=Window, ctx=Mock(), closing=False, framebuffer_size=(64, 32), **values)
 
 
@@ -105,40 +103,3 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
     first, second = viewers
     assert second.options["state"] is first.options["state"], "camera and settings"
     second.show.assert_called_once_with(first.library.entries, 1, tmp_path / "opened")
-
-
-def test_sticks_and_buttons_of_a_gamepad_reach_imgui():
-    context = imgui.create_context()
-    imgui.set_current_context(context)
-    io = imgui.get_io()
-    io.set_ini_filename("")  # write no imgui.ini into the current folder
-    io.backend_flags |= imgui.BackendFlags_.has_gamepad.value | imgui.BackendFlags_.renderer_has_textures.value
-    io.display_size, io.delta_time = (64, 32), 0.1
-    buttons = [0] * 15
-    buttons[glfw.GAMEPAD_BUTTON_A] = 1
-    state: SimpleNamespace | None = SimpleNamespace(axes=[0.5, -0.9, 0.1, 0.0, -1.0, 1.0], buttons=buttons)
-    window = Window.__new__(Window)
-    names = {name: getattr(glfw, name) for name in dir(glfw) if name.startswith("GAMEPAD_")}
-    window._glfw = SimpleNamespace(
-        joystick_is_gamepad=lambda _: state is not None, get_gamepad_state=lambda _: state, **names
-    )
-    window._had_gamepad = False
-
-    def read(name: str) -> float:
-        return imgui.internal.get_key_data(getattr(imgui.Key, f"gamepad_{name}")).analog_value
-
-    def draw() -> None:
-        window._send_gamepad()
-        imgui.new_frame()
-        imgui.end_frame()
-
-    draw()
-    assert [read(name) for name in ("l_stick_right", "l_stick_up", "r2", "face_down")] == pytest.approx(
-        [0.5, 0.9, 1, 1]
-    )
-    assert [read(name) for name in ("l_stick_left", "r_stick_right", "l2", "face_up")] == [0, 0, 0, 0], "dead zone"
-    assert window.gamepad_moves
-    state = None  # unplugged
-    draw()
-    assert read("l_stick_up") == 0 and not window.gamepad_moves
-    imgui.destroy_context(context)
