@@ -156,16 +156,6 @@ def test_a_sequence_has_a_file_for_each_frame(scene: Scene, tmp_path: Path, suff
             assert image.channels()["RGB"].pixels.shape == (32, 48, 3)
 
 
-def test_a_film_that_fails_leaves_no_file(scene: Scene, tmp_path: Path) -> None:
-    def fail(task, done):
-        if done > 0.5:
-            raise RuntimeError("stopped")
-
-    with pytest.raises(RuntimeError, match="stopped"):
-        write_film(tmp_path / "film.mp4", make_film(scene), follow_path(PATH, 8.0, scene, None), 8.0, progress=fail)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_film_of_a_flight_has_at_least_two_frames() -> None:
     poses = []
     shots = list_flight(lambda at: poses.append(at) or np.eye(4), 24.0, 75.0, 0.01)
