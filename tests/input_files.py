@@ -41,6 +41,8 @@ from pansplat.tours.camera_path import read_path
 from pansplat.training.checkpoint import extract_weights, load_checkpoint
 
 EYE = np.eye(4).tolist()
+IN_PART = "read in part: "
+"""The start of notes about what a folder of panoramas left out."""
 _NAMES = ("a.png", "b.png")
 _CHECKED = 29  # bytes of checksums and end marks behind the pixels of a picture
 _LABELS = torch.tensor([0] * 6 + [1] * 6)
@@ -123,7 +125,7 @@ def _make_room(folder: Path, example: Example) -> InputFile:
         text = "\n".join(note for note in notes if "scale.txt" not in note)  # of an arbitrary unit
         if not panoramas:
             raise InputError(text)
-        return text if len(panoramas) < len(_NAMES) or path.name in text else ""
+        return f"{IN_PART}{text}" if len(panoramas) < len(_NAMES) or path.name in text else ""
 
     def is_recognised() -> bool:
         return next(form for form in FORMATS if form.find(folder)).name == example.format
