@@ -27,6 +27,13 @@ def test_a_missing_device_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert "error: --device cuda needs a CUDA device" in capsys.readouterr().err
 
 
+def test_a_folder_of_data_that_is_missing_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = ["--data.kind", "triplets", "--data.root", str(tmp_path / "nowhere"), "--data.workers", "0"]
+    assert run(["tiny", "--out", str(tmp_path / "run"), *data, "--perceptual", "structure", "--device", "cpu"]) == 2
+    assert f"error: {tmp_path / 'nowhere'}: needed" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.pt"))
+
+
 def test_out_of_memory_is_an_error_with_advice(
     micro_run: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
