@@ -63,19 +63,13 @@ install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.system.
 pytest_plugins = ["panorama_fixtures"]  # imported after the hook
 
 
-def _selects(config: pytest.Config, marker: str) -> bool:
-    """Whether the command line has -m with a marker, without `not` before it."""
-    return re.search(rf"(?<!not )\b{marker}\b", config.option.markexpr) is not None
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests of the markers `exhaustive` and `lint` unless -m names the marker."""
-    hidden = [marker for marker in ("exhaustive", "lint") if not _selects(config, marker)]
-    left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in hidden)]
-    if left_out:
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in left_out]
+    """Leave out the tests of the marker `exhaustive` unless -m names it."""
+    if re.search(r"(?<!not )\bexhaustive\b", config.option.markexpr):
+        return
+    config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("exhaustive")])
+    items[:] = [item for item in items if not item.get_closest_marker("exhaustive")]
 
 
 @pytest.fixture
@@ -162,10 +156,35 @@ def _unchanged_threads() -> Iterator[None]:
     assert torch.get_num_threads() == threads
 
 
+@pytest.fixture
+def run_with_threads() -> Iterator[Callable[[Callable[[], Any]], list[Any]]]:
+    """The results of a function with one thread of torch, two, three and five."""
+    before = torch.get_num_threads()
+    yield lambda function: [torch.set_num_threads(count) or function() for count in (1, 2, 3, 5)]
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(autouse=True)
 def _restarted_checks() -> None:
     """Check the annotations of each function in each test."""
     restart_checks()
+
+
+@pytest.fixture
+def full_disk() -> Callable[[int], contextlib.AbstractContextManager[None]]:
+    """A block in which files end after a number of bytes; the error is that of a full disk."""
+    resource = pytest.importorskip("resource")
+
+    @contextlib.contextmanager
+    def limit(count: int) -> Iterator[None]:
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (count, limits[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    return limit
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering.image_planes import stitch_faces
 
 FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
+NO_QUATS = ("means", "scales", "opacities", "harmonics", "pose", "background")
 ORIGIN = torch.eye(4, dtype=torch.float64)
 POSE = ORIGIN.clone()
 """A camera rotated about all axes, not at the origin."""
@@ -211,3 +213,63 @@ def find_gradients(render: Renderer, scene: Gaussians, pose: Tensor | None = Non
     fields = make_leaves(scene.to(dtype=render.dtype))
     measure_loss(render(fields, camera, **options)).backward()
     return {**{name: getattr(fields, name).grad for name in FIELDS}, "pose": camera.grad}
+
+
+def assert_dense(render: Renderer, scene: Gaussians, options: dict[str, Any]) -> tuple[list, list]:
+    """Assert that a backend's image, counts and gradients equal those of the dense renderer; returns both.
+
+    Args:
+        options: of `rasterize`; and `pose`; `slack`, by which the case is worse conditioned; `fields`, whose gradients
+            are compared; `by_covariance`; and `metre`, the unit of length.
+    """
+    options = {"size": render.size, **options}
+    chosen = {name: options.pop(name, None) for name in ("pose", "slack", "fields", "by_covariance", "metre")}
+    pose = ORIGIN if chosen["pose"] is None else chosen["pose"]
+    slack, metre = chosen["slack"] or 1.0, chosen["metre"] or 1.0
+    background = torch.linspace(0.2, 0.9, scene.harmonics.shape[2], dtype=torch.float64)
+    # The scene is rounded to the backend's type first, for the dense renderer too.
+    rounded = scene.to(dtype=render.dtype)
+    names = ("kernel", "order", "lowpass", "near", "layout", "face_size")
+    dense_options = {name: options[name] for name in names if name in options}
+
+    def draw_truth(truth: Gaussians, camera: Tensor, ground: Tensor) -> tuple[Rendering, Tensor]:
+        fov = options.get("vertical_fov_degrees", 90.0)
+        sums = draw_dense(truth, camera, options["size"], fov=fov, **dense_options)
+        color, (alpha, weighted, close) = sums[:-3], sums[-3:]
+        depth = torch.where(alpha > 0, weighted / torch.where(alpha > 0, alpha, 1), 0)
+        color = color + (1 - alpha) * ground[:, None, None]
+        return Rendering(color, alpha, depth), (close == 0).detach()
+
+    def draw(given: Gaussians, camera: Tensor, ground: Tensor) -> tuple[Rendering, None]:
+        covariances = given.covariances if chosen["by_covariance"] else None
+        return render(given, camera, background=ground, covariances=covariances, **options), None
+
+    images, gradients, shown = [], [], None
+    for function, given in ((draw_truth, rounded.to(dtype=torch.float64)), (draw, rounded)):
+        inputs, camera, ground = make_leaves(given), pose.clone().requires_grad_(), background.clone().requires_grad_()
+        image, mask = function(inputs, camera, ground)
+        shown = mask if shown is None else shown
+        measure_loss(image, shown).backward()
+        images.append(image)
+        leaves = {name: getattr(inputs, name) for name in FIELDS} | {"pose": camera, "background": ground}
+        found = {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+        turn = pose[:3, :3].T @ found["pose"][:3, :3]  # both formulas agree along rigid motions only
+        found["pose"] = torch.cat((turn - turn.T, metre * found["pose"][:3, 3:]), dim=1)
+        gradients.append(found)
+    truth, got = images
+    assert shown.double().mean() > 0.8, "most pixels are not at a cut"
+    for name, weight in (("color", 1.0), ("alpha", 1.0), ("depth", truth.alpha.detach() / metre)):
+        error = (getattr(got, name) - getattr(truth, name)).detach() * weight * shown
+        size = max(1.0, float((getattr(truth, name).detach() * weight).abs().max()))
+        assert float(error.abs().max()) <= slack * render.image * size, f"{name} off by {float(error.abs().max()):.2g}"
+    radius = (rounded.means.double() - pose[:3, 3]).norm(dim=1)
+    near = int((radius < options.get("near", 0.05)).sum())
+    assert (got.info.total, got.info.dropped, got.info.near) == (len(scene), 0, near)
+    for name in chosen["fields"] or (*NO_QUATS, "quats"):
+        expected, found = gradients[0][name].double(), gradients[1][name].double()
+        assert torch.isfinite(found).all(), name
+        unit = metre if name in ("means", "scales") else 1.0
+        norm = max(unit * float(expected.norm()), 1e-6)  # a sphere's quaternion has only rounding errors as gradient
+        error = unit * float((found - expected).norm()) / norm
+        assert error <= slack * render.gradient, f"gradient of {name} off by {error:.2g}"
+    return images, gradients

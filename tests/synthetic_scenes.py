@@ -1,8 +1,12 @@
-"""Gaussians for tests: round or flat ones at given places, and the walls of a box room that a camera sees."""
+"""Gaussians for tests: round or flat ones at given places, the walls of a box room that a camera sees; and a bound."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
+import pytest
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -59,3 +63,8 @@ def place_cameras(*places: tuple[float, float, float]) -> Float[Tensor, "view 4 
     poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
     poses[:, :3, 3] = torch.tensor(places, dtype=torch.float64)
     return poses
+
+
+def approx_of_8_bits(decibels: float) -> Any:
+    """A PSNR up to the rounding of an image to 8 bits: half a step of the root of the mean square error."""
+    return pytest.approx(decibels, abs=20 * math.log10(1 + 0.5 / 255 * 10 ** (decibels / 20)))

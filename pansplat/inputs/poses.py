@@ -142,7 +142,7 @@ def parse_numbers(text: str, count: int, source: object) -> Float[Tensor, "count
     try:
         values = np.array(text.split(), np.float64)
     except ValueError as error:
-        raise InputError(f"{source}: needed {count} numbers, got other text ({error}); correct it.") from error
+        raise InputError(f"{source}: needed {count} numbers, got other text ({error!s:.200}); correct it.") from error
     if values.size != count:
         raise InputError(f"{source}: needed {count} numbers, got {values.size}; correct it.")
     return torch.from_numpy(values)

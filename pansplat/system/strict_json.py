@@ -103,7 +103,8 @@ def convert(value: Any, kind: Any, source: object, *, strict: bool = True) -> An
     try:
         return msgspec.convert(value, kind, strict=strict)
     except msgspec.ValidationError as error:
-        problem, _, path = re.sub(r" - at (`key` in )?`\$(.*)`$", r"\0\2", str(error)).partition("\0")
+        found = re.fullmatch(r"(.*?)(?: - at (?:`key` in )?`\$(.*)`)?", str(error), re.DOTALL)
+        problem, path = found[1], found[2] or ""
         for key, index in re.findall(r"\.([^.\[]+)|\[(\d+)\]", path):
             value = value[key or int(index)] if "[...]" not in path else value
         where = _locate(source, path)

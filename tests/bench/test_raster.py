@@ -66,25 +66,3 @@ def test_the_quick_run_writes_rows_and_a_plot_and_prints_the_tables(file, tmp_pa
     assert sorted(file.name for file in out.iterdir()) == ["raster.json", "raster.md", "raster.png"]
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("headline", "choices", "PSNR dB", "numba on one thread is"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("raster --height 20", "multiple of 8"),
-        ("raster --height 7", "--height: needed"),
-        ("raster --threads 0", "--threads: needed a whole number >= 1"),
-        ("raster --json no/rows.json", "create it first"),
-        ("raster none.ply", "none.ply"),
-        ("model --height 80", "multiple of 64"),
-        ("model --pair nowhere", "nowhere is not a folder"),
-        ("model --height 64 --model none.safetensors", "none.safetensors"),
-        ("viewer --heights 20", "multiple of 8"),
-        ("viewer --size 8 8", "--size, [0]: needed a whole number >= 64"),
-    ],
-)
-def test_invalid_arguments_are_refused_before_the_work(arguments, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert run(["bench", *arguments.split()]) == 2
-    printed, error = capsys.readouterr()
-    assert printed == "" and message in error and error.count("\n") == 1

@@ -1,41 +1,35 @@
 """A predictor, panoramas and a scene for the commands' tests."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from synthetic_scenes import make_balls
 from torch import Tensor
 
 from pansplat import pipeline
 from pansplat.cli import run
-from pansplat.geometry.equirect import pixel_directions
-from pansplat.system.progress import report_progress
+from pansplat.gaussians.scene import Gaussians
 
 HEIGHT = 64
 
 
-class Sphere:
-    """A predictor of Gaussians on a sphere of 2 m around each camera, one per pixel of the image at 16 rows."""
-
-    name, fingerprint = "sphere", "1"
-
-    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None):
-        report_progress("predicting", 0.5)
-        images = images[..., :: images.shape[-2] // 16, :: images.shape[-2] // 16]
-        view, _, height, width = images.shape
-        directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
-        means = torch.cat([2 * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world.double()])
-        color, views = images.flatten(2).transpose(1, 2).reshape(-1, 3), torch.arange(view)
-        levels = torch.arange(len(means)) % 2
-        return make_balls(means, 0.3, color=color, levels=levels, views=views.repeat_interleave(len(directions)))
-
-
 @pytest.fixture(autouse=True)
-def sphere_model(monkeypatch: pytest.MonkeyPatch) -> type:
-    """The predictor, which commands find as `--model sphere`."""
+def sphere_model(monkeypatch: pytest.MonkeyPatch, sphere_predictor: type) -> type:
+    """The predictor that commands find as `--model sphere`: one Gaussian per pixel of the image at 16 rows."""
+
+    class Sphere(sphere_predictor):
+        def __call__(self, images: Tensor, *arguments, progress=None, **options) -> Gaussians:
+            if progress is not None:
+                progress("predicting", 0.5)
+            step = images.shape[-2] // 16
+            sphere = super().__call__(images[..., ::step, ::step], *arguments, **options)
+            levels = torch.arange(len(sphere)) % 2
+            return replace(sphere, scales=torch.full_like(sphere.scales, 0.3), levels=levels)
+
     monkeypatch.setitem(pipeline._MODELS, "sphere", Sphere)
+    monkeypatch.setattr("pansplat.export.page._POSTER_SIZE", (27, 32))
     return Sphere
 
 

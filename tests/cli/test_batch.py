@@ -20,7 +20,6 @@ import pytest
 from pansplat import pipeline
 from pansplat.cli import batch, run
 from pansplat.cli.batch import REPORT_NAME, Batch, fingerprint_work, list_items, process_item
-from pansplat.export import page as page_module
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
 from pansplat.prediction_options import PredictOptions
@@ -33,7 +32,6 @@ SPHERE = PredictOptions("sphere", height=HEIGHT, refine_seconds=0.0)
 def sphere(sphere_predictor: type, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """`--model sphere` in this process."""
     monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
     fingerprint_work.cache_clear()
     yield
     fingerprint_work.cache_clear()
@@ -173,16 +171,11 @@ def test_files_that_a_killed_worker_left_are_removed_and_others_are_kept(
 
 
 def test_on_a_full_disk_no_half_file_is_left_and_the_item_is_done_later(
-    rooms: Path, tmp_path: Path, sphere: None
+    rooms: Path, tmp_path: Path, sphere: None, full_disk: Callable
 ) -> None:
-    resource = pytest.importorskip("resource")
     out, command = tmp_path / "out", Batch(rooms, tmp_path / "out", prediction=SPHERE)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))  # of a file; the error is that of a full disk
-    try:
+    with full_disk(100_000):
         line = process_item(("room0", rooms / "room0"), command, fingerprint_work(SPHERE))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert line["status"] == "failed" and "free disk space, got 'File too large'" in line["error"]
     assert not list_outputs(out)
     assert process(rooms / "room0", out, "predict")["status"] == "done" and len(list_outputs(out)) == 1

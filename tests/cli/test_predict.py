@@ -10,18 +10,6 @@ from pansplat.cli import run
 from pansplat.prediction_options import PredictOptions
 
 
-def test_predict_writes_the_scene(scene: Path) -> None:
-    loaded = pipeline.load(scene)
-    assert len(loaded.gaussians) == 2 * 2 * 16**2
-    assert loaded.names == ("a", "b") and loaded.model == "sphere"
-
-
-def test_predict_writes_the_format_of_the_suffix(room: Path, tmp_path: Path) -> None:
-    command = ["predict", str(room), "--model", "sphere", "--height", "64", "--layers", "-o"]
-    assert run([*command, str(tmp_path / "scene.splat")]) == 0
-    assert (tmp_path / "scene.splat").stat().st_size == 32 * 2 * 2 * 16**2
-
-
 def test_the_named_pair_of_a_folder_is_predicted_or_the_first(tmp_path: Path, write_room, refusal, capsys) -> None:
     for name in ("hall", "kitchen"):
         write_room(tmp_path / "pairs" / name)

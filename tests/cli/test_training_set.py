@@ -17,7 +17,6 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.errors import InputError, InputWarning
-from pansplat.export import page as page_module
 from pansplat.inputs.folders import find_panorama_folders, load_pairs, load_panoramas
 
 OPTIONS = ["--model", "sphere", "--refine", "0", "--predict-height", "64"]
@@ -84,10 +83,7 @@ def test_no_export_or_picture_is_a_panorama_of_the_folder(room: Path, scene: Pat
         assert [panorama.name for panorama in load_panoramas(room)] == ["a", "b", "c"]
 
 
-def test_no_export_repeats_the_metadata_of_the_photographs(
-    tmp_path: Path, write_room: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+def test_no_export_repeats_the_metadata_of_the_photographs(tmp_path: Path, write_room: Callable[..., Path]) -> None:
     room = write_room(tmp_path / "room", target=False)
     exif = Image.Exif()
     exif[0x010F] = "SECRET maker"

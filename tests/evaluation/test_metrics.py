@@ -10,7 +10,6 @@ from safetensors.torch import load_file
 from pansplat.evaluation.metrics import cross_fade, depth_errors, psnr, ssim, ws_psnr
 from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.inputs.folders import load_pairs
 
 METRICS = {"psnr": psnr, "ws_psnr": ws_psnr, "ssim": ssim}
 
@@ -136,15 +135,3 @@ def test_the_cross_fade_weights_inputs_by_distance() -> None:
     for place in (0.0, 0.25):
         faded = cross_fade(images, torch.stack((pose_at(0), pose_at(1))), pose_at(place))
         torch.testing.assert_close(faded, torch.full((3, 8, 16), place), atol=1e-5, rtol=0)
-
-
-@pytest.mark.shared
-@pytest.mark.parametrize(("folder", "expected"), [("mp3d_sample", [16.0]), ("zind", [14.1, 15.8, 17.1])])
-def test_the_cross_fade_of_real_rooms_is_unchanged(shared: Path, folder: str, expected: list[float]) -> None:
-    pairs = [pair for pair in load_pairs(shared / "data" / folder) if pair.targets]
-    scores = []
-    for pair in pairs:
-        context, target = pair.load_context(512), pair.load_targets(512)
-        faded = cross_fade(context.images, context.cam2world, target.cam2world[0])
-        scores.append(ws_psnr(faded, target.images[0]))
-    assert sorted(scores) == pytest.approx(expected, abs=0.1)

@@ -17,7 +17,6 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.rendering.image_planes import image_planes
-from pansplat.system.progress import show_progress
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.route import STOP_SECONDS
 
@@ -155,16 +154,6 @@ def test_a_sequence_has_a_file_for_each_frame(scene: Scene, tmp_path: Path, suff
         with OpenEXR.File(str(files[1])) as image:
             assert np.allclose(image.channels()["Z"].pixels, 20 * grey), "in the user's unit"
             assert image.channels()["RGB"].pixels.shape == (32, 48, 3)
-
-
-def test_a_film_that_fails_leaves_no_file(scene: Scene, tmp_path: Path) -> None:
-    def fail(task, done):
-        if done > 0.5:
-            raise RuntimeError("stopped")
-
-    with pytest.raises(RuntimeError, match="stopped"), show_progress(fail):
-        write_film(tmp_path / "film.mp4", make_film(scene), follow_path(PATH, 8.0, scene, None), 8.0)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_film_of_a_flight_has_at_least_two_frames() -> None:

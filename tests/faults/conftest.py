@@ -26,6 +26,10 @@ from pansplat_viewer import run as run_viewer
 PROGRAMS: dict[str, Callable[[list[str]], int]] = {"pansplat-train": run_training, "pansplat-view": run_viewer}
 
 
+STATED = ("note: ", "progress: ", "tiny: ")
+"""The starts of lines that are no errors: notes, the progress of a slow machine, and the network of a training."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """How a command ended."""
@@ -33,6 +37,10 @@ class Outcome:
     status: int
     out: str
     err: str
+
+    @property
+    def has_error(self) -> bool:
+        return not all(line.startswith(STATED) for line in self.err.splitlines())
 
 
 def make_scene(count: int = 12) -> Scene:
@@ -92,7 +100,7 @@ def attack(folder: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., Out
         out, err = capfd.readouterr()
         assert "Traceback" not in out + err, err
         assert status != 70, err
-        errors = [text for text in err.splitlines() if not text.startswith("note: ")]
+        errors = [text for text in err.splitlines() if not text.startswith(STATED)]
         new = list_files(folder) - before
         assert not [name for name in new if re.search(r"/\.[^/]*\.[0-9a-f]{8}\.", f"/{name}")], new
         if status not in (0, 1):

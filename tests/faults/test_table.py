@@ -6,10 +6,8 @@ from __future__ import annotations
 import json
 import os
 import re
-import resource
 import socket
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,6 +107,7 @@ SCENES = [
     Fault("header: 5000 properties", INFO, header(b"property float x\n", b"".join(b"property float p%d\n" % i for i in range(5000))), "header line"),
     Fault("file: a picture", INFO, lambda folder: (folder / "scene.ply").write_bytes((folder / "pair/a.png").read_bytes()), "not a .ply"),
     Fault("file: cut in the vertices", INFO, content(lambda data: data[:-5]), "truncated"),
+    Fault("file: cut in the header, viewed", "pansplat-view scene.ply --offscreen out", content(lambda data: data[:100]), "scene.ply"),
     Fault("vertices: -3e38, as a page", "export scene.ply -o tour.html", vertices(-3e38), "no visible Gaussians"),
     Fault("vertices: 80, as a page", "export scene.ply -o tour.html", vertices(80.0), "no visible Gaussians"),
     Fault("a page in a folder that is missing", "export scene.ply -o missing/tour.html", says="existing folder"),
@@ -126,17 +125,28 @@ TRAIN = "pansplat-train tiny --out run --device cpu"
 SIZES = [
     *(Fault(f"{command[:16]} {option} {value}", f"{command} {option} {value}", says=option) for command, option, value in (
         ("predict pair -o out.ply", "--height", "63"), ("predict pair -o out.ply", "--height", "abc"), ("predict pair -o out.ply", "--height", "9" * 5000),
-        (TRAIN, "--optimizer.batch-size", "0"), (TRAIN, "--data.augmentation.colour", "2"), ("pansplat-view scene.ply", "--fps", "nan"), ("bench raster", "--height", "20"))),
+        (TRAIN, "--optimizer.batch-size", "0"), (TRAIN, "--data.augmentation.colour", "2"), ("pansplat-view scene.ply", "--fps", "nan"))),
     *(Fault(f"pose --baseline a.png b.png {distance}", f"pose pair --baseline a.png b.png {distance}", says="`baseline` must be") for distance in ("0", "nan")),
     Fault("pose --baseline of one panorama", "pose pair --baseline a.png a.png 1", says="`baseline` must be"),
     Fault("pose --baseline of a missing panorama", "pose pair --baseline a.png x.png 1", says="x.png"),
     Fault("pose --baseline without a distance", "pose pair --baseline a.png b.png", says="--baseline"),
     Fault("export --gaussians 5000000", "export scene.ply -o tour.html --gaussians 5000000", says="4,000,000 in a page"),
     Fault("render --stereo of a perspective image", "render scene.ply --stereo --layout perspective -o x.png", says="--stereo is for"),
-    Fault("view --size 1x1", "pansplat-view scene.ply --size 1x1", says="--size"),
+    *(Fault(f"view {options}", f"pansplat-view scene.ply {options}", says=says) for options, says in (
+        ("--size 4x4", "WIDTHxHEIGHT"), ("--size huge", "WIDTHxHEIGHT"), ("--at 1.5", "--at: needed a number <= 1"), ("--pair kitchen", "number from 1 to 1 or one of scene"),
+        ("--path no.json", "no.json"), ("--refine -1", "--refine: needed a number >= 0"))),
+    Fault("view: a scene that is missing", "pansplat-view nowhere", says="no such file or folder"),
+    *(Fault(f"train {options}", f"pansplat-train {options} --device cpu --data.workers 0 --perceptual structure", says=says) for options, says in (
+        ("tiny --out run --data.kind triplets", "--data.kind triplets needs --data.root"), ("small", "needs --data.root"),
+        ("tiny --optimizer.steps 0", "--optimizer.steps: needed a whole number >= 1, got 0"), ("pansplat-256 --data.root nowhere", "--network.init"), ("tiny --network.init none.safetensors", "none.safetensors"),
+        ("", "tiny"), ("gigantic", "gigantic"), ("tiny --optimizer.stepps 3", "--optimizer.steps"), ("tiny --memory.backpropagation three-step", "two-step"))),
+    *(Fault(f"bench {options}", f"bench {options}", says=says) for options, says in (
+        ("raster --height 20", "multiple of 8"), ("raster --height 7", "--height: needed"), ("raster --threads 0", "--threads: needed a whole number >= 1"), ("raster --json no/rows.json", "create it first"),
+        ("raster none.ply", "none.ply"), ("model --height 80", "multiple of 64"), ("model --pair nowhere", "nowhere is not a folder"), ("model --height 64 --model none.safetensors", "none.safetensors"),
+        ("viewer --heights 20", "multiple of 8"), ("viewer --size 8 8", "--size, [0]: needed a whole number >= 64"))),
     Fault("an option without its number", "predict pair -o out.ply --height", says="--height"),
-    Fault("a misspelt option", "predict pair -o out.ply --heigth 64", says="--heigth"),
-    Fault("a misspelt command", "predikt pair", says="predikt"),
+    Fault("an option that is missing", "predict pair", says="--out"),
+    Fault("a misspelt option", "predict pair -o out.ply --heigth 64", says="--height"),
     Fault("a choice that is missing", "render scene.ply -o x.png --layout fisheye", says="--layout"),
     Fault("a number of a view with 400 digits", f"render scene.ply -o x.png --blend view{_HUGE}", says="--blend"),
     Fault("a number of a pair with 400 digits", f"{PREDICT} --pair {_HUGE}", says="--pair"),
@@ -167,14 +177,8 @@ def many_panoramas(folder: Path) -> None:
 
 
 NUMBERS = [
-    Fault("poses nested 100,000 deep", PREDICT, text(_DEEP), "poses.json"),
     Fault("poses: a name of 300 bytes", PREDICT, text(f'{{"convention": "cam2world opencv", "poses": {{"{_LONG}.png": 1}}}}'), _LONG),
-    Fault("poses: cut off", PREDICT, content(lambda data: data[:100], "pair/poses.json"), "line 1"),
-    Fault("pairs: nested 100,000 deep", PREDICT, text('{"pairs": ' + _DEEP, "pair/pairs.json"), "pairs.json"),
     Fault("pairs: 1,000 context panoramas", PREDICT, many_panoramas, "at most 64"),
-    *(Fault(f"render --pose {name}: {value[:20]}", f"render scene.ply -o x.png --height 8 --pose {name}", text(value, name), name) for name, value in (
-        ("p.json", _DEEP), ("p.json", "[]"), ("p.json", "{}"), ("p.json", "5"), ("p.json", '{"convention": 1, "pose": 2}'), ("p.json", "[[1e999]]"),
-        ("p.txt", "1 2 3"), ("p.txt", ""), ("p.txt", "nan " * 16), ("p.txt", "1e30 " * 16), ("p.txt", "a b c"))),
 ]  # fmt: skip
 
 
@@ -248,7 +252,6 @@ CHECKPOINTS = [
     Fault("integers instead of numbers", WEIGHTS, first(lambda t: t.to(torch.int8)), "int8"),
     Fault("complex numbers", WEIGHTS, first(lambda t: t.to(torch.complex64)), "weights.safetensors"),
     Fault("NaN in a tensor", WEIGHTS, first(lambda t: t * float("nan")), "NaN"),
-    Fault("weights cut off", WEIGHTS, content(lambda data: data[: len(data) // 2], "weights.safetensors"), "weights.safetensors"),
     Fault("weights with a header of 2^60 bytes", WEIGHTS, content(lambda data: (2**60).to_bytes(8, "little") + data[8:], "weights.safetensors"), "weights.safetensors"),
     Fault("weights: a scene", "predict pair -o out.ply --model scene.ply", says="`model`"),
     Fault("checkpoint: foreign tensors", CKPT, pickled({"state_dict": {"a": torch.zeros(1)}}), "official"),
@@ -288,10 +291,6 @@ def unix_socket(name: str) -> Damage:
     return make
 
 
-def picture(data: Callable[[Path], bytes] | bytes) -> Damage:
-    return lambda folder: (folder / "pair/a.png").write_bytes(data if isinstance(data, bytes) else data(folder))
-
-
 def resized(width: int, height: int, mode: str = "RGB") -> Damage:
     return lambda folder: Image.new(mode, (width, height)).save(folder / "pair/a.png")
 
@@ -303,16 +302,12 @@ def copy_to_subfolders(folder: Path) -> None:
             (folder / "flats" / name / image.name).write_bytes(image.read_bytes())
 
 
-def exr(change: Callable[[bytes], bytes]) -> Damage:
-    def write(folder: Path) -> None:
-        import OpenEXR
+def write_nan(folder: Path) -> None:
+    import OpenEXR
 
-        with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": np.full((16, 32, 3), np.nan, np.float32)}) as file:
-            file.write(str(folder / "x.exr"))
-        (folder / "pair/a.png").write_bytes(change((folder / "x.exr").read_bytes()))
-        (folder / "x.exr").unlink()
-
-    return write
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": np.full((16, 32, 3), np.nan, np.float32)}) as file:
+        file.write(str(folder / "x.exr"))
+    (folder / "x.exr").replace(folder / "pair/a.png")
 
 
 _PNG_BOMB = bytes.fromhex("89504e470d0a1a0a0000000d49484452000f4240 0007a120 0802000000".replace(" ", "")) + b"\0" * 40
@@ -327,7 +322,6 @@ FILES = [
     Fault("a link to itself as a scene", INFO, link("scene.ply", "scene.ply"), "scene.ply"),
     Fault("a folder as a scene", "info pair.ply", lambda f: (f / "pair.ply").mkdir(), "folder"),
     Fault("a folder without a suffix as a scene", "info pair", says="pair: needed a scene file, got a folder"),
-    Fault("a missing scene", "info no.ply", says="no.ply"),
     *(Fault(f"a file that has no poses: {name}", f"check {name}", text("x", name), f"{name}: needed {needed}")
       for name, needed in (("pair/note.txt", "a panorama, a folder"), ("pair/note.json", "a tour"), ("pair/a.xyz", "a panorama, a folder"))),
     Fault("panoramas without poses in subfolders", "check flats", copy_to_subfolders, "flats: needed panoramas (JPG, PNG, TIFF, WebP, HEIC or EXR), got some without poses in one, two; open one of these folders, or run `pansplat pose"),
@@ -365,16 +359,11 @@ FILES = [
         "evaluate pair --model sphere --out {}", "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
     *(Fault(f"{command[:12]}: an output folder in /proc", command.format("/proc/a"), says="/proc") for command in (
         "evaluate pair --model sphere --height 64 --out {}", "pansplat-train tiny --data.workers 0 --perceptual structure --device cpu --out {}")),
-    Fault("image: empty", PREDICT, picture(b""), "a.png"),
-    Fault("image: a text", PREDICT, picture(b"hello" * 50), "a.png"),
-    Fault("image: cut off", PREDICT, picture(lambda f: (f / "pair/a.png").read_bytes()[:-200]), "a.png"),
-    Fault("image: 10^6 x 5 10^5 pixels", PREDICT, picture(_PNG_BOMB), "a.png"),
+    Fault("image: 10^6 x 5 10^5 pixels", PREDICT, lambda f: (f / "pair/a.png").write_bytes(_PNG_BOMB), "a.png"),
     Fault("image: one pixel", PREDICT, resized(1, 1), "2:1"),
     Fault("image: square", PREDICT, resized(32, 32), "2:1"),
     Fault("image: transparent", PREDICT, resized(32, 16, "RGBA"), "a.png"),
-    Fault("image: an EXR of NaN", PREDICT, exr(lambda data: data), "a.png"),
-    Fault("image: an EXR that is cut off", PREDICT, exr(lambda data: data[:-90]), "a.png"),
-    Fault("image: an EXR header only", PREDICT, exr(lambda data: data[:40]), "a.png"),
+    Fault("image: an EXR of NaN", PREDICT, write_nan, "a.png"),
     Fault("image: a folder", PREDICT, lambda f: ((f / "pair/a.png").unlink(), (f / "pair/a.png").mkdir()), "a.png"),
     Fault("image: missing", PREDICT, lambda f: (f / "pair/a.png").unlink(), "a.png"),
     Fault("mask: of a text", PREDICT, lambda f: (f / "pair/a_mask.png").write_text("x"), "a_mask.png"),
@@ -409,61 +398,32 @@ def test_faults_have_distinct_names_and_refusals_a_message() -> None:
     assert not [fault.name for faults in TABLE.values() for fault in faults if fault.status and not fault.says]
 
 
-def has_error(err: str) -> bool:
-    """Whether a line is no note."""
-    return any(not line.startswith("note: ") for line in err.splitlines())
-
-
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_one_line_with_a_status(fault: Fault, folder: Path, attack: Callable[..., Any]) -> None:
     fault.damage(folder)
     outcome = attack(fault.command.split(" "))
     assert outcome.status == fault.status, outcome
-    assert fault.says in outcome.err if fault.says else not has_error(outcome.err), outcome
+    assert fault.says in outcome.err if fault.says else not outcome.has_error, outcome
     assert not (folder / "executed").exists()
     written = re.search(r"-o (\S+)", fault.command)
     assert written is None or os.path.isfile(folder / written[1]) == (fault.status == 0), outcome
 
 
-@contextmanager
-def full_disk(limit: int) -> Iterator[None]:
-    """Files end after `limit` bytes, as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+WRITTEN = {
+    **{f"x.{suffix}": "render scene.ply --height 64 -o" for suffix in ("exr", "png", "jpg", "webp")},
+    "x.mp4": "render scene.ply --height 64 --seconds 0.1 -o",
+    **{f"x.{suffix}": "export scene.ply -o" for suffix in ("ply", "compressed.ply", "spz", "splat", "sog", "glb")},
+    "y.ply": "predict pair --model sphere --height 64 --refine 0 -o",
+}
 
 
-@pytest.mark.parametrize("name", ["x.exr", "x.png", "x.jpg", "x.webp", "x.mp4"])
-def test_an_image_on_a_full_disk_is_one_line(name: str, folder: Path, attack: Callable[..., Any]) -> None:
-    command = f"render scene.ply -o {name} --height 64" + (" --seconds 0.1" if name.endswith("mp4") else "")
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_file_on_a_full_disk_is_one_line_and_the_old_file_stays(
+    name: str, folder: Path, attack: Callable[..., Any], full_disk: Callable
+) -> None:
+    assert attack([*WRITTEN[name].split(), name]).status == 0
+    before = (folder / name).read_bytes()
     with full_disk(300):
-        outcome = attack(command.split())
+        outcome = attack([*WRITTEN[name].split(), name, "--overwrite"])  # a .splat states no program
     assert outcome.status == 2 and name in outcome.err and "free disk space" in outcome.err
-    assert not (folder / name).exists()
-
-
-@pytest.mark.parametrize("name", ["x.ply", "x.compressed.ply", "x.spz", "x.splat", "x.sog", "x.glb"])
-def test_a_scene_on_a_full_disk_is_one_line(name: str, folder: Path, attack: Callable[..., Any]) -> None:
-    with full_disk(300):
-        outcome = attack(f"export scene.ply -o {name}".split())
-    assert outcome.status == 2 and name in outcome.err and "free disk space" in outcome.err
-    assert not (folder / name).exists()
-
-
-@pytest.mark.parametrize("command", [PREDICT, "convert old.ckpt -o m.safetensors"])
-def test_a_file_on_a_full_disk_is_one_line(command: str, folder: Path, attack: Callable[..., Any]) -> None:
-    if command == PREDICT:
-        with full_disk(2000):
-            outcome = attack(command.split())
-        assert outcome.status == 2 and "free disk space" in outcome.err
-    else:
-        from pansplat.errors import InputError
-        from pansplat.model.weights import WeightsFile, save_weights
-
-        weights = WeightsFile("pansplat", {}, "fixed", {"a": torch.zeros(10_000)})
-        with full_disk(2000), pytest.raises(InputError, match="free disk space"):
-            save_weights(folder / "m.safetensors", weights)
-        assert not (folder / "m.safetensors").exists()
+    assert (folder / name).read_bytes() == before

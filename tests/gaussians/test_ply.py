@@ -141,21 +141,6 @@ def test_non_finite_gaussians_are_counted_and_left_out(tmp_path: Path, make_scen
     assert len(load_ply(tmp_path / "b.ply").gaussians) == 35
 
 
-def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene) -> None:
-    path = tmp_path / "scene.ply"
-    save_ply(make_scene(), path)
-    before = path.read_bytes()
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pansplat.gaussians.ply._build_vertex_table", full)
-    with pytest.raises(InputError, match="No space left"):
-        save_ply(make_scene(seed=1), path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
-
-
 @pytest.mark.parametrize("piece", [1, 7, 40])
 def test_the_size_of_the_pieces_does_not_change_the_scene(piece, tmp_path, monkeypatch, make_scene):
     save_ply(make_scene(degree=2), tmp_path / "scene.ply")

@@ -128,22 +128,19 @@ def test_chunks_do_not_change_the_correlation(backend, monkeypatch):
         assert torch.allclose(part, expected, atol=1e-12)
 
 
-def test_the_number_of_threads_does_not_change_the_correlations_bits():
+def test_the_number_of_threads_does_not_change_the_correlations_bits(run_with_threads):
     reference, other, inverse_depth, poses = (tensor.float() for tensor in _inputs(height=32))
     positions = warp_positions(inverse_depth, poses, "sphere")
-    threads = torch.get_num_threads()
-    results = []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            forward = correlate_positions(reference, other, *positions, wraps=True)
-            backward = correlate_positions_backward(forward, reference, other, *positions, wraps=True)
-            results.append((forward, *backward))
-    finally:
-        torch.set_num_threads(threads)
-    for alone, threaded in zip(results[0], results[2], strict=True):
-        assert torch.allclose(alone, threaded, rtol=1e-4, atol=1e-4)  # the order of the sums over bands differs
-    assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][0], results[2][0])
+
+    def run():
+        forward = correlate_positions(reference, other, *positions, wraps=True)
+        return forward, *correlate_positions_backward(forward, reference, other, *positions, wraps=True)
+
+    first, *others = run_with_threads(run)
+    for threaded in others:
+        assert torch.equal(first[0], threaded[0])
+        for found, expected in zip(threaded[1:], first[1:], strict=True):  # the order of the sums over bands differs
+            assert torch.allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

@@ -572,15 +572,3 @@ def test_a_web_tour_names_the_picture_of_its_masks(tmp_path: Path) -> None:
         load_pairs(tmp_path)
     (tmp_path / "kitchen_blur.png").rename(tmp_path / "panos" / "IMG_1_Blur.PNG")
     assert find_blur_mask(_load_first(tmp_path).image) == tmp_path / "panos" / "IMG_1_Blur.PNG"
-
-
-def test_only_one_module_decodes_pictures_of_users() -> None:
-    root = Path(__file__).parents[2]
-    decoders = re.compile(r"\bImage\.open\(|\bimread\(|\bimdecode\(")
-    found = {
-        file.relative_to(root).as_posix()
-        for part in ("pansplat", "viewer")
-        for file in (root / part).rglob("*.py")
-        if decoders.search(file.read_text(encoding="utf-8"))
-    }
-    assert found == {"pansplat/images/image_files.py", "pansplat/images/panorama_metadata.py"}

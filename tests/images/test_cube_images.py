@@ -1,6 +1,5 @@
 """Cube faces become the equirectangular panorama of the same scene, without seams, from the smallest good level."""
 
-import json
 import os
 from pathlib import Path
 
@@ -97,10 +96,3 @@ def test_missing_pictures_are_named(cube: CubeImage, tmp_path: Path) -> None:
     (tmp_path / "40/l/1_2.jpg").unlink()
     with pytest.raises(InputError, match=r"l/1_2\.jpg: needed a readable image file"):
         read_panorama(path, 80)
-
-
-@pytest.mark.parametrize("content", [[], {}, {"folder": 3, "levels": [1]}, {"folder": "x", "levels": [{"size": -1}]}])
-def test_other_content_is_refused(tmp_path: Path, content: object) -> None:
-    (tmp_path / "x.cube.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"x\.cube\.json: needed a"):
-        read_height(tmp_path / "x.cube.json")

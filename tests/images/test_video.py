@@ -16,7 +16,7 @@ COUNT = 70
 def _frames(count: int, height: int = 32, width: int = 64) -> Iterator[np.ndarray]:
     for i in range(count):
         frame = np.full((height, width, 3), (200, 60, 30), np.uint8)
-        frame[:, : width // 2] = 20 * i
+        frame[:, : width // 2] = 20 * i % 256
         yield frame
 
 
@@ -39,7 +39,7 @@ def test_odd_sizes_lose_a_row_or_column_and_films_are_h264(tmp_path: Path) -> No
 
 def test_a_failing_source_keeps_the_old_file(tmp_path: Path) -> None:
     def failing() -> Iterator[np.ndarray]:
-        yield from _frames(3)
+        yield from _frames(100)  # more than the encoder keeps back
         raise RuntimeError("no more frames")
 
     write_video(tmp_path / "a.mp4", _frames(2), 30)

@@ -1,22 +1,15 @@
-"""What all formats of panoramas have in common, whatever is wrong with their files."""
+"""What all formats of panoramas have in common (tests/test_input_files.py has their damaged files)."""
 
 from __future__ import annotations
 
 import json
-import os
-import random
-import re
-import shutil
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from panorama_formats import (
     EXAMPLES,
     Example,
@@ -33,7 +26,7 @@ from panorama_formats import (
     write_room,
 )
 
-from pansplat.errors import InputError, collect_notes
+from pansplat.errors import InputError
 from pansplat.images.image_files import list_pictures
 from pansplat.images.rig_images import Lens, RigImage, RigView, write_rig
 from pansplat.inputs.folders import list_stated_files, load_collections, load_pairs, load_panoramas
@@ -44,14 +37,10 @@ from pansplat.inputs.stated_files import find_inside, locate_inside
 
 NAMES = ("a.png", "b.png")
 OUTSIDE = "needed a file inside .*room, got the path"
-JSON = [name for name, example in EXAMPLES.items() if example.stated.endswith((".json", ".js"))]
 State = Callable[[Path, list[str]], None]
 
 pytestmark = pytest.mark.filterwarnings("ignore::pansplat.errors.InputWarning")
 of_all = pytest.mark.parametrize("example", EXAMPLES.values(), ids=EXAMPLES)
-of_files = pytest.mark.parametrize(
-    "example", [e for e in EXAMPLES.values() if e.stated != "b_f.png"], ids=[k for k in EXAMPLES if k != "cube faces"]
-)
 
 
 @pytest.fixture
@@ -69,17 +58,6 @@ def read(path: Path) -> tuple[dict[Path, Panorama], set[str], str]:
     files = [file for view in views for file in (*list_pictures(view.image), view.mask, view.depth) if file]
     notes = " ".join(str(warning.message) for warning in caught)
     return {view.image: view for view in views}, {file.resolve().name for file in files}, notes
-
-
-def try_to_read(path: Path) -> tuple[dict[Path, Panorama], str]:
-    """The panoramas at a path, and all notes and errors."""
-    with collect_notes() as notes, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            views = load_panoramas(path)
-        except InputError as error:
-            return {}, "\n".join([*notes, str(error)])
-    return {view.image: view for view in views}, "\n".join(notes)
 
 
 def test_each_format_has_an_example() -> None:
@@ -102,126 +80,6 @@ def test_a_format_is_found_first_and_its_files_open_its_panoramas(room: Path, ex
 
 def test_a_folder_that_is_gone_has_files_to_watch(tmp_path: Path) -> None:
     assert tmp_path / "gone" / "poses.json" in list_stated_files(tmp_path / "gone")
-
-
-def check_read_or_named(room: Path, example: Example) -> None:
-    """Panoramas are read with a note about others, or the file is named."""
-    panoramas, text = try_to_read(room / example.opens)
-    is_script = example.format == "web tour"  # of equal keys the last one counts
-    assert len(panoramas) == 2 or (panoramas and (text or is_script)) or Path(example.stated).name in text
-
-
-@of_files
-def test_a_file_that_is_cut_or_changed_is_read_or_named(room: Path, example: Example) -> None:
-    example.state(room, NAMES)
-    file = room / example.stated
-    content, generator = file.read_bytes(), np.random.default_rng(0)
-    for end in (0, 1, len(content) // 3, 2 * len(content) // 3, len(content) - 2):
-        file.write_bytes(content[:end])
-        check_read_or_named(room, example)
-    for _ in range(20):
-        changed = bytearray(content)
-        for place in generator.integers(0, len(content), 3):
-            changed[place] = generator.integers(0, 256)
-        file.write_bytes(changed)
-        check_read_or_named(room, example)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        *(b"", b"[]", b"5", b'"a"', b"null", b"true", b"1e999", b"NaN", b"[" * 100_000, b"[" * 100 + b"]" * 100),
-        *(b'{"a": ' * 30 + b"1" + b"}" * 30, b'{"\\ud800": 1}', b'{"a\\u0000.png": 1}', b'{"a.png": 1, "a.png": 2}'),
-        *("{}".encode("utf-16"), bytes(range(256)), b"{"),
-    ],
-)
-@of_files
-def test_a_file_of_other_content_is_named(room: Path, example: Example, content: bytes) -> None:
-    example.state(room, NAMES)
-    (room / example.stated).write_bytes(content)
-    form = next(form for form in FORMATS if form.find(room))
-    if form.name == example.format:  # that of Metashape is recognised by its content
-        assert Path(example.stated).name in try_to_read(room / example.opens)[1]
-
-
-def list_fields(content: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """The keys and indices that lead to each value of a JSON document; of lists to the first one."""
-    yield keys
-    items = (
-        content.items() if isinstance(content, dict) else enumerate(content[:1]) if isinstance(content, list) else ()
-    )
-    for key, value in items:
-        yield from list_fields(value, (*keys, key))
-
-
-def parse(file: Path) -> tuple[str, Any, str]:
-    """The JSON document in a file, and what is before and behind it."""
-    found = re.fullmatch(r"([^\[{]*)(.*[\]}])(.*)", file.read_text(), re.DOTALL)
-    assert found is not None
-    return found[1], json.loads(found[2]), found[3]
-
-
-def write_changed(file: Path, keys: tuple[str | int, ...], value: object, out: Path) -> None:
-    """Write a file with another value at some keys."""
-    head, content, tail = parse(file)
-    top = holder = {"": content}
-    for key in ("", *keys)[:-1]:
-        holder = holder[key]
-    holder[("", *keys)[-1]] = value
-    out.write_text(head + json.dumps(top[""]) + tail)
-
-
-@pytest.mark.parametrize("odd", [{"odd": []}, "odd"])
-@pytest.mark.parametrize("name", JSON)
-def test_a_value_of_another_type_is_named_with_its_field(room: Path, name: str, odd: object) -> None:
-    example, original = EXAMPLES[name], room.parent / "original"
-    example.state(room, NAMES)
-    shutil.copy(room / example.stated, original)
-    for keys in list_fields(parse(original)[1]):
-        write_changed(original, keys, odd, room / example.stated)
-        panoramas, notes = try_to_read(room / example.opens)
-        fields = [key for key in keys if isinstance(key, str)]
-        is_named = Path(example.stated).name in notes and (
-            not fields or re.search(r"(frame|pose|number) \d|'.*\b[ab]\b", notes)
-        )
-        assert len(panoramas) == 2 or is_named or any(field in notes for field in fields), (keys, notes)
-
-
-_SCALARS = (
-    *(10**400, 1e300, -1, 0, "../x", "http://x", "a", "a.png", "b.png", "cubemap", "multires", "%s", "{row}", ""),
-    *("\ud800", "cam2world opencv", [[1.0, 0, 0, 0]] * 4),
-)
-_JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4) | st.sampled_from(_SCALARS),
-    lambda inner: st.lists(inner, max_size=6) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
-    max_leaves=8,
-)
-
-
-@pytest.mark.parametrize("name", JSON)
-@settings(max_examples=40, suppress_health_check=list(HealthCheck))
-@given(value=_JSON, seed=st.integers(0, 10**6))
-def test_any_value_is_read_or_named(room: Path, name: str, value: object, seed: int) -> None:
-    example, original = EXAMPLES[name], room.parent / "original"
-    if not original.exists():
-        example.state(room, NAMES)
-        shutil.copy(room / example.stated, original)
-    random.Random(seed).shuffle(fields := list(list_fields(parse(original)[1])))
-    write_changed(original, fields[0], value, room / example.stated)
-    check_read_or_named(room, example)
-    panoramas = try_to_read(room / example.opens)[0]
-    names = {view.name for view in panoramas.values()}
-    assert all(image.is_file() for image in panoramas)
-    assert all(link.target in names for view in panoramas.values() for link in view.links)
-
-
-@of_files
-def test_a_file_that_is_too_large_is_named_and_not_read(room: Path, example: Example) -> None:
-    example.state(room, NAMES)
-    os.truncate(room / example.stated, 1 << 32)  # without blocks on the disk
-    text = try_to_read(room)[1]
-    if example.format not in ("web tour", "photographs"):  # as if it were none
-        assert re.search(rf"{Path(example.stated).name}.* of at most [\d,]+ bytes, got 4,294", text)
 
 
 @pytest.mark.parametrize("example", [e for e in EXAMPLES.values() if e.missing is not None])

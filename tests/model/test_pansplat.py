@@ -32,9 +32,6 @@ def prediction(network, make_inputs):
         return network(*make_inputs(32))
 
 
-# Agreement with the official code
-
-
 # Symmetries of the fixed network
 
 

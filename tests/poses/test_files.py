@@ -174,16 +174,6 @@ def test_the_mask_of_cube_faces_is_used(tmp_path: Path, monkeypatch) -> None:
     assert sorted(shown)[0] == 0.5
 
 
-def test_a_damaged_picture_is_named_and_the_others_open(tmp_path: Path) -> None:
-    _write(tmp_path, "a.png", "b.png")
-    whole = (tmp_path / "b.png").read_bytes()
-    (tmp_path / "b.png").write_bytes(whole[:-30])
-    with pytest.warns(UserWarning, match=r"left out: .*b\.png: needed a complete image"):
-        (pair,) = _load(tmp_path)
-    assert (pair.name, pair.context[0].name) == (tmp_path.name, "a")
-    assert pair.siblings == (tmp_path / "a.png",)
-
-
 def test_a_picture_that_looks_whole_and_cannot_be_decoded_is_left_out(tmp_path: Path) -> None:
     _write(tmp_path, "a.png", "b.jpg", "c.png")
     content = (tmp_path / "b.jpg").read_bytes()

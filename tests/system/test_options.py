@@ -1,4 +1,4 @@
-"""All numbers of a command line are checked at once, and messages name the option (see also test_schemas.py)."""
+"""All numbers of a command line are checked at once, and messages name the option (see test_command_numbers.py)."""
 
 from dataclasses import dataclass, field
 from typing import Annotated

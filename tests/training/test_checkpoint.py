@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 import pickle
-import resource
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.model.weights import UnsafeCheckpointError
+from pansplat.model.weights import UnsafeCheckpointError, WeightsFile, save_weights
 from pansplat.training.checkpoint import list_checkpoints, load_checkpoint, load_latest, save_checkpoint
 
 _WRITER = """
@@ -56,15 +56,14 @@ def test_a_kill_at_any_time_leaves_a_readable_checkpoint(tmp_path: Path) -> None
         assert not list(tmp_path.glob(".step_*"))
 
 
-def test_a_full_disk_is_an_error_and_keeps_the_older_checkpoint(tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_and_keeps_the_older_file(tmp_path: Path, full_disk: Callable) -> None:
+    weights = WeightsFile("pansplat", {}, "fixed", {"a": torch.zeros(100_000)})
     save_checkpoint(tmp_path, 1, state(), keep=1)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-    try:
+    with full_disk(100_000):
         with pytest.raises(InputError, match=r"step_00000002.pt.*free disk space"):
             save_checkpoint(tmp_path, 2, state(count=1_000_000), keep=1)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        with pytest.raises(InputError, match="free disk space"):
+            save_weights(tmp_path / "m.safetensors", weights)
     found = load_latest(tmp_path)
     assert found is not None and found[1]["step"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["step_00000001.pt"]

@@ -39,9 +39,6 @@ def mean_distance(prediction: Tensor, target: Tensor, weights: Tensor | None = N
     return (prediction.mean(dim=(1, 2, 3)) - target.mean(dim=(1, 2, 3))).abs()
 
 
-# Weights
-
-
 # Images
 
 

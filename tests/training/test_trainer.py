@@ -138,9 +138,3 @@ def test_initial_weights_are_those_of_a_file(micro_run: Callable) -> None:
     other = micro_run("other", network=replace(config.network, init=config.out / "model.safetensors"))
     initial = Trainer(other, silent=True).network.state_dict()
     assert all(torch.equal(initial[name], tensor) for name, tensor in final.items())
-
-
-def test_the_first_line_of_tiny_states_its_duration(micro_run: Callable) -> None:
-    config = micro_run(steps=300, heights=(64,))
-    assert Trainer(config, silent=True)._describe().endswith("from step 0 of 300, about 6 min on two cores")
-    assert "min" not in Trainer(micro_run(steps=300), silent=True)._describe(), "of another size it is unknown"

@@ -134,8 +134,7 @@ def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dic
             f"mode deferred needs the camera of each context view, the scene has {len(positions)} cameras "
             f"for {num_views} views; use mode joint"
         )
-    is_directed = settings.layout == "pinhole" and settings.by_direction
-    forward = torch.from_numpy(frame.rotation[:, 2].astype(np.float64)) if is_directed else None
+    forward = torch.from_numpy(frame.rotation[:, 2].astype(np.float64)) if settings.layout == "pinhole" else None
     weights = blend_weights(torch.from_numpy(frame.world_position.copy()), torch.from_numpy(positions), forward)
     factors = (settings.view_weights + (1.0,) * num_views)[:num_views]
     factors = factors if any(factors) else (1.0,) * num_views

@@ -36,8 +36,6 @@ class DrawSettings:
             context view separately and blends the images per pixel by distance.
         view_weights: factors of the context views in mode `deferred`, at least 0; views beyond the last one have 1.
             Views of factor 0 are not drawn, unless all are 0, which is the same as all 1.
-        by_direction: whether the views ahead of a pinhole camera weigh more (`blend_weights`); faces of a cube would
-            have seams.
         display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `normals`, the shortest
             axes of the Gaussians, towards their camera, with 0.5 + 0.5 (x, y, z) of the world as RGB; `levels` and
             `views`, a colour for each label.
@@ -52,7 +50,6 @@ class DrawSettings:
     mode: Mode = "joint"
     view: int = 0  # the context view of mode `view`
     view_weights: tuple[float, ...] = ()
-    by_direction: bool = True
     levels: frozenset[int] | None = None  # pyramid levels to draw; None draws all
     opacity_threshold: float = 0.0  # Gaussians of lower opacity are not drawn
     display: Display = "color"

@@ -50,11 +50,6 @@ def _run(scene, pose, layout, options=None, *, backend=rasterize_planes, dtype=t
     return result, gradients
 
 
-def _assert_same_bits(run, expected):
-    assert torch.equal(run[0].sums, expected[0].sums)
-    assert all(torch.equal(run[1][name], gradient) for name, gradient in expected[1].items())
-
-
 def test_a_number_that_is_unusable_in_one_channel_drops_the_gaussian_in_all(make_colored_scene, pose):
     scene = make_colored_scene(channels=5)
     scene.harmonics[::3, 0, 4] = torch.nan
@@ -71,24 +66,6 @@ def test_bands_change_no_bit_of_the_sums(scene, pose, monkeypatch):
     assert torch.equal(whole.sums, banded.sums)
     for name, gradient in gradients.items():  # slots are added band by band, so in another order
         torch.testing.assert_close(banded_gradients[name], gradient, rtol=1e-4, atol=1e-5 * float(gradient.abs().max()))
-
-
-@pytest.fixture
-def _restore_threads():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.mark.usefixtures("_restore_threads")
-@pytest.mark.parametrize("layout", ["equirect", "cubemap"])
-def test_the_number_of_threads_changes_no_bit(layout, make_colored_scene, pose):
-    scene, runs = make_colored_scene(count=20000), []
-    for threads in (1, 2, 3, 5):
-        torch.set_num_threads(threads)
-        runs.append(_run(scene, pose, layout))
-    for run in runs[1:]:
-        _assert_same_bits(run, runs[0])
 
 
 def test_without_grad_nothing_is_saved(scene, pose):

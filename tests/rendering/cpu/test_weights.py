@@ -58,16 +58,13 @@ def test_bands_that_are_not_stored_give_the_same_products(scene, pose, values, i
         assert (len(banded._stored), len(banded._bands)) == (num_stored, 2)
 
 
-def test_the_number_of_threads_changes_no_bit(scene, pose, values, image):
-    threads, runs = torch.get_num_threads(), []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            stored = StoredWeights(scene, pose, SIZE)
-            runs.append((stored.blend(values), stored.accumulate(image)))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(*pair) for pair in zip(*runs, strict=True))
+def test_the_number_of_threads_changes_no_bit(scene, pose, values, image, run_with_threads):
+    def run():
+        stored = StoredWeights(scene, pose, SIZE)
+        return stored.blend(values), stored.accumulate(image)
+
+    first, *others = run_with_threads(run)
+    assert all(torch.equal(*pair) for other in others for pair in zip(other, first, strict=True))
 
 
 def test_no_gaussians_give_a_black_image(scene, pose, image):

@@ -7,67 +7,21 @@ import types
 
 import pytest
 import torch
+from dense_renderer import BACKENDS, FIELDS, assert_dense, find_gradients
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering import cuda, rasterize, reference
+from pansplat.rendering import Rendering, cuda, rasterize, reference
 from pansplat.rendering.rasterize import _select_backend
 
-_FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 exhaustive = pytest.mark.exhaustive  # an intersection takes milliseconds in the interpreter
-
-
-def _gradients(scene: Gaussians, camera: Tensor, dtype: torch.dtype, **options):
-    """An image and the gradients of a random loss of all of it, by name; `pose` along rigid motions."""
-    device = "cuda" if torch.cuda.is_available() and options["backend"] == "triton" else "cpu"
-
-    def make_leaf(value: Tensor, dtype: torch.dtype = dtype) -> Tensor:
-        return value.detach().to(device, dtype, copy=True).requires_grad_()
-
-    leaves = {name: make_leaf(getattr(scene, name)) for name in _FIELDS}
-    leaves["pose"] = make_leaf(camera, camera.dtype)
-    leaves["background"] = make_leaf(torch.linspace(0.2, 0.9, scene.harmonics.shape[2]))
-    changed = dataclasses.replace(scene.to(device=device), **{name: leaves[name] for name in _FIELDS})
-    got = rasterize(changed, leaves["pose"], background=leaves["background"], **options)
-    everything = torch.cat((got.color, got.alpha[None], (got.depth * got.alpha)[None])).cpu()
-    target = torch.rand(everything.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    (everything.double() * target).sum().backward()
-    gradients = {name: leaf.grad.cpu() for name, leaf in leaves.items() if leaf.grad is not None}
-    turn = camera[:3, :3].T @ gradients["pose"][:3, :3]
-    gradients["pose"] = torch.cat((turn - turn.T, gradients["pose"][:3, 3:]), dim=1)
-    return everything.detach(), gradients, got.info
-
-
-def _compare(
-    scene: Gaussians,
-    camera: Tensor,
-    dtype: torch.dtype,
-    tolerances: tuple[float, float],
-    *,
-    invisible: tuple[str, ...] = (),
-    **options,
-):
-    """Assert that Triton's image and gradients equal those of float64 torch, and return both.
-
-    Args:
-        tolerances: largest error of a pixel, and relative error of a gradient by norm.
-        invisible: gradients that are too small to compare.
-    """
-    expected = _gradients(scene, camera, torch.float64, backend="torch", **options)
-    got = _gradients(scene, camera, dtype, backend="triton", **options)
-    assert float((got[0] - expected[0]).abs().max()) < tolerances[0]
-    assert got[1].keys() == expected[1].keys()
-    for name in expected[1].keys() - set(invisible):
-        error = float((got[1][name] - expected[1][name]).norm() / expected[1][name].norm())
-        assert error < tolerances[1], name
-    return expected, got
+TRITON = dataclasses.replace(BACKENDS["triton"], gradient=1e-5)
+EXACT = dataclasses.replace(TRITON, dtype=torch.float64)
 
 
 def test_a_small_image_and_its_gradients_equal_float64_torch(make_scene, pose):
-    scene = make_scene(3, scale=0.4, degree=1)
-    _, got = _compare(scene, pose, torch.float32, (2e-6, 1e-5), size=(4, 8), layout="equirect")
-    assert got[2].backend == "triton" and got[2].intersections > 0 and got[2].bytes > 0
+    (_, got), _ = assert_dense(TRITON, make_scene(3, scale=0.4, degree=1), {"size": (4, 8), "pose": pose})
+    assert got.info.backend == "triton" and got.info.intersections > 0 and got.info.bytes > 0
 
 
 @exhaustive
@@ -76,18 +30,18 @@ def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene
 
     monkeypatch.setattr(stage, "_MANY_TILES", 4)
     scene = make_scene(2, scale=1.5, extent=0.8, seed=1, degree=0)
-    _, got = _compare(scene, pose, torch.float32, (1e-5, 1e-5), size=(48, 96), layout="equirect")
-    assert got[2].intersections > 2 * 16  # each has its own program, which sums in more than one step
+    (_, got), _ = assert_dense(TRITON, scene, {"size": (48, 96), "pose": pose})
+    assert got.info.intersections > 2 * 16  # each has its own program, which sums in more than one step
 
 
 @exhaustive
 def test_opaque_gaussians_around_the_camera_equal_float64_torch(make_scene):
     scene = make_scene(12, scale=1.5, extent=0.6, seed=2, degree=0)
     scene = dataclasses.replace(scene, opacities=torch.linspace(0.5, 2.0, 12, dtype=torch.float64))
-    camera = torch.eye(4, dtype=torch.float64)
     # Triton's tiles stop early.
-    expected, _ = _compare(scene, camera, torch.float64, (2e-5, 1e-3), size=(9, 18), layout="equirect")
-    assert float(expected[0][3].max()) > 0.9999  # several at the largest alpha
+    early = dataclasses.replace(EXACT, image=2e-5, gradient=1e-3)
+    (expected, _), _ = assert_dense(early, scene, {"size": (9, 18)})
+    assert float(expected.alpha.detach().max()) > 0.9999  # several at the largest alpha
 
 
 @exhaustive
@@ -99,9 +53,10 @@ def test_gaussians_behind_a_saturated_tile_are_left_out(make_scene, pose):
         means=(scene.means + ahead) @ pose[:3, :3].T + pose[:3, 3],
         opacities=torch.full_like(scene.opacities, 0.2),  # 32 of them do not saturate
     )
-    options = dict(size=(4, 4), layout="pinhole")
-    expected, got = _compare(scene, pose, torch.float32, (1e-4, 1e-3), invisible=("background",), **options)
-    hidden = (got[1]["opacities"] == 0) & (expected[1]["opacities"] != 0)
+    early = dataclasses.replace(TRITON, image=1e-4, gradient=1e-3)
+    options = {"size": (4, 4), "layout": "pinhole", "pose": pose, "fields": (*FIELDS, "pose")}
+    _, (expected, got) = assert_dense(early, scene, options)
+    hidden = (got["opacities"] == 0) & (expected["opacities"] != 0)
     assert 20 < int(hidden.sum()) < 100
 
 
@@ -109,18 +64,22 @@ def test_gaussians_behind_a_saturated_tile_are_left_out(make_scene, pose):
 def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
     from pansplat.rendering.cuda import tiling
 
-    scene = make_scene(12, scale=0.3, degree=0)
-    options = dict(backend="triton", size=(20, 40), layout="equirect")
-    wide = _gradients(scene, pose, torch.float64, **options)
+    scene, size = make_scene(12, scale=0.3, degree=0), (20, 40)
+
+    def draw() -> tuple[Rendering, dict[str, Tensor]]:
+        return EXACT(scene, pose, size=size), find_gradients(EXACT, scene, pose, size=size)
+
+    (wide, gradients), bands = draw(), []
     with monkeypatch.context() as by_tiles:
         by_tiles.setattr(tiling, "_MAX_TILES", 3)  # indices of tiles are of 16 bits
-        rows = _gradients(scene, pose, torch.float64, **options)
+        bands.append(draw())
     monkeypatch.setattr(tiling, "intersect_tiles", functools.partial(tiling.intersect_tiles, limit=1))
-    for narrow in (rows, _gradients(scene, pose, torch.float64, **options)):
-        assert torch.equal(narrow[0], wide[0]) and narrow[2].intersections == wide[2].intersections
-        assert narrow[2].bytes < wide[2].bytes
-        for name, expected in wide[1].items():
-            assert torch.allclose(narrow[1][name], expected, rtol=1e-12, atol=1e-12), name
+    bands.append(draw())
+    for narrow, found in bands:
+        assert torch.equal(narrow.color, wide.color) and torch.equal(narrow.depth, wide.depth)
+        assert narrow.info.intersections == wide.info.intersections and narrow.info.bytes < wide.info.bytes
+        for name, expected in gradients.items():
+            assert torch.allclose(found[name], expected, rtol=1e-12, atol=1e-12), name
 
 
 def test_gaussians_on_the_cpu_are_refused_unless_interpreted(make_scene, pose, monkeypatch):

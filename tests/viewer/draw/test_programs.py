@@ -1,24 +1,9 @@
-"""The GLSL sources are documented, and have what GLSL 3.30 allows."""
+"""The GLSL sources have what GLSL 3.30 allows."""
 
 import re
-from importlib import resources
 from types import SimpleNamespace
 
 from pansplat_viewer.draw.programs import Programs
-
-FOLDER = resources.files("pansplat.shaders")
-SOURCES = sorted(path.name for path in FOLDER.iterdir() if path.name.endswith((".glsl", ".vert", ".frag")))
-
-
-def test_readme_names_every_file_uniform_and_input():
-    readme = (FOLDER / "README.md").read_text("utf-8")
-    for name in SOURCES:
-        text = (FOLDER / name).read_text("utf-8")
-        names = re.findall(r"^uniform (?:highp )?\w+ (\w+)", text, re.MULTILINE)
-        if name.endswith(".vert"):
-            names += re.findall(r"^in \w+ (\w+)", text, re.MULTILINE)
-        missing = [each for each in (name, *names) if f"`{each}`" not in readme]
-        assert not missing, f"{name}: {missing} not in shaders/README.md"
 
 
 def test_qualifiers_of_layouts_are_signed_literals():

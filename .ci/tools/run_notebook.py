@@ -1,4 +1,4 @@
-"""Run docs/notebook.ipynb and write it with its outputs: `python tests/run_notebook.py [FILE]`, by default in place.
+"""Run docs/notebook.ipynb and write it with its outputs: `python .ci/tools/run_notebook.py [FILE]`, default: in place.
 
 The frames of scenes are left out of the file; programs show the pictures beside them until the cells are run.
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 CELL_SECONDS = 300  # limit of a cell
 

@@ -1,6 +1,6 @@
 """Compile every kernel for GPUs, which need not be present, and print one JSON line for each.
 
-Run: python tests/rendering/cuda/compile_for_gpu.py [COMPUTE_CAPABILITY ...]   (by default 80 90)
+Run: python .ci/tools/compile_for_gpu.py [COMPUTE_CAPABILITY ...]   (by default 80 90)
 TRITON_INTERPRET must not be set. NVIDIA's assembler, which Triton includes, reports registers and spills.
 """
 

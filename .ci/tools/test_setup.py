@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = {
     "id": "echo 1000",
     "sudo": '[ "$CAN_SUDO" ] && [ "$2" = true ]',  # but not apt-get

@@ -28,9 +28,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-pytestmark = pytest.mark.lint
-
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SUFFIXES = [".py", ".json", ".glsl", ".vert", ".frag", ".safetensors", ".html", ".css", ".js"]
 FOLDERS = {
     "pansplat": "pansplat",

@@ -1,4 +1,4 @@
-"""The documents: commands, calls, links and pose files of the README work; the notebook runs; every module is named."""
+"""The documents: commands, calls, links and pose files of the README work; the notebook runs; sources are described."""
 
 import base64
 import io
@@ -11,16 +11,16 @@ from pathlib import Path
 import cv2
 import nbformat
 import numpy as np
-import pytest
 from PIL import Image
 
 import pansplat
 from pansplat.cli import parse
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text("utf-8")
 BLOCKS = "\n".join(re.findall(r"^```\w*\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE))
 COMMANDS = re.findall(r"^(?:\.venv/bin/)?pansplat (.+?)(?:\s+#.*)?$", BLOCKS, flags=re.MULTILINE)
+SHADERS = ROOT / "shaders"
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 
 
@@ -75,10 +75,31 @@ def test_the_architecture_names_every_module() -> None:
     assert not missing
 
 
-@pytest.mark.slow
+def test_the_readme_of_the_shaders_names_every_file_uniform_and_input():
+    readme = (SHADERS / "README.md").read_text("utf-8")
+    for name in sorted(path.name for path in SHADERS.iterdir() if path.suffix in (".glsl", ".vert", ".frag")):
+        text = (SHADERS / name).read_text("utf-8")
+        names = re.findall(r"^uniform (?:highp )?\w+ (\w+)", text, re.MULTILINE)
+        if name.endswith(".vert"):
+            names += re.findall(r"^in \w+ (\w+)", text, re.MULTILINE)
+        missing = [each for each in (name, *names) if f"`{each}`" not in readme]
+        assert not missing, f"{name}: {missing} not in shaders/README.md"
+
+
+def test_only_one_module_decodes_pictures_of_users() -> None:
+    decoders = re.compile(r"\bImage\.open\(|\bimread\(|\bimdecode\(")
+    found = {
+        file.relative_to(ROOT).as_posix()
+        for part in ("pansplat", "viewer")
+        for file in (ROOT / part).rglob("*.py")
+        if decoders.search(file.read_text(encoding="utf-8"))
+    }
+    assert found == {"pansplat/images/image_files.py", "pansplat/images/panorama_metadata.py"}
+
+
 def test_all_cells_of_the_notebook_run_and_show_the_stored_pictures(tmp_path: Path) -> None:
     out = tmp_path / "notebook.ipynb"
-    command = [sys.executable, str(ROOT / "tests" / "run_notebook.py"), str(out)]
+    command = [sys.executable, str(Path(__file__).with_name("run_notebook.py")), str(out)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     ran, stored = (
