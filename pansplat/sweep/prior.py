@@ -1,4 +1,4 @@
-"""Priors of each view's depth in the search, from a model that knows what rooms look like.
+"""Priors of each view's depth in the search, from a model that was trained on rooms.
 
 The model sees upright panoramas. Its first estimate is the logarithm of depth in units of the camera's height over the
 floor; the height follows by matching: the estimated surfaces, scaled by each candidate, are warped into the other
