@@ -2,8 +2,9 @@
 // pansplat.tours.graph.TourGraph that they name; tests/web/test_browser.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
-// on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; and the `reach` around a part,
-// within which a camera that has jumped is in it. Edges are numbers in `edges`.
+// on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a
+// change of edge; and the `reach` around a part, within which a camera that has jumped is in it. Edges are numbers in
+// `edges`.
 
 export const DEGREE = Math.PI / 180;
 const POOR_REACH = 0.5;  // metres that a camera may walk from a panorama along a poor edge, at most a quarter of it
