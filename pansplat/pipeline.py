@@ -170,7 +170,11 @@ def load_model(
 
 
 def _load_guided(name: str | Path, path: Path | None, depth_network: str | Path | None) -> Predictor:
-    """The guided sweep of the weights of a depth network, by default the shipped one; others have no surfaces of it."""
+    """The guided sweep of a file of weights of a depth network, by default the shipped one.
+
+    Raises:
+        InputError: a depth network is given for another predictor.
+    """
     from pansplat.sweep.guided_sweep import default_weights, load_guided_sweep
 
     if str(name) == "sweep" or (path is not None and read_model_name(path) != "depth"):
@@ -230,7 +234,7 @@ def find_max_views(predictor: Predictor) -> int:
 
 
 def scale_seconds(seconds: float, pair: Pair) -> float:
-    """The time limit of a refinement of many views, from that of a scene of an edge."""
+    """The time limit of a refinement of all views of a pair, from that of three panoramas (`MAX_SCENE_VIEWS`)."""
     return seconds * max(len(pair.context) / MAX_SCENE_VIEWS, 1.0)
 
 
@@ -255,13 +259,14 @@ def choose_height(pair: Pair, predictor: Predictor) -> int:
 
 
 def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.inf) -> PredictOptions:
-    """The options of a scene of a tour, from those of the tour; the time limit is that of three panoramas.
+    """The options of a scene of a tour, from those of the tour, whose time limit is that of three panoramas.
+
+    The height, by default that of the photographs, at most 512, is halved while the prediction has more than four times
+    as many Gaussians as are kept: a refinement after a few mergers fits the photographs better than after many.
 
     Args:
         pair: of `TourGraph.make_pair`.
-        gaussians: number that is kept of each panorama. The height, by default that of the photographs, at most 512, is
-            halved while there are more than four times as many: a refinement after a few mergers fits the photographs
-            better than after many.
+        gaussians: number that is kept of each panorama.
     """
     height = options.height
     if height is None:
@@ -361,7 +366,7 @@ def predict(
 def _choose_options(
     model: str | Path | Predictor | None, options: PredictOptions | None, keywords: dict[str, Any]
 ) -> tuple[Predictor, PredictOptions]:
-    """The predictor and the options of a call; without options, what is predicted is not refined."""
+    """The predictor and the options of a call; without an object of options there is no refinement by default."""
     is_named = isinstance(model, (str, Path))
     options = PredictOptions(refine_seconds=0.0) if options is None else options
     options = options.replace(**keywords, **({"model": str(model)} if is_named else {}))
@@ -758,7 +763,7 @@ def render(
 
 
 def make_renderer(scene: Scene, work: str, count: int, **options: Any) -> Callable[..., Rendering]:
-    """A function from a pose to its image: on the device for their number, out of a card's memory on the processor.
+    """A function from a pose to its image, on the device for their number; on the processor once a card is full.
 
     Keywords of the function replace those of all images.
 

@@ -76,7 +76,7 @@ class Scenes:
 
     @property
     def _waiting(self) -> LoadedScene | None:
-        """The scene that is shown when the renderer's form of it is prepared."""
+        """The loaded scene of `coming`, which is shown once it is converted for the renderer."""
         coming = self.coming
         return coming.loaded if coming is not None and coming.is_known else None
 
@@ -259,7 +259,7 @@ class Scenes:
             self._replace(coming, result)
 
     def _fail(self, requested: SceneEntry) -> None:
-        """The loader could not make an entry."""
+        """Mark an entry as failed, which the loader could not load."""
         if self.tour is not None and self.tour.is_of(requested):
             self.tour.fail(requested.views)
         elif self.coming is not None and self.coming.entry is requested:

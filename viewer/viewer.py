@@ -29,13 +29,14 @@ from pansplat.system.files import require_replaceable
 from pansplat.tours.camera_path import read_path, write_path
 from pansplat.tours.route import find_angles
 from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.hotspots import Hotspot, find_clicked, find_hotspots
 from pansplat_viewer.scene.library import Library
 from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
 from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import RendererChoice
 from pansplat_viewer.scene.state import ViewerState, advance_path
-from pansplat_viewer.scene.tour import DEFAULT_MEMORY, Hotspot, TourScenes, find_clicked, find_hotspots
+from pansplat_viewer.scene.tour import DEFAULT_MEMORY, TourScenes
 from pansplat_viewer.scenes import Scenes
 from pansplat_viewer.screenshots import Screenshots
 from pansplat_viewer.ui.panels import Panels
@@ -221,7 +222,7 @@ class Viewer:
         self.panels.release()
         self.gui.close()
 
-    # --- scenes: search, preview, load, enter, refine ---
+    # --- scenes: open and show one, go on after an error ---
 
     def open(self, path: Path, name: str | None = None) -> None:
         """Look for the scenes at a path and show one; for an invalid path, show an error and keep the scene.

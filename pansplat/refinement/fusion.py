@@ -40,14 +40,14 @@ def fuse_views(scene: Scene) -> Scene:
     gaussians, poses = scene.gaussians, scene.cam2world
     own = gaussians.views.long()
     centers = poses[:, :3, 3].to(gaussians.means)
-    nearest = (gaussians.means - centers[own]).norm(dim=1)
+    own_distances = (gaussians.means - centers[own]).norm(dim=1)
     is_dropped = torch.zeros_like(own, dtype=torch.bool)
     for view in own.unique().tolist():
         surface = gaussians.select(own == view)
         distances = (gaussians.means - centers[view]).norm(dim=1)
-        is_nearer = (distances < nearest) | ((distances == nearest) & (own > view))
-        asked = (own != view) & ~is_dropped & (is_nearer | (gaussians.levels >= BACKGROUND_LEVEL))
-        chosen = asked.nonzero()[:, 0]
+        is_nearer = (distances < own_distances) | ((distances == own_distances) & (own > view))
+        is_tested = (own != view) & ~is_dropped & (is_nearer | (gaussians.levels >= BACKGROUND_LEVEL))
+        chosen = is_tested.nonzero()[:, 0]
         reach = measure_reach(surface, poses[view], min(scene.height, _HEIGHT))
         is_dropped[chosen] = are_seen(gaussians.means[chosen], poses[view], reach)
     return dataclasses.replace(scene, gaussians=scene.gaussians.select(~is_dropped), joint=True)

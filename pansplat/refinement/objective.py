@@ -44,13 +44,13 @@ class Photograph:
     """A photograph, and weights of its pixels.
 
     Attributes:
-        scene: of all unmasked pixels.
+        unmasked: of all pixels that are compared.
         fitted: of those that are not held out.
         held_out: of those that are.
     """
 
     image: Float[Tensor, "3 height width"]
-    scene: PixelWeights
+    unmasked: PixelWeights
     fitted: PixelWeights
     held_out: Float[Tensor, "height width"]
 

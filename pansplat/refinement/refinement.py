@@ -96,8 +96,8 @@ class RefineReport:
         steps, seconds: of the run.
         stopped: why it ended: "done", "converged", "interrupted", "worse" if the given scene is kept, or "single view",
             which is not refined.
-        before, after: mean absolute error of the held-out blocks at the start, within the limit of Gaussians, and
-            before the last part of the run, which fits them; at the end of a run without that part.
+        before: mean absolute error of the held-out blocks at the start, of the scene within the limit of Gaussians.
+        after: the same before the last part of the run, which fits these blocks, or at the end of a run without it.
         gains: factors of the photographs' channels relative to their geometric mean.
         history: (step, seconds, error of the held-out blocks) of each check.
     """
@@ -150,7 +150,7 @@ class Refinement:
         limit = self.config.gaussians
         height = min(self._images.shape[-2], _HEIGHT if limit is None else DISPLAY_HEIGHT)
         self._size = (height, 2 * height)
-        self._counted_size = (min(height, _HEIGHT), 2 * min(height, _HEIGHT))  # of contributions
+        self._contribution_size = (min(height, _HEIGHT), 2 * min(height, _HEIGHT))  # of contributions
         held_out = 0.0 if scene.joint else _HELD_OUT
         self._photographs = [
             Photograph.split(image, mask > 0.999, held_out, random)
@@ -159,7 +159,7 @@ class Refinement:
             )
         ]
         if limit is not None and len(scene.gaussians) > limit:
-            scene = merge_to(scene, self._counted_size, limit)
+            scene = merge_to(scene, self._contribution_size, limit)
         self._created = time.perf_counter()
         self._start, gaussians = scene, scene.gaussians
         self._views = {
@@ -208,7 +208,7 @@ class Refinement:
         for layer in self._layers:
             target = self._choose_target(layer)
             photograph = self._photographs[target]
-            weights = photograph.scene if fraction >= config.release else photograph.fitted
+            weights = photograph.unmasked if fraction >= config.release else photograph.fitted
             gaussians = self._build(layer)
             moved = torch.cat([self._views[view].tensors["distance"] for view in layer.views])
             if layer.source is None:
@@ -230,9 +230,7 @@ class Refinement:
         self._steps += 1
 
     def _choose_target(self, layer: _Layer) -> int:
-        """The photograph that a layer is compared with: that of its view in even steps, the others in turn in odd ones.
-        In joint drawing, all in turn.
-        """
+        """The photograph that a layer is compared with in this step (see the module)."""
         own, *others = layer.photographs
         if layer.source is None:
             return layer.photographs[self._steps % len(layer.photographs)]
@@ -306,7 +304,7 @@ class Refinement:
             for target in others or layer.photographs:
                 photograph = self._photographs[target]
                 difference = (self._draw(gaussians, layer, target) - photograph.image).abs().mean(0)
-                compared = photograph.scene.pixels if self._start.joint else photograph.held_out
+                compared = photograph.unmasked.pixels if self._start.joint else photograph.held_out
                 error += float((difference * compared).sum())
                 weight += float(compared.sum())
         return error / weight if weight > 0 else 0.0
@@ -394,10 +392,10 @@ class Refinement:
         after = measure() if after is None else after
         report_progress("fitting colours", _STEPS_SHARE)
         self._result = self.scene() if after <= before else self._start
-        self._release_parameters()
+        self._free_parameters()
         if after <= before:
-            detail = self._counted_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
-            self._result = drop_unseen(self._result, self._counted_size, detail * DROP_ERROR)
+            detail = self._contribution_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
+            self._result = drop_unseen(self._result, self._contribution_size, detail * DROP_ERROR)
         else:
             stopped = "worse"
         if after <= before or self._start.joint:  # a fused scene has the colours of single photographs
@@ -405,7 +403,7 @@ class Refinement:
         report_progress("refined", 1.0)
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
 
-    def _release_parameters(self) -> None:
+    def _free_parameters(self) -> None:
         """Free the parameters and the optimiser's state, which are gigabytes for millions of Gaussians."""
         self._views.clear()
         self._layers.clear()

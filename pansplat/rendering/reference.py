@@ -121,12 +121,12 @@ def _rasterize_columns(
         reached = (after_left <= boxes[:, 1] - boxes[:, 0] + 2 * _BOX_MARGIN) | (after_left > width - _BOX_MARGIN)
         reached = torch.nonzero(reached & is_in_image(boxes, plane))[:, 0]
         footprints = Footprints(*(field[reached] for field in footprints))
-        rows = boxes[reached]
-        rows[:, 0], rows[:, 1] = 0, 1
+        boxes = boxes[reached]
+        boxes[:, 0], boxes[:, 1] = 0, 1  # of an image of this column alone
         order = torch.argsort(projected.radius.detach()[reached], stable=True)
         pixels = _arrange_points(directions[:, column : column + 1], projected.peak.dtype)
         bands = []
-        for band in intersect_tiles(rows, order, (height, 1), wraps=False):
+        for band in intersect_tiles(boxes, order, (height, 1), wraps=False):
             bands.append(composite(footprints, band, pixels, exact=True))
             intersections += len(band.indices)
         sums = torch.cat(bands).reshape(-1, TILE_SIZE, TILE_SIZE, bands[0].shape[-1])[:, :, 0].flatten(0, 1)

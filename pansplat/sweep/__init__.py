@@ -1,8 +1,9 @@
-"""A predictor without weights: a hierarchical sphere sweep.
+"""A hierarchical sphere sweep: without weights the predictor `sweep`, with the prior of a depth network `default`.
 
-In the order of the pipeline: `predictor` (the call), `search` (three levels), `planes` (the scene's axes and planes),
-`prior` (depth that a model expects), `matching` (matching cost and its aggregation), `surface` (consistency between
-views, upsampling), `lift` (Gaussians).
+In the order of the pipeline: `predictor` (the call), `search` (observation, then three levels), `axes` (of the scene),
+`prior` (depth that a model expects), `matching` (matching cost and its aggregation), `bend` (single views, bent by
+matches), `surface` (consistency between views, upsampling), `lift` (Gaussians). `guided_sweep` loads the networks of
+the prior; `joined_crops` joins the depth of a user's network.
 """
 
 from pansplat.sweep.predictor import Sweep, SweepConfig

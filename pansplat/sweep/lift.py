@@ -3,8 +3,8 @@
 Levels 0 and 1 are discs on the surface, with gaps at depth discontinuities; level 0 is used only where level 1 would
 lose image detail. Where a large panorama has detail that a lattice of half its height would lose, finer lattices
 replace the points of level 0. Levels 2 and 3 are a closed background layer slightly behind the surface: at every
-discontinuity it continues the far side, so that a moving camera sees no holes. Points in the consistent free space of
-another view are removed.
+discontinuity it continues the far side, so that a moving camera sees no holes. Points in the consistent free
+space of more other views than confirm them move back to the background, or are removed.
 
 Source: PanSplat, section 3.3 (lattices and levels).
 """
@@ -81,7 +81,7 @@ class LiftConfig:
     """Relative change of inverse depth between pixels at a discontinuity."""
     tolerance: float = 0.15
     """Relative difference of depth up to which another view confirms a point, and beyond which it may remove it: more
-    than in `consistency_mask`, which decides whose word counts."""
+    than in `consistency_mask`, which chooses the pixels that may remove points."""
     consistent_opacity: float = 0.95
     """Where another view is consistent."""
     single_view_opacity: float = 0.9

@@ -595,7 +595,7 @@ def _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, r
 
 
 def aggregate_costs(
-    cost: np.ndarray, guide: np.ndarray, slot_map: np.ndarray, slots: int, config: AggregationConfig, threads: int = 2
+    cost: np.ndarray, guide: np.ndarray, slot_map: np.ndarray, slots: int, config: AggregationConfig
 ) -> np.ndarray:
     """Sum of the path costs of all eight directions, (h, w, sets * count).
 
@@ -619,9 +619,8 @@ def aggregate_costs(
                 _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, height // 4)
         return total
 
-    # Fixed groups, summed in a fixed order: the result does not depend on the number of threads.
-    groups = (_DIRECTIONS[::2], _DIRECTIONS[1::2])
-    with ThreadPoolExecutor(max(1, min(threads, len(groups)))) as pool:
+    groups = (_DIRECTIONS[::2], _DIRECTIONS[1::2])  # of equal cost, a thread each
+    with ThreadPoolExecutor(len(groups)) as pool:
         first, second = pool.map(run, groups)
     first += second
     return first

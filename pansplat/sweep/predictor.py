@@ -40,7 +40,7 @@ class SweepConfig:
 class Sweep:
     """Hierarchical sphere sweep with a hand-crafted matching cost; see docs/sweep.md.
 
-    It takes one or more views and matches each against a few others. A prior model adds knowledge of rooms where the
+    It takes one or more views and matches each against a few others. A prior model estimates depth where the
     panoramas have no evidence: `default` has one (`guided_sweep`), `sweep` has none.
     """
 

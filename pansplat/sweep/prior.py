@@ -1,4 +1,4 @@
-"""Priors of each view's depth in the search, from a model that knows what rooms look like.
+"""Priors of each view's depth in the search, from a model that was trained on rooms.
 
 The model sees upright panoramas. Its first estimate is the logarithm of depth in units of the camera's height over the
 floor; the height follows by matching: the estimated surfaces, scaled by each candidate, are warped into the other
@@ -116,6 +116,8 @@ class PriorEstimator:
         images: (h, w, 3) of each view.
         cam2world: (v, 4, 4).
         down: (3,) unit vector of the world.
+        limits: smallest and largest inverse height of the cameras over the floor: those of the inverse depth, because
+            the floor is in its range.
     """
 
     def __init__(
@@ -124,9 +126,11 @@ class PriorEstimator:
         images: Sequence[np.ndarray],
         cam2world: np.ndarray,
         down: np.ndarray,
+        limits: tuple[float, float],
         config: PriorConfig,
     ) -> None:
-        self._cam2world, self._down, self._config = cam2world, down, config
+        self._cam2world, self._down, self._limits, self._config = cam2world, down, limits, config
+        self._usual_height = min(max(CAMERA_HEIGHT, 1 / limits[1]), 1 / limits[0])
         self._turns = [upright_rotation(pose[:3, :3], down) for pose in cam2world]
         self._observed = model.observe(
             [i if turn is None else rotate_image(i, turn) for i, turn in zip(images, self._turns, strict=True)]
@@ -136,35 +140,26 @@ class PriorEstimator:
             if turn is not None:
                 pose[:3, :3] = pose[:3, :3] @ turn
 
-    def sharpen(self, limits: tuple[float, float]) -> list[np.ndarray]:
+    def sharpen(self) -> list[np.ndarray]:
         """Sharpened log-depth (h, w) of each view by itself, in the unit of the poses for a usual camera height.
 
         The search bends it to the matches, and uses it as it is where nothing can be matched.
-
-        Args:
-            limits: smallest and largest inverse height of the cameras over the floor.
         """
-        height = min(max(CAMERA_HEIGHT, 1 / limits[1]), 1 / limits[0])
-        upright = [log_depth + math.log(height) for log_depth in self._observed.sharpen()]
+        upright = [log_depth + math.log(self._usual_height) for log_depth in self._observed.sharpen()]
         return [
             log_depth if turn is None else rotate_image(log_depth[..., None], turn.T)[..., 0]
             for log_depth, turn in zip(upright, self._turns, strict=True)
         ]
 
-    def choose_neighbours(self, limits: tuple[float, float], count: int) -> list[list[int]]:
-        """The other views of each view that see most of the same surfaces, those of the largest overlap first.
+    def choose_neighbours(self, count: int) -> list[list[int]]:
+        """At most `count` other views of each view that see most of the same surfaces, the largest overlap first.
 
         Cameras that are too near for parallax come later.
 
         The surfaces are the estimates of each view by itself. An overlap is the smaller share of the two spheres that
         the other camera sees, from at most twice the distance. Each view has at least one other view.
-
-        Args:
-            limits: smallest and largest inverse height of the cameras over the floor.
-            count: number of other views, at most.
         """
-        height = min(max(CAMERA_HEIGHT, 1 / limits[1]), 1 / limits[0])
-        priors = self._turn_back(_scale_depth(self._observed.priors, [height] * len(self._turns)))
+        priors = self._turn_back(_scale_depth(self._observed.priors, [self._usual_height] * len(self._turns)))
         shares = np.array(
             [
                 [_share_seen(here, there, poses) for there, poses in zip(priors, pairs, strict=True)]
@@ -172,7 +167,7 @@ class PriorEstimator:
             ]
         )
         overlap = np.minimum(shares, shares.T)
-        parallax = np.minimum(measure_distances(self._cam2world) * limits[1], 1)
+        parallax = np.minimum(measure_distances(self._cam2world) * self._limits[1], 1)
         order = (overlap * parallax - np.eye(len(overlap))).argsort(axis=1, kind="stable")[:, ::-1]
         return [
             [int(other) for n, other in enumerate(row[:count]) if n == 0 or overlap[view, other] > _MIN_OVERLAP]
@@ -183,7 +178,6 @@ class PriorEstimator:
         self,
         views: Sequence[View],
         neighbours: Sequence[Sequence[int]],
-        limits: tuple[float, float],
         matching: MatchingConfig,
     ) -> list[list[DepthPrior]]:
         """The priors of each view, from the height by the floor and, where it differs, from that by all surfaces.
@@ -191,7 +185,6 @@ class PriorEstimator:
         Args:
             views: the views at the size at which heights are compared.
             neighbours: the other views that each view is compared with.
-            limits: smallest and largest inverse height of the cameras over the floor.
         """
         first = self._turn_back(self._observed.priors)
         by_pair = {}  # by the best neighbour: the model errs by another factor in each room
@@ -200,7 +193,7 @@ class PriorEstimator:
             pair = [[maps[n] for n in nodes] for maps in (first, views)]
             by_pair[nodes] = [
                 _estimate_camera_heights(
-                    *pair, self._cam2world[list(nodes)], self._down, limits, matching, floor_only=floor_only
+                    *pair, self._cam2world[list(nodes)], self._down, self._limits, matching, floor_only=floor_only
                 )
                 for floor_only in (True, False)
             ]
@@ -223,7 +216,10 @@ def _scale_depth(priors: Sequence[DepthPrior], factors: Sequence[float]) -> list
 
 
 def upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | None:
-    """The smallest rotation (3, 3) after which a camera's y axis is `down`, as new axes in the old ones."""
+    """The smallest rotation (3, 3) after which a camera's y axis is `down`, as new axes in the old ones.
+
+    None for a camera that is upright already.
+    """
     target = rotation.T @ down
     axis = np.cross((0.0, 1.0, 0.0), target)
     sine, cosine = float(np.linalg.norm(axis)), float(target[1])
@@ -236,6 +232,7 @@ def upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | Non
 
 
 def rotate_image(image: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """A panorama (h, w, c) of the camera rotated by `rotation` (3, 3), its new axes in the old ones."""
     maps = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
     return np.ascontiguousarray(rotate_equirect(maps, torch.from_numpy(rotation)).permute(1, 2, 0).numpy())
 

@@ -51,7 +51,7 @@ from pansplat.sweep.surface import (
 )
 from pansplat.system.progress import report_progress
 
-_HEIGHTS_SIZE = 96  # pixels; heights of the cameras over the floor are compared at this size
+_SMALL_HEIGHT = 96  # pixels, of the panoramas in which heights of the cameras over the floor are compared
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class ObservedScene:
         neighbours: the other views that each view is matched against, best first.
         axes: (3, 3) of each view (`estimate_axes`).
         priors: of each view; empty if nothing can be matched, because there is one view or all are at one place.
-        estimator: of further priors; None without a prior model.
+        estimator: of the priors, and of the surfaces of single views; None without a prior model.
     """
 
     posed: PosedImages
@@ -120,12 +120,12 @@ def observe(
     estimator = None
     if prior_model is not None:
         report_progress("estimating depth", 0.02)
-        estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
+        estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], (low, high), config.prior)
     neighbours = choose_nearest(posed.cam2world, config.max_neighbours, 1 / high)
     if posed.measure_baseline(range(len(posed.images))) < ONE_POSITION * posed.near:
         return ObservedScene(posed, config, depths, neighbours, [axes] * len(posed.images), estimator=estimator)
     if estimator is not None:
-        neighbours = estimator.choose_neighbours((low, high), config.max_neighbours)
+        neighbours = estimator.choose_neighbours(config.max_neighbours)
 
     by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
     pairs = list_best_pairs(neighbours)
@@ -136,8 +136,8 @@ def observe(
     report_progress("finding the cameras' heights", 0.15)
     priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
-        views = _make_views(posed, min(height, _HEIGHTS_SIZE))
-        priors = estimator.estimate_by_matching(views, neighbours, (low, high), config.matching)
+        views = _make_views(posed, min(height, _SMALL_HEIGHT))
+        priors = estimator.estimate_by_matching(views, neighbours, config.matching)
     return ObservedScene(posed, config, depths, neighbours, own_axes, priors, estimator)
 
 
@@ -172,7 +172,7 @@ def _search(scene: ObservedScene) -> list[Surface]:
     ]
     sharp, finest_posed = None, posed
     if estimator is not None:
-        sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen((depths.low, depths.high))]
+        sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen()]
         finest_posed = posed.resize(finest)
     for n, height in enumerate(heights[1:]):
         report_progress("refining the surfaces", 0.55 + 0.1 * n)
@@ -195,11 +195,9 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int]) -> l
     config, posed = scene.config, scene.posed
     assert scene.estimator is not None
     log_depths, bent = [], []
-    for sharp, (prior, *_) in zip(
-        scene.estimator.sharpen((scene.depths.low, scene.depths.high)), scene.priors, strict=True
-    ):
-        scale = np.median(prior.log_depth - resize_sphere(sharp, len(prior.log_depth)))
-        log_depths.append((sharp + scale).astype(np.float32))
+    for sharp, (prior, *_) in zip(scene.estimator.sharpen(), scene.priors, strict=True):
+        log_factor = np.median(prior.log_depth - resize_sphere(sharp, len(prior.log_depth)))
+        log_depths.append((sharp + log_factor).astype(np.float32))
     for n, height in enumerate(heights):
         report_progress("searching near the estimated depth", 0.25 + 0.15 * n)
         small = [resize_sharp(log_depth, height) for log_depth in log_depths]
@@ -227,7 +225,7 @@ def _place_unmatched(scene: ObservedScene, height: int) -> list[Surface]:
     if scene.estimator is None:
         inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far))
     else:
-        sharp = scene.estimator.sharpen((scene.depths.low, scene.depths.high))
+        sharp = scene.estimator.sharpen()
         inverse = np.stack([np.exp(-resize_sharp(values, height)) for values in sharp]).clip(*scene.depths.limits)
     return [Surface(values.astype(np.float32)) for values in inverse]
 
@@ -255,8 +253,8 @@ class _SearchLevel:
         sides = [np.zeros(rays.shape[1:], np.uint8), *(rays > 0).astype(np.uint8)]
         no_penalty = np.zeros(count, np.float32)
         sets = [
-            HypothesisSet(low * slope, step * slope, no_penalty, side)
-            for slope, side in zip(slopes, sides, strict=True)
+            HypothesisSet(low * slope, step * slope, no_penalty, side, sphere=n == 0)
+            for n, (slope, side) in enumerate(zip(slopes, sides, strict=True))
         ]
         # Factor and offset from each set's hypothesis number to a depth slot that all share (`aggregate_costs`).
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
@@ -271,7 +269,7 @@ class _SearchLevel:
         """Copies of the sets in which the planes that separate the two views are back-facing."""
         pose, there = self.posed.cam2world[[view, other]]
         marks = [None] + [mark_separating_planes(axis, pose, there, inverse) for axis in self.axes[view]]
-        return [dataclasses.replace(s, back_facing=m, sphere=m is None) for s, m in zip(sets, marks, strict=True)]
+        return [dataclasses.replace(s, back_facing=m) for s, m in zip(sets, marks, strict=True)]
 
     def refine(self, view: int, count: int, step: float, *, widen: bool) -> Surface:
         """The best hypotheses near the surface; with `widen` also near the depths of neighbouring pixels."""

@@ -110,7 +110,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """Input of the search: images (v, h, w, 3) float32, poses (v, 4, 4), masks (v, h, w) bool, depth range."""
+    """Input of the sweep: images (v, h, w, 3) float32, poses (v, 4, 4), masks (v, h, w) bool, depth range."""
 
     images: np.ndarray
     cam2world: np.ndarray

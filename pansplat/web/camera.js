@@ -7,7 +7,7 @@ import {
 } from "./graph.js";
 import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, state } from "./state.js";
 
-export const MAX_PITCH = 89.9 * Math.PI / 180;
+export const MAX_PITCH = 89.9 * DEGREE;
 export const MIN_FOV = 20, MAX_FOV = 110;  // degrees, vertical
 const SOFT = 0.3;                   // of the way to the limit of the camera, in which steps become shorter
 

@@ -1,13 +1,13 @@
 // The doll's house view: the camera turns around the rooms from outside, and no wall is drawn that shows its back. docs/web.md
 // describes it.
 
-import { tangentOf, turned } from "./camera.js";
+import { MAX_PITCH, tangentOf, turned } from "./camera.js";
 import { clamp, column, cross, DEGREE, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
 import { camera, changed, state } from "./state.js";
 
 const DOLL_FOV = 45;                               // degrees, vertical, of a landscape picture
-const DOLL_PITCH = -45 * Math.PI / 180;            // of the first view
-const LOWEST = -8 * Math.PI / 180;                 // pitch of a camera that looks along the floor
+const DOLL_PITCH = -45 * DEGREE;                   // of the first view
+const LOWEST = -8 * DEGREE;                        // pitch of a camera that looks along the floor
 const DOLL_ZOOM = [0.15, 2];                       // of the distance from which all rooms are in the picture
 const DOLL_TURN = Math.PI / 2;                     // radians a second, by keys
 
@@ -48,7 +48,7 @@ function placeOutside(yaw, pitch) {
 export function orbit(yaw, pitch) {
   if (state.doll.flight) return;
   camera.yaw += yaw;
-  camera.pitch = clamp(camera.pitch + pitch, -89.9 * DEGREE, LOWEST);
+  camera.pitch = clamp(camera.pitch + pitch, -MAX_PITCH, LOWEST);
   camera.position = placeOutside(camera.yaw, camera.pitch);
   changed();
 }

@@ -25,11 +25,11 @@ class Embed {
     addEventListener("keydown", (event) => { if (event.code === "Escape") engage(false); });
     addEventListener("blur", () => engage(false));
     document.documentElement.addEventListener("pointerleave", ({ pointerType }) => { if (pointerType === "mouse") engage(false); });
-    this.tell("ready", { panoramas: api.panoramas });
+    this.post("ready", { panoramas: api.panoramas });
   }
 
   // The browser delivers a message only if the host has the origin.
-  tell(name, detail) {
+  post(name, detail) {
     for (const origin of this.hosts) window.parent.postMessage({ pansplat: name, ...detail }, origin);
   }
 
@@ -39,9 +39,9 @@ class Embed {
     const { pansplat: call, id, values = [] } = data;
     try {
       await window.pansplat.ready;
-      this.tell("answer", { id, value: await window.pansplat[call](...values) });
+      this.post("answer", { id, value: await window.pansplat[call](...values) });
     } catch (error) {
-      this.tell("answer", { id, error: error.message || String(error) });
+      this.post("answer", { id, error: error.message || String(error) });
     }
   }
 
@@ -56,7 +56,7 @@ class Embed {
   follow(node, isMoving) {
     if (node !== null && node !== this.at) {
       const detail = { panorama: node + 1, name: HEADER.spots[node].name };
-      this.tell("arrive", detail);
+      this.post("arrive", detail);
       this.api.dispatchEvent(new CustomEvent("arrive", { detail }));
     }
     this.at = node;

@@ -5,7 +5,7 @@ import { orbit, zoomDoll } from "./doll.js";
 import { byId, canvas, say, showMore } from "./dom.js";
 import { embed } from "./embed.js";
 import { enterAt, flyTo, goHome, setPose, setTouring, toggleDoll } from "./flight.js";
-import { clamp, distanceOf, dot, multiply } from "./graph.js";
+import { clamp, DEGREE, distanceOf, dot, multiply } from "./graph.js";
 import { measure } from "./measure.js";
 import { plan } from "./plan.js";
 import { openList } from "./rings.js";
@@ -90,11 +90,11 @@ function onMove(event) {
 let motion = null;
 function onOrientation({ alpha, beta, gamma }) {
   if (alpha === null || beta === null || gamma === null || state.doll.isOn) return;
-  const [ca, sa, cb, sb, cg, sg] = [alpha, beta, gamma].map((degrees) => degrees * Math.PI / 180)
+  const [ca, sa, cb, sb, cg, sg] = [alpha, beta, gamma].map((degrees) => degrees * DEGREE)
     .flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
   const toEarth = multiply([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]],
     multiply([[1, 0, 0], [0, cb, -sb], [0, sb, cb]], [[cg, 0, sg], [0, 1, 0], [-sg, 0, cg]]));
-  const angle = (screen.orientation ? screen.orientation.angle : 0) * Math.PI / 180;
+  const angle = (screen.orientation ? screen.orientation.angle : 0) * DEGREE;
   const inLevel = (axis) => {  // x east, y down, z north
     const [east, north, up] = toEarth.map((row) => dot(row, axis));
     return [east, -up, north];

@@ -43,18 +43,18 @@ export async function fetchFile(name) {
   return response;
 }
 
-const countChunks = () => [...state.asked].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
+const countChunks = () => [...state.requested].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
 
 // Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all without edges.
 export function loadAround() {
-  if (state.asked.size === HEADER.loading.length) return;
+  if (state.requested.size === HEADER.loading.length) return;
   const nodes = [nodeHere(), ...(state.flight ? [state.flight.spot] : [])];
   const groups = edges.filter(([a, b]) => nodes.includes(a) || nodes.includes(b)).map(([, , each]) => each);
   const near = new Set([...groups, state.group].flatMap((each) => HEADER.groups[each]));
   const isAll = HEADER.folder === null || !edges.length;
   for (const view of HEADER.loading) {
-    if (state.asked.has(view) || !(isAll || near.has(view))) continue;
-    state.asked.add(view);
+    if (state.requested.has(view) || !(isAll || near.has(view))) continue;
+    state.requested.add(view);
     canvas.ariaBusy = true;
     if (HEADER.folder === null) continue;
     queue = queue.then(() => fetchFile(...HEADER.views[view].files)).then((response) => response.arrayBuffer()).then(
@@ -64,7 +64,7 @@ export function loadAround() {
 }
 
 // `tolerance`: distance in metres for which the order of before is kept.
-export function requestSort(tolerance) {
+export function requestSort(tolerance = 0) {
   if (state.isSorting || isSortedFor(camera.position, currentPart(), tolerance)) return;
   state.isSorting = true;
   worker.postMessage({ position: [...camera.position], part: currentPart() });
@@ -88,7 +88,7 @@ export function load(onView) {
         onSorted(data);
         resolve();
       } else {
-        state.got.add(data.view);
+        state.received.add(data.view);
         onView(data);
       }
     };

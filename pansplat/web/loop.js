@@ -1,5 +1,5 @@
-// Frames. A frame is drawn only if something changed. While it
-// moves, the scale of the resolution follows the time between frames; at rest the image has the full resolution.
+// Frames. One is drawn only if something changed. While the picture moves, the scale of its resolution follows the time
+// between frames; at rest it has the full resolution.
 
 import { FADE_MS, nodeHere, showViews, tangentOf, updateEdge, walk } from "./camera.js";
 import { orbitByKeys } from "./doll.js";

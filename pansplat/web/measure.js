@@ -52,7 +52,7 @@ class Measure {
     return isAlone ? `${length} m ± ${error} m` : `${length} m`;
   }
 
-  // Draws the points and their line over the picture. `project`: from the scene to camera axes, and from there to the window.
+  // Draws the points and their line over the picture. `toCamera`: from the scene to camera axes; `toWindow`: from there.
   show(toCamera, toWindow) {
     if (!this.isOn) return;
     const seen = this.points.map(toCamera), marks = [];

@@ -1,5 +1,5 @@
 // All that changes while the page is shown. Every module but the renderers is functions of it and of HEADER, which is
-// PageHeader of pansplat/export/page_data.py. This module, graph.js, camera.js and doll.js need no browser.
+// PageHeader of pansplat/export/page_data.py. This module, graph.js, camera.js, choices.js and doll.js need no browser.
 
 import { distanceOf, partOfEdge } from "./graph.js";
 
@@ -16,7 +16,7 @@ export const shown = HEADER.views.map(() => 0);
 
 export const state = {
   edge: 0, group: edges.length ? edges[0][2] : 0, fade: null,  // at the camera; `fade`: from the views of another group
-  asked: new Set(), got: new Set(),                            // views whose data is loaded, and is there
+  requested: new Set(), received: new Set(),                   // views whose data is loaded, and is there
   sorted: null, isSorting: false,                              // the last order of the worker (sorter.js)
   renderer: null,                                              // null while the graphics are lost
   isDirty: true, drawnScale: 0, lastChange: 0,                 // of the picture
@@ -45,10 +45,10 @@ export function redraw() {
 
 export const currentPart = () => edges.length ? partOfEdge(GRAPH, state.edge) : 0;
 export const endsOfEdge = () => edges.length ? edges[state.edge].slice(0, 2) : [];
-export const isComplete = () => [...state.asked].every((view) => state.got.has(view));
+export const isComplete = () => [...state.requested].every((view) => state.received.has(view));
 
 // Whether the order is that of a camera; the doll's house needs none.
 export const isSortedFor = (position, part, tolerance = 0) => {
-  const { sorted, got, doll } = state;
-  return sorted !== null && (doll.isOn || sorted.part === part && sorted.arrived === got.size && distanceOf(sorted.position, position) <= tolerance);
+  const { sorted, received, doll } = state;
+  return sorted !== null && (doll.isOn || sorted.part === part && sorted.arrived === received.size && distanceOf(sorted.position, position) <= tolerance);
 };

@@ -23,6 +23,7 @@ const FLOOR_SPEED = 5;              // of the way to the height of a new floor, 
 const HEIGHT_RATIO = 1.5;           // of the head to the panorama's camera, both over their floors
 const MIN_RATE = 72, LOWEST_RATE = 60;  // frames a second: if the device has a choice, and of any device
 const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30;  // of the resolution, after so many frames
+const PLAIN = 0, RING = 1, VIGNETTE = 2, PICTURE = 3;  // shapes of shaders/mark.frag
 const BUTTONS = { 4: () => goHome(), 5: () => headset.leave() };  // A and X, B and Y
 
 const rowsOf = (matrix) => [0, 1, 2].map((row) => [0, 1, 2].map((k) => matrix[4 * k + row]));
@@ -79,7 +80,7 @@ class Headset {
     this.motion = 0;  // strength of the vignette
     this.pressed = new Map();
     this.isTurned = false;
-    Object.assign(this, { scale: 1, times: [], interval: null, calm: 0, patience: 1, isRaised: false });
+    Object.assign(this, { scale: 1, times: [], interval: null, steady: 0, patience: 1, isRaised: false });
     session.updateRenderState({ baseLayer: this.makeLayer(session) });
     const rate = (session.supportedFrameRates || []).find((each) => each >= MIN_RATE);
     if (rate && rate !== session.frameRate) session.updateTargetFrameRate(rate).catch(() => {});
@@ -264,7 +265,7 @@ class Headset {
 
   // ---- resolution ----
 
-  // Lowers the resolution when frames are late, and raises it after some calm seconds, the more of them the more often that
+  // Lowers the resolution when frames are late, and raises it after some steady seconds, the more of them the more often that
   // has made frames late.
   adaptScale(elapsed) {
     const { session, scale, times } = this;
@@ -277,15 +278,15 @@ class Headset {
       return;
     }
     const mean = sum / FRAMES, isLate = mean > 1.15 * (session.frameRate ? 1000 / session.frameRate : this.interval);
-    this.calm = isLate ? 0 : this.calm + FRAMES * mean / 1000;
+    this.steady = isLate ? 0 : this.steady + FRAMES * mean / 1000;
     if (isLate) {
       this.scale = Math.max(scale * SCALE_STEP, MIN_SCALE);
       if (this.isRaised) this.patience = Math.min(2 * this.patience, 64);
       this.isRaised = false;
-    } else if (this.calm > this.patience) {
+    } else if (this.steady > this.patience) {
       this.scale = Math.min(scale / SCALE_STEP, 1);
       this.isRaised = true;
-      this.calm = 0;
+      this.steady = 0;
     }
     if (this.scale !== scale && !("requestViewportScale" in XRView.prototype)) {
       session.updateRenderState({ baseLayer: this.makeLayer(session) });
@@ -303,19 +304,19 @@ class Headset {
       if (!ray) continue;
       const found = this.findRing(ray), along = scaled(ray.direction, 0.5 * (found ? found.distance : RAY_LENGTH));
       const center = plus(ray.origin, along), across = unit(cross(along, minus(center, camera.position)));
-      marks.push({ center, axes: [along, scaled(across, 0.003)], shape: 0, color: [0.6, 0.6, 0.6, 0.6] });
+      marks.push({ center, axes: [along, scaled(across, 0.003)], shape: PLAIN, color: [0.6, 0.6, 0.6, 0.6] });
       if (found) pointed.set(found.ring, found.distance);
     }
     for (const ring of findRings()) {
       const color = ring.link ? [1, 0.8, 0.4, 1] : [1, 1, 1, 1], strength = pointed.has(ring) ? 1 : 0.6;
       const axes = [right, ahead].map((axis) => scaled(axis, ring.radius));
-      marks.push({ center: ring.mark, axes, shape: 1, color: scaled(color, strength) });
+      marks.push({ center: ring.mark, axes, shape: RING, color: scaled(color, strength) });
     }
     const [ring] = pointed.keys();
     if (ring) {
       const size = 0.05 * pointed.get(ring), across = unit(cross(down, minus(ring.mark, camera.position)));
       const axes = [scaled(across, 8 * size), scaled(down, size)];
-      marks.push({ center: minus(ring.mark, scaled(down, 2 * ring.radius)), axes, shape: 3, color: [1, 1, 1, 1], ring });
+      marks.push({ center: minus(ring.mark, scaled(down, 2 * ring.radius)), axes, shape: PICTURE, color: [1, 1, 1, 1], ring });
     }
     return marks;
   }
@@ -327,8 +328,8 @@ class Headset {
       return { center: plus(position, forward), axes: [scaled(right, 4), scaled(down, 4)], shape, color, radius };
     };
     const veils = [];
-    if (this.motion > 0.01) veils.push(cover(2, [0, 0, 0, 1], 0.125 + 0.3 * (1 - this.motion)));
-    if (coverage()) veils.push(cover(0, [0, 0, 0, coverage()], 0));
+    if (this.motion > 0.01) veils.push(cover(VIGNETTE, [0, 0, 0, 1], 0.125 + 0.3 * (1 - this.motion)));
+    if (coverage()) veils.push(cover(PLAIN, [0, 0, 0, coverage()], 0));
     return veils;
   }
 

@@ -264,12 +264,6 @@ def test_a_change_of_set_is_cheap_only_at_equal_depth():
     assert 0 < least[0] < 0.5 * least[1]
 
 
-def test_the_number_of_threads_changes_no_bit():
-    cost, guide = _noise(32, 24), _noise(32, 3, seed=2)
-    one, two = (aggregate_costs(cost, guide, _slots(32, 2), 12, AggregationConfig(), threads=n) for n in (1, 2))
-    assert np.array_equal(one, two)
-
-
 @pytest.mark.parametrize("axis", (0, 1))
 def test_mirroring_the_cost_mirrors_the_total(axis):
     cost, guide = _noise(64, 12), 0.1 * _noise(64, 3, seed=2)

@@ -11,6 +11,7 @@ from pansplat.sweep.surface import ray_grid, resize_sphere
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
 _DOWN = np.array((0.0, 1.0, 0.0))
+_LIMITS = 1 / 8, 1 / 0.3  # inverse heights of the cameras over the floor
 
 
 class TrueDepth:
@@ -69,10 +70,9 @@ def _estimate(room, poses, model_type=TrueDepth):
         turn = prior_module.upright_rotation(pose[:3, :3], _DOWN)
         pose[:3, :3] = pose[:3, :3] if turn is None else pose[:3, :3] @ turn
     model = model_type(room, upright)
-    limits = (1 / 8, 1 / 0.3)
-    estimator = PriorEstimator(model, images, np.stack(poses), _DOWN, PriorConfig())
+    estimator = PriorEstimator(model, images, np.stack(poses), _DOWN, _LIMITS, PriorConfig())
     others = [[other for other in range(len(views)) if other != view] for view in range(len(views))]
-    priors = estimator.estimate_by_matching(views, others, limits, MatchingConfig())
+    priors = estimator.estimate_by_matching(views, others, MatchingConfig())
     assert {len(own) for own in priors} == {len(model.starts)}
     return model, priors, estimator
 
@@ -98,11 +98,11 @@ def test_neighbours_are_the_views_that_see_the_same_surfaces_best_first(make_roo
     room = make_room()
     poses = [room.pose((x, 0.0, 0.0)) for x in (0.0, 1.0, 0.4, 9.0)]
     estimator = PriorEstimator(
-        Spheres(room, poses), [np.ones((64, 128, 3), np.float32)] * 4, np.stack(poses), _DOWN, PriorConfig()
+        Spheres(room, poses), [np.ones((64, 128, 3), np.float32)] * 4, np.stack(poses), _DOWN, _LIMITS, PriorConfig()
     )
-    *near, far = estimator.choose_neighbours((1 / 8, 1 / 0.3), 3)
+    *near, far = estimator.choose_neighbours(3)
     assert near == [[2, 1], [2, 0], [0, 1]] and len(far) == 1
-    assert estimator.choose_neighbours((1 / 8, 1 / 0.3), 1)[:3] == [[2], [2], [0]]
+    assert estimator.choose_neighbours(1)[:3] == [[2], [2], [0]]
 
 
 def test_hall_has_a_prior_by_its_floor_and_one_by_all_surfaces(make_room):

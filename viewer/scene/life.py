@@ -1,12 +1,14 @@
 """The life of a scene in the viewer, from its photographs to its refinement. Needs no window.
 
     photograph --request--> predicting --receive--> refining --receive--> refined
-                                |                      | cancel
-                                | receive a scene      v
-                                +-- that is final --> predicted
+        ^                     |    |                 |    ^                  |
+        +------ cancel -------+    | receive  cancel |    | request          | revert
+                                   | a final scene   v    |                  |
+                                   +--------------> predicted <--------------+
 
 It is `failed` if it cannot be predicted, refined or drawn. It is `too large` if it does not fit into memory, until a
-smaller one takes its place or the message is dismissed.
+smaller one takes its place or the message is dismissed. A scene of a tour that is dropped from memory keeps its state,
+and a request predicts it again.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ class Placing:
         self.shown = Snapped(self._raw)
         self.fit: Fit | None = None
         self._measured: tuple[object, ...] = ()
-        self._doubted: PlanPose | None = None  # a place of which the user was asked
+        self._doubted: PlanPose | None = None  # a place of a poor fit that `save` has not written yet
         self._is_moved = False
         self._step = 0.0  # metres, of the adjustment in progress
         self.is_changed = False
@@ -164,7 +164,7 @@ class Placing:
 
     @property
     def is_listed(self) -> bool:
-        """Whether there is anything to tell of the photographs' poses."""
+        """Whether a photograph states how its pose was found, so that the panel lists them all."""
         return any(view.placement.source is not None for view in self.panoramas)
 
     @property

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import torch
@@ -17,20 +17,16 @@ from jaxtyping import Float
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours.floor import FloorOutline, choose_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
-from pansplat.tours.links import find_link_ring, link_parts
+from pansplat.tours.links import link_parts
 from pansplat.tours.outlook import BINS
 from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
-from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
-from pansplat_viewer.scene.picking import project_point
 
 DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
 _LARGEST_STOP_STEP = 1 / 3  # of this fade in a frame, also after a pause without frames
 _FIRST_STOP_WEIGHT = 0.01  # of a photograph after a cut
 _NEXT_SCENES = 3  # that are dropped last
-_HOTSPOT_RADIUS = 0.22  # metres, on the floor
-_MIN_HOTSPOT_PIXELS = 14.0
 
 
 class TourScenes:
@@ -64,7 +60,7 @@ class TourScenes:
         self.tour = tour
         self._graphs = [tour]  # also those before poor edges and walls were found, which pending entries have
         self.edge: Edge = next(iter(tour.overlaps))
-        self._is_placed = False  # whether the camera has been at the edge
+        self._is_edge_known = False  # whether the camera has been at the edge
         self.outlines: dict[int, FloorOutline] = {}
         self._outlooks: dict[int, np.ndarray] = {}
         self._views = tour.choose_scene_views()
@@ -96,7 +92,7 @@ class TourScenes:
         scenes.add(loaded)
         edges = [edge for edge, views in scenes._views.items() if views == entry.views]
         if edges:  # else it is a prediction of a part
-            scenes.edge, scenes._is_placed = max(edges, key=lambda edge: entry.start in edge), True
+            scenes.edge, scenes._is_edge_known = max(edges, key=lambda edge: entry.start in edge), True
         return scenes
 
     @property
@@ -232,9 +228,9 @@ class TourScenes:
     def move(self, position: Float[np.ndarray, "3"], edge: Edge | None = None) -> None:
         """Choose an edge that is flown, or that of a camera position."""
         if edge is None:
-            tour, known = self.tour, self._is_placed
+            tour, known = self.tour, self._is_edge_known
             edge = tour.follow_edge(position, self.edge) if known else tour.find_nearest_edge(position)[0]
-        self.edge, self._is_placed = edge, True
+        self.edge, self._is_edge_known = edge, True
 
     def find_nearest(self, position: Float[np.ndarray, "3"]) -> int:
         """The end of the edge that is nearer to a position: another panorama may be behind a wall."""
@@ -367,77 +363,3 @@ class StopFade:
         self.weight = 1.0 if is_here and at_once else min(max(self.weight + (step if is_here else -step), 0.0), 1.0)
         if not is_here or self.weight >= 1:
             self.before = None
-
-
-@dataclass(frozen=True)
-class Hotspot:
-    """The place of a panorama in the image, on the floor below its camera, or on the floor where a link leads to it.
-
-    Attributes:
-        node: number of the panorama.
-        label: its name, or the text of the link.
-        center: pixels, from the left and from the top.
-        radius: pixels, within which a click is meant.
-        ring: corners of the circle on the floor, pixels.
-        is_fade: whether the panorama is in another part, to which the image fades.
-    """
-
-    node: int
-    label: str
-    center: tuple[float, float]
-    radius: float
-    ring: tuple[tuple[float, float], ...]
-    is_fade: bool = False
-
-
-def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> list[Hotspot]:
-    """The panoramas that the nearest one leads to, by its edges and its own links, and that are in the image; the
-    nearest last."""
-    tour, position = scenes.tour, np.asarray(camera.position)
-    here = scenes.find_nearest(position)
-    below = scenes.camera_height * np.asarray(camera.level)[:, 1]
-    feet = {
-        node: (tour.positions[node] + below, tour.panoramas[node].label)
-        for node in (here, *tour.neighbours(here))
-        if np.linalg.norm(tour.positions[node] - position) >= 3 * _HOTSPOT_RADIUS
-    }
-    for (start, node), link in tour.links.items():
-        if start == here and tour.is_fade(start, node) and node not in feet:
-            ring = find_link_ring(tour, start, node, scenes.camera_height)
-            if ring is not None:
-                feet[node] = (tour.positions[start] + ring, link.text or tour.panoramas[node].label)
-    found = []
-    for node, (foot, label) in feet.items():
-        hotspot = make_hotspot(camera, size, node, label, foot, is_fade=tour.is_fade(scenes.edge[0], node))
-        if hotspot is not None:
-            found.append((float(np.linalg.norm(foot - position)), hotspot))
-    return [hotspot for _, hotspot in sorted(found, key=lambda item: -item[0])]
-
-
-def make_hotspot(
-    camera: Camera,
-    size: tuple[int, int],
-    node: int,
-    label: str,
-    foot: Float[np.ndarray, "3"],
-    *,
-    is_fade: bool = False,
-) -> Hotspot | None:
-    """The hotspot of a panorama around a place on the floor; None if it is not in an image of this size."""
-    right, _, forward = np.asarray(camera.level).T
-    angles = np.arange(24) * (2 * np.pi / 24)
-    circle = foot + _HOTSPOT_RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
-    center = project_point(camera, tuple(foot), size)
-    ring = [project_point(camera, tuple(corner), size) for corner in circle]
-    if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):
-        return None
-    radius = max(np.ptp([corner[0] for corner in ring]) / 2, _MIN_HOTSPOT_PIXELS)
-    return Hotspot(node, label, center, float(radius), tuple(ring), is_fade)
-
-
-def find_clicked(hotspots: Sequence[Hotspot], pixel: tuple[float, float]) -> int | None:
-    """The panorama of the hotspot at a pixel, the nearest one first; None if there is none."""
-    for hotspot in reversed(hotspots):
-        if np.hypot(pixel[0] - hotspot.center[0], pixel[1] - hotspot.center[1]) <= hotspot.radius:
-            return hotspot.node
-    return None

@@ -7,10 +7,10 @@ import math
 from imgui_bundle import imgui
 
 from pansplat_viewer.draw.color_maps import get_table
+from pansplat_viewer.scene.hotspots import Hotspot
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.settings import SCALAR_MAPS, FrameStats
 from pansplat_viewer.scene.state import ViewerState
-from pansplat_viewer.scene.tour import Hotspot
 from pansplat_viewer.window.gui import PANEL_WIDTH
 
 MARGIN = 10.0  # from the border of the window, pixels

@@ -151,7 +151,7 @@ class DisplayScene:
             rows, balls = self._rows[part], self._balls[:, part]
             rows[:, 0:3], rows[:, 3] = means[part], opacities[part]
             rows[:, 4:8], rows[:, 8:11] = quats[part], scales[part]
-            rows[:, 11 : 11 + 3 * self._num_coefficients] = harmonics[part].reshape(len(rows), -1)
+            rows[:, _GEOMETRY : _GEOMETRY + 3 * self._num_coefficients] = harmonics[part].reshape(len(rows), -1)
             balls[:3], balls[4] = rows[:, 0:3].T, reach[part]
             balls[3] = balls[4] * np.maximum.reduce([rows[:, axis] for axis in (8, 9, 10)])
 

@@ -1,4 +1,4 @@
-"""The scenes of a tour are chosen, requested, kept and faded; hotspots are found; the film has no jumps."""
+"""The scenes of a tour are chosen, requested, kept and faded; the film has no jumps."""
 
 import contextlib
 import itertools
@@ -13,16 +13,16 @@ import torch
 from PIL import Image
 
 from pansplat.export.film import Film, Shot, list_flight
-from pansplat.inputs.pairs import Link
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.route import FADE_SECONDS, plan_route
 from pansplat_viewer import run
 from pansplat_viewer.capture import find_nearest_frames, open_film, write_flight
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.hotspots import find_hotspots
 from pansplat_viewer.scene.loader import SceneEntry
 from pansplat_viewer.scene.settings import DrawSettings
-from pansplat_viewer.scene.tour import StopFade, TourScenes, find_clicked, find_hotspots, measure_bytes
+from pansplat_viewer.scene.tour import StopFade, TourScenes, measure_bytes
 from pansplat_viewer.ui.minimap import describe_panoramas
 
 
@@ -237,36 +237,6 @@ def test_scenes_of_other_parts_are_loaded_next_those_of_links_first(parted_house
     assert scenes.camera_height == 1.0
     scenes.move(route.pose(1.0)[:3, 3], route.edge(1.0))
     assert scenes.views == (0, 1)
-
-
-def test_the_hotspot_of_a_link_is_where_it_meets_the_floor(parted_house, load_house):
-    scenes = TourScenes(parted_house)
-    scenes.add(load_house(scenes.make_entry((1, 2))))
-    scenes.move(parted_house.positions[2])
-    camera = Camera(position=(0.0, 0.0, 1.6), vertical_fov_degrees=120.0)
-    (hotspot,) = find_hotspots(scenes, camera, (200, 200))
-    assert (hotspot.node, hotspot.label, hotspot.is_fade) == (3, "to the hall", True)
-    focal = 100 / np.tan(np.radians(60))
-    assert hotspot.center == pytest.approx((100 + focal * np.tan(0.1), 100 + focal * np.tan(0.6) / np.cos(0.1)))
-    scenes.move(parted_house.positions[3])
-    for pitch, distance in ((1.4, 1.0), (0.05, 3.0), (-0.2, 3.0)):
-        panoramas = list(parted_house.panoramas)
-        panoramas[3] = replace(panoramas[3], links=(Link("room2", 0.0, pitch),))
-        scenes.tour = replace(parted_house, panoramas=tuple(panoramas))
-        (hotspot,) = find_hotspots(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
-        assert hotspot.center == pytest.approx((100, 100 + focal / distance)), "1 to 3 m away"
-        assert hotspot.label == "room2"
-
-
-def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(scenes):
-    camera, focal = Camera(position=(0.0, 0.0, 0.8), vertical_fov_degrees=120.0), 100 / np.tan(np.radians(60))
-    hotspots = find_hotspots(scenes, camera, (200, 200))
-    assert [hotspot.node for hotspot in hotspots] == [2], "0 is behind the camera, no flight leads to 3"
-    x, y = hotspots[0].center
-    assert x == pytest.approx(100) and y == pytest.approx(100 + focal / 0.8), "1 m below the camera, 0.8 m ahead"
-    assert find_clicked(hotspots, (x + 5, y)) == 2
-    assert find_clicked(hotspots, (x, y - 60)) is None
-    assert [spot.node for spot in find_hotspots(scenes, replace(camera, yaw_radians=np.pi), (200, 200))] == [0]
 
 
 @pytest.fixture

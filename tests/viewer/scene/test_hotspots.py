@@ -1,0 +1,43 @@
+"""Hotspots are on the floor, under their panoramas or where links lead, and are found by a click."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pansplat.inputs.pairs import Link
+from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.hotspots import find_clicked, find_hotspots
+from pansplat_viewer.scene.tour import TourScenes
+
+
+def test_the_hotspot_of_a_link_is_where_it_meets_the_floor(parted_house, load_house):
+    scenes = TourScenes(parted_house)
+    scenes.add(load_house(scenes.make_entry((1, 2))))
+    scenes.move(parted_house.positions[2])
+    camera = Camera(position=(0.0, 0.0, 1.6), vertical_fov_degrees=120.0)
+    (hotspot,) = find_hotspots(scenes, camera, (200, 200))
+    assert (hotspot.node, hotspot.label, hotspot.is_fade) == (3, "to the hall", True)
+    focal = 100 / np.tan(np.radians(60))
+    assert hotspot.center == pytest.approx((100 + focal * np.tan(0.1), 100 + focal * np.tan(0.6) / np.cos(0.1)))
+    scenes.move(parted_house.positions[3])
+    for pitch, distance in ((1.4, 1.0), (0.05, 3.0), (-0.2, 3.0)):
+        panoramas = list(parted_house.panoramas)
+        panoramas[3] = replace(panoramas[3], links=(Link("room2", 0.0, pitch),))
+        scenes.tour = replace(parted_house, panoramas=tuple(panoramas))
+        (hotspot,) = find_hotspots(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
+        assert hotspot.center == pytest.approx((100, 100 + focal / distance)), "1 to 3 m away"
+        assert hotspot.label == "room2"
+
+
+def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(house, load_house):
+    scenes = TourScenes(house)
+    scenes.add(load_house(scenes.make_entry((0, 1))))
+    camera, focal = Camera(position=(0.0, 0.0, 0.8), vertical_fov_degrees=120.0), 100 / np.tan(np.radians(60))
+    hotspots = find_hotspots(scenes, camera, (200, 200))
+    assert [hotspot.node for hotspot in hotspots] == [2], "0 is behind the camera, no flight leads to 3"
+    x, y = hotspots[0].center
+    assert x == pytest.approx(100) and y == pytest.approx(100 + focal / 0.8), "1 m below the camera, 0.8 m ahead"
+    assert find_clicked(hotspots, (x + 5, y)) == 2
+    assert find_clicked(hotspots, (x, y - 60)) is None
+    assert [spot.node for spot in find_hotspots(scenes, replace(camera, yaw_radians=np.pi), (200, 200))] == [0]

@@ -1,0 +1,91 @@
+"""The hotspots of a tour: where other panoramas stand in the image, and which one a click means."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pansplat.tours.links import find_link_ring
+from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.picking import project_point
+from pansplat_viewer.scene.tour import TourScenes
+
+_RADIUS = 0.22  # metres, on the floor
+_MIN_PIXELS = 14.0  # of the radius within which a click is meant
+
+
+@dataclass(frozen=True)
+class Hotspot:
+    """The place of a panorama in the image, on the floor below its camera, or on the floor where a link leads to it.
+
+    Attributes:
+        node: number of the panorama.
+        label: its name, or the text of the link.
+        center: pixels, from the left and from the top.
+        radius: pixels, within which a click is meant.
+        ring: corners of the circle on the floor, pixels.
+        is_fade: whether the panorama is in another part, to which the image fades.
+    """
+
+    node: int
+    label: str
+    center: tuple[float, float]
+    radius: float
+    ring: tuple[tuple[float, float], ...]
+    is_fade: bool = False
+
+
+def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> list[Hotspot]:
+    """The panoramas that the nearest one leads to, by its edges and its own links, and that are in the image; the
+    nearest last."""
+    tour, position = scenes.tour, np.asarray(camera.position)
+    here = scenes.find_nearest(position)
+    below = scenes.camera_height * np.asarray(camera.level)[:, 1]
+    feet = {
+        node: (tour.positions[node] + below, tour.panoramas[node].label)
+        for node in (here, *tour.neighbours(here))
+        if np.linalg.norm(tour.positions[node] - position) >= 3 * _RADIUS
+    }
+    for (start, node), link in tour.links.items():
+        if start == here and tour.is_fade(start, node) and node not in feet:
+            ring = find_link_ring(tour, start, node, scenes.camera_height)
+            if ring is not None:
+                feet[node] = (tour.positions[start] + ring, link.text or tour.panoramas[node].label)
+    found = []
+    for node, (foot, label) in feet.items():
+        hotspot = _make_hotspot(camera, size, node, label, foot, is_fade=tour.is_fade(scenes.edge[0], node))
+        if hotspot is not None:
+            found.append((float(np.linalg.norm(foot - position)), hotspot))
+    return [hotspot for _, hotspot in sorted(found, key=lambda item: -item[0])]
+
+
+def _make_hotspot(
+    camera: Camera,
+    size: tuple[int, int],
+    node: int,
+    label: str,
+    foot: Float[np.ndarray, "3"],
+    *,
+    is_fade: bool,
+) -> Hotspot | None:
+    """The hotspot of a panorama around a place on the floor; None if it is not in an image of this size."""
+    right, _, forward = np.asarray(camera.level).T
+    angles = np.arange(24) * (2 * np.pi / 24)
+    circle = foot + _RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
+    center = project_point(camera, tuple(foot), size)
+    ring = [project_point(camera, tuple(corner), size) for corner in circle]
+    if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):
+        return None
+    radius = max(np.ptp([corner[0] for corner in ring]) / 2, _MIN_PIXELS)
+    return Hotspot(node, label, center, float(radius), tuple(ring), is_fade)
+
+
+def find_clicked(hotspots: Sequence[Hotspot], pixel: tuple[float, float]) -> int | None:
+    """The panorama of the hotspot at a pixel, the nearest one first; None if there is none."""
+    for hotspot in reversed(hotspots):
+        if np.hypot(pixel[0] - hotspot.center[0], pixel[1] - hotspot.center[1]) <= hotspot.radius:
+            return hotspot.node
+    return None
