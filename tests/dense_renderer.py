@@ -220,10 +220,10 @@ def assert_dense(render: Renderer, scene: Gaussians, options: dict[str, Any]) ->
 
     Args:
         options: of `rasterize`; and `pose`; `slack`, by which the case is worse conditioned; `fields`, whose gradients
-            are compared; `by_covariance`; and `metre`, the unit of length.
+            are compared; and `metre`, the unit of length.
     """
     options = {"size": render.size, **options}
-    chosen = {name: options.pop(name, None) for name in ("pose", "slack", "fields", "by_covariance", "metre")}
+    chosen = {name: options.pop(name, None) for name in ("pose", "slack", "fields", "metre")}
     pose = ORIGIN if chosen["pose"] is None else chosen["pose"]
     slack, metre = chosen["slack"] or 1.0, chosen["metre"] or 1.0
     background = torch.linspace(0.2, 0.9, scene.harmonics.shape[2], dtype=torch.float64)
@@ -241,8 +241,7 @@ def assert_dense(render: Renderer, scene: Gaussians, options: dict[str, Any]) ->
         return Rendering(color, alpha, depth), (close == 0).detach()
 
     def draw(given: Gaussians, camera: Tensor, ground: Tensor) -> tuple[Rendering, None]:
-        covariances = given.covariances if chosen["by_covariance"] else None
-        return render(given, camera, background=ground, covariances=covariances, **options), None
+        return render(given, camera, background=ground, **options), None
 
     images, gradients, shown = [], [], None
     for function, given in ((draw_truth, rounded.to(dtype=torch.float64)), (draw, rounded)):

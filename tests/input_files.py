@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 import safetensors.torch
 import torch
-from panorama_formats import EXAMPLES, Example, move, write_picture, write_room
+from panorama_formats import EXAMPLES, Example, write_picture, write_room
 from PIL import Image
 
 from pansplat.cache import CachedScene, _is_valid
 from pansplat.cli.batch import list_items
-from pansplat.cli.render import read_poses
+from pansplat.cli.render import read_pose
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.scene import Gaussians, Scene
@@ -191,6 +191,9 @@ def _make_checkpoint(folder: Path) -> InputFile:
     document = {"step": 3, "weights": weights, "network": {"a": 1}, "mean": None, "auxiliary": None, "optimizer": {}}
 
     def pack(document: Any) -> bytes:
+        if not isinstance(document, dict):
+            torch.save(document, path)
+            return path.read_bytes()
         changed = dict(document)
         if "weights" in changed:
             changed["weights"] = json.dumps(changed["weights"])
@@ -256,7 +259,7 @@ def _make_depth(folder: Path) -> InputFile:
 
 def _make_text(path: Path, lines: Sequence[str]) -> InputFile:
     path.write_text("".join(f"{line}\n" for line in lines))
-    return InputFile(path, _whole(read_poses), has_cuts=True)
+    return InputFile(path, _whole(read_pose), has_cuts=True)
 
 
 def _make_cube(folder: Path) -> InputFile:
@@ -286,13 +289,8 @@ FILES: dict[str, Callable[[Path], InputFile]] = {
     "key frames": lambda folder: _make_json(
         folder / "path.json", {"key_frames": [_KEY_FRAME], "software": "x"}, read_path
     ),
-    "pose": lambda folder: _make_json(
-        folder / "pose.json", {"convention": "cam2world opencv", "pose": EYE}, read_poses
-    ),
-    "path of KITTI": lambda folder: _make_text(
-        folder / "path.kitti", [" ".join(map(str, np.ravel(move(n)[:3]))) for n in range(2)]
-    ),
-    "path of TUM": lambda folder: _make_text(folder / "path.tum", [f"{n} {n} 0 0 0 0 0 1" for n in range(3)]),
+    "pose": lambda folder: _make_json(folder / "pose.json", {"convention": "cam2world opencv", "pose": EYE}, read_pose),
+    "pose of numbers": lambda folder: _make_text(folder / "pose.txt", [" ".join(map(str, row)) for row in EYE]),
     **{f"scene{suffix}": lambda folder, suffix=suffix: _make_scene(folder, suffix) for suffix in SCENE_SUFFIXES},
     "scene comment": _make_comment,
     "network": _make_network,

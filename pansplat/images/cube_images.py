@@ -158,8 +158,8 @@ def read_cube(path: Path) -> CubeImage:
     """The cube that a file of `write_cube` stands for."""
     content = read_json(path, dict[str, Any])
     try:
-        levels = tuple(_read_level(level) for level in content["levels"])
-        return CubeImage(Path(content["folder"]), levels)
+        first, *larger = (_read_level(level) for level in content["levels"])
+        return CubeImage(Path(content["folder"]), (first, *larger))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: needed a description of cube faces, got another content; delete the file."

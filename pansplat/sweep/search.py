@@ -143,21 +143,27 @@ def observe(
 
 def search(scene: ObservedScene) -> list[Surface]:
     """The surface (h, 2h) of each view at the height of the finest level."""
-    surfaces = _search(scene)
+    posed, finest = scene.posed, min(scene.posed.images.shape[1], scene.config.finest_height)
+    if scene.priors:
+        surfaces = _search(scene, finest)
+    elif scene.estimator is not None:
+        log_depths = [resize_sharp(log_depth, finest) for log_depth in scene.estimator.sharpen()]
+        surfaces = [Surface(np.exp(-log_depth).clip(*scene.depths.limits)) for log_depth in log_depths]
+    else:  # nothing is known: spheres in the middle of the range
+        inverse = np.full((finest, 2 * finest), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
+        return [Surface(inverse)] * len(posed.images)
     straight = []
-    for surface, axes, image, pose in zip(surfaces, scene.axes, scene.posed.images, scene.posed.cam2world, strict=True):
+    for surface, axes, image, pose in zip(surfaces, scene.axes, posed.images, posed.cam2world, strict=True):
         small, down = resize_sphere(image, surface.height), pose[:3, :3].T @ axes[0]
         log_depth = straighten(-np.log(surface.inverse_depth), small, down, scene.config.straighten)
         straight.append(Surface(np.exp(-log_depth).clip(*scene.depths.limits)))
     return straight
 
 
-def _search(scene: ObservedScene) -> list[Surface]:
+def _search(scene: ObservedScene, finest: int) -> list[Surface]:
+    """The surfaces (finest, 2 * finest) of views that can be matched."""
     config, posed, depths = scene.config, scene.posed, scene.depths
     neighbours, estimator = scene.neighbours, scene.estimator
-    finest = min(posed.images.shape[1], config.finest_height)
-    if not scene.priors:
-        return _place_unmatched(scene, finest)
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     if config.near_single_views:
         return _search_near_single_views(scene, heights)
@@ -217,17 +223,6 @@ def choose_nearest(cam2world: np.ndarray, count: int, least: float) -> list[list
     distances[distances < least] += distances.max()
     np.fill_diagonal(distances, -1)
     return distances.argsort(axis=1, kind="stable")[:, 1 : count + 1].tolist()
-
-
-def _place_unmatched(scene: ObservedScene, height: int) -> list[Surface]:
-    """Surfaces of the prior alone; without a prior, spheres in the middle of the range."""
-    posed, shape = scene.posed, (height, 2 * height)
-    if scene.estimator is None:
-        inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far))
-    else:
-        sharp = scene.estimator.sharpen()
-        inverse = np.stack([np.exp(-resize_sharp(values, height)) for values in sharp]).clip(*scene.depths.limits)
-    return [Surface(values.astype(np.float32)) for values in inverse]
 
 
 def _make_views(posed: PosedImages, height: int, surfaces: Sequence[Surface] = ()) -> list[View]:

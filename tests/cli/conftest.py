@@ -11,6 +11,7 @@ from torch import Tensor
 from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.gaussians.scene import Gaussians
+from pansplat.system.progress import report_progress
 
 HEIGHT = 64
 
@@ -20,9 +21,8 @@ def sphere_model(monkeypatch: pytest.MonkeyPatch, sphere_predictor: type) -> typ
     """The predictor that commands find as `--model sphere`: one Gaussian per pixel of the image at 16 rows."""
 
     class Sphere(sphere_predictor):
-        def __call__(self, images: Tensor, *arguments, progress=None, **options) -> Gaussians:
-            if progress is not None:
-                progress("predicting", 0.5)
+        def __call__(self, images: Tensor, *arguments, **options) -> Gaussians:
+            report_progress("predicting", 0.5)
             step = images.shape[-2] // 16
             sphere = super().__call__(images[..., ::step, ::step], *arguments, **options)
             levels = torch.arange(len(sphere)) % 2

@@ -41,7 +41,7 @@ def _run(scene, pose, layout, options=None, *, backend=rasterize_planes, dtype=t
     leaves = {name: getattr(scene, name).to(dtype).requires_grad_() for name in _NAMES}
     camera = pose.clone().requires_grad_()
     given = dataclasses.replace(scene, **{name: leaves[name] for name in _NAMES})
-    result = backend(given, None, camera, _planes(layout), options or RasterOptions())
+    result = backend(given, camera, _planes(layout), options or RasterOptions())
     weights = torch.randn(result.sums.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     (result.sums.double() * weights).sum().backward()
     gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
