@@ -333,7 +333,7 @@ def _read_view_folder(view: Path, folder: Path, convention: str) -> Panorama:
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = _read_numbers(view / "rot.txt", 9).reshape(3, 3)
     matrix[:3, 3] = _read_numbers(view / "tran.txt", 3)
-    cam2world = _Z_UP @ to_cam2world(rigid_matrix(matrix.tolist(), str(view / "rot.txt")), convention)
+    cam2world = _Z_UP @ to_cam2world(rigid_matrix(matrix.tolist(), f"{view / 'rot.txt'} with tran.txt"), convention)
     depth = view / "depth.png"
     mask = find_mask(image, folder)
     return Panorama(view.name, image, cam2world, mask, depth if depth.is_file() else None, is_scan=True)
