@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from pansplat.sweep.prior import rotate_image, upright_rotation
+from pansplat.sweep.surface import rotate_image, upright_rotation
 
 _LEAST_DEVIATION = 0.04  # of log-depth at a right match: heights of two cameras differ, too
 _SCALE_SHARE = 1.0  # of the network's own Laplace scale

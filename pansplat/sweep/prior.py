@@ -17,19 +17,25 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-import torch
 
-from pansplat.geometry.equirect import rotate_equirect, row_weights
+from pansplat.geometry.equirect import row_weights
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
-from pansplat.sweep.surface import list_best_pairs, measure_distances, nearest_pixel, ray_grid, resize_sphere
+from pansplat.sweep.surface import (
+    list_best_pairs,
+    measure_distances,
+    nearest_pixel,
+    ray_grid,
+    resize_sphere,
+    rotate_image,
+    upright_rotation,
+)
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
 _MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
-_MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
 _HEIGHT_PENALTY = 0.06  # matching cost of a height by a factor of e from the usual one
 _FLOOR_TOLERANCE = 0.15  # in camera heights, from the floor to the pixels that the model places on it
 _SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
@@ -213,28 +219,6 @@ class PriorEstimator:
 def _scale_depth(priors: Sequence[DepthPrior], factors: Sequence[float]) -> list[DepthPrior]:
     """The priors with their depths multiplied by one factor each."""
     return [DepthPrior(p.log_depth + math.log(factor), p.scale) for p, factor in zip(priors, factors, strict=True)]
-
-
-def upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | None:
-    """The smallest rotation (3, 3) after which a camera's y axis is `down`, as new axes in the old ones.
-
-    None for a camera that is upright already.
-    """
-    target = rotation.T @ down
-    axis = np.cross((0.0, 1.0, 0.0), target)
-    sine, cosine = float(np.linalg.norm(axis)), float(target[1])
-    angle = math.atan2(sine, cosine)
-    if angle < _MIN_TILT:
-        return None
-    if sine < 1e-9:  # upside down
-        return np.diag((1.0, -1.0, -1.0))
-    return cv2.Rodrigues(axis / sine * angle)[0]
-
-
-def rotate_image(image: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """A panorama (h, w, c) of the camera rotated by `rotation` (3, 3), its new axes in the old ones."""
-    maps = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
-    return np.ascontiguousarray(rotate_equirect(maps, torch.from_numpy(rotation)).permute(1, 2, 0).numpy())
 
 
 def _estimate_camera_heights(

@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.sweep.bend import smooth_lines
-from pansplat.sweep.prior import rotate_image, upright_rotation
-from pansplat.sweep.surface import pad_sphere
+from pansplat.sweep.surface import pad_sphere, rotate_image, upright_rotation
 
 
 @dataclass(frozen=True)

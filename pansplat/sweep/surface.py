@@ -12,12 +12,14 @@ from functools import partial
 import cv2
 import numba as nb
 import numpy as np
+import torch
 
-from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.equirect import pixel_directions, rotate_equirect
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 
 CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
 _RANGE = 1 << 14  # points that a thread processes together
+_MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
 _SMOOTH = 0.03  # largest relative change of inverse depth that is interpolated bilinearly
 _CONSISTENCY = 0.06  # largest relative difference of depth of two views' surfaces that are consistent
 
@@ -95,6 +97,28 @@ def resize_sharp(values: np.ndarray, height: int) -> np.ndarray:
 def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:
     """A panorama (h, w) of bool at another height, by the nearest pixel."""
     return cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | None:
+    """The smallest rotation (3, 3) after which a camera's y axis is `down`, as new axes in the old ones.
+
+    None for a camera that is upright already.
+    """
+    target = rotation.T @ down
+    axis = np.cross((0.0, 1.0, 0.0), target)
+    sine, cosine = float(np.linalg.norm(axis)), float(target[1])
+    angle = math.atan2(sine, cosine)
+    if angle < _MIN_TILT:
+        return None
+    if sine < 1e-9:  # upside down
+        return np.diag((1.0, -1.0, -1.0))
+    return cv2.Rodrigues(axis / sine * angle)[0]
+
+
+def rotate_image(image: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """A panorama (h, w, c) of the camera rotated by `rotation` (3, 3), its new axes in the old ones."""
+    maps = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
+    return np.ascontiguousarray(rotate_equirect(maps, torch.from_numpy(rotation)).permute(1, 2, 0).numpy())
 
 
 @dataclass(frozen=True, eq=False)

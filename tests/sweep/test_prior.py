@@ -3,11 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep import prior as prior_module
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View
 from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, apply_prior_cost
 from pansplat.sweep.search import SearchConfig, observe, search
-from pansplat.sweep.surface import ray_grid, resize_sphere
+from pansplat.sweep.surface import ray_grid, resize_sphere, upright_rotation
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
 _DOWN = np.array((0.0, 1.0, 0.0))
@@ -67,7 +66,7 @@ def _estimate(room, poses, model_type=TrueDepth):
     views = [View(image, np.ones(image.shape[:2], bool)) for image in images]
     upright = [pose.copy() for pose in poses]
     for pose in upright:
-        turn = prior_module.upright_rotation(pose[:3, :3], _DOWN)
+        turn = upright_rotation(pose[:3, :3], _DOWN)
         pose[:3, :3] = pose[:3, :3] if turn is None else pose[:3, :3] @ turn
     model = model_type(room, upright)
     estimator = PriorEstimator(model, images, np.stack(poses), _DOWN, _LIMITS, PriorConfig())

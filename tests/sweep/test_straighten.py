@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep.prior import rotate_image
 from pansplat.sweep.straighten import StraightenConfig, straighten
+from pansplat.sweep.surface import rotate_image
 
 _HEIGHT = 128
 _DOWN = np.array((0.0, 1.0, 0.0))
