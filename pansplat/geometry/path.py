@@ -5,7 +5,6 @@ direction of the cameras.
 """
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -153,13 +152,6 @@ def fly_pose(
         pose[:3, 3] += 0.5 * _EXCURSION * ((1 - math.cos(angle)) * pose[:3, 2] - math.sin(angle) * pose[:3, 0])
     # The turn depends on the eased fraction, so that it also starts and stops smoothly.
     return turn_pose(pose, -math.radians(turn_degrees) * math.sin(2 * math.pi * eased), up)
-
-
-def fly_path(
-    cam2world: Float[Tensor, "view 4 4"], fractions: Sequence[float], *, turn_degrees: float = 40.0
-) -> Float[Tensor, "time 4 4"]:
-    """The poses of `fly_pose` at each of the fractions."""
-    return torch.stack([fly_pose(cam2world, fraction, turn_degrees=turn_degrees) for fraction in fractions])
 
 
 def _interpolate_path(poses: Float[Tensor, "stop 4 4"], fraction: float) -> Float[Tensor, "4 4"]:

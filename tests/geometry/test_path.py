@@ -7,7 +7,6 @@ import torch
 
 from pansplat.geometry.path import (
     ease_in_out,
-    fly_path,
     fly_pose,
     level_pose,
     look_pose,
@@ -24,6 +23,11 @@ def _pose(position=(0.0, 0.0, 0.0), rotation=None) -> torch.Tensor:
         pose[:3, :3] = torch.as_tensor(rotation, dtype=torch.float64)
     pose[:3, 3] = torch.tensor(position, dtype=torch.float64)
     return pose
+
+
+def fly_path(cam2world: torch.Tensor, fractions: list[float], **options: float) -> torch.Tensor:
+    """The poses of a flight at each of the fractions."""
+    return torch.stack([fly_pose(cam2world, fraction, **options) for fraction in fractions])
 
 
 def _rotation_z(degrees: float) -> list[list[float]]:
