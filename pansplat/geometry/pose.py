@@ -131,13 +131,8 @@ def blend_weights(
     nearest = distances.detach().amin()
     is_at_position = distances == 0
     # Only ratios matter. In units of the nearest distance nothing overflows.
-    closeness = nearest / torch.where(is_at_position, torch.ones_like(distances), distances)
-    closeness = torch.where(is_at_position, torch.ones_like(distances), closeness)
+    divisors = torch.where(is_at_position, torch.ones_like(distances), distances)
+    closeness = torch.where(is_at_position, torch.ones_like(distances), nearest / divisors)
     if forward is not None:
-        ahead = (
-            (positions - position)
-            @ forward.to(distances)
-            / torch.where(is_at_position, torch.ones_like(distances), distances)
-        )
-        closeness = closeness * torch.exp(_AHEAD * ahead)
+        closeness = closeness * torch.exp(_AHEAD * ((positions - position) @ forward.to(distances) / divisors))
     return closeness / closeness.sum()

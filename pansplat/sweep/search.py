@@ -143,9 +143,10 @@ def observe(
 
 def search(scene: ObservedScene) -> list[Surface]:
     """The surface (h, 2h) of each view at the height of the finest level."""
-    posed, finest = scene.posed, min(scene.posed.images.shape[1], scene.config.finest_height)
+    finest = min(scene.posed.images.shape[1], scene.config.finest_height)
+    posed = scene.posed.resize(finest)
     if scene.priors:
-        surfaces = _search(scene, finest)
+        surfaces = _search(scene, posed)
     elif scene.estimator is not None:
         log_depths = [resize_sharp(log_depth, finest) for log_depth in scene.estimator.sharpen()]
         surfaces = [Surface(np.exp(-log_depth).clip(*scene.depths.limits)) for log_depth in log_depths]
@@ -154,16 +155,16 @@ def search(scene: ObservedScene) -> list[Surface]:
         return [Surface(inverse)] * len(posed.images)
     straight = []
     for surface, axes, image, pose in zip(surfaces, scene.axes, posed.images, posed.cam2world, strict=True):
-        small, down = resize_sphere(image, surface.height), pose[:3, :3].T @ axes[0]
-        log_depth = straighten(-np.log(surface.inverse_depth), small, down, scene.config.straighten)
+        down = pose[:3, :3].T @ axes[0]
+        log_depth = straighten(-np.log(surface.inverse_depth), image, down, scene.config.straighten)
         straight.append(Surface(np.exp(-log_depth).clip(*scene.depths.limits)))
     return straight
 
 
-def _search(scene: ObservedScene, finest: int) -> list[Surface]:
-    """The surfaces (finest, 2 * finest) of views that can be matched."""
+def _search(scene: ObservedScene, finest_posed: PosedImages) -> list[Surface]:
+    """The surfaces of views that can be matched; `finest_posed` are those of the scene at the height of the result."""
     config, posed, depths = scene.config, scene.posed, scene.depths
-    neighbours, estimator = scene.neighbours, scene.estimator
+    neighbours, estimator, finest = scene.neighbours, scene.estimator, finest_posed.images.shape[1]
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     if config.near_single_views:
         return _search_near_single_views(scene, heights)
@@ -176,10 +177,9 @@ def _search(scene: ObservedScene, finest: int) -> list[Surface]:
         level.search_full_range(view, depths.sample(count), priors)
         for view, (count, priors) in enumerate(zip(counts, scene.priors, strict=True))
     ]
-    sharp, finest_posed = None, posed
+    sharp = None
     if estimator is not None:
         sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen()]
-        finest_posed = posed.resize(finest)
     for n, height in enumerate(heights[1:]):
         report_progress("refining the surfaces", 0.55 + 0.1 * n)
         surfaces = [
