@@ -106,7 +106,7 @@ KEYS = (
     KeyRow("Q E", "fly down, up", dict.fromkeys("qe")),
     KeyRow("Shift, Alt", "faster, slower"),
     KeyRow("drag", "look around (orbit: turn)"),
-    KeyRow("click", "depth and Gaussian of a point; twice: their distance"),
+    KeyRow("click", "distance of a point; twice: the distance between both"),
     KeyRow("right drag", "pan"),
     KeyRow("scroll", "field of view (orbit: distance)"),
     KeyRow("V", "orbit or fly", {"v": _toggle("orbiting")}),
