@@ -181,7 +181,6 @@ class Viewer:
         _, _, width, height = target.viewport
         state.now, stage.size = self._clock(), (width, height)
         self.scenes.poll()
-        self.library.watch.look(state.now)
         if not self.moving:
             self.scenes.exchange()
         if self.placing is not None:
@@ -307,7 +306,6 @@ class Viewer:
         with self._showing_errors():
             file = write_notes(photographs.panoramas[index], notes)
             photographs.change_notes(index, notes)
-            self.library.watch.skip(file)
             self.state.show_message(f"wrote {file}")
 
     def save_path(self, text: str) -> None:

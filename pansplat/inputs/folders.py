@@ -14,7 +14,7 @@ from pathlib import Path
 from pansplat.errors import InputError, InputWarning, collect_notes
 from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
 from pansplat.images.image_files import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
-from pansplat.inputs.folder_formats import CAMERA_POSES, PAIRS, POSES
+from pansplat.inputs.folder_formats import PAIRS, POSES
 from pansplat.inputs.formats import FORMATS, PHOTOGRAPHS, POSED, TRIPLETS, WEB_TOURS, Format
 from pansplat.inputs.pairs import Collection, Pair, Panorama, list_names, list_panorama_files, localize_pairs
 from pansplat.inputs.photographs import LINKS, add_links, list_unread_panoramas
@@ -242,24 +242,11 @@ def _find(folder: Path, wanted: Sequence[Format], depth: int, exports: bool) -> 
     ]
 
 
-def list_stated_files(folder: Path) -> list[Path]:
-    """The files that state the panoramas of a folder, their poses, pairs and links; some need not exist."""
-    files = [folder / name for name in (POSES, PAIRS, CAMERA_POSES, LINKS)]
-    with contextlib.suppress(OSError, InputError):
-        files += [each for form in (*POSED, WEB_TOURS) for source in form.find(folder) for each in form.files(source)]
-        files += [place / LINKS for place in _list_link_folders(folder)]
-    return list(dict.fromkeys(files))
-
-
-def _list_link_folders(folder: Path) -> list[Path]:
-    """The folders whose links.json is read: a folder, and that of the data of its web tour."""
-    return list(dict.fromkeys((folder, *(source.parent for source in find_web_tours(folder)))))
-
-
 def _link(collections: Sequence[Collection]) -> list[Collection]:
     """The collections of one folder with what its links.json states."""
     views = linked = [view for found in collections for view in found.views]
-    for place in _list_link_folders(collections[0].folder):
+    folder = collections[0].folder
+    for place in dict.fromkeys((folder, *(source.parent for source in find_web_tours(folder)))):  # a tour's data
         linked = add_links(linked, place)
     of = dict(zip(views, linked, strict=True))
     return [

@@ -823,7 +823,6 @@ def test_a_probable_photograph_is_rejected_restored_and_the_rejection_undone(pla
     assert "c.png" not in json.loads((tmp_path / "poses.json").read_text())["poses"]
     user.draw_frames(2)
     assert "Restore##2" in user.panels.widgets.items and "Reject##2" not in user.panels.widgets.items
-    user.draw_until(lambda: user.viewer.library.watch.changed, "note of the changed file")  # it moves the button
     user.click("Load the changed poses")
     user.draw_until(lambda: not user.viewer.placing.is_changed, "loaded poses")
     user.settle()

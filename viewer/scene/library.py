@@ -1,11 +1,10 @@
-"""The scenes that a user can choose from: where they were found, which one is listed as current, and file changes."""
+"""The scenes that a user can choose from: where they were found, and which one is listed as current."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from pansplat.errors import InputError
-from pansplat_viewer.scene.file_watch import FileWatch
 from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader, choose_entry
 
 
@@ -17,7 +16,6 @@ class Library:
         entries: to choose from.
         current: number of the one that is shown or loaded; -1 if there is none.
         path: where they were found; None if they are only loaded again.
-        watch: of the files of the current one.
     """
 
     def __init__(self, loader: SceneLoader, find: Find) -> None:
@@ -26,7 +24,6 @@ class Library:
         self.entries: list[SceneEntry] = []
         self.current = -1
         self.path: Path | None = None
-        self.watch = FileWatch()
         self._wanted: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
         self._shown: tuple[list[SceneEntry], int, Path | None] | None = None  # arguments of `offer`
 
@@ -60,7 +57,6 @@ class Library:
     def offer(self, entries: list[SceneEntry], index: int, path: Path | None) -> None:
         """Offer these entries, of which one is loaded."""
         self.entries, self.current, self.path = entries, index, path
-        self.watch.start(entries[index].files)
 
     def keep(self) -> None:
         """Remember the list and its current entry, which is shown, for `restore`."""

@@ -66,23 +66,6 @@ class SceneEntry:
         return () if self.pair is None else self.pair.context + self.pair.targets
 
     @property
-    def files(self) -> tuple[Path, ...]:
-        """The files that the scene is made from, those that state its poses and links, and the panoramas' folders."""
-        source = self.tour or self.pair
-        if self.file is not None or source is None:
-            return () if self.file is None else (self.file,)
-        from pansplat.images.image_files import list_masks, list_pictures
-        from pansplat.inputs.folders import list_stated_files
-
-        files = dict.fromkeys(list_stated_files(source.folder))
-        folders = {source.folder: None}
-        for panorama in self.panoramas:
-            pictures = list_pictures(panorama.image)
-            files |= dict.fromkeys((panorama.image, *pictures, panorama.mask, *list_masks(panorama.image)))
-            folders |= {} if len(pictures) > 1 else {panorama.image.parent: None}
-        return (*(file for file in files if file is not None), *folders)
-
-    @property
     def folder_name(self) -> str:
         """The name as a valid folder name, without separators and leading dots."""
         return make_file_name(self.name)

@@ -218,8 +218,6 @@ class Panels:
             imgui.same_line()
         if library.entries and self.widgets.button("Reload"):
             viewer.queue(viewer.scenes.reload)
-        if library.watch.changed:
-            imgui.text_unformatted("changed on disk")
         if viewer.scenes.refinement == 1:
             viewer.state.refined = self.widgets.check("refined", viewer.state.refined)
         elif viewer.scenes.refinement is not None:

@@ -63,7 +63,7 @@ def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_fil
     tour, scenes = first.entry.tour, TourScenes.start(first)
     assert tour.name == "home" and tour.overlaps == house.overlaps and first.is_final
     assert np.allclose(tour.positions, house.positions) and first.entry.views == (0, 1)
-    assert first.entry.panoramas == () and first.entry.files == (house_file,)
+    assert first.entry.panoramas == ()
     assert set(first.facts.outlines) <= {0, 1, 2, 3} and scenes.edge == (0, 1) and not scenes.list_next(None, 0.0)[1:]
     other = scenes.get((2, 3))
     assert other.entry.views == (2, 3) and scenes.loaded == [(0, 1), (1, 2), (2, 3)]
