@@ -158,7 +158,7 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
 
     try:
         from pansplat_viewer.viewer import Viewer
-        from pansplat_viewer.window.preferences import find_file
+        from pansplat_viewer.window.recent import find_file
         from pansplat_viewer.window.window import ContextLostError, NoWindowError, Window, run_viewer
     except ImportError as error:  # imgui_bundle needs the libraries of X11
         return f"the window's libraries cannot be loaded ({error})"
@@ -198,7 +198,7 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
             dpi_scale=window.dpi_scale,
             renderer=options.renderer,
             memory=options.memory,
-            preferences=find_file(),
+            recent=find_file(),
         )
         if loader.is_searching:
             viewer.scenes.expect(entries, source, options.pair)

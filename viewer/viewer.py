@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,7 @@ from pansplat_viewer.ui.panels import Panels
 from pansplat_viewer.ui.stage import Stage
 from pansplat_viewer.window.gui import Gui
 from pansplat_viewer.window.input import apply_input, read_input
-from pansplat_viewer.window.preferences import Theme, read_preferences, write_preferences
+from pansplat_viewer.window.recent import add_recent, read_recent
 
 _MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
 _NOTE_COSINE = math.cos(math.radians(5))  # of the angle within which a note is at the middle of the image
@@ -60,7 +59,7 @@ class Viewer:
         placing, screenshots: what else a user does with the scene.
         hotspots: places of panoramas in the image.
         panels: the panels, with the rectangles of their widgets.
-        preferences: the remembered values.
+        recent: the paths that were opened, the last one first.
         error: message of the last failure.
         frame_ms: time of a whole frame, smoothed.
     """
@@ -77,7 +76,7 @@ class Viewer:
         dpi_scale: float = 1.0,
         renderer: RendererChoice = "auto",
         memory: float = DEFAULT_MEMORY,
-        preferences: Path | None = None,
+        recent: Path | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Create GL objects on the current context.
@@ -92,7 +91,7 @@ class Viewer:
             dpi_scale: size of the panels.
             renderer: draws the image; `auto` is `cpu` where OpenGL is software.
             memory: limit of the scenes of a tour, GiB.
-            preferences: file of the remembered values; None remembers nothing.
+            recent: file of the paths that were opened; None remembers none.
             clock: returns seconds.
         """
         self._ctx, self.state = ctx, state or ViewerState()
@@ -114,8 +113,8 @@ class Viewer:
         self.placing: Placing | None = None
         self.screenshots = Screenshots(self.state, self.stage, folder, self.show_error)
         self.panels = Panels(ctx)
-        self._preferences_file, self.preferences = preferences, read_preferences(preferences)
-        self.gui = Gui(dpi_scale, theme=self.preferences.theme, layout=self.preferences.layout)
+        self._recent_file, self.recent = recent, read_recent(recent)
+        self.gui = Gui(dpi_scale)
         self.hotspots: list[Hotspot] = []
         self._queue: list[Callable[[], object]] = []
 
@@ -204,7 +203,6 @@ class Viewer:
         if problem is not None:
             self.scenes.offer_reduced(problem)
         self.gui.end(self._ctx, target)
-        self._save_layout()
         actions, self._queue = self._queue, []
         for action in actions:
             action()
@@ -213,7 +211,6 @@ class Viewer:
 
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""
-        self._save_layout(changed=False)
         if self.placing is not None:
             self.placing.close()
         self.library.loader.close()
@@ -239,7 +236,7 @@ class Viewer:
     def _note_listed(self, path: Path | None) -> None:
         self.error = None
         if path is not None:
-            self._remember(recent=self.preferences.add_recent(path).recent)
+            self.recent = add_recent(self.recent, path, self._recent_file)
 
     def _open_placing(self, entry: SceneEntry) -> None:
         self.placing = Placing.open(self.placing, entry, self.library.entries)
@@ -332,22 +329,3 @@ class Viewer:
             yield
         except (InputError, OSError) as error:
             self.show_error(str(error))
-
-    # --- preferences ---
-
-    def set_theme(self, theme: Theme) -> None:
-        """Choose the colours of the panels."""
-        self.gui.set_theme(theme)
-        self._remember(theme=theme)
-
-    def _save_layout(self, *, changed: bool = True) -> None:
-        """Remember the layout of the panels."""
-        layout = None if self._preferences_file is None else self.gui.save_layout(changed=changed)
-        if layout is not None:
-            self._remember(layout=layout)
-
-    def _remember(self, **values: object) -> None:
-        preferences = replace(self.preferences, **values)
-        if preferences != self.preferences:
-            self.preferences = preferences
-            write_preferences(preferences, self._preferences_file)

@@ -46,7 +46,6 @@ from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
 from pansplat_viewer.ui.photographs import Photographs
 from pansplat_viewer.viewer import Viewer
-from pansplat_viewer.window.preferences import Preferences
 
 pytestmark = pytest.mark.gl
 
@@ -72,7 +71,7 @@ OTHER_WIDGETS = {
     "Notes", "note", "Put at the middle", "Remove",
     "Film", "PNG", "EXR + depth", "360 PNG", "Add key frame", "time", "path file", "Save", "Load",
     "Expert", "fly", "orbit", "Reset", "speed", *get_args(Display), "background", "coarser while moving",
-    "photographs at panoramas", "light", "dark", "Default layout",
+    "photographs at panoramas",
 }  # fmt: skip
 
 
@@ -449,14 +448,12 @@ def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeyp
         return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
 
     user.find = find
-    monkeypatch.setattr(user.viewer, "preferences", Preferences())
+    monkeypatch.setattr(user.viewer, "recent", ())
     user.panels.path = "kitchen"
     user.click("Open")
     user.settle()
     user.panels.path = ""
-    assert user.viewer.library.names == ["kitchen 1"] and user.viewer.preferences.recent == (
-        str(Path("kitchen").absolute()),
-    )
+    assert user.viewer.library.names == ["kitchen 1"] and user.viewer.recent == (str(Path("kitchen").absolute()),)
     user.draw_frames(2)
     user.click("recent")
     left, _, _, bottom = user.panels.widgets.items["recent"]
@@ -618,24 +615,14 @@ def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair,
     assert changed_fraction(photograph, image) > 0.3 and changed_fraction(before, image) > 0.1
 
 
-def test_theme_scale_and_layout_change_the_panels(user):
+def test_the_panel_has_the_height_of_the_window_and_the_scale_of_its_screen(user):
     user.click("Film")  # closed for space
-    panel = (slice(0, None), slice(0, 280))
-
-    def read_panel() -> np.ndarray:
-        user.draw_frames(3)
-        return user.read_window()[panel]
-
-    dark, height = read_panel(), user.panels.widgets.items["joint"][3] - user.panels.widgets.items["joint"][1]
-    user.click("light")
-    assert read_panel().mean() > dark.mean() + 80
-    user.click("dark")
-    assert np.abs(read_panel() - dark).mean() < 2
-    user.click_at(4, 4)  # shows the title
-    user.drag((30, 8), (60, 60))
-    assert np.abs(read_panel() - dark).mean() > 20, "the panel is no longer docked"
-    user.click("Default layout")
-    assert np.abs(read_panel() - dark).mean() < 2
+    panel, (_, top, _, bottom) = imgui.internal.find_window_by_name("pansplat"), user.panels.widgets.items["joint"]
+    height = bottom - top
+    for x, width in ((500, 0.6 * SIZE[0]), (290, 290)):
+        user.drag((panel.size.x - 3, SIZE[1] - 3), (x, 400))  # the lower right corner
+        assert (panel.pos.x, panel.pos.y, panel.size.y) == (0, 0, SIZE[1])
+        assert panel.size.x == pytest.approx(width, abs=4)
     user.viewer.gui.set_scale(1.5)
     user.draw_frames(3)
     _, top, _, bottom = user.panels.widgets.items["joint"]

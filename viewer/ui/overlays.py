@@ -11,14 +11,11 @@ from pansplat_viewer.scene.hotspots import Hotspot
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.settings import SCALAR_MAPS, FrameStats
 from pansplat_viewer.scene.state import ViewerState
-from pansplat_viewer.window.gui import PANEL_WIDTH
 
+PANEL_WIDTH = 290.0  # of the main panel at first, pixels at a DPI scale of 1
 MARGIN = 10.0  # from the border of the window, pixels
 FIXED = (  # flags of a window that is placed anew in each frame
-    imgui.WindowFlags_.no_move.value
-    | imgui.WindowFlags_.no_resize.value
-    | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_docking.value
+    imgui.WindowFlags_.no_move.value | imgui.WindowFlags_.no_resize.value | imgui.WindowFlags_.no_saved_settings.value
 )
 _LABEL = (
     FIXED

@@ -33,6 +33,7 @@ from pansplat_viewer.ui.notes import NotesSection, draw_notes
 from pansplat_viewer.ui.overlays import (
     FIXED,
     MARGIN,
+    PANEL_WIDTH,
     UNITS,
     draw_hotspots,
     draw_legend,
@@ -42,12 +43,12 @@ from pansplat_viewer.ui.overlays import (
 )
 from pansplat_viewer.ui.placing import PlacingWindow, draw_photographs
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
-from pansplat_viewer.window.gui import PANEL_WIDTH
 from pansplat_viewer.window.input import KEYS
-from pansplat_viewer.window.preferences import Theme
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
+
+_PANEL = imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_bring_to_front_on_focus.value
 
 
 class Panels:
@@ -99,13 +100,15 @@ class Panels:
         self.placing.release()
 
     def _draw_main_panel(self, viewer: Viewer) -> None:
-        scale, height = imgui.get_style().font_scale_dpi, imgui.get_io().display_size.y
-        imgui.set_next_window_size((PANEL_WIDTH * scale, 0.8 * height), imgui.Cond_.first_use_ever.value)
-        opened, _ = imgui.begin("pansplat")
-        if opened:
-            imgui.push_item_width(-110 * scale)
-            self._draw_sections(viewer)
-            imgui.pop_item_width()
+        scale, size = imgui.get_style().font_scale_dpi, imgui.get_io().display_size
+        imgui.set_next_window_pos((0, 0))
+        imgui.set_next_window_size((PANEL_WIDTH * scale, size.y), imgui.Cond_.first_use_ever.value)
+        imgui.set_next_window_size_constraints((0, size.y), (0.6 * size.x, size.y))
+        imgui.set_next_window_bg_alpha(0.98)
+        imgui.begin("pansplat", None, _PANEL)
+        imgui.push_item_width(-110 * scale)
+        self._draw_sections(viewer)
+        imgui.pop_item_width()
         imgui.end()
 
     def _draw_sections(self, viewer: Viewer) -> None:
@@ -176,7 +179,7 @@ class Panels:
         self._draw_path(viewer)
 
     def _draw_expert(self, viewer: Viewer) -> None:
-        """Draw how the camera moves, what is drawn of the Gaussians, and the look of the window."""
+        """Draw how the camera moves, and what is drawn of the Gaussians."""
         imgui.separator_text("Camera")
         self._draw_camera(viewer)
         if viewer.stage.renderer.stats.total:
@@ -188,11 +191,9 @@ class Panels:
         imgui.separator_text("Display")
         self._draw_display(viewer.state)
         self._draw_settings(viewer)
-        imgui.separator_text("Window")
-        self._draw_window(viewer)
 
     def _draw_scene(self, viewer: Viewer) -> None:
-        library, recent, width = viewer.library, viewer.preferences.recent, -60 * imgui.get_style().font_scale_dpi
+        library, recent, width = viewer.library, viewer.recent, -60 * imgui.get_style().font_scale_dpi
         if library.entries:
             names = [f"{i + 1}. {name}" for i, name in enumerate(library.names)]  # numbered, because names may repeat
             imgui.set_next_item_width(-1)
@@ -310,14 +311,6 @@ class Panels:
             form = f"%.{1 if largest < 100 else 0}f{UNITS[state.settings.display]}"
             chosen = self.widgets.slider("range", largest, 1.0, 1000.0, form, logarithmic=True)
             state.settings = replace(state.settings, display_max=chosen)
-
-    def _draw_window(self, viewer: Viewer) -> None:
-        for theme in get_args(Theme):
-            if self.widgets.radio(theme, viewer.preferences.theme == theme):
-                viewer.queue(viewer.set_theme, theme)
-            imgui.same_line()
-        if self.widgets.button("Default layout"):
-            viewer.queue(viewer.gui.reset_layout)
 
     def _draw_progress(self, viewer: Viewer, name: str, task: str, fraction: float) -> None:
         """Draw the progress of a load."""

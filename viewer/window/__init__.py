@@ -1,1 +1,1 @@
-"""The window, its events and the preferences of its user."""
+"""The window, its events and the paths that its user has opened."""

@@ -97,7 +97,7 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
     monkeypatch.setattr("pansplat_viewer.viewer.Viewer", make)
     monkeypatch.setattr(windows, "Window", Mock())
     monkeypatch.setattr(windows, "run_viewer", run)
-    monkeypatch.setattr("pansplat_viewer.window.preferences.find_file", lambda: tmp_path / "viewer.json")
+    monkeypatch.setattr("pansplat_viewer.window.recent.find_file", lambda: tmp_path / "viewer.json")
     monkeypatch.setattr(app, "find_entries", lambda *_: [SceneEntry("a")])
     assert app._run_window(app.Options(tmp_path), (64, 32), None) is None
     first, second = viewers
