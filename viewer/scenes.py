@@ -20,7 +20,6 @@ from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.library import Library
 from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
-from pansplat_viewer.scene.slots import keep_largest
 from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene, enter_tour
 from pansplat_viewer.scene.tour import TourScenes
 from pansplat_viewer.ui.photographs import find_open_view
@@ -123,16 +122,6 @@ class Scenes:
             return False
         return self._waiting is None if entry is None else self.tour.is_of(entry)
 
-    @property
-    def _too_large(self) -> SceneLife | None:
-        lives = (life for life in (self.coming, self.shown) if life is not None and life.state == "too large")
-        return next(lives, None)
-
-    @property
-    def reduced(self) -> int | None:
-        """Number of Gaussians that are offered in place of a scene that did not fit; None if there is none."""
-        return None if self._too_large is None else self._too_large.reduced
-
     # --- what a user does ---
 
     def show(self, entries: list[SceneEntry], index: int, path: Path | None = None) -> None:
@@ -203,22 +192,8 @@ class Scenes:
 
     def dismiss(self) -> None:
         """Go on with the scene that is shown after an error."""
-        too_large = self._too_large
-        if too_large is not None:
-            too_large.dismiss()
-        if too_large is self.coming:
-            self.coming = None
         self._stage.has_failed = False
         self._library.restore()
-
-    def show_reduced(self) -> None:
-        """Show the largest Gaussians of the scene that did not fit."""
-        too_large = self._too_large
-        if too_large is not None:
-            self._stage.has_failed = False
-            if self._library.loader.entry is too_large.entry:
-                self._library.loader.cancel()
-            self.coming = too_large.reduce(keep_largest)
 
     # --- frames ---
 
@@ -268,21 +243,13 @@ class Scenes:
             self.shown.cancel()
 
     def _replace(self, life: SceneLife, loaded: LoadedScene) -> None:
-        """Show a scene; if it does not fit into memory, keep the one before and offer the largest Gaussians."""
-        error = self._stage.upload(self._stage.slots[0], loaded.scene, loaded.entry.name)
-        if error is None:
-            self._stage.has_failed, self.coming = False, None
+        """Show a scene; if it does not fit into memory, keep the one before."""
+        self.coming = None
+        if self._stage.upload(self._stage.slots[0], loaded.scene, loaded.entry.name):
+            self._stage.has_failed = False
             self._enter(life, loaded)
-        elif isinstance(error, MemoryError) and life.reduced:
-            life.exhaust()
         else:
             life.fail()
-            self.coming = None
-
-    def offer_reduced(self, error: Exception) -> None:
-        """Offer the largest Gaussians of the scene that is shown, if drawing it has exhausted the memory."""
-        if self.shown is not None and self.tour is None and isinstance(error, MemoryError) and self.shown.reduced:
-            self.shown.exhaust()
 
     def exchange(self) -> None:
         """Show the refined scene or the prediction, whichever is chosen, while the camera stands still."""
@@ -292,7 +259,7 @@ class Scenes:
         scene = loaded.scene if self._state.refined else life.prediction
         if scene is stage.slot.scene or not stage.preparer.is_ready(scene):
             return
-        if stage.upload(stage.slot, scene, loaded.entry.name) is not None:
+        if not stage.upload(stage.slot, scene, loaded.entry.name):
             life.revert()
 
     def _enter(self, life: SceneLife, loaded: LoadedScene) -> None:

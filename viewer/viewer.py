@@ -199,9 +199,7 @@ class Viewer:
         self.scenes.update()
         if self.loaded is None and self.tour is None:
             stage.fade_to_photograph(stage.photographs.find_nearest(np.asarray(state.camera.position)))
-        problem = stage.draw(target)
-        if problem is not None:
-            self.scenes.offer_reduced(problem)
+        stage.draw(target)
         self.gui.end(self._ctx, target)
         actions, self._queue = self._queue, []
         for action in actions:
@@ -245,11 +243,6 @@ class Viewer:
         """Close the error message, and go on with the scene that is shown."""
         self.error = None
         self.scenes.dismiss()
-
-    def show_reduced(self) -> None:
-        """Close the error message, and show the largest Gaussians of the scene that did not fit."""
-        self.error = None
-        self.scenes.show_reduced()
 
     # --- actions of keys and panels ---
 

@@ -19,7 +19,7 @@ from PIL import Image
 from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.path import find_direction
@@ -29,7 +29,6 @@ from pansplat.inputs.pairs import Note, Panorama
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
-from pansplat.rendering.cpu.display import DisplayScene
 from pansplat.system.progress import report_progress
 from pansplat.tours.graph import find_tours
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
@@ -374,7 +373,7 @@ def predict_forever(entry, show):
         time.sleep(0.002)
 
 
-@pytest.mark.parametrize("state", ["predicting", "refining", "refined", "too large", "failed"])
+@pytest.mark.parametrize("state", ["predicting", "refining", "refined", "failed"])
 def test_each_state_of_a_scene_has_its_button(user, small_scene, monkeypatch, state):
     scenes, before = user.viewer.scenes, user.read_image()
     if state == "predicting":
@@ -401,20 +400,6 @@ def test_each_state_of_a_scene_has_its_button(user, small_scene, monkeypatch, st
             user.click("refined")
         user.settle()
         assert user.viewer.error is None and changed_fraction(before, user.read_image()) == 0, "the prediction"
-    elif state == "too large":
-        twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
-
-        def refuse_rows(means, *arguments):
-            if len(means) == len(twice.gaussians):
-                raise MemoryError("too many")
-            return DisplayScene(means, *arguments)
-
-        monkeypatch.setattr("pansplat_viewer.draw.cpu_renderer.DisplayScene", refuse_rows)
-        user.load = lambda entry, show: LoadedScene(entry, twice)
-        user.show(SceneEntry("large"))
-        user.click("Reduce")
-        after = user.read_image()
-        assert changed_fraction(before, after) > 0.02 and np.abs(before - after).mean() < 20, "the largest Gaussians"
     else:
         user.show(SceneEntry("damaged"))
         assert changed_fraction(before, user.read_image()) > 0.02, "the message is on the screen"

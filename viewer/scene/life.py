@@ -6,14 +6,12 @@
                                    | a final scene   v    |                  |
                                    +--------------> predicted <--------------+
 
-It is `failed` if it cannot be predicted, refined or drawn. It is `too large` if it does not fit into memory, until a
-smaller one takes its place or the message is dismissed. A scene of a tour that is dropped from memory keeps its state,
-and a request predicts it again.
+It is `failed` if it cannot be predicted, refined or drawn. A scene of a tour that is dropped from memory keeps its
+state, and a request predicts it again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
@@ -22,9 +20,7 @@ from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
 
-State = Literal["photograph", "predicting", "predicted", "refining", "refined", "too large", "failed"]
-
-_REDUCTION = 4  # a scene that does not fit is offered with this fraction of its Gaussians
+State = Literal["photograph", "predicting", "predicted", "refining", "refined", "failed"]
 
 
 class SceneLife:
@@ -43,17 +39,11 @@ class SceneLife:
         self.state: State = "photograph"
         self.loaded: LoadedScene | None = None
         self.prediction: Scene | None = None
-        self._before: State = "photograph"  # too large
 
     @property
     def is_known(self) -> bool:
         """Whether it has been predicted, also if the scene is not in memory any more."""
         return self.state in ("predicted", "refining", "refined")
-
-    @property
-    def reduced(self) -> int:
-        """Number of Gaussians that are offered in place of the whole scene."""
-        return 0 if self.loaded is None else len(self.loaded.scene.gaussians) // _REDUCTION
 
     def request(self) -> None:
         """The loader begins to predict it, or to refine the prediction that is there."""
@@ -87,21 +77,3 @@ class SceneLife:
         assert self.loaded is not None
         loaded, self.loaded, self.prediction = self.loaded, None, None
         return loaded
-
-    def exhaust(self) -> None:
-        """The memory does not hold it."""
-        if self.state != "too large":
-            self._before, self.state = self.state, "too large"
-
-    def dismiss(self) -> None:
-        """Go on with a scene that was too large when it was drawn."""
-        if self.state == "too large":
-            self.state = self._before
-
-    def reduce(self, keep_largest: Callable[[Scene, int], Scene]) -> SceneLife:
-        """The life of the same scene with fewer Gaussians, `keep_largest` of a scene and a number."""
-        assert self.loaded is not None
-        life = SceneLife(self.entry)
-        smaller = keep_largest(self.loaded.scene, self.reduced)
-        life.receive(replace(self.loaded, scene=smaller, is_final=True, facts=None))
-        return life

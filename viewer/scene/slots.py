@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import moderngl
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
@@ -18,19 +16,6 @@ from pansplat_viewer.scene.settings import DrawSettings
 
 _SMALL_SCENE = 100_000  # Gaussians; converted without a thread, because that takes less time than a frame
 _LARGE_SCENE = 2_000_000  # Gaussians; the first image is not waited for, because it can take seconds
-
-
-def keep_largest(scene: Scene, count: int) -> Scene:
-    """The scene with the Gaussians that cover the largest solid angles, weighted by opacity, seen from its cameras."""
-    gaussians = scene.gaussians
-    cameras = scene.cam2world[:, :3, 3].float() if len(scene.cam2world) else gaussians.means.mean(dim=0, keepdim=True)
-    squared = torch.full((len(gaussians),), torch.inf)
-    for camera in cameras:
-        squared = torch.minimum(squared, (gaussians.means - camera).square().sum(dim=1))
-    scales = gaussians.scales.sort(dim=1).values
-    cover = gaussians.opacities * scales[:, 1] * scales[:, 2] / squared.clamp(min=1e-12)
-    largest = cover.nan_to_num(0.0).topk(min(count, len(cover))).indices
-    return replace(scene, gaussians=gaussians.select(largest.sort().values))
 
 
 class SceneSlot:

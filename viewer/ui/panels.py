@@ -378,11 +378,6 @@ class Panels:
         draw_wrapped(error)
         if self.widgets.button("OK"):
             viewer.queue(viewer.dismiss_error)
-        if viewer.scenes.reduced is not None:
-            imgui.same_line()
-            if self.widgets.button(f"Show the {viewer.scenes.reduced:,} largest Gaussians###Reduce"):
-                viewer.queue(viewer.show_reduced)
-            self.widgets.record("Reduce")
         imgui.end()
 
 

@@ -112,14 +112,14 @@ class Stage:
 
     # --- what is shown ---
 
-    def upload(self, slot: SceneSlot, scene: Scene, name: str) -> Exception | None:
-        """Upload a scene; if this fails, show the error and return it."""
+    def upload(self, slot: SceneSlot, scene: Scene, name: str) -> bool:
+        """Upload a scene; if this fails, show the error and return False."""
         try:
             slot.upload(scene, self.preparer.take(scene))
         except DRAW_ERRORS as error:
             self._show_error(f"{name}: {describe_error(error)}")
-            return error
-        return None
+            return False
+        return True
 
     def clear(self) -> None:
         """Show nothing; the next scene is that of the first slot."""
@@ -145,7 +145,7 @@ class Stage:
             return True
         if self.slots[slot].scene is not loaded.scene:
             ready = can_wait and self.preparer.is_ready(loaded.scene)
-            if not ready or self.upload(self.slots[slot], loaded.scene, loaded.entry.name) is not None:
+            if not ready or not self.upload(self.slots[slot], loaded.scene, loaded.entry.name):
                 return False
         self.fade.show(slot, loaded.scene, self._state.now, part)
         self._scene_slot, self.scene_views = slot, loaded.entry.views
@@ -173,18 +173,16 @@ class Stage:
 
     # --- frames ---
 
-    def draw(self, target: moderngl.Framebuffer) -> Exception | None:
-        """Draw the image. If this fails, show the error, return it, and draw the background while `has_failed`."""
-        problem = None
+    def draw(self, target: moderngl.Framebuffer) -> None:
+        """Draw the image. If this fails, show the error, and draw the background while `has_failed`."""
         if not self.has_failed:
             try:
                 self._draw_image(target)
-                return None
+                return
             except DRAW_ERRORS as error:
-                self.has_failed, self.slot.image, problem = True, None, error
+                self.has_failed, self.slot.image = True, None
                 self._show_error(describe_error(error))
         self._draw_background(target)
-        return problem
 
     def _draw_background(self, target: moderngl.Framebuffer) -> None:
         target.use()
@@ -310,5 +308,5 @@ class Stage:
 def describe_error(error: Exception) -> str:
     """The text of an error of drawing."""
     if isinstance(error, MemoryError):
-        return f"the memory is exhausted ({type(error).__name__}: {error})"
+        return f"the memory is exhausted ({type(error).__name__}: {error}); open a scene with fewer Gaussians"
     return f"OpenGL failed: {error}" if isinstance(error, moderngl.Error) else str(error)

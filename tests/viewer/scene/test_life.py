@@ -6,7 +6,6 @@ import pytest
 
 from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
-from pansplat_viewer.scene.slots import keep_largest
 
 ENTRY = SceneEntry("kitchen")
 
@@ -52,9 +51,6 @@ def live(small_scene):
         ("request show fail request final", "refined", 0.5, True),
         ("request show final drop", "refined", None, False),
         ("request show final drop request", "predicting", None, False),
-        ("request show exhaust exhaust", "too large", 0.45, False),
-        ("request show exhaust cancel", "too large", 0.45, False),
-        ("request show exhaust dismiss dismiss", "refining", 0.45, False),
     ],
 )
 def test_the_state_after_events(live, events, state, near, has_prediction):
@@ -62,11 +58,3 @@ def test_the_state_after_events(live, events, state, near, has_prediction):
     assert (life.state, life.prediction is not None) == (state, has_prediction)
     assert (None if life.loaded is None else life.loaded.scene.near) == near
     assert life.is_known == (state in ("predicted", "refining", "refined"))
-
-
-def test_a_scene_that_is_too_large_is_reduced_to_a_life_of_its_own(live, small_scene):
-    life = live("request show exhaust")
-    assert life.reduced == len(small_scene.gaussians) // 4
-    reduced = life.reduce(keep_largest)
-    assert reduced.state == "predicted" and len(reduced.loaded.scene.gaussians) == life.reduced
-    assert reduced.entry is ENTRY and len(life.loaded.scene.gaussians) == len(small_scene.gaussians)
