@@ -98,11 +98,8 @@ class Scenes:
 
     @property
     def refinement(self) -> float | None:
-        """Fraction of the refinement that is done; 1 if the refined scene is there, None without a refinement."""
-        if self._loads_for_tour:
-            return None
-        has_both = self.shown is not None and self.shown.prediction is not None
-        return 1.0 if has_both else self._library.loader.refinement
+        """Fraction of the refinement of the scene that is done; None without one."""
+        return None if self._loads_for_tour else self._library.loader.refinement
 
     @property
     def background(self) -> tuple[str, float] | None:
@@ -252,15 +249,14 @@ class Scenes:
             life.fail()
 
     def exchange(self) -> None:
-        """Show the refined scene or the prediction, whichever is chosen, while the camera stands still."""
+        """Show the refined scene in place of its prediction, while the camera stands still."""
         stage, life, loaded = self._stage, self.shown, self.loaded
-        if life is None or loaded is None or life.prediction is None or self._waiting is not None:
+        if life is None or loaded is None or life.state != "refined" or self._waiting is not None:
             return
-        scene = loaded.scene if self._state.refined else life.prediction
-        if scene is stage.slot.scene or not stage.preparer.is_ready(scene):
+        if loaded.scene is stage.slot.scene or not stage.preparer.is_ready(loaded.scene):
             return
-        if not stage.upload(stage.slot, scene, loaded.entry.name):
-            life.revert()
+        if not stage.upload(stage.slot, loaded.scene, loaded.entry.name):
+            life.fail()
 
     def _enter(self, life: SceneLife, loaded: LoadedScene) -> None:
         """Show a scene that is uploaded, and go to its start."""

@@ -372,12 +372,28 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
     go.set()
     app.until(lambda: app.library.loader.refinement is None, "refined scene")
     app.settle()
-    assert app.viewer.scenes.refinement == 1 and stage.slot.scene is refined and app.state.camera == camera
+    assert stage.slot.scene is refined and app.state.camera == camera
     assert app.library.loader.poll() is None
-    for expected in (small_scene, refined):
-        app.press("b")
-        app.settle()
-        assert stage.slot.scene is expected
+
+
+def test_a_refined_scene_that_cannot_be_drawn_is_one_error_and_the_prediction_stays(app, small_scene, monkeypatch):
+    refined, refusals = replace(small_scene, near=0.5), []
+    prediction = replace(small_scene, near=0.4)
+
+    def load(entry: SceneEntry, show: Callable[..., None]) -> LoadedScene:
+        show(LoadedScene(entry, prediction, is_final=False))
+        return LoadedScene(entry, refined)
+
+    def refuse(scene: Scene) -> Exception | None:
+        return refusals.append(scene) or MemoryError("no memory") if scene is refined else None
+
+    monkeypatch.setattr(NoRenderer, "refuse", staticmethod(refuse))
+    app.load = load
+    app.show(SceneEntry("kitchen"))
+    app.until(lambda: app.viewer.error, "error")
+    app.viewer.dismiss_error()
+    app.settle()
+    assert app.viewer.stage.slot.scene is prediction and refusals == [refined] and app.viewer.error is None
 
 
 def test_a_scene_beyond_the_memory_is_an_error_and_the_scene_before_stays(app, small_scene, monkeypatch):

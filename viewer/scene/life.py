@@ -1,10 +1,10 @@
 """The life of a scene in the viewer, from its photographs to its refinement. Needs no window.
 
     photograph --request--> predicting --receive--> refining --receive--> refined
-        ^                     |    |                 |    ^                  |
-        +------ cancel -------+    | receive  cancel |    | request          | revert
-                                   | a final scene   v    |                  |
-                                   +--------------> predicted <--------------+
+        ^                     |    |                 |    ^
+        +------ cancel -------+    | receive  cancel |    | request
+                                   | a final scene   v    |
+                                   +--------------> predicted
 
 It is `failed` if it cannot be predicted, refined or drawn. A scene of a tour that is dropped from memory keeps its
 state, and a request predicts it again.
@@ -12,13 +12,12 @@ state, and a request predicts it again.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 
 if TYPE_CHECKING:
-    from pansplat.gaussians.scene import Scene
+    pass
 
 State = Literal["photograph", "predicting", "predicted", "refining", "refined", "failed"]
 
@@ -30,7 +29,6 @@ class SceneLife:
         entry: what it is made from.
         state: see the module.
         loaded: the newest scene; None before it is predicted, and while it is not in memory.
-        prediction: the scene before the refinement; None before `refined`, and where it is not kept.
     """
 
     def __init__(self, entry: SceneEntry) -> None:
@@ -38,7 +36,6 @@ class SceneLife:
         self.entry = entry
         self.state: State = "photograph"
         self.loaded: LoadedScene | None = None
-        self.prediction: Scene | None = None
 
     @property
     def is_known(self) -> bool:
@@ -49,11 +46,9 @@ class SceneLife:
         """The loader begins to predict it, or to refine the prediction that is there."""
         self.state = "predicting" if self.loaded is None else "refining"
 
-    def receive(self, loaded: LoadedScene, *, keep_prediction: bool = True) -> None:
-        """The loader has predicted or refined it; `keep_prediction` keeps the scene before a refinement."""
+    def receive(self, loaded: LoadedScene) -> None:
+        """The loader has predicted or refined it."""
         is_refined = loaded.is_final and self.state == "refining" and self.loaded is not None
-        if is_refined and keep_prediction and self.loaded is not None:
-            self.prediction = self.loaded.scene
         self.state = "refined" if is_refined else "predicted" if loaded.is_final else "refining"
         self.loaded = loaded
 
@@ -66,14 +61,8 @@ class SceneLife:
         """It cannot be predicted, refined or drawn; a prediction that is there stays."""
         self.state = "failed"
 
-    def revert(self) -> None:
-        """Go back to the prediction, because the renderer refuses the refined scene."""
-        if self.prediction is not None and self.loaded is not None:
-            self.loaded, self.prediction = replace(self.loaded, scene=self.prediction, facts=None), None
-            self.state = "predicted"
-
     def drop(self) -> LoadedScene:
         """Take the scene out of memory, and return it; it stays known."""
         assert self.loaded is not None
-        loaded, self.loaded, self.prediction = self.loaded, None, None
+        loaded, self.loaded = self.loaded, None
         return loaded

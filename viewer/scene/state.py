@@ -49,7 +49,6 @@ class ViewerState:
     playing: bool = False  # whether this flight goes on
     overlay: bool = True
     help: bool = False
-    refined: bool = True  # whether the refined scene is shown, where there is one, or the prediction
     stops: bool = True  # whether the photograph is shown where the camera stands at a panorama
     adaptive: bool = True  # whether the resolution is lowered while the camera moves
     speed: float = 1.0  # of flying, metres per second

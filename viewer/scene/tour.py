@@ -151,7 +151,7 @@ class TourScenes:
         if views not in self._lives:
             self._selected[views] = loaded
             return
-        self._lives[views].receive(loaded, keep_prediction=False)
+        self._lives[views].receive(loaded)
         self._lives.move_to_end(views)
         for scene in [scene for scene in self._selected if views in self._sources[scene] and self._has_sources(scene)]:
             del self._selected[scene]

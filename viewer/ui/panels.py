@@ -219,9 +219,7 @@ class Panels:
             imgui.same_line()
         if library.entries and self.widgets.button("Reload"):
             viewer.queue(viewer.scenes.reload)
-        if viewer.scenes.refinement == 1:
-            viewer.state.refined = self.widgets.check("refined", viewer.state.refined)
-        elif viewer.scenes.refinement is not None:
+        if viewer.scenes.refinement is not None:
             if self.widgets.button("Cancel"):
                 viewer.queue(viewer.scenes.cancel_refinement)
             imgui.same_line()

@@ -124,7 +124,6 @@ KEYS = (
     KeyRow(
         ", .", "step along the flight (placing: turn)", {",": _change(step_flight, -1), ".": _change(step_flight, 1)}
     ),
-    KeyRow("B", "before or after the refinement", {"b": _toggle("refined")}),
     KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
     KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),
     KeyRow("R", "back to the start", {"r": _change(_restart)}),
