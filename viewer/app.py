@@ -203,18 +203,18 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
         if loader.is_searching:
             viewer.scenes.expect(entries, source, options.pair)
         else:
-            viewer.show(entries, first, source)
+            viewer.scenes.show(entries, first, source)
         try:
             run_viewer(window, viewer)
             return None
         except ContextLostError:  # start again with the same scene, camera and settings
             if attempt == _MAX_CONTEXTS - 1:
                 raise
-            library, loader = viewer.library, create_loader()
-            if library.path is None:  # poses were being estimated
+            scenes, loader = viewer.scenes, create_loader()
+            if scenes.path is None:  # poses were being estimated
                 loader.search(source, find)
             else:
-                entries, first, source = library.entries, max(library.current, 0), library.path
+                entries, first, source = scenes.entries, max(scenes.current, 0), scenes.path
     return None
 
 

@@ -1,10 +1,11 @@
-"""The scenes of the window: which one is shown, which one comes next, and those of a tour.
+"""The scenes of the window: those to choose from, which one is shown, which one comes next, and those of a tour.
 
 `Scenes` follows the loader: each scene has a `SceneLife`. The stage draws them.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,9 +18,8 @@ from pansplat.geometry.path import find_direction
 from pansplat.tours.graph import list_starts
 from pansplat.tours.route import plan_route
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.library import Library
 from pansplat_viewer.scene.life import SceneLife
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
 from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene, enter_tour
 from pansplat_viewer.scene.tour import TourScenes
 from pansplat_viewer.ui.photographs import find_open_view
@@ -30,6 +30,10 @@ class Scenes:
     """Shows what the loader finds, predicts and refines.
 
     Attributes:
+        loader: loads one entry at a time; closed with the viewer.
+        entries: to choose from.
+        current: number of the one that is shown or loaded; -1 if there is none.
+        path: where they were found; None if they are only loaded again.
         shown: the scene that is shown, of a tour the first one; None before the first one.
         coming: the scene that replaces it when it is predicted and prepared; None if there is none.
         tour: the scenes of the tour that is shown, or whose photographs are; None for other scenes.
@@ -39,7 +43,8 @@ class Scenes:
         self,
         state: ViewerState,
         stage: Stage,
-        library: Library,
+        loader: SceneLoader,
+        find: Find,
         *,
         at: float,
         memory: float,
@@ -52,21 +57,37 @@ class Scenes:
         Args:
             state: of the viewer.
             stage: draws the image.
-            library: the scenes to choose from, and their loader.
+            loader: finds and loads entries.
+            find: returns the entries of a path; called in a worker thread.
             at: fraction of the flight at which a scene is entered.
             memory: limit of the scenes of a tour, GiB.
             show_error: shows a message.
             listed: called when other entries are listed, with the path at which they were found.
             entered: called when a scene is shown.
         """
-        self._state, self._stage, self._library = state, stage, library
+        self._state, self._stage, self.loader, self._find = state, stage, loader, find
         self._at, self._memory = at, memory
         self._show_error, self._listed, self._entered = show_error, listed, entered
+        self.entries: list[SceneEntry] = []
+        self.current = -1
+        self.path: Path | None = None
+        self._wanted: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
+        self._kept: tuple[list[SceneEntry], int, Path | None] | None = None  # of the scene that is shown
         self.shown: SceneLife | None = None
         self.coming: SceneLife | None = None
         self.tour: TourScenes | None = None
 
     # --- what the panels read ---
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the entries."""
+        return [entry.name for entry in self.entries]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was not used or not placed at the path, and why."""
+        return self.entries[self.current].notes if 0 <= self.current < len(self.entries) else ()
 
     @property
     def loaded(self) -> LoadedScene | None:
@@ -82,29 +103,29 @@ class Scenes:
     @property
     def is_busy(self) -> bool:
         """Whether something is looked for, made or prepared."""
-        loader = self._library.loader
+        loader = self.loader
         is_loading = loader.entry is not None or loader.is_searching
         return is_loading or self._waiting is not None or self._stage.preparer.progress is not None
 
     @property
     def loading(self) -> tuple[str, str, float] | None:
         """Name, task and fraction done of the search, or of the scene that will be shown; None without them."""
-        if self._loads_for_tour and not self._library.loader.is_searching:
+        if self._loads_for_tour and not self.loader.is_searching:
             return None
         progress, waiting = self._stage.preparer.progress, self._waiting
         if waiting is not None and progress is not None:
             return waiting.entry.name, f"preparing {len(waiting.scene.gaussians):,} Gaussians", progress
-        return self._library.loader.progress
+        return self.loader.progress
 
     @property
     def refinement(self) -> float | None:
         """Fraction of the refinement of the scene that is done; None without one."""
-        return None if self._loads_for_tour else self._library.loader.refinement
+        return None if self._loads_for_tour else self.loader.refinement
 
     @property
     def background(self) -> tuple[str, float] | None:
         """Work of the loader on the tour, and the fraction done."""
-        loader = self._library.loader
+        loader = self.loader
         if not self._loads_for_tour or loader.entry is None:
             return None
         if loader.progress is not None:
@@ -114,12 +135,22 @@ class Scenes:
     @property
     def _loads_for_tour(self) -> bool:
         """Whether the loader works for the tour that is shown, and not for a scene that the user has chosen."""
-        entry = self._library.loader.entry
+        entry = self.loader.entry
         if self.tour is None or self.shown is None:
             return False
         return self._waiting is None if entry is None else self.tour.is_of(entry)
 
     # --- what a user does ---
+
+    def search(self, path: Path, name: str | None = None) -> None:
+        """Look for the scenes at a path and show one; for an invalid path, show an error and keep the scene.
+
+        Args:
+            path: a file or folder.
+            name: name or number of the entry to show; the first one if there is none of this name.
+        """
+        self._wanted = path, name
+        self.loader.search(path, self._find)
 
     def show(self, entries: list[SceneEntry], index: int, path: Path | None = None) -> None:
         """List these entries and load one of them.
@@ -129,7 +160,7 @@ class Scenes:
             index: of the entry to load.
             path: where they were found, so that a reload finds new ones; None if they are only loaded again.
         """
-        self._library.offer(entries, index, path)
+        self.entries, self.current, self.path = entries, index, path
         self._listed(path)
         if self.shown is None:
             self._preview(entries[index])
@@ -137,7 +168,7 @@ class Scenes:
             self.shown.cancel()
         self.coming = SceneLife(entries[index])
         self.coming.request()
-        self._library.loader.request(entries[index])
+        self.loader.request(entries[index])
 
     def expect(self, entries: list[SceneEntry], path: Path, name: str | None) -> None:
         """Show panoramas while their poses are estimated by a search of the loader, which has begun.
@@ -147,56 +178,56 @@ class Scenes:
             path: where they are.
             name: name or number of the entry to show when the search ends; None for the first.
         """
-        self._library.expect(path, name)
+        self._wanted = path, name
         self._show_unplaced(entries)
 
     def _show_unplaced(self, entries: list[SceneEntry]) -> None:
         if self.shown is None and entries:
-            self._library.offer(entries, 0, None)
+            self.entries, self.current, self.path = entries, 0, None
             self._preview(entries[0])
 
     def choose(self, index: int) -> None:
         """Show another entry of the list."""
-        if index != self._library.current:
-            self.show(self._library.entries, index, self._library.path)
-
-    def open_text(self, text: str) -> None:
-        """Show the scenes at the path that a user has typed."""
-        self._library.search(Path(text).expanduser())
+        if index != self.current:
+            self.show(self.entries, index, self.path)
 
     def reload(self) -> None:
         """Load the entry again."""
-        library, current = self._library, max(self._library.current, 0)
-        if library.path is None:
-            self.show(library.entries, current)
+        current = max(self.current, 0)
+        if self.path is None:
+            self.show(self.entries, current)
         else:
-            library.search(library.path, library.entries[current].name)
+            self.search(self.path, self.entries[current].name)
 
     def cancel_loading(self) -> None:
         """End the search for scenes, else the prediction."""
-        loader = self._library.loader
-        if not loader.cancel_search():
-            loader.cancel()
+        if not self.loader.cancel_search():
+            self.loader.cancel()
             self._stage.preparer.stop()
-            self.coming, self._library.current = None, -1
-            self._library.restore()
+            self.coming, self.current = None, -1
+            self._restore()
 
     def cancel_refinement(self) -> None:
         """End the refinement of the scene that is shown."""
-        self._library.loader.cancel()
+        self.loader.cancel()
         if self.shown is not None:
             self.shown.cancel()
 
     def dismiss(self) -> None:
         """Go on with the scene that is shown after an error."""
         self._stage.has_failed = False
-        self._library.restore()
+        self._restore()
+
+    def _restore(self) -> None:
+        """List the entry that is shown again, after another one was not loaded."""
+        if self._kept is not None:
+            self.entries, self.current, self.path = self._kept
 
     # --- frames ---
 
     def poll(self) -> None:
         """Show the scene, the entries or the error of a finished load or search."""
-        loader, coming, waiting = self._library.loader, self.coming, self._waiting
+        loader, coming, waiting = self.loader, self.coming, self._waiting
         if coming is not None and waiting is not None and self._stage.preparer.is_ready(waiting.scene):
             self._replace(coming, waiting)
         requested = loader.entry
@@ -204,7 +235,10 @@ class Scenes:
         if isinstance(result, list) and loader.is_searching:
             self._show_unplaced(result)
         elif isinstance(result, list):
-            self.show(result, *self._library.choose_found(result))
+            (path, name), index = self._wanted, 0
+            with contextlib.suppress(InputError):
+                index = choose_entry(result, name)
+            self.show(result, index, path)
         elif isinstance(result, LoadedScene):
             self._receive(result)
         elif result is not None:
@@ -212,7 +246,7 @@ class Scenes:
             self._show_error(str(result) if known else f"{type(result).__name__}: {result}")
             if requested is not None and loader.entry is None:  # else the search
                 self._fail(requested)
-            self._library.restore()
+            self._restore()
 
     def _receive(self, result: LoadedScene) -> None:
         """Take a prediction or a refined scene of the loader."""
@@ -264,7 +298,7 @@ class Scenes:
         photograph = stage.photograph if self.shown is None else None
         remaining = self._list_remaining() if self.shown is None else ()
         self.shown, self.tour = life, None
-        self._library.keep()
+        self._kept = self.entries, self.current, self.path
         stage.clear()
         stage.photographs.open(entry.panoramas)
         self._entered(entry)
@@ -346,7 +380,7 @@ class Scenes:
         self._show_place(tour)
         self._stage.fade.move(state.camera.cam2world, tour.part)
         if self._loads_for_tour:
-            loader = self._library.loader
+            loader = self.loader
             request = tour.choose_request(tour.list_next(route, state.flight), loader.entry)
             if request is not None:
                 loader.request(request)

@@ -29,13 +29,12 @@ from pansplat.tours.camera_path import read_path, write_path
 from pansplat.tours.route import find_angles
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.hotspots import Hotspot, find_clicked, find_hotspots
-from pansplat_viewer.scene.library import Library
-from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader
+from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader
 from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
 from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import RendererChoice
 from pansplat_viewer.scene.state import ViewerState, advance_path
-from pansplat_viewer.scene.tour import DEFAULT_MEMORY, TourScenes
+from pansplat_viewer.scene.tour import DEFAULT_MEMORY
 from pansplat_viewer.scenes import Scenes
 from pansplat_viewer.screenshots import Screenshots
 from pansplat_viewer.ui.panels import Panels
@@ -53,8 +52,7 @@ class Viewer:
 
     Attributes:
         state: the values that a user can change.
-        library: the scenes to choose from.
-        scenes: which one is shown, and which one comes next.
+        scenes: those to choose from, which one is shown, and which one comes next.
         stage: draws the image.
         placing, screenshots: what else a user does with the scene.
         hotspots: places of panoramas in the image.
@@ -98,12 +96,12 @@ class Viewer:
         self.error: str | None = None
         self.frame_ms = 0.0
         self._clock = clock
-        self.library = Library(loader, find)
         self.stage = Stage(ctx, renderer, self.state, self.show_error)
         self.scenes = Scenes(
             self.state,
             self.stage,
-            self.library,
+            loader,
+            find,
             at=at,
             memory=memory,
             show_error=self.show_error,
@@ -135,16 +133,6 @@ class Viewer:
         return self.moving or self.scenes.is_busy or self.stage.photographs.is_reading or is_placing
 
     @property
-    def loaded(self) -> LoadedScene | None:
-        """The scene that is shown; None before the first one."""
-        return self.scenes.loaded
-
-    @property
-    def tour(self) -> TourScenes | None:
-        """The scenes of the tour that is shown, or whose photographs are; None for other scenes."""
-        return self.scenes.tour
-
-    @property
     def moving(self) -> bool:
         """Whether the image is still changing, so that a window draws as often as it can."""
         return self.stage.is_moving(self._clock())
@@ -166,8 +154,8 @@ class Viewer:
         camera, fade = self.state.camera, self.stage.fade
         size = imgui.get_io().display_size
         points = int(size.x), int(size.y)
-        has_arrived = self.tour is not None and fade.parts[fade.front] == self.tour.part
-        return find_hotspots(self.tour, camera, points) if self.tour is not None and has_arrived else []
+        has_arrived = self.scenes.tour is not None and fade.parts[fade.front] == self.scenes.tour.part
+        return find_hotspots(self.scenes.tour, camera, points) if self.scenes.tour is not None and has_arrived else []
 
     # --- frames ---
 
@@ -197,7 +185,7 @@ class Viewer:
         self.scenes.fly(step, was_playing)
         advance_path(state, step)
         self.scenes.update()
-        if self.loaded is None and self.tour is None:
+        if self.scenes.loaded is None and self.scenes.tour is None:
             stage.fade_to_photograph(stage.photographs.find_nearest(np.asarray(state.camera.position)))
         stage.draw(target)
         self.gui.end(self._ctx, target)
@@ -211,25 +199,12 @@ class Viewer:
         """Stop the threads and free every GL object; the context must still be current."""
         if self.placing is not None:
             self.placing.close()
-        self.library.loader.close()
+        self.scenes.loader.close()
         self.stage.release()
         self.panels.release()
         self.gui.close()
 
-    # --- scenes: open and show one, go on after an error ---
-
-    def open(self, path: Path, name: str | None = None) -> None:
-        """Look for the scenes at a path and show one; for an invalid path, show an error and keep the scene.
-
-        Args:
-            path: a file or folder.
-            name: of the entry to show; the first one if there is none of this name.
-        """
-        self.library.search(path, name)
-
-    def show(self, entries: list[SceneEntry], index: int, path: Path | None = None) -> None:
-        """List these entries, which were found at a path, and load one of them; see `Scenes.show`."""
-        self.scenes.show(entries, index, path)
+    # --- scenes ---
 
     def _note_listed(self, path: Path | None) -> None:
         self.error = None
@@ -237,7 +212,7 @@ class Viewer:
             self.recent = add_recent(self.recent, path, self._recent_file)
 
     def _open_placing(self, entry: SceneEntry) -> None:
-        self.placing = Placing.open(self.placing, entry, self.library.entries)
+        self.placing = Placing.open(self.placing, entry, self.scenes.entries)
 
     def dismiss_error(self) -> None:
         """Close the error message, and go on with the scene that is shown."""
@@ -271,14 +246,14 @@ class Viewer:
 
     def write_screenshot(self, suffix: str, panorama: bool = False) -> None:
         """Write the image as PNG, or EXR with depth; or the panorama at the camera."""
-        if self._has_scene() and self.loaded is not None:
-            self.screenshots.write(self.loaded, suffix, panorama=panorama)
+        if self._has_scene() and self.scenes.loaded is not None:
+            self.screenshots.write(self.scenes.loaded, suffix, panorama=panorama)
 
     def _has_scene(self) -> bool:
         """Whether a scene is shown; while a photograph is, a message says so."""
-        if self.loaded is not None and self.stage.photograph is not None:
+        if self.scenes.loaded is not None and self.stage.photograph is not None:
             self.state.show_message("there is no scene of this place yet")
-        return self.loaded is not None and self.stage.photograph is None
+        return self.scenes.loaded is not None and self.stage.photograph is None
 
     def put_note(self, text: str) -> None:
         """State a note at the middle of the image, in place of one that is there; without a text remove that one."""
@@ -302,17 +277,17 @@ class Viewer:
         """Write the key frames of the camera path."""
         file = Path(text).expanduser()
         with self._showing_errors():
-            if self.loaded is not None:
+            if self.scenes.loaded is not None:
                 require_replaceable("the camera path", [file])
-                write_path(self.state.path.map_places(self.loaded.scene.frame.globalize_places), file)
+                write_path(self.state.path.map_places(self.scenes.loaded.scene.frame.globalize_places), file)
                 self.state.show_message(f"wrote {text}; pansplat render SCENE --path {text} -o film.mp4 draws it")
 
     def open_path(self, text: str) -> None:
         """Read the key frames of a camera path."""
         with self._showing_errors():
-            if self.loaded is not None:
+            if self.scenes.loaded is not None:
                 path = read_path(Path(text).expanduser())
-                self.state.path = path.map_places(self.loaded.scene.frame.localize_places)
+                self.state.path = path.map_places(self.scenes.loaded.scene.frame.localize_places)
                 self.state.path_seconds, self.state.path_playing = 0.0, False
 
     @contextlib.contextmanager

@@ -125,7 +125,7 @@ class User:
         return self.read_screen()
 
     def show(self, *entries: SceneEntry) -> None:
-        self.viewer.show(list(entries), 0)
+        self.viewer.scenes.show(list(entries), 0)
         self.settle()
 
     def click(self, label: str) -> None:
@@ -231,7 +231,7 @@ def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp
 def user(session, ctx) -> User:
     """The session with scene, state and camera as at the start."""
     session.load, session.find = session.first_load, lambda path, show: [SceneEntry("opened")]
-    if session.viewer.library.names != NAMES or session.viewer.library.current != 0:
+    if session.viewer.scenes.names != NAMES or session.viewer.scenes.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
     kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "adaptive", "message", "message_until")
@@ -312,7 +312,7 @@ CLICKS = [  # in the window of a pair, and what is then true
     ("key tab", "not panels.widgets.items"),
     ("key tab; key h", "changed > 0.1"),
     ("key h; key escape", "changed == 0 and not state.quit"),
-    ("open pair 20 36", "viewer.library.current == 1"),
+    ("open pair 20 36", "viewer.scenes.current == 1"),
     ("open background 60 60; point 500 880", "max(state.settings.background) > 0"),
 ]
 
@@ -389,7 +389,7 @@ def test_each_state_of_a_scene_has_its_button(user, small_scene, monkeypatch, st
     elif state in ("refining", "refined"):
         bright = replace(small_scene.gaussians, harmonics=small_scene.gaussians.harmonics + 1.0)
         go, user.load = refine(small_scene, replace(small_scene, gaussians=bright))
-        user.viewer.show([SceneEntry("kitchen")], 0)
+        user.viewer.scenes.show([SceneEntry("kitchen")], 0)
         user.draw_until(lambda: scenes.refinement is not None, "refinement")
         user.draw_frames(2)
         if state == "refining":
@@ -422,7 +422,7 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
     assert user.state.camera == user.state.home
     user.press(imgui.Key.enter)
     user.settle()
-    assert user.viewer.library.names == ["opened"]
+    assert user.viewer.scenes.names == ["opened"]
 
 
 def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
@@ -438,13 +438,13 @@ def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeyp
     user.click("Open")
     user.settle()
     user.panels.path = ""
-    assert user.viewer.library.names == ["kitchen 1"] and user.viewer.recent == (str(Path("kitchen").absolute()),)
+    assert user.viewer.scenes.names == ["kitchen 1"] and user.viewer.recent == (str(Path("kitchen").absolute()),)
     user.draw_frames(2)
     user.click("recent")
     left, _, _, bottom = user.panels.widgets.items["recent"]
     user.click_at(left + 30, bottom + 12)
     user.settle()
-    assert user.viewer.library.names == ["kitchen 2"]
+    assert user.viewer.scenes.names == ["kitchen 2"]
 
 
 @both
@@ -587,7 +587,7 @@ def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair,
     monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(300) and draw(*arguments))
     other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
     user.load = lambda entry, show: LoadedScene(entry, other)
-    user.viewer.show([SceneEntry("large", pair=pair)], 0)
+    user.viewer.scenes.show([SceneEntry("large", pair=pair)], 0)
     user.draw_until(
         lambda: user.viewer.stage.slot.scene is other and user.viewer.stage.photographs._textures, "photograph"
     )
@@ -643,7 +643,7 @@ def tour_user(user, house, small_pacing) -> User:
 def test_a_note_is_typed_shown_and_removed(tour_user, house, monkeypatch):
     user, file, center = tour_user, house.folder / "links.json", tour_user.state.camera
     aside = replace(center, yaw_radians=center.yaw_radians - 0.3, pitch_radians=0.15)  # the panels cover the middle
-    monkeypatch.setattr(user.viewer.library, "path", house.folder)
+    monkeypatch.setattr(user.viewer.scenes, "path", house.folder)
     shown = []
     for button in ("", "Put at the middle", "Remove"):
         user.state.camera = center
@@ -677,12 +677,12 @@ def fly(user: User, seconds: float = 1 / 5) -> list[float]:
 
 
 def find_node(user: User) -> int:
-    return int(np.linalg.norm(user.viewer.tour.tour.positions - user.state.camera.position, axis=1).argmin())
+    return int(np.linalg.norm(user.viewer.scenes.tour.tour.positions - user.state.camera.position, axis=1).argmin())
 
 
 def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
     user = tour_user
-    assert user.viewer.tour.tour.name == "house tour"
+    assert user.viewer.scenes.tour.tour.name == "house tour"
     # The hotspot is right of the panel, above the statistics and messages.
     user.state.camera = replace(user.state.camera, yaw_radians=-0.25, pitch_radians=-0.4)
 
@@ -713,7 +713,7 @@ def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     user.click_at(*hotspot.center)
     assert user.state.playing and not user.state.points
     fly(user)
-    assert np.linalg.norm(user.state.camera.position - user.viewer.tour.tour.positions[1]) < 1e-6
+    assert np.linalg.norm(user.state.camera.position - user.viewer.scenes.tour.tour.positions[1]) < 1e-6
     user.click_at(*user.panels.minimap.nodes[3])
     steps = fly(user)
     assert find_node(user) == 3 and user.viewer.stage.slot.scene is not first
@@ -776,8 +776,8 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
 
     user.find = find
     monkeypatch.setattr("pansplat_viewer.scene.placing.read_piece", read)
-    user.viewer.open(tmp_path)
-    user.draw_until(lambda: user.viewer.tour is not None and not user.viewer.library.loader.is_searching, "tour")
+    user.viewer.scenes.search(tmp_path)
+    user.draw_until(lambda: user.viewer.scenes.tour is not None and not user.viewer.scenes.loader.is_searching, "tour")
     user.settle()
     yield user
     user.viewer.placing.stop()
@@ -786,7 +786,7 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
 @pytest.mark.filterwarnings("ignore:.*has no pose of")
 def test_a_probable_photograph_is_rejected_restored_and_the_rejection_undone(placing_user, tmp_path):
     user = placing_user
-    tour, before, pixels = user.viewer.tour.tour, (tmp_path / "poses.json").read_bytes(), user.read_window()
+    tour, before, pixels = user.viewer.scenes.tour.tour, (tmp_path / "poses.json").read_bytes(), user.read_window()
     assert [describe_panorama(tour, node) for node in range(4)] == ["a", "b", "c (probably placed)", "d (not placed)"]
     assert not {"Reject##0", "Reject##1", "Reject##3", "Restore##2"} & set(user.panels.widgets.items)
     centres = [pixels[round(y), round(x)].sum() for x, y in user.panels.minimap.nodes]
@@ -798,7 +798,7 @@ def test_a_probable_photograph_is_rejected_restored_and_the_rejection_undone(pla
     user.click("Load the changed poses")
     user.draw_until(lambda: not user.viewer.placing.is_changed, "loaded poses")
     user.settle()
-    assert describe_panoramas(user.viewer.tour.tour) == "2 placed, 2 not placed"
+    assert describe_panoramas(user.viewer.scenes.tour.tour) == "2 placed, 2 not placed"
     assert "Restore##2" in user.panels.widgets.items
     user.click("Undo##poses")  # also after loading
     assert (tmp_path / "poses.json").read_bytes() == before
@@ -857,7 +857,7 @@ def test_a_photograph_is_dragged_turned_snapped_saved_and_shown_in_the_tour(plac
     user.click("Load the changed poses##pose")
     user.draw_until(lambda: not placing.is_changed, "loaded poses")
     user.settle()
-    tour = user.viewer.tour.tour
+    tour = user.viewer.scenes.tour.tour
     assert describe_panorama(tour, 3) == "d (placed by hand)" and (3, 3) not in tour.overlaps
     user.press(imgui.Key.escape)
     assert placing.node is None and not user.state.quit

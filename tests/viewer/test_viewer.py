@@ -93,7 +93,7 @@ class App:
             MagicMock(), loader, find=lambda *arguments: self.find(*arguments), folder=folder, clock=lambda: self.now,
             **options,
         )  # fmt: skip
-        self.state, self.library, self.target = self.viewer.state, self.viewer.library, Mock(viewport=(0, 0, *SIZE))
+        self.state, self.scenes, self.target = self.viewer.state, self.viewer.scenes, Mock(viewport=(0, 0, *SIZE))
         self.state.stops = False  # the camera is at a panorama, and tests count images of the scene
 
     def frame(self, seconds: float = 1 / 30, **events: Any) -> None:
@@ -122,7 +122,7 @@ class App:
         self.frame()
 
     def show(self, *entries: SceneEntry) -> None:
-        self.viewer.show(list(entries), 0)
+        self.viewer.scenes.show(list(entries), 0)
         self.settle()
 
     def fly(self, seconds: float = 0.2) -> None:
@@ -133,7 +133,7 @@ class App:
     @property
     def node(self) -> int:
         """The panorama of the tour that is nearest to the camera."""
-        return int(np.linalg.norm(self.viewer.tour.tour.positions - self.state.camera.position, axis=1).argmin())
+        return int(np.linalg.norm(self.viewer.scenes.tour.tour.positions - self.state.camera.position, axis=1).argmin())
 
     @property
     def content(self) -> object:
@@ -300,13 +300,13 @@ def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
         raise InputError(f"{path}: no such file or folder")
 
     app.find = find
-    app.viewer.open(Path("nothing"))
+    app.scenes.search(Path("nothing"))
     app.settle()
     assert "no such file" in app.viewer.error
     app.viewer.dismiss_error()
     app.show(SceneEntry("damaged"))
     assert app.viewer.error.startswith("damaged.ply: 100% unreadable")
-    assert app.library.names == ["first", "second"] and app.library.current == 0
+    assert app.scenes.names == ["first", "second"] and app.scenes.current == 0
     assert app.viewer.stage.slot.scene is small_scene
     app.viewer.dismiss_error()
     assert app.viewer.error is None
@@ -321,36 +321,36 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
 
     app = make_app()
     app.find = find
-    app.viewer.open(Path("home"))
-    app.until(lambda: app.viewer.tour is not None, "photographs")
-    assert app.library.names == ["unplaced"] and isinstance(app.content, int) and app.viewer.loaded is None
-    app.until(lambda: app.viewer.scenes.loading == ("home", "pairs of panoramas", 0.3), "progress")
-    assert app.library.loader.entry is None, "nothing is predicted from panoramas that may get poses"
+    app.scenes.search(Path("home"))
+    app.until(lambda: app.scenes.tour is not None, "photographs")
+    assert app.scenes.names == ["unplaced"] and isinstance(app.content, int) and app.scenes.loaded is None
+    app.until(lambda: app.scenes.loading == ("home", "pairs of panoramas", 0.3), "progress")
+    assert app.scenes.loader.entry is None, "nothing is predicted from panoramas that may get poses"
     gate.open()
     app.settle()
-    assert app.library.names == ["placed"] and app.viewer.loaded.entry.tour is house
+    assert app.scenes.names == ["placed"] and app.scenes.loaded.entry.tour is house
     gate.event.clear()
-    shown = app.viewer.loaded
-    app.viewer.open(Path("another"))
-    app.until(lambda: app.viewer.scenes.loading == ("another", "pairs of panoramas", 0.3), "progress")
+    shown = app.scenes.loaded
+    app.scenes.search(Path("another"))
+    app.until(lambda: app.scenes.loading == ("another", "pairs of panoramas", 0.3), "progress")
     app.frames(2)
-    assert app.viewer.loaded is shown and app.library.names == ["placed"]
+    assert app.scenes.loaded is shown and app.scenes.names == ["placed"]
     gate.open()
 
 
 def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
     gate = Gate(lambda entry: LoadedScene(entry, small_scene), "estimating poses", 0.3)
     app.find = lambda path, show: gate(path, None)
-    app.viewer.open(Path("unposed"))
-    app.until(lambda: app.viewer.scenes.loading == ("unposed", "estimating poses", 0.3), "search")
-    app.viewer.scenes.cancel_loading()
-    assert app.viewer.scenes.loading is None and app.library.current == 0, "the scene is still the current one"
+    app.scenes.search(Path("unposed"))
+    app.until(lambda: app.scenes.loading == ("unposed", "estimating poses", 0.3), "search")
+    app.scenes.cancel_loading()
+    assert app.scenes.loading is None and app.scenes.current == 0, "the scene is still the current one"
     app.load = gate
-    app.viewer.scenes.reload()
-    app.until(lambda: app.viewer.scenes.loading == ("first", "estimating poses", 0.3), "prediction")
-    app.viewer.scenes.cancel_loading()
+    app.scenes.reload()
+    app.until(lambda: app.scenes.loading == ("first", "estimating poses", 0.3), "prediction")
+    app.scenes.cancel_loading()
     app.settle()
-    assert app.viewer.scenes.loading is app.viewer.error is None
+    assert app.scenes.loading is app.viewer.error is None
     app.until(lambda: gate.ended == 2, "end of both threads")
 
 
@@ -364,16 +364,16 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
         return LoadedScene(entry, refined)
 
     app.load = load
-    app.viewer.show([SceneEntry("kitchen")], 0)
-    app.until(lambda: app.viewer.scenes.refinement == 0.5, "refinement")
-    assert app.viewer.scenes.loading is None and not app.viewer.loaded.is_final
+    app.scenes.show([SceneEntry("kitchen")], 0)
+    app.until(lambda: app.scenes.refinement == 0.5, "refinement")
+    assert app.scenes.loading is None and not app.scenes.loaded.is_final
     app.frame(held=frozenset("w"))
     camera, stage = app.state.camera, app.viewer.stage
     go.set()
-    app.until(lambda: app.library.loader.refinement is None, "refined scene")
+    app.until(lambda: app.scenes.loader.refinement is None, "refined scene")
     app.settle()
     assert stage.slot.scene is refined and app.state.camera == camera
-    assert app.library.loader.poll() is None
+    assert app.scenes.loader.poll() is None
 
 
 def test_a_refined_scene_that_cannot_be_drawn_is_one_error_and_the_prediction_stays(app, small_scene, monkeypatch):
@@ -405,9 +405,9 @@ def test_a_scene_beyond_the_memory_is_an_error_and_the_scene_before_stays(app, s
     assert (
         app.viewer.error == "large: the memory is exhausted (MemoryError: too many); open a scene with fewer Gaussians"
     )
-    assert app.library.names == ["large"]
+    assert app.scenes.names == ["large"]
     app.viewer.dismiss_error()
-    assert app.viewer.stage.slot.scene is small_scene and app.library.names == ["first", "second"]
+    assert app.viewer.stage.slot.scene is small_scene and app.scenes.names == ["first", "second"]
 
 
 def test_an_error_of_opengl_is_not_called_exhausted_memory(app, monkeypatch):
@@ -441,14 +441,14 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(make_app, pai
     app = make_app()
     app.show(SceneEntry("first", pair=pair))
     app.load = lambda entry, *_: LoadedScene(entry, other)
-    app.viewer.show([SceneEntry("large")], 0)
-    app.until(lambda: app.viewer.scenes.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
+    app.scenes.show([SceneEntry("large")], 0)
+    app.until(lambda: app.scenes.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
     assert app.viewer.busy and app.viewer.stage.slot.scene is small_scene
     app.frame(drag=(30.0, 0.0))
     assert app.state.camera.yaw_radians != 0
     go.set()
     app.settle()
-    assert app.viewer.stage.slot.scene is other and app.viewer.scenes.loading is None
+    assert app.viewer.stage.slot.scene is other and app.scenes.loading is None
 
 
 def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(app, monkeypatch):
@@ -471,13 +471,13 @@ def test_a_reload_searches_the_folder_again(app, pair, tmp_path):
         return [SceneEntry(name, pair=pair) for name in ("new", "pair 1", "pair 2")[len(found) == 1 :]]
 
     app.find = find
-    app.viewer.open(folder)
+    app.scenes.search(folder)
     app.settle()
-    assert app.library.names == ["pair 1", "pair 2"]
-    app.viewer.scenes.reload()
+    assert app.scenes.names == ["pair 1", "pair 2"]
+    app.scenes.reload()
     app.settle()
     assert found == [folder] * 2
-    assert app.library.names[app.library.current] == "pair 1" and app.library.current == 1
+    assert app.scenes.names[app.scenes.current] == "pair 1" and app.scenes.current == 1
 
 
 # --- photographs and comparison ---
@@ -491,7 +491,7 @@ def test_a_panorama_alone_is_entered_in_a_wide_view(make_app, tmp_path):
     for start, yaw in ((None, 2 * np.pi * (98 / 128 - 0.5)), ((0.5, 0.0), 0.5)):
         app = make_app()
         pair = Pair("alone", tmp_path, (replace(panorama, start=start),), (), 0.45, 10.0)
-        app.viewer.show([SceneEntry("alone", pair=pair)], 0)
+        app.scenes.show([SceneEntry("alone", pair=pair)], 0)
         assert app.state.camera == app.state.home
         assert app.state.camera.yaw_radians == pytest.approx(yaw, abs=0.1)
 
@@ -499,7 +499,7 @@ def test_a_panorama_alone_is_entered_in_a_wide_view(make_app, tmp_path):
 def test_the_view_of_a_photograph_is_kept_when_its_scene_is_there(make_app, pair, small_scene):
     app = make_app()
     app.load = gate = Gate(lambda entry: LoadedScene(entry, small_scene), "matching", 0.5)
-    app.viewer.show([SceneEntry("kitchen", pair=pair)], 0)
+    app.scenes.show([SceneEntry("kitchen", pair=pair)], 0)
     app.until(lambda: app.content == 0, "photograph")
     app.frame(drag=(-120.0, 0.0))
     camera = app.state.camera
@@ -574,20 +574,21 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
         return loaded
 
     app.load = load
-    app.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    app.scenes.show([SceneEntry(house.name, tour=house)], 0)
     app.until(
-        lambda: app.viewer.tour is not None and (app.viewer.tour.tour.poor or app.viewer.tour.tour.walls), "edges"
+        lambda: app.scenes.tour is not None and (app.scenes.tour.tour.poor or app.scenes.tour.tour.walls),
+        "edges",
     )
-    tour, edges = app.viewer.tour, app.viewer.tour.tour
+    tour, edges = app.scenes.tour, app.scenes.tour.tour
     go.set()
     app.settle()
-    assert app.viewer.tour is tour and tour.tour is edges and app.viewer.error is None
+    assert app.scenes.tour is tour and tour.tour is edges and app.viewer.error is None
     assert len(tour.loaded) == tour.num_scenes
 
 
 def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     app = make_app()
-    app.viewer.show([SceneEntry(house.name, tour=house)], 0, house.folder)
+    app.scenes.show([SceneEntry(house.name, tour=house)], 0, house.folder)
     app.settle()
     photographs, file = app.viewer.stage.photographs, house.folder / "links.json"
     app.state.camera = replace(app.state.camera, yaw_radians=0.4, pitch_radians=0.2)
@@ -635,8 +636,8 @@ def test_hotspots_are_in_points_of_a_screen_with_two_pixels_a_point(tour_app):
 def test_a_flight_shows_photographs_where_no_scene_is_ready(make_app, house, load_house):
     app, gate = make_app(), Gate(load_house, "predicting", 0.5)
     app.load = lambda entry, *rest: gate(entry, *rest) if entry.views not in ((), (0, 1)) else load_house(entry)
-    app.viewer.show([SceneEntry(house.name, tour=house)], 0)
-    app.until(lambda: app.viewer.loaded is not None, "tour")
+    app.scenes.show([SceneEntry(house.name, tour=house)], 0)
+    app.until(lambda: app.scenes.loaded is not None, "tour")
     first, contents = app.viewer.stage.slot.scene, []
     app.press("4")
 
@@ -653,13 +654,13 @@ def test_a_flight_shows_photographs_where_no_scene_is_ready(make_app, house, loa
     gate.open()
     app.until(lambda: app.viewer.stage.photograph is None, "scene")
     app.settle()
-    assert app.viewer.stage.slot.scene is app.viewer.tour.get((2, 3)).scene
+    assert app.viewer.stage.slot.scene is app.scenes.tour.get((2, 3)).scene
 
 
 def test_a_tour_shows_its_photographs_before_the_first_scene(make_app, house, load_house):
     app, gate = make_app(), Gate(load_house, "predicting", 0.5)
     app.load = lambda entry, *rest: load_house(entry) if entry.views else gate(entry, *rest)
-    app.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    app.scenes.show([SceneEntry(house.name, tour=house)], 0)
     app.frame()
     assert app.content == 0 and app.state.camera.yaw_radians == 0, "towards its neighbour"
     app.press("3")
@@ -669,7 +670,7 @@ def test_a_tour_shows_its_photographs_before_the_first_scene(make_app, house, lo
     app.press("space")
     app.frames(5, 1 / 10)
     gate.open()
-    app.until(lambda: app.viewer.loaded is not None, "first scene", 1e-3)
+    app.until(lambda: app.scenes.loaded is not None, "first scene", 1e-3)
     assert app.state.playing, "the flight goes on"
     assert app.content == 2, "the scene of panoramas 0 and 1 is not shown from here"
     app.until(lambda: app.viewer.stage.photograph is None, "scene", 1 / 10)
@@ -684,7 +685,7 @@ def test_space_plays_the_tour_through_all_panoramas_within_the_memory(make_app, 
 
     def has_ended() -> bool:
         visited.add(app.node)
-        assert len(app.viewer.tour.loaded) <= 3, "a scene, that of the camera and the one before"
+        assert len(app.scenes.tour.loaded) <= 3, "a scene, that of the camera and the one before"
         return not app.state.playing
 
     app.until(has_ended, "end of the tour", 1 / 4)
@@ -711,7 +712,7 @@ def test_a_link_leads_to_a_panorama_without_a_place_and_the_scene_before_stays(m
     notes = ("room3.png: no pose was found; it is a part of its own",)
     app = make_app()
     app.show(SceneEntry(parted_house.name, tour=parted_house, notes=notes))
-    assert app.library.notes == notes
+    assert app.scenes.notes == notes
     app.state.target = 2
     app.fly(1.0)
     app.state.camera = replace(app.state.camera, pitch_radians=-0.25, yaw_radians=-0.1)
@@ -720,7 +721,7 @@ def test_a_link_leads_to_a_panorama_without_a_place_and_the_scene_before_stays(m
     assert (spot.node, spot.label, spot.is_fade) == (3, "to the hall", True)
     left, stage = app.viewer.stage.slot.scene, app.viewer.stage
     click_on(app, 3)
-    app.until(lambda: app.viewer.tour.part == 1, "fade", 0.2)
+    app.until(lambda: app.scenes.tour.part == 1, "fade", 0.2)
     poses, front = stage.fade.poses, stage.fade.front
     assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 0.71, "the scene before stays"
     assert np.allclose(poses[front], app.state.camera.cam2world) and stage.slots[1 - front].scene is left
@@ -738,22 +739,22 @@ def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(tour_app, l
         requested.append(entry.name)
         return LoadedScene(entry, small_scene) if entry.tour is None else load_house(entry)
 
-    next(life for life in app.viewer.tour._lives.values() if life.loaded).drop()  # a scene of the tour is still missing
+    next(life for life in app.scenes.tour._lives.values() if life.loaded).drop()  # one is missing
     is_ready = app.viewer.stage.preparer.is_ready
     monkeypatch.setattr(
         app.viewer.stage.preparer,
         "is_ready",
         lambda scene: is_ready(scene) and (scene is not small_scene or ready.is_set()),
     )
-    app.library.loader.cancel()
+    app.scenes.loader.cancel()
     app.load = load
-    app.viewer.show([SceneEntry("large")], 0)
+    app.scenes.show([SceneEntry("large")], 0)
     app.until(lambda: requested, "request")
     app.frames(5)
     ready.set()
     app.settle()
     assert requested == ["large"], "the tour requests nothing"
-    assert app.viewer.loaded.entry.name == "large" and app.viewer.tour is None
+    assert app.scenes.loaded.entry.name == "large" and app.scenes.tour is None
 
 
 def test_a_scene_of_a_tour_that_fails_is_reported_once(make_app, house, load_house):
@@ -766,7 +767,7 @@ def test_a_scene_of_a_tour_that_fails_is_reported_once(make_app, house, load_hou
         return load_house(entry)
 
     app.load = load
-    app.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    app.scenes.show([SceneEntry(house.name, tour=house)], 0)
     app.until(lambda: app.viewer.error, "error")
     app.viewer.error = None
     app.settle()
@@ -781,6 +782,6 @@ def test_a_scene_after_a_tour_does_not_fade_from_it(tour_app, pair):
     app = tour_app
     app.state.target = 3
     app.fly(1.0)
-    app.viewer.show([SceneEntry("first", pair=pair)], 0)
-    app.until(lambda: app.viewer.tour is None, "pair")
+    app.scenes.show([SceneEntry("first", pair=pair)], 0)
+    app.until(lambda: app.scenes.tour is None, "pair")
     assert app.viewer.stage.fade.compute_weight(app.now) == 1

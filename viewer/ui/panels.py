@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 import moderngl
@@ -117,9 +118,9 @@ class Panels:
         self._draw_scene(viewer)
         if viewer.state.context.size:
             section("Photographs", partial(self._draw_photographs, viewer))
-        if viewer.tour is not None:
-            section("Plan", partial(self._draw_plan, viewer, viewer.tour))
-        if viewer.library.notes or len(viewer.stage.photographs):
+        if viewer.scenes.tour is not None:
+            section("Plan", partial(self._draw_plan, viewer, viewer.scenes.tour))
+        if viewer.scenes.notes or len(viewer.stage.photographs):
             section("Notes", partial(self._draw_notes, viewer))
         section("Film", partial(self._draw_film, viewer))
         self._is_expert = section("Expert", partial(self._draw_expert, viewer), opened=False)
@@ -170,7 +171,7 @@ class Panels:
         """Draw the note at the middle of the image, and what was not used of the folder."""
         if len(viewer.stage.photographs):
             self.notes.draw(viewer)
-        for note in viewer.library.notes:
+        for note in viewer.scenes.notes:
             draw_wrapped(note, is_disabled=True)
 
     def _draw_film(self, viewer: Viewer) -> None:
@@ -185,19 +186,19 @@ class Panels:
         if viewer.stage.renderer.stats.total:
             imgui.separator_text("Gaussians")
             self._draw_gaussians(viewer.state)
-        if viewer.tour is not None:
-            loaded, count = len(viewer.tour.loaded), describe_count(viewer.tour.num_scenes, "scene")
+        if viewer.scenes.tour is not None:
+            loaded, count = len(viewer.scenes.tour.loaded), describe_count(viewer.scenes.tour.num_scenes, "scene")
             imgui.text_unformatted(f"{loaded} of {count} in memory")
         imgui.separator_text("Display")
         self._draw_display(viewer.state)
         self._draw_settings(viewer)
 
     def _draw_scene(self, viewer: Viewer) -> None:
-        library, recent, width = viewer.library, viewer.recent, -60 * imgui.get_style().font_scale_dpi
-        if library.entries:
-            names = [f"{i + 1}. {name}" for i, name in enumerate(library.names)]  # numbered, because names may repeat
+        scenes, recent, width = viewer.scenes, viewer.recent, -60 * imgui.get_style().font_scale_dpi
+        if scenes.entries:
+            names = [f"{i + 1}. {name}" for i, name in enumerate(scenes.names)]  # numbered, because names may repeat
             imgui.set_next_item_width(-1)
-            changed, index = imgui.combo("##pair", max(library.current, 0), names)
+            changed, index = imgui.combo("##pair", max(scenes.current, 0), names)
             self.widgets.record("pair")
             if changed:
                 viewer.queue(viewer.scenes.choose, index)
@@ -207,17 +208,17 @@ class Panels:
         self.widgets.record("path")
         imgui.same_line()
         if (self.widgets.button("Open") or entered) and self.path.strip():
-            viewer.queue(viewer.scenes.open_text, self.path.strip())
+            viewer.queue(scenes.search, Path(self.path.strip()).expanduser())
         if recent:
             imgui.set_next_item_width(width)
             if imgui.begin_combo("##recent", "recent"):
                 for path in recent:
                     if imgui.selectable(path, False)[0]:
-                        viewer.queue(viewer.scenes.open_text, path)
+                        viewer.queue(scenes.search, Path(path))
                 imgui.end_combo()
             self.widgets.record("recent")
             imgui.same_line()
-        if library.entries and self.widgets.button("Reload"):
+        if scenes.entries and self.widgets.button("Reload"):
             viewer.queue(viewer.scenes.reload)
         if viewer.scenes.refinement is not None:
             if self.widgets.button("Cancel"):
