@@ -30,7 +30,7 @@ from pansplat.tours.route import find_angles
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.hotspots import Hotspot, find_clicked, find_hotspots
 from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader
-from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
+from pansplat_viewer.scene.picking import PickedPoint, compute_pixel_ray, pick_point
 from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import RendererChoice
 from pansplat_viewer.scene.state import ViewerState, advance_path
@@ -222,27 +222,31 @@ class Viewer:
     # --- actions of keys and panels ---
 
     def focus_center(self) -> None:
-        """Orbit the point in the centre of the last image."""
-        distance, camera = self.stage.measure_center_depth(), self.state.camera
-        if distance is not None:
-            point = np.asarray(camera.position) + distance * camera.rotation[:, 2]
-            self.state.camera, self.state.orbiting = cameras.focus_on_point(camera, point), True
+        """Orbit the point in the centre of the image."""
+        point, state = self._pick((0.5, 0.5)), self.state
+        if point is not None:
+            state.camera, state.orbiting = cameras.focus_on_point(state.camera, np.array(point.position)), True
 
     def click(self, place: tuple[float, float]) -> None:
         """Fly to the panorama of the hotspot at a place, or show the point there; fractions of width and height."""
-        state, stage, scene = self.state, self.stage, self.stage.slot.scene
+        state = self.state
         if state.hotspots and state.overlay:
             points = imgui.get_io().display_size
             state.target = find_clicked(self.hotspots, (place[0] * points.x, place[1] * points.y))
-        if state.target is not None or scene is None or stage.photograph is not None:
-            return
+        if state.target is None:
+            point = self._pick(place)
+            state.points = [] if point is None else [*state.points[-1:], point]
+
+    def _pick(self, place: tuple[float, float]) -> PickedPoint | None:
+        """The point of the scene at a place of the image; None, and a message, if there is none."""
+        state, stage, scene = self.state, self.stage, self.stage.slot.scene
+        if scene is None or stage.photograph is not None:
+            return None
         pixel = place[0] * stage.size[0], place[1] * stage.size[1]
         point = pick_point(scene, *compute_pixel_ray(state.camera, pixel, stage.size), state.settings)
         if point is None:
-            state.points = []
             state.show_message("no Gaussian there")
-        else:
-            state.points = [*state.points[-1:], point]
+        return point
 
     def write_screenshot(self, suffix: str, panorama: bool = False) -> None:
         """Write the image as PNG, or EXR with depth; or the panorama at the camera."""

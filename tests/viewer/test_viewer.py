@@ -221,7 +221,7 @@ ROWS = [  # at the first of two panoramas, which are 0.5 m apart
         (f"press v; {turn}", "camera != home and camera.orbit_center == approx(home.orbit_center)")
         for turn in ("drag 80 10", "scroll 1", *(f"hold {key}" for key in "wasdqe"))
     ],
-    ("press f", "state.orbiting and camera.orbit_center == approx((0, 0, 3))"),
+    ("click 0.5 0.5; press f", "state.orbiting and camera.orbit_center == approx(state.points[0].position)"),
     ("press 2", "camera.position == approx((0, 0, 0.5)) and state.flight == 1"),
     ("press 2; press 1", "camera.position == approx((0, 0, 0)) and state.flight == 0"),
     ("press 2; press 3", "camera.position == approx((0, 0, 0.5))"),

@@ -27,7 +27,6 @@ from pansplat_viewer.ui.photographs import Photographs
 from pansplat_viewer.ui.presenter import PhotographLayer, PosedPhotograph, Presenter
 
 DRAW_ERRORS = (InputError, MemoryError, moderngl.Error)
-_CENTER_REACHES = 4, 16, 64  # pixels around the image centre
 
 
 class Stage:
@@ -280,19 +279,6 @@ class Stage:
             settings = replace(settings, scale=plan.scale)
         wait = plan.moving and slot.renderer.pacing.waits_while_moving
         return slot.draw(cam2world, self.size, settings, wait=wait)
-
-    def measure_center_depth(self) -> float | None:
-        """Median depth around the centre of the last image, metres; None if nothing is drawn there."""
-        if self.slot.image is None or self.photograph is not None:
-            return None
-        depth = self.renderer.read_depth()
-        self.slot.image = None  # `read_depth` may have replaced the texture
-        row, column = depth.shape[0] // 2, depth.shape[1] // 2
-        for reach in _CENTER_REACHES:
-            near = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
-            if (near > 0).any():
-                return float(np.median(near[near > 0]))
-        return None
 
     def release(self) -> None:
         """Stop the threads and free every GL object."""
