@@ -7,10 +7,12 @@ Keys and panels change `state` at once, and queue all other actions, which are d
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,11 +24,13 @@ from imgui_bundle import imgui
 
 from pansplat.errors import InputError
 from pansplat.geometry.path import find_direction
+from pansplat.images.image_files import write_image
 from pansplat.inputs.photographs import write_notes
 from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable
 from pansplat.tours.camera_path import read_path, write_path
 from pansplat.tours.route import find_angles
+from pansplat_viewer.draw.frame_renderer import render_image
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.hotspots import Hotspot, find_clicked, find_hotspots
 from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader
@@ -36,13 +40,13 @@ from pansplat_viewer.scene.settings import RendererChoice
 from pansplat_viewer.scene.state import ViewerState, advance_path
 from pansplat_viewer.scene.tour import DEFAULT_MEMORY
 from pansplat_viewer.scenes import Scenes
-from pansplat_viewer.screenshots import Screenshots
 from pansplat_viewer.ui.panels import Panels
-from pansplat_viewer.ui.stage import Stage
+from pansplat_viewer.ui.stage import DRAW_ERRORS, Stage, describe_error
 from pansplat_viewer.window.gui import Gui
 from pansplat_viewer.window.input import apply_input, read_input
 from pansplat_viewer.window.recent import add_recent, read_recent
 
+PANORAMA_HEIGHT = 1024  # pixels, of screenshots
 _MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
 _NOTE_COSINE = math.cos(math.radians(5))  # of the angle within which a note is at the middle of the image
 
@@ -54,7 +58,7 @@ class Viewer:
         state: the values that a user can change.
         scenes: those to choose from, which one is shown, and which one comes next.
         stage: draws the image.
-        placing, screenshots: what else a user does with the scene.
+        placing: the photographs whose poses a user changes; None without any.
         hotspots: places of panoramas in the image.
         panels: the panels, with the rectangles of their widgets.
         recent: the paths that were opened, the last one first.
@@ -109,7 +113,7 @@ class Viewer:
             entered=self._open_placing,
         )
         self.placing: Placing | None = None
-        self.screenshots = Screenshots(self.state, self.stage, folder, self.show_error)
+        self._folder = folder
         self.panels = Panels(ctx)
         self._recent_file, self.recent = recent, read_recent(recent)
         self.gui = Gui(dpi_scale)
@@ -249,15 +253,29 @@ class Viewer:
         return point
 
     def write_screenshot(self, suffix: str, panorama: bool = False) -> None:
-        """Write the image as PNG, or EXR with depth; or the panorama at the camera."""
-        if self._has_scene() and self.scenes.loaded is not None:
-            self.screenshots.write(self.scenes.loaded, suffix, panorama=panorama)
+        """Write the image, or the panorama at the camera, as PNG, or EXR with depth in metres.
 
-    def _has_scene(self) -> bool:
-        """Whether a scene is shown; while a photograph is, a message says so."""
-        if self.scenes.loaded is not None and self.stage.photograph is not None:
-            self.state.show_message("there is no scene of this place yet")
-        return self.scenes.loaded is not None and self.stage.photograph is None
+        The file is the first of `view_001.png`, `view_002.png`, ... (`panorama_001.png`, ...) that does not exist.
+        """
+        stage, state, loaded = self.stage, self.state, self.scenes.loaded
+        if loaded is None or stage.photograph is not None:
+            state.show_message("there is no scene of this place yet")
+            return
+        settings = replace(state.draw_settings, layout="equirect" if panorama else "pinhole")
+        size = (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT) if panorama else stage.size
+        stage.slot.image = None  # the texture will hold the screenshot
+        try:
+            pose = state.camera.cam2world
+            color, depth = render_image(stage.renderer, pose, size, settings, with_depth=suffix == "exr")
+            folder, stem = self._folder / loaded.entry.folder_name, "panorama" if panorama else "view"
+            folder.mkdir(parents=True, exist_ok=True)
+            files = (folder / f"{stem}_{number:03d}.{suffix}" for number in itertools.count(1))
+            file = next(file for file in files if not file.exists())
+            unit = loaded.scene.frame.unit
+            write_image(file, color, depth=None if depth is None else unit * depth, panorama=panorama)
+            state.show_message(f"wrote {file}")
+        except (*DRAW_ERRORS, OSError) as error:
+            self.show_error(f"no screenshot written: {describe_error(error)}")
 
     def put_note(self, text: str) -> None:
         """State a note at the middle of the image, in place of one that is there; without a text remove that one."""

@@ -507,12 +507,14 @@ def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_
 
 @both
 def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.screenshots.PANORAMA_HEIGHT", 128)
-    image = user.read_image()
+    monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 128)
+    image, files = user.read_image(), []
     user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
-    for label in ("EXR + depth", "PNG", "360 PNG"):
-        user.click(label)
-    by_key, exr, png, panorama = user.viewer.screenshots.files[-4:]
+    for label in ("EXR + depth", "PNG", "360 PNG", None):
+        files.append(Path(user.state.message.removeprefix("wrote ")))
+        if label is not None:
+            user.click(label)
+    by_key, exr, png, panorama = files
     assert by_key.suffix == exr.suffix == ".exr"
     with OpenEXR.File(str(exr)) as file:
         depth = file.channels()["Z"].pixels
