@@ -278,21 +278,6 @@ def test_clicking_the_widget_changes_the_image(user, label):
     assert changed_fraction(before, user.read_image()) > 3e-4  # 0 without an effect; the filter changes few pixels
 
 
-def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
-    user.click("view 1")
-    single = user.read_image()
-    user.click("deferred")
-    user.state.camera = replace(user.state.camera, position=(0.0, 0.0, 0.2))
-    both = user.read_image()
-    user.slide("weight 0", 0.0, start=0.4)
-    assert user.state.settings.view_weights == (0.0, 1.0)
-    assert changed_fraction(both, user.read_image()) > 0.1
-    user.state.camera = user.state.home
-    assert changed_fraction(single, user.read_image()) == 0
-    user.slide("weight 1", 0.4)
-    assert 0 < user.state.settings.view_weights[1] < 1
-
-
 CLICKS = [  # in the window of a pair, and what is then true
     ("slide speed 0.5", "state.speed > 1 and camera == home"),
     ("click Fly", "state.playing"),
@@ -561,7 +546,7 @@ def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):
     state.camera = replace(state.camera, yaw_radians=state.camera.yaw_radians + 0.3)
     user.settle()
     assert match_photograph(user, 0) < 1, "also in another direction"
-    for change in ({"display": "depth"}, {"opacity_threshold": 0.5}, {"mode": "view"}, {"view_weights": (1.0, 0.0)}):
+    for change in ({"display": "depth"}, {"opacity_threshold": 0.5}, {"mode": "view"}):
         state.settings = replace(DrawSettings(), **change)
         user.settle()
         assert user.viewer.stage.stop.weight == 0, change

@@ -136,7 +136,4 @@ def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dic
         )
     forward = torch.from_numpy(frame.rotation[:, 2].astype(np.float64)) if settings.layout == "pinhole" else None
     weights = blend_weights(torch.from_numpy(frame.world_position.copy()), torch.from_numpy(positions), forward)
-    factors = (settings.view_weights + (1.0,) * num_views)[:num_views]
-    factors = factors if any(factors) else (1.0,) * num_views
-    weighted = enumerate(zip(weights.tolist(), factors, strict=True))
-    return {view: max(weight * factor, min_weight) for view, (weight, factor) in weighted if factor > 0}
+    return {view: max(weight, min_weight) for view, weight in enumerate(weights.tolist())}

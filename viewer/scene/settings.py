@@ -34,8 +34,6 @@ class DrawSettings:
     Attributes:
         mode: `joint` draws all Gaussians together. `view` draws those of one context view. `deferred` draws each
             context view separately and blends the images per pixel by distance.
-        view_weights: factors of the context views in mode `deferred`, at least 0; views beyond the last one have 1.
-            Views of factor 0 are not drawn, unless all are 0, which is the same as all 1.
         display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `normals`, the shortest
             axes of the Gaussians, towards their camera, with 0.5 + 0.5 (x, y, z) of the world as RGB; `levels` and
             `views`, a colour for each label.
@@ -49,7 +47,6 @@ class DrawSettings:
 
     mode: Mode = "joint"
     view: int = 0  # the context view of mode `view`
-    view_weights: tuple[float, ...] = ()
     levels: frozenset[int] | None = None  # pyramid levels to draw; None draws all
     opacity_threshold: float = 0.0  # Gaussians of lower opacity are not drawn
     display: Display = "color"
@@ -71,8 +68,6 @@ class DrawSettings:
                 f"`vertical_fov_degrees` must be between 0 and 180, got {self.vertical_fov_degrees}; "
                 "use layout equirect for a whole panorama"
             )
-        if not all(0 <= weight < math.inf for weight in self.view_weights):
-            raise InputError(f"`view_weights` must be finite numbers of at least 0, got {self.view_weights}")
         if not 0 < self.display_max < math.inf:
             raise InputError(f"`display_max` must be a positive number, got {self.display_max}")
         if not 0 < self.near < math.inf:
@@ -88,8 +83,7 @@ class DrawSettings:
     @property
     def shows_scene(self) -> bool:
         """Whether the colours of the whole scene are shown."""
-        is_whole = self.selection == (None, 0.0) and set(self.view_weights) <= {1.0}
-        return is_whole and self.display == "color" and self.mode != "view"
+        return self.selection == (None, 0.0) and self.display == "color" and self.mode != "view"
 
     @property
     def splat_colors(self) -> Literal["color", "normals", "levels", "views"]:

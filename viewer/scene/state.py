@@ -139,12 +139,11 @@ def choose_display(state: ViewerState, display: Display) -> None:
 
 
 def fit_settings(settings: DrawSettings, scene: Scene) -> DrawSettings:
-    """The settings with a view, a mode and weights of views that a scene supports."""
+    """The settings with a view and a mode that a scene supports."""
     num_views = max(len(scene.cam2world), 1)
     if settings.mode == "deferred" and (num_views < 2 or scene.joint):
         settings = replace(settings, mode="joint")
-    view_weights = settings.view_weights if len(settings.view_weights) == num_views else ()
-    return replace(settings, view=min(settings.view, num_views - 1), view_weights=view_weights)
+    return replace(settings, view=min(settings.view, num_views - 1))
 
 
 def jump_to_view(state: ViewerState, view: int) -> None:

@@ -238,11 +238,6 @@ class Panels:
                 imgui.same_line()
             if self.widgets.radio(f"view {view}", settings.mode == "view" and settings.view == view):
                 settings = replace(settings, mode="view", view=view)
-        if settings.mode == "deferred" and num_views > 1:
-            weights = list(settings.view_weights or (1.0,) * num_views)
-            for view in range(num_views):
-                weights[view] = self.widgets.slider(f"weight {view}", weights[view], 0.0, 1.0, "%.2f")
-            settings = replace(settings, view_weights=() if set(weights) == {1.0} else tuple(weights))
         if len(state.levels) > 1:
             shown = set(state.levels if settings.levels is None else settings.levels)
             _draw_row_label("level")
