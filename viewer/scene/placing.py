@@ -279,12 +279,11 @@ class Placing:
         self.update()
 
     def apply(self, events: Input) -> Input:
-        """The input without the keys of the window in which a photograph is placed; Escape closes it."""
-        if self.node is None:
+        """The input; Escape closes the window in which a photograph is placed, and nothing else then."""
+        if self.node is None or "escape" not in events.pressed:
             return events
-        if "escape" in events.pressed:
-            self.stop()
-        return replace(events, pressed=events.pressed - {",", ".", "escape"})
+        self.stop()
+        return replace(events, pressed=events.pressed - {"escape"})
 
     def stop(self) -> None:
         """End placing; the photograph stays where it was saved."""

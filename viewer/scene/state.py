@@ -24,7 +24,6 @@ from pansplat_viewer.scene.settings import Display, DrawSettings
 
 FLIGHT_SECONDS = 6.0
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
-_FLIGHT_STEPS = 24  # for the `,` and `.` keys
 _MAX_SAMPLES = 100_000  # Gaussians that percentiles are measured on
 
 
@@ -185,12 +184,6 @@ def toggle_play(state: ViewerState) -> None:
     state.playing = not state.playing
     if state.playing and state.flight >= 1:
         state.flight = 0.0
-
-
-def step_flight(state: ViewerState, steps: int) -> None:
-    """Move along the flight by whole steps and stop playing."""
-    state.playing = False
-    fly_to(state, (round(state.flight * _FLIGHT_STEPS) + steps) / _FLIGHT_STEPS)
 
 
 def advance_flight(state: ViewerState, seconds: float) -> None:

@@ -33,7 +33,7 @@ STATE_NAMES: dict[State, str] = {
     "probable": "probably placed",
     "not placed": "not placed",
 }
-HINT = "drag: move    wheel, keys , . or knob: turn    Shift: fine    Alt: free"
+HINT = "drag: move    wheel or knob: turn    Shift: fine    Alt: free"
 
 _WALL, _FLOOR = (0.9, 0.9, 0.92, 1.0), (0.3, 0.33, 0.37, 1.0)
 _PIECE, _PIECE_FLOOR = (0.35, 0.8, 1.0, 1.0), (0.35, 0.8, 1.0, 0.22)
@@ -177,7 +177,7 @@ class PlacingWindow:
         imgui.get_window_draw_list().add_line((middle, at.y), (middle, at.y + height), _color((*_PIECE[:3], 0.7)), 1.0)
 
     def _draw_plan(self, placing: Placing, scale: float) -> None:
-        """Draw the plan, and apply the pointer, the wheel and the keys to the piece."""
+        """Draw the plan, and apply the pointer and the wheel to the piece."""
         available = imgui.get_content_region_avail()
         size = (max(available.x, 50.0), max(available.y - 92 * scale, 50.0))
         at = imgui.get_cursor_screen_pos()
@@ -302,8 +302,6 @@ class PlacingWindow:
             (x, y), *_ = self._to_screen(np.array([placing.shown.place[:2]]))
             placing.turn_to(math.atan2(mouse.x - x, y - mouse.y), free=fine or free)
         steps = io.mouse_wheel if imgui.is_item_hovered() else 0.0
-        if not io.want_text_input:
-            steps += imgui.is_key_pressed(imgui.Key.period) - imgui.is_key_pressed(imgui.Key.comma)
         if steps:
             placing.turn(steps, fine=fine, free=free)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, step_flight, toggle_play
+from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, toggle_play
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
@@ -121,9 +121,6 @@ KEYS = (
     ),
     KeyRow("Space", "play the flight between them", {"space": _change(toggle_play)}),
     KeyRow("M", "floor plan and hotspots of a tour", {"m": _change(_toggle_plan)}),
-    KeyRow(
-        ", .", "step along the flight (placing: turn)", {",": _change(step_flight, -1), ".": _change(step_flight, 1)}
-    ),
     KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
     KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),
     KeyRow("R", "back to the start", {"r": _change(_restart)}),
@@ -134,7 +131,7 @@ KEYS = (
 """The help in the window and the actions."""
 
 _ACTIONS = {key: action for row in KEYS for key, action in row.actions.items()}
-_IMGUI_NAMES = {",": "comma", ".": "period"} | {name: f"{name}_arrow" for name in ("up", "down", "left", "right")}
+_IMGUI_NAMES = {name: f"{name}_arrow" for name in ("up", "down", "left", "right")}
 _IMGUI_NAMES |= {digit: f"_{digit}" for digit in "123456789"}
 
 
@@ -150,7 +147,7 @@ def read_input(seconds: float) -> Input:
         value = getattr(imgui.Key, key.replace(" ", "_"))
         if imgui.is_key_down(value):
             held.add(name)
-        if imgui.is_key_pressed(value, repeat=name in ",."):
+        if imgui.is_key_pressed(value, repeat=False):
             pressed.add(name)
     modifiers = {"shift": io.key_shift, "alt": io.key_alt, "ctrl": io.key_ctrl}
     held |= {name for name, down in modifiers.items() if down}
