@@ -76,8 +76,6 @@ class Options:
     """Length of the film (4); of a tour, by default the time at 1 metre per second."""
     fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
     """Frames per second of the film."""
-    memory: Annotated[float, Meta(ge=0, le=1024)] = 2.0
-    """Limit of the scenes of a tour that are kept in memory, GiB; the least recently used ones are read again."""
 
     @property
     def pixels(self) -> tuple[int, int]:
@@ -197,7 +195,6 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
             at=options.at or 0.0,
             dpi_scale=window.dpi_scale,
             renderer=options.renderer,
-            memory=options.memory,
             recent=find_file(),
         )
         if loader.is_searching:
@@ -243,7 +240,7 @@ def _write_film(options: Options, entry: SceneEntry, folder: Path, pixels: tuple
 
         loaded = load(entry, _PREDICTION_PART * _find_part(entry))
         scene, tour, settings = loaded.scene, loaded.entry.tour, fit_settings(options.settings, loaded.scene)
-        scenes = None if tour is None else TourScenes.start(loaded, options.memory)
+        scenes = None if tour is None else TourScenes.start(loaded)
         create = partial(create_renderer, ctx, options.renderer, color_bits=32)
         at = 0.5 if options.at is None else options.at
         try:

@@ -47,7 +47,6 @@ class Scenes:
         find: Find,
         *,
         at: float,
-        memory: float,
         show_error: Callable[[str], None],
         listed: Callable[[Path | None], None],
         entered: Callable[[SceneEntry], None],
@@ -60,13 +59,12 @@ class Scenes:
             loader: finds and loads entries.
             find: returns the entries of a path; called in a worker thread.
             at: fraction of the flight at which a scene is entered.
-            memory: limit of the scenes of a tour, GiB.
             show_error: shows a message.
             listed: called when other entries are listed, with the path at which they were found.
             entered: called when a scene is shown.
         """
         self._state, self._stage, self.loader, self._find = state, stage, loader, find
-        self._at, self._memory = at, memory
+        self._at = at
         self._show_error, self._listed, self._entered = show_error, listed, entered
         self.entries: list[SceneEntry] = []
         self.current = -1
@@ -358,7 +356,7 @@ class Scenes:
         tour, state = loaded.entry.tour, self._state
         assert tour is not None
         self._stage.add_slot()
-        self.tour = TourScenes.start(loaded, self._memory)
+        self.tour = TourScenes.start(loaded)
         enter_tour(state, tour, loaded.scene, plan_route(tour, tour.plan_walk(loaded.entry.start)), at=self._at)
         self.tour.move(np.asarray(state.camera.position))
         if remaining:

@@ -38,7 +38,6 @@ from pansplat_viewer.scene.picking import PickedPoint, compute_pixel_ray, pick_p
 from pansplat_viewer.scene.placing import Placing
 from pansplat_viewer.scene.settings import RendererChoice
 from pansplat_viewer.scene.state import ViewerState, advance_path
-from pansplat_viewer.scene.tour import DEFAULT_MEMORY
 from pansplat_viewer.scenes import Scenes
 from pansplat_viewer.ui.panels import Panels
 from pansplat_viewer.ui.stage import DRAW_ERRORS, Stage, describe_error
@@ -77,7 +76,6 @@ class Viewer:
         at: float = 0.0,
         dpi_scale: float = 1.0,
         renderer: RendererChoice = "auto",
-        memory: float = DEFAULT_MEMORY,
         recent: Path | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
@@ -92,7 +90,6 @@ class Viewer:
             at: fraction of the flight at which a scene is entered.
             dpi_scale: size of the panels.
             renderer: draws the image; `auto` is `cpu` where OpenGL is software.
-            memory: limit of the scenes of a tour, GiB.
             recent: file of the paths that were opened; None remembers none.
             clock: returns seconds.
         """
@@ -107,7 +104,6 @@ class Viewer:
             loader,
             find,
             at=at,
-            memory=memory,
             show_error=self.show_error,
             listed=self._note_listed,
             entered=self._open_placing,

@@ -673,8 +673,9 @@ def test_a_tour_shows_its_photographs_before_the_first_scene(make_app, house, lo
     assert 2 in app.viewer.stage.scene_views
 
 
-def test_space_plays_the_tour_through_all_panoramas_within_the_memory(make_app, house):
-    app = make_app(memory=0.0)
+def test_space_plays_the_tour_through_all_panoramas_within_the_memory(make_app, house, monkeypatch):
+    monkeypatch.setattr("pansplat_viewer.scene.tour._MEMORY", 0)
+    app = make_app()
     app.show(SceneEntry(house.name, tour=house))
     app.press("space")
     visited = set()

@@ -23,7 +23,7 @@ from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
 from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 
-DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
+_MEMORY = 2 << 30  # bytes of the scenes of a tour that are kept; two predictions are kept in any case
 _LARGEST_STOP_STEP = 1 / 3  # of this fade in a frame, also after a pause without frames
 _FIRST_STOP_WEIGHT = 0.01  # of a photograph after a cut
 _NEXT_SCENES = 3  # that are dropped last
@@ -41,19 +41,11 @@ class TourScenes:
         outlines: floor outlines of the panoramas whose scenes have been loaded, also after a scene is dropped.
     """
 
-    def __init__(
-        self,
-        tour: TourGraph,
-        *,
-        memory: float = DEFAULT_MEMORY,
-        merged: Scene | None = None,
-        max_views: int = MAX_SCENE_VIEWS,
-    ) -> None:
+    def __init__(self, tour: TourGraph, *, merged: Scene | None = None, max_views: int = MAX_SCENE_VIEWS) -> None:
         """Start without scenes.
 
         Args:
             tour: the graph.
-            memory: limit of the loaded scenes, GiB; two predictions are kept in any case.
             merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
             max_views: of the predictor (`TourGraph.choose_predictions`).
         """
@@ -74,7 +66,6 @@ class TourScenes:
             for views in self._views.values()
         }
         predictions = dict.fromkeys(source for sources in self._sources.values() for source in sources)
-        self._budget = memory * 2**30
         # Predictions, the least recently used one first.
         self._lives = OrderedDict((views, SceneLife(SceneEntry("", tour=tour, views=views))) for views in predictions)
         self._selected: OrderedDict[ViewNumbers, LoadedScene] = OrderedDict()  # from predictions, and the first one
@@ -84,11 +75,11 @@ class TourScenes:
             self._lives.setdefault(everything, SceneLife(entry)).receive(LoadedScene(entry, merged))
 
     @staticmethod
-    def start(loaded: LoadedScene, memory: float = DEFAULT_MEMORY) -> TourScenes:
+    def start(loaded: LoadedScene) -> TourScenes:
         """The scenes of the tour whose first scene is loaded."""
         entry = loaded.entry
         assert entry.tour is not None
-        scenes = TourScenes(entry.tour, memory=memory, merged=entry.merged, max_views=entry.max_views)
+        scenes = TourScenes(entry.tour, merged=entry.merged, max_views=entry.max_views)
         scenes.add(loaded)
         edges = [edge for edge, views in scenes._views.items() if views == entry.views]
         if edges:  # else it is a prediction of a part
@@ -184,11 +175,11 @@ class TourScenes:
         total = sum(measure_bytes(each.scene) for each in every)
         needed = {newest, self.views, *self._sources[self.views]}
         for other in [other for other in self._selected if other not in needed]:
-            if total > self._budget:
+            if total > _MEMORY:
                 total -= measure_bytes(self._selected.pop(other).scene)
         may_go = [other for other in kept if other not in needed][: max(len(kept) - 2, 0)]
         for other in may_go:
-            if total > self._budget:
+            if total > _MEMORY:
                 total -= measure_bytes(self._lives[other].drop().scene)
 
     def fail(self, views: ViewNumbers) -> None:

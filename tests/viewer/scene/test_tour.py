@@ -34,10 +34,10 @@ def scenes(house, load_house) -> TourScenes:
     return scenes
 
 
-def test_the_least_recently_used_scene_is_dropped_when_the_memory_is_exceeded(house, load_house, scenes):
+def test_the_least_recently_used_scene_is_dropped_when_the_memory_is_exceeded(house, load_house, scenes, monkeypatch):
     size = measure_bytes(scenes.get((0, 1)).scene)
     assert size == 1000 * (4 * (3 + 3 + 4 + 1 + 3) + 8 + 8)
-    scenes._budget = 2.5 * size
+    monkeypatch.setattr("pansplat_viewer.scene.tour._MEMORY", 2.5 * size)
     for views in ((1, 2), (2, 3)):
         scenes.add(load_house(scenes.make_entry(views)))
     assert scenes.loaded == [(0, 1), (2, 3)], "the scene of the camera is kept"
@@ -164,12 +164,13 @@ def test_a_scene_is_good_along_its_edges_and_near_its_panoramas(scenes):
         assert scenes.is_inside(np.array((0.0, 0.0, z)), (0, 1)) == inside, z
 
 
-def test_predictions_go_on_to_the_last_scene_and_what_was_dropped_is_read_when_it_is_needed(house, load_house):
+def test_predictions_go_on_to_the_last_scene_and_what_was_dropped_is_read_again(house, load_house, monkeypatch):
+    monkeypatch.setattr("pansplat_viewer.scene.tour._MEMORY", 0)
     panoramas = [replace(house.panoramas[0], cam2world=torch.eye(4, dtype=torch.float64)) for _ in range(8)]
     for k, panorama in enumerate(panoramas):
         panorama.cam2world[2, 3] = 0.8 * k
     row = replace(house, panoramas=tuple(panoramas), overlaps={(k, k + 1): 0.4 for k in range(7)})
-    scenes, loaded = TourScenes(row, memory=0.0), []
+    scenes, loaded = TourScenes(row), []
     while (request := scenes.choose_request(scenes.list_next(None, 0.0), None)) is not None:
         loaded.append(request.views)
         scenes.add(load_house(request))
