@@ -22,7 +22,6 @@ from pansplat_viewer.scene.state import (
     add_key_frame,
     choose_display,
     fly_to,
-    go_home,
     jump_to_view,
     make_key_frame,
     show_path,
@@ -256,11 +255,6 @@ class Panels:
         flags = imgui.ColorEditFlags_.no_inputs.value
         changed, background = imgui.color_edit3("background", list(settings.background), flags)
         self.widgets.record("background")
-        for name, color in (("black", 0.0), ("grey", 0.5), ("white", 1.0)):
-            imgui.same_line()
-            if imgui.small_button(name):
-                changed, background = True, [color] * 3
-            self.widgets.record(name)
         if changed:
             settings = replace(settings, background=(background[0], background[1], background[2]))
         state.settings = settings
@@ -269,14 +263,7 @@ class Panels:
 
     def _draw_camera(self, viewer: Viewer) -> None:
         state = viewer.state
-        if self.widgets.radio("fly", not state.orbiting):
-            state.orbiting = False
-        imgui.same_line()
-        if self.widgets.radio("orbit", state.orbiting):
-            state.orbiting = True
-        imgui.same_line()
-        if self.widgets.button("Reset"):
-            go_home(state)
+        state.orbiting = self.widgets.check("orbit", state.orbiting)
         fov = state.camera.vertical_fov_degrees
         chosen = self.widgets.slider("field of view", fov, cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES, "%.0f deg")
         if chosen != fov:
