@@ -145,7 +145,6 @@ class CpuRenderer:
         gaussians = drop_not_finite(scene.gaussians, lambda done: report(0.2 * done))
         finite = replace(scene, gaussians=gaussians)
         splats = Splats.from_scene(finite, lambda done: report(0.2 + 0.4 * done), with_rows=False)
-        splats = replace(splats, dropped=len(scene.gaussians) - len(gaussians))
         arrays = (values.detach().numpy() for values in (gaussians.quats, gaussians.scales.abs(), gaussians.harmonics))
         rows = DisplayScene(
             splats.means, splats.opacities, *arrays, splats.reach, lambda done: report(0.6 + 0.4 * done)
@@ -162,7 +161,7 @@ class CpuRenderer:
         self._selected = SelectionCache()
         self._faces.clear()
         self._picture = self._texture = self._colored = None
-        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, renderer="cpu")
+        self.stats = FrameStats(total=len(splats), renderer="cpu")
 
     def render(
         self,
@@ -400,7 +399,6 @@ class CpuRenderer:
     ) -> FrameStats:
         return FrameStats(
             total=self.stats.total,
-            dropped=self.stats.dropped,
             visible=groups.visible,
             drawn=drawn,
             sort_ms=stages.get("sort", 0.0),

@@ -47,7 +47,7 @@ class FrameRenderer(Protocol):
         """A function that converts a scene for `upload`, in any thread.
 
         It reports the fraction done, from any thread; an exception of the report ends the work. Gaussians with NaN or
-        infinity are dropped and counted.
+        infinity are dropped.
         """
         ...
 

@@ -110,7 +110,7 @@ class SplatRenderer:
     def _show(self, splats: Splats, painter: LayerPainter) -> None:
         self._splats, self._painter = splats, painter
         self._unread = None
-        self.stats = FrameStats(total=len(splats), dropped=splats.dropped)
+        self.stats = FrameStats(total=len(splats))
 
     def render(
         self,
@@ -196,7 +196,6 @@ class SplatRenderer:
         self._targets.trim()
         self.stats = FrameStats(
             total=len(splats.splats),
-            dropped=splats.splats.dropped,
             visible=sum(layer.visible for layer in layers),
             drawn=sum(layer.drawn for layer in layers),
             sort_ms=splats.milliseconds,

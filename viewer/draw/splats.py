@@ -53,7 +53,6 @@ class Splats:
     base_colors: Float[np.ndarray, "n 4"] | None  # colours if they do not depend on the direction (degree 0), else None
     view_positions: Float[np.ndarray, "view 3"]  # camera centres of the context views in the world
     num_views: int  # number of context views that have Gaussians or a camera
-    dropped: int  # Gaussians removed because a value in them is NaN or infinite
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -90,7 +89,6 @@ class Splats:
             base_colors=np.zeros((rows, 4), np.float32) if with_rows and gaussians.degree == 0 else None,
             view_positions=positions,
             num_views=max(len(positions), int(gaussians.views.max()) + 1 if num else 0),
-            dropped=len(scene.gaussians) - num,
         )
         fields = (gaussians.means, gaussians.opacities, gaussians.scales, gaussians.quats, coefficients)
         sources = [values.detach().numpy() for values in fields]

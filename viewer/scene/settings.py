@@ -109,7 +109,6 @@ class FrameStats:
     """
 
     total: int = 0  # Gaussians of the scene on the GPU
-    dropped: int = 0  # Gaussians removed at upload because a value in them is NaN or infinite
     visible: int = 0
     drawn: int = 0
     sort_ms: float = 0.0
