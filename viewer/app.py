@@ -27,7 +27,7 @@ from pansplat_viewer.scene.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.scene.settings import DrawSettings, Mode, RendererChoice
+from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
 
 if TYPE_CHECKING:
     import moderngl
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 _WRITTEN = "view_*.png", "panorama_*.png", "[0-9]*_*.png", "flythrough.mp4", "tour.mp4"  # offscreen
 _WINDOW_SIZE, _FILM_SIZE = (1280, 720), (1920, 1080)  # pixels
+_SETTINGS = DrawSettings(mode="deferred")
 _PREDICTION_PART = 0.6  # of the work of a film; the rest is drawing
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
 
@@ -59,8 +60,6 @@ class Options:
     """Name or number of the tour, pair or scene to show first if the path holds several; offscreen also "all"."""
     prediction: PredictOptions = field(default_factory=PredictOptions)
     reading: ReadOptions = field(default_factory=ReadOptions)
-    mode: Mode = "deferred"
-    """How the Gaussians of the input views are combined."""
     renderer: RendererChoice = "auto"
     """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, and cpu where OpenGL is
     software."""
@@ -91,11 +90,6 @@ class Options:
     def load_options(self) -> LoadOptions:
         """Options of reading and prediction."""
         return LoadOptions(self.reading, self.prediction)
-
-    @property
-    def settings(self) -> DrawSettings:
-        """The draw settings with which the viewer begins."""
-        return DrawSettings(mode=self.mode)
 
 
 def run_arguments(args: Sequence[str] | None = None) -> int:
@@ -162,7 +156,7 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
         return f"the window's libraries cannot be loaded ({error})"
 
     load_options = options.load_options
-    state = ViewerState(settings=options.settings, path=path or CameraPath())
+    state = ViewerState(settings=_SETTINGS, path=path or CameraPath())
     source = expand_home(options.path)
 
     def create_loader() -> SceneLoader:
@@ -239,7 +233,7 @@ def _write_film(options: Options, entry: SceneEntry, folder: Path, pixels: tuple
             print(file, flush=True)
 
         loaded = load(entry, _PREDICTION_PART * _find_part(entry))
-        scene, tour, settings = loaded.scene, loaded.entry.tour, fit_settings(options.settings, loaded.scene)
+        scene, tour, settings = loaded.scene, loaded.entry.tour, fit_settings(_SETTINGS, loaded.scene)
         scenes = None if tour is None else TourScenes.start(loaded)
         create = partial(create_renderer, ctx, options.renderer, color_bits=32)
         at = 0.5 if options.at is None else options.at

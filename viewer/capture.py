@@ -141,8 +141,7 @@ def write_flight(
         show_file(file)
     if scenes is None:
         file = folder / f"panorama_{round(100 * at):03d}.png"
-        blend = settings.view if settings.mode == "view" else settings.mode
-        write_image(file, pipeline.render(scene, compute_flight_pose(scene, at), blend=blend).color)
+        write_image(file, pipeline.render(scene, compute_flight_pose(scene, at), blend=settings.mode).color)
         show_file(file)
 
 

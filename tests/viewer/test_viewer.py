@@ -579,7 +579,7 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
     go.set()
     app.settle()
     assert app.scenes.tour is tour and tour.tour is edges and app.viewer.error is None
-    assert len(tour.loaded) == tour.num_scenes
+    assert tour.loaded == list(tour._sources)
 
 
 def test_a_note_is_put_at_the_middle_and_removed(make_app, house):

@@ -97,11 +97,6 @@ class TourScenes:
         return self.tour.parts[self.edge[0]]
 
     @property
-    def num_scenes(self) -> int:
-        """Number of scenes of the tour."""
-        return len(self._sources)
-
-    @property
     def loaded(self) -> list[ViewNumbers]:
         """The scenes that need no prediction."""
         return [views for views in self._sources if views in self._selected or self._has_sources(views)]

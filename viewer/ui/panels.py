@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, get_args
 import moderngl
 from imgui_bundle import imgui
 
-from pansplat.system.descriptions import describe_count
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.settings import Display
 from pansplat_viewer.scene.state import (
@@ -185,9 +184,6 @@ class Panels:
         if viewer.stage.renderer.stats.total:
             imgui.separator_text("Gaussians")
             self._draw_gaussians(viewer.state)
-        if viewer.scenes.tour is not None:
-            loaded, count = len(viewer.scenes.tour.loaded), describe_count(viewer.scenes.tour.num_scenes, "scene")
-            imgui.text_unformatted(f"{loaded} of {count} in memory")
         imgui.separator_text("Display")
         self._draw_display(viewer.state)
         self._draw_settings(viewer)
