@@ -287,11 +287,9 @@ class CpuRenderer:
     def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
         """Draw the image of a frame."""
         start = time.perf_counter()
-        if frame.settings.layout == "pinhole":
-            pinhole = Pinhole(frame.rotation, frame.position, frame.focal, *frame.size)
-            layers = self._rasterize(frame, groups, pinhole, self._selected)
-        else:
-            layers = self._rasterize_panorama(frame, groups)
+        focal = frame.focal if frame.settings.layout == "pinhole" else 0.0
+        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), focal)
+        layers = self._rasterize(frame, groups, plane, self._selected)
         sums, drawn = layers.sums, layers.statistics.visible
         stages = {name: 1e3 * seconds for name, seconds in layers.statistics.seconds.items()}
         pixels = pooled_empty(frame.size[::-1], np.uint32)
@@ -303,14 +301,15 @@ class CpuRenderer:
         stats = self._make_stats(frame, groups, drawn, 1e3 * (now - start), stages)
         return _Picture(frame, pixels, groups, sums, stats)
 
-    def _rasterize(self, frame: Frame, groups: _Groups, camera: Pinhole, cache: SelectionCache | None = None) -> Layers:
-        """Rasterise the Gaussians in a pinhole camera's view."""
-        plane = ImagePlane(
-            (camera.height, camera.width), torch.from_numpy(np.ascontiguousarray(camera.rotation)), camera.focal
-        )
-        options = RasterOptions(near=frame.settings.near)
-        deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
-        selection = Selection(camera.compute_side_normals(), deviation)
+    def _rasterize(
+        self, frame: Frame, groups: _Groups, plane: ImagePlane, cache: SelectionCache | None = None
+    ) -> Layers:
+        """Rasterise the Gaussians in view of a plane; a panorama has a ray for each pixel."""
+        options, selection = RasterOptions(near=frame.settings.near), None
+        if not plane.is_panorama:
+            camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
+            deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
+            selection = Selection(camera.compute_side_normals(), deviation)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,
@@ -334,19 +333,6 @@ class CpuRenderer:
             colors = color_by_property(name, *arrays)
             self._colored = name, scene.with_colors(colors)
         return self._colored[1]
-
-    def _rasterize_panorama(self, frame: Frame, groups: _Groups) -> Layers:
-        """Rasterise a panorama, with a ray for each pixel."""
-        settings = frame.settings
-        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), 0.0)
-        return self._find_scene(settings).rasterize(
-            np.asarray(frame.position),
-            plane,
-            groups.labels,
-            len(groups.weights),
-            RasterOptions(near=settings.near),
-            min_transmittance=self._min_transmittance,
-        )
 
     def _read_from_faces(self, frame: Frame, groups: _Groups) -> _Picture:
         """Read the image from the cube faces of the position; draws those that are missing."""
@@ -375,9 +361,7 @@ class CpuRenderer:
         """Draw one face unless it is finished; returns the number of Gaussians."""
         if face in stored.done:
             return 0
-        plane = stored.faces.plane(face)
-        camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size)
-        layers = self._rasterize(frame, stored.groups, camera)
+        layers = self._rasterize(frame, stored.groups, stored.faces.plane(face))
         _write_pixels(frame.settings, stored.groups, layers.sums, stored.faces.pixels[face])
         stored.done.add(face)
         return layers.statistics.visible
