@@ -19,7 +19,6 @@ from pansplat.system.options import check_numbers
 from pansplat.system.progress import stage
 from pansplat_viewer.scene.loader import (
     LoadedScene,
-    LoadOptions,
     SceneEntry,
     SceneLoader,
     ShowEntries,
@@ -86,11 +85,6 @@ class Options:
             raise InputError(f"`--size` must be WIDTHxHEIGHT in pixels, 16 to 16384, got {self.size!r}")
         return int(match[1]), int(match[2])
 
-    @property
-    def load_options(self) -> LoadOptions:
-        """Options of reading and prediction."""
-        return LoadOptions(self.reading, self.prediction)
-
 
 def run_arguments(args: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, those of the process by default, and return its exit status."""
@@ -125,7 +119,7 @@ def _run(options: Options) -> int:
     if path is not None:
         raise InputError("--path needs a window; `pansplat render SCENE --path FILE -o film.mp4` draws its film")
     with progress_bar():  # of poses, which take minutes for a tour without them
-        entries = find_entries(expand_home(options.path), options.load_options)
+        entries = find_entries(expand_home(options.path), options.reading, options.prediction)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)
     chosen = entries if show_all else entries[first : first + 1]
@@ -155,15 +149,14 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
     except ImportError as error:  # imgui_bundle needs the libraries of X11
         return f"the window's libraries cannot be loaded ({error})"
 
-    load_options = options.load_options
     state = ViewerState(settings=_SETTINGS, path=path or CameraPath())
     source = expand_home(options.path)
 
     def create_loader() -> SceneLoader:
-        return SceneLoader(lambda entry, show: load_entry(entry, load_options, show))
+        return SceneLoader(lambda entry, show: load_entry(entry, options.prediction, show))
 
     def find(path: Path, show: ShowEntries) -> list[SceneEntry]:
-        found = find_entries(path, load_options, show)
+        found = find_entries(path, options.reading, options.prediction, show)
         choose_entry(found, options.pair if path == source else None)
         return found
 
@@ -224,7 +217,7 @@ def _write_film(options: Options, entry: SceneEntry, folder: Path, pixels: tuple
 
         def load(entry: SceneEntry, end: float = 0.0) -> LoadedScene:  # 0: within the frames of the film
             with stage(end, f"{entry.name}: "):
-                loaded = load_entry(entry, options.load_options)
+                loaded = load_entry(entry, options.prediction)
             name = loaded.entry.pair.name if loaded.entry.pair is not None else entry.name
             print(f"{name}: {len(loaded.scene.gaussians):,} Gaussians", flush=True)
             return loaded

@@ -15,8 +15,8 @@ from pansplat.cli import run
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import load
-from pansplat.prediction_options import PredictOptions
-from pansplat_viewer.scene.loader import LoadOptions, find_entries, load_entry
+from pansplat.prediction_options import PredictOptions, ReadOptions
+from pansplat_viewer.scene.loader import find_entries, load_entry
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +78,8 @@ def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room, sm
         assert image.height == 16 and len(set(image.convert("L").getextrema())) == 2
     run_on_room("evaluate", tmp_path / "results", "--height", "64", "--compat", "fixed")
     assert (tmp_path / "results" / "results.json").exists()
-    options = LoadOptions(prediction=PredictOptions(str(weights), "fixed", height=64, refine_seconds=0))
-    (entry,) = (entry for entry in find_entries(room, options) if entry.pair is not None)
+    options = PredictOptions(str(weights), "fixed", height=64, refine_seconds=0)
+    (entry,) = (entry for entry in find_entries(room, ReadOptions(), options) if entry.pair is not None)
     viewed = load_entry(entry, options).scene
     assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)
 

@@ -19,8 +19,9 @@ from pansplat.cli import run
 from pansplat.export import page as page_module
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.world import WorldFrame
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import show_progress
-from pansplat_viewer.scene.loader import LoadOptions, find_entries
+from pansplat_viewer.scene.loader import find_entries
 
 
 def test_a_scene_is_written_pruned(
@@ -94,7 +95,7 @@ def test_every_format_is_described_drawn_and_opened(
             images.append(np.asarray(image).astype(float))
     error = np.mean((images[0] - images[1]) ** 2)
     assert 10 * np.log10(255**2 / max(error, 1e-9)) > 36
-    (entry,) = find_entries(out, LoadOptions())
+    (entry,) = find_entries(out, ReadOptions(), PredictOptions())
     assert entry.file == out
 
 

@@ -16,8 +16,9 @@ from pansplat.images.image_files import write_image
 from pansplat.images.video import write_video
 from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import is_progress_shown
-from pansplat_viewer.scene.loader import LoadOptions, find_entries
+from pansplat_viewer.scene.loader import find_entries
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
@@ -177,7 +178,7 @@ CALLERS = {
     "pose of a tour's file": lambda folder, out: run(["pose", *map(str, folder.glob("*.html"))]),
     "export": _export,
     "predict_tour": lambda folder, out: pansplat.predict_tour(folder),
-    "the window": lambda folder, out: find_entries(folder, LoadOptions()),
+    "the window": lambda folder, out: find_entries(folder, ReadOptions(), PredictOptions()),
 }
 
 

@@ -12,11 +12,10 @@ import pytest
 from PIL import Image
 
 from pansplat.errors import InputError
-from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat_viewer import run
 from pansplat_viewer.app import Options
 from pansplat_viewer.capture import STILLS, compute_flight_pose
-from pansplat_viewer.scene.loader import LoadOptions, SceneEntry, choose_entry
+from pansplat_viewer.scene.loader import SceneEntry, choose_entry
 
 
 @pytest.fixture(autouse=True)
@@ -151,10 +150,7 @@ def test_pairs_are_chosen_by_name_or_number():
         choose_entry(entries, "4")
 
 
-def test_options_are_passed_on(tmp_path):
-    reading, prediction = ReadOptions("world2cam opengl", 0.3, 9.0), PredictOptions("w.safetensors", height=256)
-    expected = LoadOptions(reading, prediction)
-    assert Options(tmp_path, prediction=prediction, reading=reading).load_options == expected
+def test_the_size_of_films_is_that_of_the_option(tmp_path):
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 
 

@@ -21,10 +21,11 @@ from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.progress import report_progress
 from pansplat.tours.camera_path import CameraPath
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, load_entry
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, load_entry
 from pansplat_viewer.scene.settings import FrameStats
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.viewer import Viewer
@@ -696,7 +697,7 @@ def test_space_plays_the_tour_through_all_panoramas_within_the_memory(make_app, 
 
 def test_a_file_of_a_tour_is_flown_along_its_edges(make_app, house_file):
     app = make_app()
-    app.load = lambda entry, *rest: load_entry(entry, LoadOptions(), *rest)
+    app.load = lambda entry, *rest: load_entry(entry, PredictOptions(), *rest)
     app.show(SceneEntry("home", file=house_file))
     first = app.viewer.stage.slot.scene
     assert first.gaussians.views.unique().tolist() == [0, 1], "only the views of the edge are blended"

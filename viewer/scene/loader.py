@@ -7,7 +7,7 @@ are parts of the scene in the file. Imports no torch before it loads.
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -86,20 +86,15 @@ class LoadedScene:
     facts: "TourFacts | None" = None
 
 
-@dataclass(frozen=True)
-class LoadOptions:
-    """Options of reading and prediction."""
-
-    reading: ReadOptions = field(default_factory=ReadOptions)
-    prediction: PredictOptions = field(default_factory=PredictOptions)
-
-
-def find_entries(path: Path, options: LoadOptions, show: ShowEntries | None = None) -> list[SceneEntry]:
+def find_entries(
+    path: Path, reading: ReadOptions, prediction: PredictOptions, show: ShowEntries | None = None
+) -> list[SceneEntry]:
     """Return all scenes at `path`: tours first, then pairs and single views, then scene files.
 
     Args:
         path: a file or folder.
-        options: arguments of reading.
+        reading: options of reading.
+        prediction: options of the predictor, which may need two views.
         show: called before poses are estimated, with the panoramas as a tour of which none is placed.
     """
     if not path.exists():
@@ -112,7 +107,7 @@ def find_entries(path: Path, options: LoadOptions, show: ShowEntries | None = No
 
         with collect_notes() as notes:
             on_unposed = None if show is None else lambda pairs: show(_list_tours(pairs))
-            pairs = load_pairs(path, on_unposed=on_unposed, **vars(options.reading))
+            pairs = load_pairs(path, on_unposed=on_unposed, **vars(reading))
     except InputError:
         if not scenes:
             raise
@@ -122,7 +117,7 @@ def find_entries(path: Path, options: LoadOptions, show: ShowEntries | None = No
 
     tours = find_tours(pairs)
     if any(a == b for tour in tours for a, b in tour.overlaps):
-        predictor = load_predictor(options.prediction)
+        predictor = load_predictor(prediction)
         with collect_notes() as replaced:
             for tour in tours:
                 warn_of_single_views(tour, predictor)
@@ -164,7 +159,7 @@ def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panor
 
 
 def load_entry(
-    entry: SceneEntry, options: LoadOptions, show: Callable[[LoadedScene], None] | None = None
+    entry: SceneEntry, prediction: PredictOptions, show: Callable[[LoadedScene], None] | None = None
 ) -> LoadedScene:
     """Read an entry's scene, or predict and refine it. Of a tour, a scene of the panorama in which `plan_walk` starts.
 
@@ -173,13 +168,13 @@ def load_entry(
 
     Args:
         entry: the entry.
-        options: arguments of reading and prediction.
+        prediction: its options.
         show: called with the prediction before it is refined.
     """
     from pansplat import pipeline
 
     if entry.tour is not None:
-        return _load_tour_scene(entry, options, show)
+        return _load_tour_scene(entry, prediction, show)
     if entry.pair is None:
         report_progress("reading", 0.0)
         assert entry.file is not None
@@ -189,17 +184,17 @@ def load_entry(
         from pansplat.tours.graph import make_graph
 
         tour = replace(make_graph(scene), name=entry.name)
-        return _load_tour_scene(replace(entry, tour=tour, merged=scene), options, show)
+        return _load_tour_scene(replace(entry, tour=tour, merged=scene), prediction, show)
     scene = pipeline.predict(
         entry.pair,
-        options=options.prediction,
+        options=prediction,
         on_predicted=None if show is None else lambda scene: show(LoadedScene(entry, scene, is_final=False)),
     )
     return LoadedScene(entry, scene)
 
 
 def _load_tour_scene(
-    entry: SceneEntry, options: LoadOptions, show: Callable[[LoadedScene], None] | None
+    entry: SceneEntry, prediction: PredictOptions, show: Callable[[LoadedScene], None] | None
 ) -> LoadedScene:
     """The scene of `entry.views` of a tour, predicted and refined, with its floor outlines.
 
@@ -212,7 +207,7 @@ def _load_tour_scene(
     from pansplat.tours.links import link_parts
     from pansplat.tours.overlap import connect
 
-    tour, views, merged, prediction = entry.tour, entry.views, entry.merged, options.prediction
+    tour, views, merged = entry.tour, entry.views, entry.merged
     assert tour is not None
     if merged is not None:
         first, views = _choose_first_scene(tour, tour)

@@ -13,9 +13,9 @@ from PIL import Image
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.ply import save_ply
-from pansplat.prediction_options import PredictOptions
+from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
-from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, load_entry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import fit_settings
 from pansplat_viewer.scene.tour import TourScenes
@@ -41,25 +41,25 @@ def test_paths_without_scenes_are_refused(tmp_path):
         (Path("~nobody-has-this-name"), "no such"),
     ):
         with pytest.raises(InputError, match=message):
-            find_entries(path, LoadOptions())
+            find_entries(path, ReadOptions(), PredictOptions())
     (tmp_path / "scene.ply").write_bytes(b"ply\nnot really")
-    (entry,) = find_entries(tmp_path / "scene.ply", LoadOptions())
+    (entry,) = find_entries(tmp_path / "scene.ply", ReadOptions(), PredictOptions())
     with pytest.raises(InputError, match=r"scene\.ply"):
-        load_entry(entry, LoadOptions())
+        load_entry(entry, PredictOptions())
 
 
 def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
     for name in ("b", "a"):
         save_ply(small_scene, tmp_path / f"{name}.ply")
-    entries = find_entries(tmp_path, LoadOptions())
+    entries = find_entries(tmp_path, ReadOptions(), PredictOptions())
     assert [entry.name for entry in entries] == ["a", "b"]
-    loaded = load_entry(entries[0], LoadOptions())
+    loaded = load_entry(entries[0], PredictOptions())
     assert len(loaded.scene.gaussians) == len(small_scene.gaussians)
 
 
 def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_file):
-    (entry,) = find_entries(house_file, LoadOptions())
-    first = load_entry(entry, LoadOptions())
+    (entry,) = find_entries(house_file, ReadOptions(), PredictOptions())
+    first = load_entry(entry, PredictOptions())
     tour, scenes = first.entry.tour, TourScenes.start(first)
     assert tour.name == "home" and tour.overlaps == house.overlaps and first.is_final
     assert np.allclose(tour.positions, house.positions) and first.entry.views == (0, 1)
@@ -78,7 +78,7 @@ def test_warnings_about_the_input_are_notes_of_its_entries(monkeypatch, house):
 
     monkeypatch.setattr("pansplat.pipeline.load_pairs", load_pairs)
     with pytest.warns(InputWarning, match="no pose was found"):
-        (entry,) = find_entries(house.folder, LoadOptions())
+        (entry,) = find_entries(house.folder, ReadOptions(), PredictOptions())
     assert entry.notes == ("b.jpg: no pose was found",)
 
 
@@ -91,7 +91,7 @@ def test_a_tour_of_parts_begins_with_the_scene_of_one_view_where_its_walk_does(m
     monkeypatch.setattr("pansplat.pipeline.predict", lambda pair, model, **options: scene)
     single = replace(tour, panoramas=(alone,), overlaps={(0, 0): 1.0})
     for each in (tour, single):
-        loaded = load_entry(SceneEntry("house", tour=each), LoadOptions())
+        loaded = load_entry(SceneEntry("house", tour=each), PredictOptions())
         assert loaded.entry.views == (0,) and loaded.entry.tour is each and loaded.scene is scene
 
 
@@ -107,16 +107,16 @@ def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_f
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
-    first = load_entry(SceneEntry("house", tour=house), LoadOptions(), lambda loaded: None)
+    first = load_entry(SceneEntry("house", tour=house), PredictOptions(), lambda loaded: None)
     assert first.entry.start == 0 and 0 in first.entry.views and first.entry.tour is connected
     scenes = TourScenes.start(first)
     request = scenes.choose_request(scenes.list_next(None, 0.0), SceneEntry("house", tour=house))
     assert request.views == (0, 1, 2, 3)
-    part = load_entry(request, LoadOptions(), lambda loaded: None)
+    part = load_entry(request, PredictOptions(), lambda loaded: None)
     assert asked[0] == ((0, 1, 2), 0.0, False), "the first scene is not refined"
     assert asked[1] == ((0, 1, 2, 3), pytest.approx(10.0 * 4 / 3), True)
     assert part.entry.views == request.views and set(part.facts.outlines) <= set(request.views)
-    film = load_entry(SceneEntry("house", tour=house), LoadOptions())
+    film = load_entry(SceneEntry("house", tour=house), PredictOptions())
     assert film.entry.views == (0, 1, 2, 3), "a film needs all, so that nothing is predicted twice"
 
 
@@ -131,9 +131,9 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     pairs = [parted_house.make_pair(views) for views in ((0, 1), (1, 2), (3,))]
     pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], world=1),))
     with pytest.warns(InputWarning, match="1 single view is predicted by default"):
-        entries = find_entries(parted_house.folder, LoadOptions(prediction=PredictOptions("pairs")))
+        entries = find_entries(parted_house.folder, ReadOptions(), PredictOptions("pairs"))
     assert all(any("predicted by default" in note for note in entry.notes) for entry in entries)
-    assert not find_entries(parted_house.folder, LoadOptions())[0].notes
+    assert not find_entries(parted_house.folder, ReadOptions(), PredictOptions())[0].notes
     used = []
 
     def predict(pair, model, **options):
@@ -143,13 +143,13 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     scenes = TourScenes(parted_house)
     for views in ((0, 1), (3,)):
-        load_entry(scenes.make_entry(views), LoadOptions(prediction=PredictOptions("pairs")))
+        load_entry(scenes.make_entry(views), PredictOptions("pairs"))
     assert used == ["pairs", "default"]
 
 
 @pytest.mark.shared
 def test_a_folder_of_pairs_has_an_entry_for_each(shared):
-    entries = find_entries(shared / "data" / "zind", LoadOptions())
+    entries = find_entries(shared / "data" / "zind", ReadOptions(), PredictOptions())
     assert entries[0].tour is not None and len(entries[0].tour) == 13, "the tour of all panoramas is the first"
     assert len(entries) >= 4 and all(entry.pair is not None for entry in entries[1:])
 
@@ -167,7 +167,7 @@ def test_panoramas_are_shown_before_their_poses_are_estimated_but_not_if_these_a
     monkeypatch.setattr("pansplat.poses.files._estimate", estimate)
     for _ in range(2):
         with pytest.warns(InputWarning, match="bare walls"):
-            entries = find_entries(tmp_path, LoadOptions(), shown.append)
+            entries = find_entries(tmp_path, ReadOptions(), PredictOptions(), shown.append)
     (early,), (entry, *_) = shown[0], entries
     assert estimates == [[1]] and len(shown) == 1
     assert [view.name for view in early.tour.panoramas] == [view.name for view in entry.tour.panoramas]
@@ -195,10 +195,10 @@ def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
 
 
 def test_a_prediction_has_the_options_and_is_shown_before_the_refined_scene(monkeypatch, small_scene):
-    options = LoadOptions(prediction=PredictOptions("sweep", height=256, cache=False, refine_seconds=3.0))
+    options = PredictOptions("sweep", height=256, cache=False, refine_seconds=3.0)
 
     def predict(pair, **arguments):
-        assert arguments["options"] is options.prediction
+        assert arguments["options"] is options
         report_progress("predicting", 0.5)
         arguments["on_predicted"](small_scene)
         return small_scene
@@ -215,7 +215,7 @@ def test_a_fused_tour_is_one_scene_that_is_drawn_jointly(tmp_path, small_scene):
     edges = tuple((view, view + 1, 0.5) for view in range(count - 1))
     for joint in (False, True):
         save_ply(replace(small_scene, overlaps=edges, joint=joint), tmp_path / "tour.ply")
-        (entry,) = find_entries(tmp_path / "tour.ply", LoadOptions())
-        loaded = load_entry(entry, LoadOptions())
+        (entry,) = find_entries(tmp_path / "tour.ply", ReadOptions(), PredictOptions())
+        loaded = load_entry(entry, PredictOptions())
         assert (loaded.entry.tour is None) == joint
         assert fit_settings(DrawSettings(mode="deferred"), loaded.scene).mode == ("joint" if joint else "deferred")
