@@ -12,7 +12,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")"
 
 CPU_WHEELS=https://download.pytorch.org/whl/cpu
 GL_PACKAGES=(libegl1 libgl1 libgl1-mesa-dri libgles2 libx11-6 libxcursor1 libxext6 libxi6 libxinerama1 libxkbcommon0 libxrandr2)
-DEV_PACKAGES=(xvfb xdotool chromium libatomic1) # libatomic1: for the node of playwright
+DEV_PACKAGES=(xvfb xdotool libosmesa6 chromium libatomic1) # libatomic1: for the node of playwright
 IWER=iwer@2.5.0 # npm package: the emulated headset of the tests
 IWER_SHA256=23d8640949f19db4b1e70398b30e084e4aa555f3a81e4329da3fac1a70b39542 # of iwer.min.js
 
@@ -58,7 +58,7 @@ install_libraries() {
     local failed=("${missing[@]}")
     if [ ${#as_root[@]} -gt 0 ]; then
         say "installing ${missing[*]}"
-        # If this fails, install the packages one by one: some releases lack one of them.
+        # If this fails, install the packages one by one: some releases lack one of them (newer ones lack libosmesa6).
         apt_install "${missing[@]}" && return
         failed=()
         for package in "${missing[@]}"; do apt_install "$package" || failed+=("$package"); done
