@@ -24,27 +24,25 @@ if TYPE_CHECKING:
 class Pose(Computation):
     """Estimate the camera poses of equirectangular panoramas of one place."""
 
-    paths: Positional[tuple[Path, ...]]
-    """A folder of panoramas, a web tour, or two or more files; or a 360-degree video."""
+    path: Positional[Path]
+    """A folder of panoramas, a web tour, or a 360-degree video."""
     out: OptionalOut = None
     """The poses.json to write. Without it, only the table is shown. For a video, a folder for the key frames and their
     poses.json."""
     camera_height: Positive = CAMERA_HEIGHT
     """Mean height of the cameras over the floor, metres; it sets the scale."""
     baseline: tuple[str, str, float] | None = None
-    """Two of the files and their distance in metres, instead of the camera's height."""
+    """Two of the panoramas and their distance in metres, instead of the camera's height."""
     frames: Count = 24
     """Largest number of key frames of a video."""
 
     def run(self) -> int:
         """Estimate, print the table and write the file."""
-        from pansplat.inputs.folders import VIDEO_FILES, list_unposed
+        from pansplat.inputs.folders import VIDEO_FILES, load_panoramas
         from pansplat.poses.files import estimate_panoramas, require_mergeable, write_poses
         from pansplat.poses.key_frames import extract_key_frames
 
-        if not self.paths:
-            raise InputError("`pansplat pose` needs a folder of panoramas, a web tour, two or more files, or a video")
-        is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in VIDEO_FILES
+        is_video = self.path.suffix.lower() in VIDEO_FILES
         out = self.out
         if is_video:
             if out is None:
@@ -53,18 +51,18 @@ class Pose(Computation):
             out = out / "poses.json"
         elif out is not None:
             require_output_file("--out", out, (".json",))
-        panoramas = [] if is_video else list_unposed(self.paths)
+        panoramas = [] if is_video else load_panoramas(self.path, posed=False)
         if not is_video and len(panoramas) < 2:
-            raise InputError(f"{self.paths[0]}: needed two or more panoramas, got {len(panoramas)}; add the others.")
+            raise InputError(f"{self.path}: needed two or more panoramas, got {len(panoramas)}; add the others.")
         if out is not None:
             require_mergeable(out, [view.image for view in panoramas], overwrite=self.overwrite)
-        folder = self.paths[0] if self.paths[0].is_dir() else self.paths[0].parent
+        folder = self.path if self.path.is_dir() else self.path.parent
         with progress_bar():
             if is_video and out is not None:
                 folder = out.parent
                 with stage(0.5):
-                    frames = extract_key_frames(self.paths[0], out.parent, self.frames, overwrite=self.overwrite)
-                panoramas = list_unposed(frames)
+                    frames = extract_key_frames(self.path, out.parent, self.frames, overwrite=self.overwrite)
+                panoramas = [view for view in load_panoramas(folder, posed=False) if view.image in frames]
             estimate = estimate_panoramas(folder, panoramas, camera_height=self.camera_height, baseline=self.baseline)
         _print_estimate(estimate)
         if out is not None:

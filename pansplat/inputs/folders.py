@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from pansplat.errors import InputError, InputWarning, collect_notes
+from pansplat.errors import InputError, InputWarning
 from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
 from pansplat.images.image_files import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
 from pansplat.inputs.folder_formats import CAMERA_POSES, PAIRS, POSES
@@ -20,7 +20,6 @@ from pansplat.inputs.pairs import Collection, Pair, Panorama, list_names, list_p
 from pansplat.inputs.photographs import LINKS, add_links, list_unread_panoramas
 from pansplat.inputs.poses import parse_convention
 from pansplat.inputs.web_tours import find_web_tours, is_web_tour_file
-from pansplat.inputs.web_tours.entries import make_panorama
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import expand_home, is_scene_file, is_written, require_text
 from pansplat.system.options import CAMERA_HEIGHT
@@ -95,27 +94,9 @@ def load_collections(path: Path | str, *, convention: str | None = None, posed: 
     return collections
 
 
-def load_panoramas(path: Path | str) -> list[Panorama]:
-    """All panoramas at a path (see `load_collections`), with titles, links and start views."""
-    return [view for found in load_collections(path) for view in found.views]
-
-
-@list_folders_once()
-def list_unposed(paths: Sequence[Path]) -> list[Panorama]:
-    """The panoramas of folders, files of web tours, and pictures, with links and titles; no poses are read."""
-    panoramas: list[Panorama] = []
-    siblings: dict[Path, dict[Path, Panorama]] = {}
-    for path in paths:
-        if path.exists() and not path.is_dir() and not is_web_tour_file(path):
-            folder = path.parent
-            if folder not in siblings:
-                with collect_notes(), contextlib.suppress(InputError):  # without notes about other files
-                    siblings[folder] = {view.image: view for found in _read_unposed(folder) for view in found.views}
-            panoramas.append(siblings.get(folder, {}).get(path) or make_panorama(path.stem, path, folder))
-            require_known_masks(path)
-        else:
-            panoramas += [view for found in load_collections(path, posed=False) for view in found.views]
-    return panoramas
+def load_panoramas(path: Path | str, *, posed: bool = True) -> list[Panorama]:
+    """All panoramas at a path, with titles, links and start views; see `load_collections`."""
+    return [view for found in load_collections(path, posed=posed) for view in found.views]
 
 
 def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:

@@ -334,7 +334,6 @@ FILES = [
     Fault("a FIFO as a pose", "render scene.ply -o x.png --pose p.json", fifo("p.json"), "FIFO"),
     Fault("a FIFO as the numbers of a pose", "render scene.ply -o x.png --pose p.txt", fifo("p.txt"), "FIFO"),
     Fault("a FIFO as a pair", "predict fifo -o out.ply", fifo("fifo"), "fifo"),
-    Fault("a FIFO as a panorama without a pose", "pose pair/b.png f.png", fifo("f.png"), "FIFO"),
     Fault("a FIFO as a video", "pose f.mp4 -o frames", fifo("f.mp4"), "FIFO"),
     Fault("a video of a text", "pose f.mp4 -o frames", lambda f: (f / "f.mp4").write_text("x"), "readable video"),
     Fault("an empty video", "pose f.mp4 -o frames", lambda f: (f / "f.mp4").touch(), "readable video"),

@@ -289,7 +289,7 @@ def test_a_scene_file_is_no_mask(tmp_path: Path) -> None:
     assert len(load_pairs(folder)) == 1
 
 
-@pytest.mark.parametrize("source", ["file", "poses.json", "pose", "pose folder"])
+@pytest.mark.parametrize("source", ["file", "poses.json", "pose folder"])
 def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     mask = _draw_mask(folder / "lefd_Blur.jpg") if source == "pose folder" else folder / "left_blur.png"
@@ -304,7 +304,7 @@ def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
         elif source == "poses.json":
             load_pairs(folder)
         else:
-            Pose((folder,) if source == "pose folder" else (folder / "left.png", mask, folder / "right.png")).run()
+            Pose(folder).run()
 
 
 @pytest.mark.parametrize("name", ["walk_blur.png", "Walk_Mask.PNG"])
@@ -313,7 +313,7 @@ def test_a_mask_of_a_video_is_refused(tmp_path: Path, name: str) -> None:
     write_video(tmp_path / "walk.mp4", iter([frame, frame]), 30)
     _draw_mask(tmp_path / name)
     with pytest.raises(InputError, match=rf"{name}: needed the name of a panorama before .* got '{name}'"):
-        Pose((tmp_path / "walk.mp4",), tmp_path / "frames").run()
+        Pose(tmp_path / "walk.mp4", tmp_path / "frames").run()
 
 
 def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:
