@@ -1,9 +1,8 @@
-"""Reading frames of video files by number, and writing MP4 and WebM files."""
+"""Writing MP4 and WebM files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,108 +13,13 @@ from numpy.typing import NDArray
 from pansplat.errors import InputError
 from pansplat.images.panorama_metadata import Stereo, mark_spherical_video
 from pansplat.system.atomic import replacing
-from pansplat.system.files import SOFTWARE, require_file
+from pansplat.system.files import SOFTWARE
 
-_MAX_SKIP = 48  # frames between two reads; a larger gap is skipped by seeking
 _ENCODERS = {
     ".mp4": ("libx264", "libopenh264", "mpeg4"),  # H.264 first: every browser and player supports it
     ".webm": ("libvpx-vp9", "libsvtav1", "libaom-av1"),  # VP9 first: it is faster to encode
 }
 VIDEO_SUFFIXES = tuple(_ENCODERS)
-
-
-@dataclass(frozen=True, eq=False)
-class VideoFile:
-    """A video file with the times of its frames. `read` decodes frames.
-
-    Attributes:
-        path: the file.
-        stamps: presentation time of each frame in units of the file, ascending.
-        width, height: pixels.
-    """
-
-    path: Path
-    stamps: tuple[int, ...]
-    width: int
-    height: int
-
-    def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
-        """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order."""
-        numbers = sorted(set(frames))
-        if not numbers:
-            return {}
-        if not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
-            raise InputError(
-                f"{self.path}: needed frames 0 to {len(self.stamps) - 1}, got {numbers[0]} to {numbers[-1]}."
-            )
-        found: dict[int, NDArray[np.uint8]] = {}
-        with _open_container(self.path) as container:
-            container.streams.video[0].thread_type = "AUTO"
-            gaps = np.flatnonzero(np.diff(numbers) > _MAX_SKIP)
-            for group in (part.tolist() for part in np.split(numbers, gaps + 1)):
-                found |= self._decode(container, group, self.stamps[group[0]])
-                missing = [frame for frame in group if frame not in found]
-                if missing:  # key frames of some files are wrong: decode from the start
-                    found |= self._decode(container, missing, self.stamps[0])
-        missing = [frame for frame in numbers if frame not in found]
-        if missing:
-            raise InputError(
-                f"{self.path}: needed {len(numbers)} frames, got none for {missing[:5]}: the file is damaged there; "
-                "copy or encode it again."
-            )
-        return found
-
-    def _decode(self, container: Any, frames: Sequence[int], seek_to: int) -> dict[int, NDArray[np.uint8]]:
-        """Pixels of the frames that are found from the key frame at or before the time `seek_to` on."""
-        from av.error import FFmpegError
-
-        numbers = {self.stamps[frame]: frame for frame in frames}
-        last = max(numbers)
-        found = {}
-        stream = container.streams.video[0]
-        try:
-            container.seek(seek_to, stream=stream)
-            for frame in container.decode(stream):
-                if frame.pts in numbers:
-                    found[numbers[frame.pts]] = frame.to_ndarray(format="rgb24")
-                if len(found) == len(numbers) or (frame.pts is not None and frame.pts > last):
-                    break
-        except FFmpegError as error:
-            raise InputError(f"{self.path}: needed readable frames, got '{error}'; copy or encode it again.") from error
-        return found
-
-
-def open_video(path: Path | str) -> VideoFile:
-    """A video file with the times of its frames, which are read from packets without decoding."""
-    path = Path(path)
-    with _open_container(path) as container:
-        from av.error import FFmpegError
-
-        if not container.streams.video:
-            raise InputError(f"{path}: needed a video, got a file without a video stream; give another file.")
-        stream = container.streams.video[0]
-        try:
-            packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
-        except FFmpegError as error:
-            raise InputError(f"{path}: needed a complete video, got '{error}'; copy it again.") from error
-        stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
-        if not stamps or len(stamps) != len(packets):
-            raise InputError(
-                f"{path}: needed a time for each frame, got {len(stamps)} times for {len(packets)} frames; write it "
-                "again as .mp4 (ffmpeg -i FILE -c:v libx264 -crf 12 video.mp4)."
-            )
-        return VideoFile(path, tuple(stamps), stream.width, stream.height)
-
-
-def _open_container(path: Path) -> Any:
-    import av
-    from av.error import FFmpegError
-
-    require_file(path, "a readable video file")
-    try:
-        return av.open(str(path))
-    except (OSError, FFmpegError) as error:
-        raise InputError(f"{path}: needed a readable video file, got '{error}'; check it.") from error
 
 
 def write_video(

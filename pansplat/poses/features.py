@@ -98,10 +98,6 @@ class Matches:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def best(self, count: int) -> Matches:
-        """The first `count` matches."""
-        return Matches(self.indices[:count], self.prior[:count])
-
     def joined(self, other: Matches) -> Matches:
         """These matches and those of `other`, sorted."""
         prior = np.concatenate((self.prior, other.prior))

@@ -22,7 +22,6 @@ from pansplat.images.blur_masks import blur_hidden, find_blur_mask, resize_hidde
 from pansplat.images.cube_images import CubeImage, CubeLevel, write_cube
 from pansplat.images.image_files import read_blur_mask, read_hidden, read_panorama, read_thumbnail, write_image
 from pansplat.images.rig_images import Lens
-from pansplat.images.video import write_video
 from pansplat.inputs.content import hash_context, hash_panorama
 from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.inputs.pairs import Pair, Panorama
@@ -305,15 +304,6 @@ def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
             load_pairs(folder)
         else:
             Pose(folder).run()
-
-
-@pytest.mark.parametrize("name", ["walk_blur.png", "Walk_Mask.PNG"])
-def test_a_mask_of_a_video_is_refused(tmp_path: Path, name: str) -> None:
-    frame = np.zeros((64, 128, 3), np.uint8)
-    write_video(tmp_path / "walk.mp4", iter([frame, frame]), 30)
-    _draw_mask(tmp_path / name)
-    with pytest.raises(InputError, match=rf"{name}: needed the name of a panorama before .* got '{name}'"):
-        Pose(tmp_path / "walk.mp4", tmp_path / "frames").run()
 
 
 def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:

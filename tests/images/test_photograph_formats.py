@@ -189,7 +189,10 @@ def test_dual_fisheye_pictures_are_named(tmp_path: Path, pixels: Array) -> None:
 
 def test_files_of_cameras_and_videos_name_what_to_do(tmp_path: Path) -> None:
     for name, message in (
-        ("walk.mp4", r"got the video walk\.mp4; `pansplat pose .*walk\.mp4 -o FOLDER` writes its key frames"),
+        (
+            "walk.mp4",
+            r"got the video walk\.mp4; write frames of it into a folder \(mkdir FOLDER; ffmpeg -i .*walk\.mp4",
+        ),
         ("IMG_1.insp", r"got IMG_1\.insp, which the program of its camera must stitch; export it as a 2:1 JPG"),
     ):
         (tmp_path / name).write_bytes(b"x")
