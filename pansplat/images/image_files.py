@@ -37,7 +37,15 @@ from pansplat.images.blur_masks import (
     widen_hidden,
 )
 from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage, read_cube
-from pansplat.images.panorama_metadata import SOFTWARE_XMP, Crop, find_crop, find_xmp, make_gpano_xmp, parse_gpano
+from pansplat.images.panorama_metadata import (
+    SOFTWARE_XMP,
+    Crop,
+    find_crop,
+    find_xmp,
+    make_gpano_xmp,
+    parse_gpano,
+    read_xmp,
+)
 from pansplat.images.rig_images import RIG_SUFFIX, RigImage, read_rig
 from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, read_file, require_file
@@ -140,6 +148,17 @@ def read_crop(path: Path) -> Crop | None:
         return None if is_assembled(path) else _read_shape(path)[2]
     except InputError:
         return None
+
+
+def find_stated_problem(path: Path) -> str | None:
+    """Why a picture is not a full equirectangular panorama, by its GPano properties; None if they state no reason."""
+    projection = parse_gpano(read_xmp(path)).get("ProjectionType", "equirectangular").strip()
+    if projection.lower() != "equirectangular":
+        return f"its projection is {projection!r} (GPano:ProjectionType); convert it to equirectangular"
+    crop = read_crop(path)
+    if crop is None or crop.degrees[0] == 360:  # above and below it is masked
+        return None
+    return f"it covers {crop.degrees[0]} of 360 degrees (GPano:CroppedArea); give the full panorama"
 
 
 def is_two_to_one(path: Path) -> bool:

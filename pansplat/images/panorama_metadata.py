@@ -93,7 +93,7 @@ def parse_gpano(xmp: bytes) -> dict[str, str]:
     return {name: attribute or element for name, attribute, element in found}
 
 
-def gpano_number(tags: dict[str, str], name: str) -> float | None:
+def _find_number(tags: dict[str, str], name: str) -> float | None:
     """A finite number among GPano properties; None if there is none."""
     try:
         value = float(tags[name])
@@ -129,7 +129,7 @@ def find_crop(tags: dict[str, str], width: int, height: int) -> Crop | None:
         "FullPanoWidthPixels", "FullPanoHeightPixels", "CroppedAreaImageWidthPixels", "CroppedAreaImageHeightPixels",
         "CroppedAreaLeftPixels", "CroppedAreaTopPixels",
     )  # fmt: skip
-    numbers = [gpano_number(tags, name) for name in names]
+    numbers = [_find_number(tags, name) for name in names]
     if any(number is None for number in numbers):
         return None
     full_width, full_height, part_width, part_height, left, top = (number or 0.0 for number in numbers)

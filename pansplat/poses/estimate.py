@@ -18,12 +18,12 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.images.image_files import read_height, read_mask, read_panorama
+from pansplat.images.image_files import find_stated_problem, read_height, read_mask, read_panorama
 from pansplat.images.masks import scene_mask_of_files
 from pansplat.inputs.pairs import FAR, NEAR, find_mask
 from pansplat.inputs.placements import Tie, find_holds
 from pansplat.inputs.views import CAMERA_HEIGHT
-from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes, with_hints
+from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap, estimate_depth
 from pansplat.poses.features import (
@@ -35,7 +35,6 @@ from pansplat.poses.features import (
     drop_repeated,
     match_features,
 )
-from pansplat.poses.hints import Hints, read_hints
 from pansplat.poses.learned import (
     LearnedFeatures,
     Matcher,
@@ -292,8 +291,7 @@ def estimate_poses(
                 f"`baseline` must be two different images and a distance above 0 to {_MAX_BASELINE:g} metres, got "
                 f"{' '.join(map(str, baseline))}"
             )
-    hints = [read_hints(path) for path in paths]
-    pixels, unplaced = _read_images(paths, names, hints)
+    pixels, unplaced = _read_images(paths, names)
     kept = [n for n in range(len(paths)) if n not in unplaced]
     if len(kept) < 2:
         raise _no_poses(paths, names, unplaced | {n: "no other panorama is left" for n in kept})
@@ -303,7 +301,7 @@ def estimate_poses(
         count = len(kept)
         split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
         with stage(split):
-            views = _describe_views(paths, files, pixels, hints, kept, cache)
+            views = _describe_views(paths, files, pixels, kept, cache)
         links = links or {}
         yaws = {
             (i, j): LinkDirections(links.get(paths[a], {}).get(paths[b]), links.get(paths[b], {}).get(paths[a]))
@@ -408,14 +406,14 @@ def _no_poses(
 
 
 def _read_images(
-    paths: Sequence[Path], names: Mapping[Path, str], hints: Sequence[Hints]
+    paths: Sequence[Path], names: Mapping[Path, str]
 ) -> tuple[dict[int, UInt8[Array, "height width"]], dict[int, str]]:
     """Grey panoramas by index, and the reasons against those that cannot be used."""
     pixels: dict[int, Array] = {}
     reasons: dict[int, str] = {}
     thumbnails: dict[int, Array] = {}
     for n, path in enumerate(paths):
-        problem = hints[n].problem
+        problem = find_stated_problem(path)
         if problem is not None:
             reasons[n] = problem
             continue
@@ -458,12 +456,9 @@ def _describe_views(
     paths: Sequence[Path],
     masks: Mapping[Path, Path | None],
     pixels: dict[int, Array],
-    hints: Sequence[Hints],
     kept: Sequence[int],
     cache: Store,
 ) -> list[_View]:
-    headings = {hints[n].heading for n in kept} - {None}
-    is_compass = len(headings) > 1  # one value for all pictures is a program's default
     hashes = {n: hash_parts(fingerprint_estimates(), pixels[n]) for n in kept}
     static = _find_scene_mask([paths[n] for n in kept], list(hashes.values()), cache)
     matcher = _load_matcher(len(kept))
@@ -477,14 +472,13 @@ def _describe_views(
         if not opaque.all():
             scene = scene & (cv2.resize(opaque.numpy().astype(np.uint8), scene.shape[::-1]) > 0)
         image = pixels_of_view.permute(1, 2, 0).numpy()
-        heading = hints[n].heading if is_compass else None
-        key = hash_parts(hashes[n], image, np.packbits(scene), f"{hints[n].down} {heading}")
-        return cache.get("view", key, lambda: describe(n, key, scene, image, heading))
+        key = hash_parts(hashes[n], image, np.packbits(scene))
+        return cache.get("view", key, lambda: describe(n, key, scene, image))
 
-    def describe(n: int, key: str, scene: Array, image: Array, heading: float | None) -> _View:
+    def describe(n: int, key: str, scene: Array, image: Array) -> _View:
         grey = pixels[n]
         small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
-        axes = with_hints(find_axes(grey), hints[n].down, heading)
+        axes = find_axes(grey)
         turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
         learned = None
         if matcher is not None:

@@ -15,7 +15,14 @@ from PIL import Image
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.images.image_files import read_height, read_panorama, read_size, read_thumbnail, write_image
+from pansplat.images.image_files import (
+    find_stated_problem,
+    read_height,
+    read_panorama,
+    read_size,
+    read_thumbnail,
+    write_image,
+)
 from pansplat.inputs.folders import load_pairs
 
 SIZE = 64
@@ -125,7 +132,7 @@ def _add_png_exif(path: Path, exif: bytes) -> None:
     path.write_bytes(data[:at] + chunk + data[at:])
 
 
-def _gpano(**tags: int) -> bytes:
+def _gpano(**tags: int | str) -> bytes:
     text = " ".join(f'GPano:{name}="{value}"' for name, value in tags.items())
     return (
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -158,6 +165,22 @@ def test_a_crop_is_put_into_its_panorama_and_the_rest_is_masked(tmp_path: Path, 
         InputError, match=r"needed a 2:1 .*pad a part of a panorama to 2:1, or state its place by GPano"
     ):
         load_pairs(tmp_path)
+
+
+def test_parts_of_the_horizon_and_other_projections_are_named_before_poses_are_estimated(tmp_path: Path) -> None:
+    part = {
+        "FullPanoWidthPixels": 256, "FullPanoHeightPixels": 128, "CroppedAreaImageWidthPixels": 192,
+        "CroppedAreaImageHeightPixels": 64, "CroppedAreaLeftPixels": 0, "CroppedAreaTopPixels": 0,
+    }  # fmt: skip
+    file = tmp_path / "a.jpg"
+    Image.new("RGB", (192, 64)).save(file, xmp=_gpano(**part))
+    assert "it covers 270 of 360 degrees" in str(find_stated_problem(file))
+    Image.new("RGB", (256, 64)).save(file, xmp=_gpano(**part | {"CroppedAreaImageWidthPixels": 256}))
+    assert find_stated_problem(file) is None, "what is above and below is masked"
+    Image.new("RGB", (8, 4)).save(file, xmp=_gpano(ProjectionType="cylindrical"))
+    assert "'cylindrical'" in str(find_stated_problem(file))
+    file.write_text("no picture")
+    assert find_stated_problem(file) is find_stated_problem(tmp_path / "none.jpg") is None
 
 
 def _fisheye(height: int, count: int) -> Array:
