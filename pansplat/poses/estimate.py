@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import itertools
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
@@ -17,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputError
 from pansplat.images.image_files import find_stated_problem, read_height, read_mask, read_panorama
 from pansplat.images.masks import scene_mask_of_files
 from pansplat.inputs.pairs import FAR, NEAR, find_mask
@@ -36,9 +34,9 @@ from pansplat.poses.features import (
     match_features,
 )
 from pansplat.poses.learned import (
+    NO_LEARNED,
     LearnedFeatures,
     Matcher,
-    MatcherMissingError,
     detect_learned,
     load_matcher,
     match_learned,
@@ -202,7 +200,7 @@ class _View:
     Attributes:
         features: by SIFT, of faces along the camera's axes.
         turned: the same, of faces turned against the walls.
-        learned: by the learned matcher, if it is installed.
+        learned: by the learned matcher.
         axes: gravity and walls.
         small: grey, for the search of the floor.
         surroundings: all that it shows, with estimated depth.
@@ -211,7 +209,7 @@ class _View:
 
     features: Features
     turned: Features
-    learned: LearnedFeatures | None
+    learned: LearnedFeatures
     axes: SceneAxes
     small: Float[Array, "height width"]
     surroundings: Surroundings
@@ -221,8 +219,6 @@ class _View:
     @functools.cached_property
     def matched(self) -> Features:
         """The features from which the pose of a pair is estimated."""
-        if self.learned is None:
-            return self.features
         count = len(self.learned)
         return self.features.joined(
             Features(
@@ -241,7 +237,9 @@ class _View:
     @functools.cached_property
     def mirrored(self) -> _View:
         """The view of the panorama that is mirrored left to right; its gravity and walls are not used."""
-        return replace(self, features=self.features.mirrored(), learned=None, surroundings=self.surroundings.mirrored())
+        return replace(
+            self, features=self.features.mirrored(), learned=NO_LEARNED, surroundings=self.surroundings.mirrored()
+        )
 
 
 @with_progress_bar
@@ -253,7 +251,6 @@ def estimate_poses(
     names: Mapping[Path, str] | None = None,
     camera_height: float = CAMERA_HEIGHT,
     baseline: tuple[Path | str, Path | str, float] | None = None,
-    seed: int = 0,
     cache_folder: Path | None = None,
 ) -> PoseEstimate:
     """Camera poses of two or more equirectangular panoramas of one home or site.
@@ -265,7 +262,6 @@ def estimate_poses(
         names: of the images, for messages; by default those of the files.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images of the largest group and their distance in metres, instead of the camera's height.
-        seed: of the random samples.
         cache_folder: folder whose cache keeps features and relative poses, so that a further panorama costs its own
             only; none by default.
 
@@ -299,16 +295,17 @@ def estimate_poses(
         files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
         cache = Store(cache_folder, _CACHED)
         count = len(kept)
+        matcher = load_matcher(choose_device("learned matcher", count * _MATCHER_SECONDS))
         split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
         with stage(split):
-            views = _describe_views(paths, files, pixels, kept, cache)
+            views = _describe_views(paths, files, pixels, kept, matcher, cache)
         links = links or {}
         yaws = {
             (i, j): LinkDirections(links.get(paths[a], {}).get(paths[b]), links.get(paths[b], {}).get(paths[a]))
             for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
         }
         with stage(0.9):
-            relations = _relate_views(views, yaws, seed, cache)
+            relations = _relate_views(views, yaws, matcher, cache)
     report_progress("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
@@ -457,11 +454,11 @@ def _describe_views(
     masks: Mapping[Path, Path | None],
     pixels: dict[int, Array],
     kept: Sequence[int],
+    matcher: Matcher,
     cache: Store,
 ) -> list[_View]:
     hashes = {n: hash_parts(fingerprint_estimates(), pixels[n]) for n in kept}
     static = _find_scene_mask([paths[n] for n in kept], list(hashes.values()), cache)
-    matcher = _load_matcher(len(kept))
 
     def look_up(n: int) -> _View:
         mask = masks.get(paths[n])
@@ -480,9 +477,7 @@ def _describe_views(
         small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
         axes = find_axes(grey)
         turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
-        learned = None
-        if matcher is not None:
-            learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
+        learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
         shown = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
         depth = estimate_depth(shown, axes.axes[0] if axes.has_down else None)
         surroundings = Surroundings(shown, depth)
@@ -530,7 +525,7 @@ def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: Store)
 
 
 def _relate_views(
-    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], seed: int, cache: Store
+    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], matcher: Matcher, cache: Store
 ) -> dict[IndexPair, RelativePose]:
     """Relative poses of the pairs that have most in common, and of those that links connect.
 
@@ -550,13 +545,11 @@ def _relate_views(
             chosen |= set(own[:_THOROUGH])
         pairs = sorted(chosen, key=lambda pair: (-overlap[pair], pair))
 
-    matcher = None if views[0].learned is None else _load_matcher(len(views))
-
     def relate(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
         matches = _match(first, second, matcher)
         prior = RotationPrior(first.axes, second.axes)
-        relation = _estimate_pair(first, second, matches, prior, links[pair], seed)
+        relation = _estimate_pair(first, second, matches, prior, links[pair])
         if not (relation.is_reliable or relation.is_doubtful):
             return relation
         if relation.is_reliable and _is_mirrored(first, second, overlap.get(pair), relation):
@@ -569,7 +562,7 @@ def _relate_views(
 
     def look_up(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
-        key = hash_parts(first.key, second.key, f"{links[pair]} {seed}")
+        key = hash_parts(first.key, second.key, f"{links[pair]}")
         return cache.get("pair", key, lambda: relate(pair))
 
     groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
@@ -597,30 +590,17 @@ def _relate_views(
 
 def fingerprint_estimates() -> str:
     """A hash of the code and of the weights that poses are estimated by."""
-    files = list_default_weights()
-    with contextlib.suppress(MatcherMissingError):
-        files.append(default_matcher())
-    return hash_parts(hash_sources(__name__), *(hash_file(file) for file in files if file.is_file()))
+    files = *list_default_weights(), default_matcher()
+    return hash_parts(hash_sources(__name__), *map(hash_file, files))
 
 
-def _load_matcher(count: int) -> Matcher | None:
-    """The learned matcher for some panoramas; None, with a warning, if its weights are not installed."""
-    try:
-        return load_matcher(device=choose_device("learned matcher", count * _MATCHER_SECONDS))
-    except MatcherMissingError as error:
-        warnings.warn(f"poses are estimated by SIFT alone: {error}.", InputWarning, stacklevel=2)
-        return None
-
-
-def _match(first: _View, second: _View, matcher: Matcher | None) -> Matches:
+def _match(first: _View, second: _View, matcher: Matcher) -> Matches:
     """Matches of `matched` features: by SIFT, and by the learned matcher where those hardly suffice."""
     matches = match_features(first.features, second.features)
-    if matcher is None or first.learned is None or second.learned is None:
-        return matches
     if matches.prior[matches.prior > _COUNTED_PRIOR].sum() > _ENOUGH_SIFT_MATCHES:
         return matches
     found = match_learned(matcher, first.learned, second.learned)
-    learned = Matches(found.indices, np.minimum(found.probability, _LEARNED_PRIOR))
+    learned = Matches(found.indices, np.minimum(found.prior, _LEARNED_PRIOR))
     every = matches.joined(learned.shifted(len(first.features), len(second.features)))
     return drop_repeated(first.matched, second.matched, every)
 
@@ -631,11 +611,10 @@ def _estimate_pair(
     matches: Matches,
     prior: RotationPrior = NO_PRIOR,
     links: LinkDirections = NO_LINKS,
-    seed: int = 0,
 ) -> RelativePose:
     """The relative pose of two views."""
     surroundings = first.surroundings, second.surroundings
-    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, links, seed=seed)
+    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, links)
 
 
 def _describe_mirrored(view: int, views: Sequence[_View], placed: Sequence[int], names: Sequence[str]) -> str | None:
