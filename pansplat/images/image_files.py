@@ -31,7 +31,7 @@ from pansplat.images.blur_masks import (
     MASK_SUFFIX,
     blur_hidden,
     find_blur_mask,
-    find_masks_beside,
+    find_mask_beside,
     locate_panorama,
     resize_hidden,
     widen_hidden,
@@ -264,28 +264,15 @@ def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height wid
     return resize_panorama(_decode_panorama(path, height, reduced=find_blur_mask(path) is None).color, height)
 
 
-def find_masks(path: Path, kind: str) -> dict[Path, Path]:
-    """The masks of a panorama, and of the pictures that it is joined from, by the files of these.
-
-    A picture of six faces has the panorama's name: its mask is the panorama's if it is 2:1.
-    """
-    place, pictures = locate_panorama(path), list[Path]()
-    if is_assembled(path):
-        parts = _read_assembled(path)
-        pictures = list(parts.list_files() if isinstance(parts, CubeImage) else (view.file for view in parts.views))
-    found, own = find_masks_beside(pictures, kind), find_masks_beside([place], kind).get(place)
-    if own is None or (own in found.values() and not is_two_to_one(own)):
-        return found
-    return {path: own} | {picture: mask for picture, mask in found.items() if mask != own}
-
-
 def list_masks(path: Path, *, check: bool = False) -> list[Path]:
-    """The files of all masks of a panorama, and of the pictures that it is joined from."""
-    found = [item for kind in (BLUR_SUFFIX, MASK_SUFFIX) for item in find_masks(path, kind).items()]
-    for picture, mask in found if check else ():
-        _require_fit(mask, read_size(mask), read_size(picture))
+    """The files of the blur mask and of the scene mask of a panorama."""
+    place = locate_panorama(path)
+    found = [find_mask_beside(place, kind) for kind in (BLUR_SUFFIX, MASK_SUFFIX)]
+    masks = [mask for mask in found if mask is not None]
+    for mask in masks if check else ():
+        _require_fit(mask, read_size(mask), read_size(path))
         require_complete(mask)
-    return [mask for _, mask in found]
+    return masks
 
 
 def _require_fit(mask: Path, size: tuple[int, int], picture: tuple[int, int]) -> None:
@@ -297,44 +284,16 @@ def _require_fit(mask: Path, size: tuple[int, int], picture: tuple[int, int]) ->
         )
 
 
-def read_hidden(path: Path, height: int, kind: str = BLUR_SUFFIX) -> Bool[Array, "height width"]:
-    """What the blur masks of a panorama and of its pictures hide, at (height, 2 height), without the margin.
-
-    With the kind `MASK_SUFFIX`, what the scene masks of its pictures mask. An InputError if a mask cannot be used.
-    """
-    masks = find_masks(path, kind)
-    own = masks.pop(path, None)
-    hidden = np.zeros((height, 2 * height), bool)
-    if own is not None and kind == BLUR_SUFFIX:
-        hidden = read_blur_mask(own, height)
-        if hidden.all():
-            raise InputError(f"{own}: needed a blur mask with black where the panorama is shown, got white only.")
-    if not masks:
-        return hidden
-
-    def decode(file: Path) -> UInt8[Array, "rows columns 3"]:
-        width, rows = read_size(file)
-        part = read_blur_mask(masks[file], rows, width, kind) if file in masks else np.zeros((rows, width), bool)
-        return np.where(part[..., None], np.uint8(255), np.uint8(0)).repeat(3, axis=2)
-
-    parts = _read_assembled(path)
-    for level in parts.levels if isinstance(parts, CubeImage) else (None,):  # a mask of a tile covers it at all levels
-        one = parts if level is None else dataclasses.replace(parts, levels=(level,))
-        hidden = hidden | (one.read(height, decode)[0].max(axis=2) > 0)
-    return hidden
-
-
-def read_blur_mask(
-    mask: Path, height: int, width: int | None = None, kind: str = BLUR_SUFFIX
-) -> Bool[Array, "height width"]:
-    """A mask at (height, width), 2:1 by default: each pixel that its white touches, or its black if of another kind."""
-    decoded, width = _decode(mask), 2 * height if width is None else width
-    _require_fit(mask, decoded.color.shape[1::-1], (width, height))
-    grey = decoded.color.astype(np.float32).mean(axis=2) / (255 if decoded.color.dtype == np.uint8 else 1)
-    hidden = grey >= 0.5 if kind == BLUR_SUFFIX else grey < 0.5
-    if kind == BLUR_SUFFIX and decoded.alpha is not None:
+def read_blur_mask(mask: Path, height: int) -> Bool[Array, "height width"]:
+    """A blur mask at (height, 2 height), without the margin: each pixel that its white touches."""
+    decoded = _decode(mask)
+    _require_fit(mask, decoded.color.shape[1::-1], (2 * height, height))
+    hidden = decoded.color.astype(np.float32).mean(axis=2) / (255 if decoded.color.dtype == np.uint8 else 1) >= 0.5
+    if decoded.alpha is not None:
         hidden &= decoded.alpha >= 0.5
-    return resize_hidden(hidden, height, width)
+    if hidden.all():
+        raise InputError(f"{mask}: needed a blur mask with black where the panorama is shown, got white only.")
+    return resize_hidden(hidden, height, 2 * height)
 
 
 def read_pixels(path: Path) -> UInt8[Array, "rows columns 3"]:
@@ -544,12 +503,11 @@ def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) ->
     path = Path(path)
     _check_height(height)
     decoded = _decode_shown(path, height, reduced=reduced)
-    hidden = read_hidden(path, decoded.color.shape[0])
-    if not hidden.any():
+    mask = find_blur_mask(path)
+    if mask is None:
         return decoded
-    hidden = widen_hidden(hidden)
+    hidden = widen_hidden(read_blur_mask(mask, decoded.color.shape[0]))
     if hidden.mean() > 0.5:
-        mask = next(iter(find_masks(path, BLUR_SUFFIX).values()))
         warnings.warn(
             f"{mask}: {100 * hidden.mean():.0f}% of the photograph is blurred; white is blurred, black is shown.",
             category=InputWarning,
@@ -559,20 +517,9 @@ def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) ->
 
 
 def _decode_shown(path: Path, height: int, *, reduced: bool) -> _DecodedImage:
-    """Pixels of a 2:1 image file as they are; of single pictures without what their blur masks hide."""
+    """Pixels of a panorama as they are."""
     if is_assembled(path):
-        masks = find_masks(path, BLUR_SUFFIX)
-
-        def decode(file: Path) -> UInt8[Array, "rows columns 3"]:
-            pixels = read_pixels(file)
-            if file not in masks:
-                return pixels
-            return np.where(read_blur_mask(masks[file], *pixels.shape[:2])[..., None], np.uint8(0), pixels)
-
-        color, shown = _read_assembled(path).read(height, decode)
-        masked = read_hidden(path, height, MASK_SUFFIX)
-        if masked.any():
-            shown = np.float32(~masked) if shown is None else shown * ~masked
+        color, shown = _read_assembled(path).read(height, read_pixels)
         return _DecodedImage(color, shown, hole="is in no picture; these pixels are masked")
     crop = read_crop(path)
     decoded = _decode(path, height if reduced and crop is None else None)

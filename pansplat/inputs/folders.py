@@ -112,26 +112,31 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
             raise InputError(f"{image}: needed a panorama, got the mask of another by its name; rename or remove it.")
     folders = dict.fromkeys(_list_folders(root, _MAX_DEPTH) if root.is_dir() else [root.parent])
     read: set[Path] = set()  # pictures
+    parts: set[Path] = set()  # of them, those that panoramas are joined from
     used: set[Path] = set()
     names: dict[str, Path] = {}  # pictures by their names
     for image, view in views.items():
-        places = *list_pictures(image), locate_panorama(image)
+        pictures, place = list_pictures(image), locate_panorama(image)
+        parts |= {picture.resolve() for picture in pictures} - {image.resolve()}
+        places = *pictures, place
         read |= {picture.resolve() for picture in places}
         folders |= dict.fromkeys(folder for file in places for folder in (file.parent, file.resolve().parent))
         used |= {mask.resolve() for mask in (view.mask, *list_masks(image, check=True)) if mask is not None}
-        names[fold_name(view.name)] = places[-1]
+        names[fold_name(view.name)] = place
+    used |= parts  # among them are masks of perspective pictures
     listed = ((folder, name) for folder in folders for name in sorted(next(os.walk(folder), ("", [], []))[2]))
     files = [folder / name for folder, name in listed if not (name.startswith(".") or is_scene_file(name))]
     masks = {file: name for file in files if (name := split_mask_name(file)) and file.resolve() not in used}
     pictures = [file for file in files if file.suffix.lower() in _PICTURES and not split_mask_name(file)]
-    names |= {fold_name(picture.stem): picture for picture in pictures}
+    names |= {fold_name(picture.stem): picture for picture in pictures if picture.resolve() not in parts}
     for mask, (stem, kind) in masks.items():
         own = [
             file for file in pictures if file.parent == mask.parent and fold_name(stem) in ("", fold_name(file.stem))
         ]
         is_named = bool(own) or (mask.parent == root and not stem)
         # Pictures that are not read have masks, too, and poses.json may state another mask of the scene.
-        is_spare = kind == MASK_SUFFIX or (stem and read.isdisjoint(file.resolve() for file in own))
+        shown = parts if kind == MASK_SUFFIX else read
+        is_spare = (stem or kind == MASK_SUFFIX) and shown.isdisjoint(file.resolve() for file in own)
         if (is_named and is_spare and mask.suffix.lower() == ".png") or not (
             is_named or mask.suffix.lower() in _PICTURES
         ):
