@@ -37,15 +37,7 @@ from pansplat.images.blur_masks import (
     widen_hidden,
 )
 from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage, read_cube
-from pansplat.images.panorama_metadata import (
-    SOFTWARE_XMP,
-    Crop,
-    find_crop,
-    find_xmp,
-    make_gpano_xmp,
-    parse_gpano,
-    read_xmp,
-)
+from pansplat.images.panorama_metadata import SOFTWARE_XMP, find_stated_problem, find_xmp, make_gpano_xmp
 from pansplat.images.rig_images import RIG_SUFFIX, RigImage, read_rig
 from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, read_file, require_file
@@ -110,8 +102,8 @@ def read_panorama(
     (`pansplat.images.blur_masks`) is blurred before.
 
     Args:
-        path: JPG, PNG and TIFF (8 or 16 bit), WebP, HEIC or EXR file, 2:1 or a crop with GPano properties; or a file
-            that stands for cube faces or perspective pictures (pansplat.images.cube_images, .rig_images).
+        path: JPG, PNG and TIFF (8 or 16 bit), WebP, HEIC or EXR file, 2:1; or a file that stands for cube faces or
+            perspective pictures (pansplat.images.cube_images, .rig_images).
         height: pixels.
     """
     decoded = _decode_panorama(path, height)
@@ -133,32 +125,12 @@ def read_height(path: Path | str) -> int:
 
 
 def read_size(path: Path | str) -> tuple[int, int]:
-    """Width and height of an image file, pixels, of a crop those of the full panorama; see `read_height`."""
+    """Width and height of an image file, pixels; see `read_height`."""
     path = Path(path)
     if is_assembled(path):
         height = _read_assembled(path).height
         return 2 * height, height
-    width, height, crop = _read_shape(path)
-    return (width, height) if crop is None else (2 * crop.height, crop.height)
-
-
-def read_crop(path: Path) -> Crop | None:
-    """The place of a picture in its full panorama, by its GPano properties; None if it is one, or cannot be read."""
-    try:
-        return None if is_assembled(path) else _read_shape(path)[2]
-    except InputError:
-        return None
-
-
-def find_stated_problem(path: Path) -> str | None:
-    """Why a picture is not a full equirectangular panorama, by its GPano properties; None if they state no reason."""
-    projection = parse_gpano(read_xmp(path)).get("ProjectionType", "equirectangular").strip()
-    if projection.lower() != "equirectangular":
-        return f"its projection is {projection!r} (GPano:ProjectionType); convert it to equirectangular"
-    crop = read_crop(path)
-    if crop is None or crop.degrees[0] == 360:  # above and below it is masked
-        return None
-    return f"it covers {crop.degrees[0]} of 360 degrees (GPano:CroppedArea); give the full panorama"
+    return _read_shape(path)[:2]
 
 
 def is_two_to_one(path: Path) -> bool:
@@ -170,8 +142,8 @@ def is_two_to_one(path: Path) -> bool:
     return width == 2 * height
 
 
-def _read_shape(path: Path) -> tuple[int, int, Crop | None]:
-    """Width and height of an image file as it is, and its crop."""
+def _read_shape(path: Path) -> tuple[int, int, str | None]:
+    """Width and height of an image file, and what it is by its metadata instead of a full panorama."""
     require_file(path, "a readable image file")
     try:
         with open(path, "rb") as file:
@@ -184,11 +156,18 @@ def _read_shape(path: Path) -> tuple[int, int, Crop | None]:
             is_done = image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info)
             if not is_done and image.getexif().get(_ORIENTATION) in _TURNED:
                 size = size[::-1]
-            return (*size, find_crop(parse_gpano(find_xmp(image)), *size))
+            return (*size, find_stated_problem(find_xmp(image), *size))
     except (*_DAMAGED, Image.DecompressionBombError) as error:
         if isinstance(error, InputError):
             raise
         return (*_open_with_pillow(path, _read_bytes(path), load=False).size, None)  # its error names the reason
+
+
+def _require_full(path: Path) -> None:
+    """Check that the metadata of an image file do not state that it is no full panorama."""
+    problem = _read_shape(path)[2]
+    if problem is not None:
+        raise InputError(f"{path}: needed a full equirectangular panorama, got {problem}.")
 
 
 def _list_formats(path: Path, head: bytes) -> tuple[str, ...]:
@@ -235,7 +214,10 @@ def require_complete(path: Path | str) -> None:
 
 def require_panorama(path: Path | str) -> None:
     """Check that a file is a 2:1 image that is not damaged (`require_complete`)."""
-    require_two_to_one(Path(path), *read_size(path))
+    path = Path(path)
+    if not is_assembled(path):
+        _require_full(path)
+    require_two_to_one(path, *read_size(path))
     require_complete(path)
 
 
@@ -484,7 +466,7 @@ def _advise_on_shape(width: int, height: int) -> str:
             "program of its camera; of a stereo panorama give the upper half"
         )
     if width > 2 * height:
-        return "pad a part of a panorama to 2:1, or state its place by GPano properties (exiftool)"
+        return "pad a part of a panorama to 2:1"
     return "crop or resample it first"
 
 
@@ -521,10 +503,8 @@ def _decode_shown(path: Path, height: int, *, reduced: bool) -> _DecodedImage:
     if is_assembled(path):
         color, shown = _read_assembled(path).read(height, read_pixels)
         return _DecodedImage(color, shown, hole="is in no picture; these pixels are masked")
-    crop = read_crop(path)
-    decoded = _decode(path, height if reduced and crop is None else None)
-    if crop is not None:
-        return _pad_crop(decoded, crop)
+    _require_full(path)
+    decoded = _decode(path, height if reduced else None)
     require_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
     if _is_dual_fisheye(decoded.color):
         raise InputError(
@@ -532,18 +512,6 @@ def _decode_shown(path: Path, height: int, *, reduced: bool) -> _DecodedImage:
             "its camera, or by ffmpeg -i IN -vf v360=dfisheye:e:ih_fov=190:iv_fov=190 OUT."
         )
     return decoded
-
-
-def _pad_crop(decoded: _DecodedImage, crop: Crop) -> _DecodedImage:
-    """The full panorama of a crop; what it does not show has no alpha."""
-    rows, columns = decoded.color.shape[:2]
-    place = slice(crop.top, crop.top + rows), slice(crop.left, crop.left + columns)
-    color = np.zeros((crop.height, 2 * crop.height, 3), decoded.color.dtype)
-    alpha = np.zeros(color.shape[:2], np.float32)
-    color[place] = decoded.color
-    alpha[place] = 1 if decoded.alpha is None else decoded.alpha
-    hole = f"is masked: it covers {crop.degrees[0]} x {crop.degrees[1]} degrees (GPano)"
-    return _DecodedImage(color, alpha, hole)
 
 
 def _is_dual_fisheye(color: NDArray[Any]) -> bool:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
 from pansplat.errors import InputError
-from pansplat.images.image_files import find_stated_problem, read_height, read_mask, read_panorama
+from pansplat.images.image_files import read_height, read_mask, read_panorama
 from pansplat.images.masks import scene_mask_of_files
 from pansplat.inputs.pairs import FAR, NEAR, find_mask
 from pansplat.inputs.placements import Tie, find_holds
@@ -410,10 +410,6 @@ def _read_images(
     reasons: dict[int, str] = {}
     thumbnails: dict[int, Array] = {}
     for n, path in enumerate(paths):
-        problem = find_stated_problem(path)
-        if problem is not None:
-            reasons[n] = problem
-            continue
         try:
             image = read_panorama(path, _working_height(path))[0].numpy()
         except InputError as error:

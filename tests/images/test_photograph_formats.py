@@ -16,8 +16,6 @@ from PIL import Image
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.images.image_files import (
-    find_stated_problem,
-    read_height,
     read_panorama,
     read_size,
     read_thumbnail,
@@ -141,46 +139,34 @@ def _gpano(**tags: int | str) -> bytes:
 
 
 @pytest.mark.parametrize("resized", [1, 2])
-def test_a_crop_is_put_into_its_panorama_and_the_rest_is_masked(tmp_path: Path, resized: int) -> None:
-    pixels = _pixels(128)
-    top, bottom = 20, 100
+def test_parts_of_panoramas_and_other_projections_are_refused_by_what_they_state(tmp_path: Path, resized: int) -> None:
     tags = {
         "FullPanoWidthPixels": 256, "FullPanoHeightPixels": 128, "CroppedAreaImageWidthPixels": 256,
-        "CroppedAreaImageHeightPixels": bottom - top, "CroppedAreaLeftPixels": 0, "CroppedAreaTopPixels": top,
+        "CroppedAreaImageHeightPixels": 80, "CroppedAreaLeftPixels": 0, "CroppedAreaTopPixels": 20,
     }  # fmt: skip
-    picture = Image.fromarray(pixels[top:bottom])
-    picture = picture.resize((256 // resized, (bottom - top) // resized), Image.Resampling.BOX)
-    picture.save(tmp_path / "a.jpg", xmp=_gpano(**tags), quality=98, subsampling=0)
-    assert read_height(tmp_path / "a.jpg") == 128 // resized
-    (pair,) = load_pairs(tmp_path)
-    with pytest.warns(InputWarning, match=r"a\.jpg: 37\.5% of the image is masked: it covers 360 x 112 degrees"):
-        views = pair.load_context(64)
-    shown = views.masks[0].numpy()
-    assert not shown[:10].any() and shown[10:50].all() and not shown[50:].any()
-    image = views.images[0].permute(1, 2, 0).numpy() * 255
-    assert np.abs(image - _pixels(64))[12:48].max() < 6
-    tags["CroppedAreaImageHeightPixels"] = 128  # contradicts the picture
-    picture.save(tmp_path / "a.jpg", xmp=_gpano(**tags))
-    with pytest.raises(
-        InputError, match=r"needed a 2:1 .*pad a part of a panorama to 2:1, or state its place by GPano"
+    file, picture = tmp_path / "a.jpg", Image.new("RGB", (256 // resized, 80 // resized))
+    picture.save(file, xmp=_gpano(**tags))
+    half = tags | {"CroppedAreaImageWidthPixels": 128, "CroppedAreaImageHeightPixels": 64}
+    Image.new("RGB", (128, 64)).save(tmp_path / "b.jpg", xmp=_gpano(**half))  # is 2:1, too
+    Image.new("RGB", (128, 64)).save(tmp_path / "c.jpg", xmp=_gpano(ProjectionType="cylindrical"))
+    for name, problem in (
+        ("a", r"360 x 112 degrees of 360 x 180 \(GPano\); pad it to 2:1, and mask the rest"),
+        ("b", r"180 x 90 degrees of 360 x 180"),
+        ("c", r"the projection 'cylindrical' \(GPano:ProjectionType\); convert it"),
     ):
-        load_pairs(tmp_path)
+        for read in (load_pairs, lambda path: read_panorama(path, 16), lambda path: read_thumbnail(path, 16)):
+            with pytest.raises(
+                InputError, match=rf"{name}\.jpg: needed a full equirectangular panorama, got {problem}"
+            ):
+                read(tmp_path / f"{name}.jpg")
 
 
-def test_parts_of_the_horizon_and_other_projections_are_named_before_poses_are_estimated(tmp_path: Path) -> None:
-    part = {
-        "FullPanoWidthPixels": 256, "FullPanoHeightPixels": 128, "CroppedAreaImageWidthPixels": 192,
-        "CroppedAreaImageHeightPixels": 64, "CroppedAreaLeftPixels": 0, "CroppedAreaTopPixels": 0,
-    }  # fmt: skip
-    file = tmp_path / "a.jpg"
-    Image.new("RGB", (192, 64)).save(file, xmp=_gpano(**part))
-    assert "it covers 270 of 360 degrees" in str(find_stated_problem(file))
-    Image.new("RGB", (256, 64)).save(file, xmp=_gpano(**part | {"CroppedAreaImageWidthPixels": 256}))
-    assert find_stated_problem(file) is None, "what is above and below is masked"
-    Image.new("RGB", (8, 4)).save(file, xmp=_gpano(ProjectionType="cylindrical"))
-    assert "'cylindrical'" in str(find_stated_problem(file))
-    file.write_text("no picture")
-    assert find_stated_problem(file) is find_stated_problem(tmp_path / "none.jpg") is None
+def test_metadata_that_contradict_the_picture_or_are_no_numbers_count_for_nothing(tmp_path: Path) -> None:
+    tags = {"FullPanoWidthPixels": 256, "FullPanoHeightPixels": 128, "CroppedAreaImageWidthPixels": 256}
+    for height in (80, "many", "nan", 0):
+        packet = _gpano(**tags, CroppedAreaImageHeightPixels=height)
+        Image.new("RGB", (128, 64)).save(tmp_path / "a.jpg", xmp=packet)
+        assert read_panorama(tmp_path / "a.jpg", 16)[0].shape == (3, 16, 32)
 
 
 def _fisheye(height: int, count: int) -> Array:
