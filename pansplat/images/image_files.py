@@ -43,16 +43,16 @@ from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, read_file, require_file
 
 WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
-READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff", ".heic", ".heif")
+READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff")
 
 _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
-_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MAX_BYTES = 1 << 31  # of a file
 _MAX_PIXELS = 178_956_970  # of Pillow: twice Image.MAX_IMAGE_PIXELS
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _JPEG_MAGIC, _JPEG_END, _PNG_MAGIC = b"\xff\xd8", b"\xff\xd9", b"\x89PNG"
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # panoramas of 100 megapixels are normal
+logging.getLogger("PIL").setLevel(logging.CRITICAL)  # a damaged file is an error of one line
 _TAIL = 4096  # bytes at the end of a file that are read to find the end of a JPEG
 _ORIENTATION, _TURNED = 0x0112, (5, 6, 7, 8)  # tag of EXIF, and its values for a quarter turn
 _ORIENT = {
@@ -102,7 +102,7 @@ def read_panorama(
     (`pansplat.images.blur_masks`) is blurred before.
 
     Args:
-        path: JPG, PNG and TIFF (8 or 16 bit), WebP, HEIC or EXR file, 2:1; or a file that stands for cube faces or
+        path: JPG, PNG and TIFF (8 or 16 bit), WebP or EXR file, 2:1; or a file that stands for cube faces or
             perspective pictures (pansplat.images.cube_images, .rig_images).
         height: pixels.
     """
@@ -147,10 +147,10 @@ def _read_shape(path: Path) -> tuple[int, int, str | None]:
     require_file(path, "a readable image file")
     try:
         with open(path, "rb") as file:
-            head = file.read(32)
+            head = file.read(len(_EXR_MAGIC))
         if head.startswith(_EXR_MAGIC):
             return (*_exr_size(path), None)
-        with Image.open(path, formats=_list_formats(path, head)) as image:
+        with Image.open(path, formats=_PILLOW_FORMATS) as image:
             size = image.size
             # Pillow would decode the pixels of a PNG to look for EXIF behind them, and turns the size of a TIFF itself.
             is_done = image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info)
@@ -168,22 +168,6 @@ def _require_full(path: Path) -> None:
     problem = _read_shape(path)[2]
     if problem is not None:
         raise InputError(f"{path}: needed a full equirectangular panorama, got {problem}.")
-
-
-def _list_formats(path: Path, head: bytes) -> tuple[str, ...]:
-    """Pillow's names of the formats of a file that starts with some bytes."""
-    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # a damaged file is an error of one line
-    if head[4:8] != b"ftyp" or head[8:12] not in _HEIF_BRANDS:
-        return _PILLOW_FORMATS
-    try:
-        import pillow_heif
-    except ImportError as error:
-        raise InputError(
-            f"{path}: needed pillow-heif to read HEIC, got no such package; install it (pip install pillow-heif), or "
-            "convert the picture to JPG."
-        ) from error
-    pillow_heif.register_heif_opener()
-    return ("HEIF",)
 
 
 def is_assembled(path: Path) -> bool:
@@ -555,7 +539,7 @@ def _open_with_pillow(
         orient: whether the orientation of EXIF is applied.
     """
     try:
-        image = Image.open(io.BytesIO(data), formats=_list_formats(path, data[:32]))
+        image = Image.open(io.BytesIO(data), formats=_PILLOW_FORMATS)
         if at_least is not None:
             image.draft("RGB", (2 * at_least, at_least))
         if load:
@@ -567,7 +551,7 @@ def _open_with_pillow(
                 f"{path}: needed a complete image, got damaged or truncated data; copy or export it again."
             ) from error
         raise InputError(
-            f"{path}: needed a JPG, PNG, TIFF, WebP, HEIC or EXR image, got an unknown format "
+            f"{path}: needed a JPG, PNG, TIFF, WebP or EXR image, got an unknown format "
             f"(it starts with {data[:8]!r}); convert it."
         ) from error
     except Image.DecompressionBombError as error:
@@ -575,8 +559,6 @@ def _open_with_pillow(
         raise InputError(
             f"{path}: needed at most {megapixels:.0f} megapixels ({2 * rows}x{rows}), got more ({error}); shrink it."
         ) from error
-    except InputError:
-        raise
     except _DAMAGED as error:
         raise InputError(
             f"{path}: needed a complete image, got damaged or truncated data ({error}); copy or export it again."

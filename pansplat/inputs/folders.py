@@ -26,6 +26,7 @@ from pansplat.system.options import CAMERA_HEIGHT
 
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
 _RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
+_UNREAD_SUFFIXES = (*_VIDEO_SUFFIXES, *_RAW_SUFFIXES, ".heic", ".heif")
 _TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # that may hold poses
 _PICTURES = (*READABLE_SUFFIXES, ".bmp", ".gif")  # that may be masks
 
@@ -160,7 +161,7 @@ def _list_folders(folder: Path, depth: int) -> Iterator[Path]:
 
 def _read_file(file: Path, convention: str | None, posed: bool) -> list[Collection]:
     """The panorama of a picture, those of a triplet or web tour, or those of the folder of another file with poses."""
-    if file.suffix.lower() in (*_VIDEO_SUFFIXES, *_RAW_SUFFIXES):
+    if file.suffix.lower() in _UNREAD_SUFFIXES:
         raise InputError(f"{file}: needed panoramas, got {_advise_on_file(file)}.")
     folder = file.parent
     if file.suffix.lower() in READABLE_SUFFIXES:
@@ -345,7 +346,7 @@ def _is_export(folder: Path) -> bool:
 
 def _nothing_found(root: Path) -> InputError:
     inside = [folder for folder in find_panorama_folders(root) if folder != root]
-    others = [file for file in sorted(root.iterdir()) if file.suffix.lower() in (*_VIDEO_SUFFIXES, *_RAW_SUFFIXES)]
+    others = [file for file in sorted(root.iterdir()) if file.suffix.lower() in _UNREAD_SUFFIXES]
     tables = [file for file in sorted(root.iterdir()) if file.suffix.lower() in _TABLE_SUFFIXES and file.is_file()]
     if inside:
         got = f"some without poses in {list_first([str(folder.relative_to(root)) for folder in inside])}; "
@@ -357,16 +358,18 @@ def _nothing_found(root: Path) -> InputError:
             "none; " if not tables else f"none, and {list_first([file.name for file in tables])}, of no known format; "
         )
         advice = "give the folder that holds the pictures; docs/input.md lists the formats of poses"
-    return InputError(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP, HEIC or EXR), got {got}{advice}.")
+    return InputError(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP or EXR), got {got}{advice}.")
 
 
 def _advise_on_file(file: Path) -> str:
-    """What a video or a file of a camera is, and what to do with it."""
+    """What a video or a file of a camera or phone is, and what to do with it."""
     if file.suffix.lower() in _VIDEO_SUFFIXES:
         return (
             f"the video {file.name}; write frames of it into a folder (mkdir FOLDER; ffmpeg -i {file} -vf fps=1 "
             "FOLDER/%03d.png), and open FOLDER"
         )
+    if file.suffix.lower() not in _RAW_SUFFIXES:
+        return f"{file.name}; convert it to JPG"
     return f"{file.name}, which the program of its camera must stitch; export it as a 2:1 JPG"
 
 

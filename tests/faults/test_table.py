@@ -324,7 +324,7 @@ FILES = [
     Fault("a folder without a suffix as a scene", "info pair", says="pair: needed a scene file, got a folder"),
     *(Fault(f"a file that has no poses: {name}", f"check {name}", text("x", name), f"{name}: needed {needed}")
       for name, needed in (("pair/note.txt", "a panorama, a folder"), ("pair/note.json", "a tour"), ("pair/a.xyz", "a panorama, a folder"))),
-    Fault("panoramas without poses in subfolders", "check flats", copy_to_subfolders, "flats: needed panoramas (JPG, PNG, TIFF, WebP, HEIC or EXR), got some without poses in one, two; open one of these folders, or run `pansplat pose"),
+    Fault("panoramas without poses in subfolders", "check flats", copy_to_subfolders, "flats: needed panoramas (JPG, PNG, TIFF, WebP or EXR), got some without poses in one, two; open one of these folders, or run `pansplat pose"),
     Fault("a scene with a name of 300 bytes", f"info {_LONG}.ply", says=_LONG),
     Fault("a FIFO as poses", PREDICT, fifo("pair/poses.json"), "pair"),
     Fault("a FIFO as an image", PREDICT, fifo("pair/a.png"), "a.png"),

@@ -47,23 +47,6 @@ def _check(path: Path, pixels: Array, tolerance: float) -> None:
     assert pair.image_height == SIZE
 
 
-def test_heic_is_read(tmp_path: Path, pixels: Array) -> None:
-    pillow_heif = pytest.importorskip("pillow_heif")
-    for name in ("a.heic", "b.HEIF"):
-        pillow_heif.from_pillow(Image.fromarray(pixels)).save(tmp_path / name, quality=95)
-        _check(tmp_path / name, pixels, 12)
-    with pytest.raises(InputError, match=r"got images only .*b\.HEIF"):
-        load_pairs(tmp_path)
-
-
-def test_heic_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(64))
-    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
-    for path in (tmp_path, tmp_path / "a.heic"):
-        with pytest.raises(InputError, match=r"a\.heic: needed pillow-heif to read HEIC.*pip install pillow-heif"):
-            load_pairs(path)
-
-
 @pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_adobe_deflate"])
 def test_tiff_of_8_bits_is_read(tmp_path: Path, pixels: Array, compression: str | None) -> None:
     Image.fromarray(pixels).save(tmp_path / "a.tif", compression=compression)
@@ -202,6 +185,7 @@ def test_files_of_cameras_and_videos_name_what_to_do(tmp_path: Path) -> None:
             "walk.mp4",
             r"got the video walk\.mp4; write frames of it into a folder \(mkdir FOLDER; ffmpeg -i .*walk\.mp4",
         ),
+        ("IMG_1.HEIC", r"got IMG_1\.HEIC; convert it to JPG"),
         ("IMG_1.insp", r"got IMG_1\.insp, which the program of its camera must stitch; export it as a 2:1 JPG"),
     ):
         (tmp_path / name).write_bytes(b"x")

@@ -166,7 +166,7 @@ def test_names_are_file_safe_and_unique(tmp_path: Path, write_scene) -> None:
         ({"panorama": "hall.jpg", "haov": 120}, "needed a picture of 360 x 180 degrees, got 120 x 180"),
         ({"panorama": "hall.jpg", "dynamic": True}, "needed a picture, got a video"),
         ({"panorama": "photo.jpg"}, "photo.jpg: needed a 2:1 equirectangular panorama, got 30x30"),
-        ({"panorama": "text.jpg"}, "text.jpg: needed a JPG, PNG, TIFF, WebP, HEIC or EXR image"),
+        ({"panorama": "text.jpg"}, "text.jpg: needed a JPG, PNG, TIFF, WebP or EXR image"),
         (
             {"type": "fisheye", "panorama": "hall.jpg"},
             "needed the type equirectangular, cubemap, multires, got 'fisheye'",
