@@ -473,7 +473,7 @@ def _describe_views(
         small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
         axes = find_axes(grey)
         turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
-        learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
+        learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, axes.frame)
         shown = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
         depth = estimate_depth(shown, axes.axes[0] if axes.has_down else None)
         surroundings = Surroundings(shown, depth)

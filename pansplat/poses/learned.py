@@ -101,36 +101,30 @@ NO_LEARNED = LearnedFeatures(np.empty((0, 3)), torch.empty(0, 128), torch.empty(
 def detect_learned(
     matcher: Matcher,
     image: UInt8[Array, "height width 3"],
-    mask: Bool[Array, "height width"] | None = None,
-    *,
-    frame: Float[Array, "3 3"] | None = None,
-    count: int = _KEYPOINTS,
+    mask: Bool[Array, "height width"],
+    frame: Float[Array, "3 3"],
 ) -> LearnedFeatures:
     """Learned features of an RGB panorama, outside the masked pixels.
 
     Args:
         mask: True where the panorama shows the scene.
-        frame: axes of the walls in the camera's frame, as columns x, y (down), z; by default the camera's own.
-        count: largest number of features of a face.
+        frame: axes of the walls in the camera's frame, as columns x, y (down), z.
     """
     focal, device = image.shape[1] / (2 * math.pi), next(matcher.parameters()).device
-    rotations = FACE_ROTATIONS[:_FACES] if frame is None else frame @ FACE_ROTATIONS[:_FACES]
     bearings, descriptors, places, starts = [], [], [], [0]
-    for rotation in rotations:
+    for rotation in frame @ FACE_ROTATIONS[:_FACES]:
         pixels = render_face(image, rotation, focal)
         margin = len(pixels) % _STRIDE
         side = len(pixels) - margin
         pixels = pixels[margin // 2 :][:side, margin // 2 :][:, :side]
         centre = len(pixels) / 2 + margin / 2 - margin // 2  # of the face, in pixels from the corner
-        allowed = torch.ones(side, side, dtype=torch.bool)
-        if mask is not None:
-            steps = (np.arange(side) + 0.5 - centre) / focal
-            x, y = np.meshgrid(steps, steps)
-            rays = np.stack((x, y, np.ones_like(x)), axis=-1).reshape(-1, 3) @ rotation.T
-            allowed = torch.from_numpy(sample_mask(mask, rays).reshape(side, side))
+        steps = (np.arange(side) + 0.5 - centre) / focal
+        x, y = np.meshgrid(steps, steps)
+        rays = np.stack((x, y, np.ones_like(x)), axis=-1).reshape(-1, 3) @ rotation.T
+        allowed = torch.from_numpy(sample_mask(mask, rays).reshape(side, side))
         with torch.inference_mode():
             rgb = torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
-            found = matcher.aliked(rgb.to(device), allowed.to(device), count)
+            found = matcher.aliked(rgb.to(device), allowed.to(device), _KEYPOINTS)
         points, described = (each.cpu() for each in found)
         xy = (points.double().numpy() + 0.5 - centre) / focal
         rays = np.concatenate((xy, np.ones((len(xy), 1))), axis=1)

@@ -203,7 +203,7 @@ def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> 
         image = cv2.imread(str(SAMPLE / f"{name.replace('mirrored', 'right')}.jpg"), cv2.IMREAD_GRAYSCALE)
         image = cv2.resize(image, (768, 384), interpolation=cv2.INTER_AREA)
         image = image[:, ::-1].copy() if name == "mirrored" else image
-        features = detect_features(image, count=2500)
+        features = detect_features(image).strongest(2500)
         views[name] = _view(features, image.astype(np.float32) / 255)
     assert _is_mirrored(views["left"], views["mirrored"])
     assert not _is_mirrored(views["left"], views["right"])
