@@ -94,7 +94,7 @@ def test_only_one_module_decodes_pictures_of_users() -> None:
         for file in (ROOT / part).rglob("*.py")
         if decoders.search(file.read_text(encoding="utf-8"))
     }
-    assert found == {"pansplat/images/image_files.py", "pansplat/images/panorama_metadata.py"}
+    assert found == {"pansplat/images/image_files.py"}
 
 
 def test_all_cells_of_the_notebook_run_and_show_the_stored_pictures(tmp_path: Path) -> None:

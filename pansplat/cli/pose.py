@@ -1,4 +1,4 @@
-"""`pansplat pose`: camera poses of panoramas, or of the key frames of a video, without any other input."""
+"""`pansplat pose`: camera poses of panoramas, without any other input."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from tyro.conf import Positional
 from pansplat.cli.inputs import Computation, OptionalOut
 from pansplat.errors import InputError
 from pansplat.system.console import make_table_console, print_message, progress_bar
-from pansplat.system.files import require_output_file, require_output_folder
-from pansplat.system.options import CAMERA_HEIGHT, Count, Positive
-from pansplat.system.progress import stage
+from pansplat.system.files import require_output_file
+from pansplat.system.options import CAMERA_HEIGHT, Positive
 
 if TYPE_CHECKING:
     from pansplat.poses.estimate import PoseEstimate
@@ -24,52 +23,34 @@ if TYPE_CHECKING:
 class Pose(Computation):
     """Estimate the camera poses of equirectangular panoramas of one place."""
 
-    paths: Positional[tuple[Path, ...]]
-    """A folder of panoramas, a web tour, or two or more files; or a 360-degree video."""
+    path: Positional[Path]
+    """A folder of panoramas, or a web tour."""
     out: OptionalOut = None
-    """The poses.json to write. Without it, only the table is shown. For a video, a folder for the key frames and their
-    poses.json."""
+    """The poses.json to write. Without it, only the table is shown."""
     camera_height: Positive = CAMERA_HEIGHT
     """Mean height of the cameras over the floor, metres; it sets the scale."""
     baseline: tuple[str, str, float] | None = None
-    """Two of the files and their distance in metres, instead of the camera's height."""
-    frames: Count = 24
-    """Largest number of key frames of a video."""
+    """Two of the panoramas and their distance in metres, instead of the camera's height."""
 
     def run(self) -> int:
         """Estimate, print the table and write the file."""
-        from pansplat.inputs.folders import VIDEO_FILES, list_unposed
+        from pansplat.inputs.folders import load_panoramas
         from pansplat.poses.files import estimate_panoramas, require_mergeable, write_poses
-        from pansplat.poses.key_frames import extract_key_frames
 
-        if not self.paths:
-            raise InputError("`pansplat pose` needs a folder of panoramas, a web tour, two or more files, or a video")
-        is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in VIDEO_FILES
-        out = self.out
-        if is_video:
-            if out is None:
-                raise InputError("--out must name a folder for the key frames of a video, got none")
-            require_output_folder("--out", out)
-            out = out / "poses.json"
-        elif out is not None:
-            require_output_file("--out", out, (".json",))
-        panoramas = [] if is_video else list_unposed(self.paths)
-        if not is_video and len(panoramas) < 2:
-            raise InputError(f"{self.paths[0]}: needed two or more panoramas, got {len(panoramas)}; add the others.")
-        if out is not None:
-            require_mergeable(out, [view.image for view in panoramas], overwrite=self.overwrite)
-        folder = self.paths[0] if self.paths[0].is_dir() else self.paths[0].parent
+        if self.out is not None:
+            require_output_file("--out", self.out, (".json",))
+        panoramas = load_panoramas(self.path, posed=False)
+        if len(panoramas) < 2:
+            raise InputError(f"{self.path}: needed two or more panoramas, got {len(panoramas)}; add the others.")
+        if self.out is not None:
+            require_mergeable(self.out, [view.image for view in panoramas], overwrite=self.overwrite)
+        folder = self.path if self.path.is_dir() else self.path.parent
         with progress_bar():
-            if is_video and out is not None:
-                folder = out.parent
-                with stage(0.5):
-                    frames = extract_key_frames(self.paths[0], out.parent, self.frames, overwrite=self.overwrite)
-                panoramas = list_unposed(frames)
             estimate = estimate_panoramas(folder, panoramas, camera_height=self.camera_height, baseline=self.baseline)
         _print_estimate(estimate)
-        if out is not None:
-            write_poses(estimate, out, overwrite=self.overwrite)
-            print(out)
+        if self.out is not None:
+            write_poses(estimate, self.out, overwrite=self.overwrite)
+            print(self.out)
         return 0
 
 

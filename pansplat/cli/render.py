@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pansplat.tours.camera_path import CameraPath
     from pansplat.tours.route import Route
 
-_VIDEO_SUFFIXES = (".mp4", ".webm")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 _VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # pixels
 _MAX_MATRIX = 4096  # bytes of a file with the 16 numbers of a matrix
@@ -37,7 +36,7 @@ _MAX_MATRIX = 4096  # bytes of a file with the 16 numbers of a matrix
 
 @dataclass(frozen=True)
 class Render(Computation):
-    """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4, .webm) that
+    """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4) that
     shows the photograph while the camera stands at a panorama."""
 
     path: Positional[Path]
@@ -118,7 +117,7 @@ class Render(Computation):
 
     @property
     def _is_film(self) -> bool:
-        return self.out.suffix.lower() in _VIDEO_SUFFIXES or self.path_file is not None
+        return self.out.suffix.lower() == ".mp4" or self.path_file is not None
 
     def _choose_height(self, layout: str, scene: Scene) -> int:
         if not self._is_film:
@@ -128,7 +127,7 @@ class Render(Computation):
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
         if self.path_file is None:
-            require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, *_VIDEO_SUFFIXES), overwrite=self.overwrite)
+            require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, ".mp4"), overwrite=self.overwrite)
         else:
             from pansplat.export.film import require_film_file
 

@@ -23,7 +23,7 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import level_axes
 from pansplat.images.image_files import write_image
 from pansplat.images.panorama_metadata import Stereo
-from pansplat.images.video import VIDEO_SUFFIXES, write_video
+from pansplat.images.video import write_video
 from pansplat.inputs.pairs import Pair
 from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
 from pansplat.system.files import require_output_file, require_replaceable
@@ -266,7 +266,7 @@ def write_film(
     """Write a film, or the files of its frames, each completely or not at all; returns the files.
 
     Args:
-        file: a film (.mp4 or .webm), or the name of a sequence: `walk.png` and `walk.exr` are written as
+        file: a film (.mp4), or the name of a sequence: `walk.png` and `walk.exr` are written as
             `walk_0000.png` or `walk_0000.exr`, and so on.
         film: draws the frames.
         shots: the frames.
@@ -284,7 +284,7 @@ def write_film(
             show(number, color)
             yield color, depth
 
-    if file.suffix.lower() in VIDEO_SUFFIXES:
+    if file.suffix.lower() == ".mp4":
         images = ((color.clip(0, 1) * 255 + 0.5).astype(np.uint8) for color, _ in draw())
         write_video(file, images, fps, panorama=panorama, stereo=stereo)
         return [file]
@@ -303,6 +303,6 @@ def name_frame(file: Path, number: int) -> Path:
 def require_film_file(option: str, file: Path, overwrite: bool) -> None:
     """Check that `write_film` can write a film, or the files of its frames; see `require_output_file`."""
     suffix = file.suffix.lower()
-    require_output_file(option, file, (*VIDEO_SUFFIXES, ".png", ".exr"))
+    require_output_file(option, file, (".mp4", ".png", ".exr"))
     sequence = file.parent.glob(f"{glob.escape(file.stem)}_[0-9]*{suffix}")
-    require_replaceable(option, [file] if suffix in VIDEO_SUFFIXES else sequence, overwrite)
+    require_replaceable(option, [file] if suffix == ".mp4" else sequence, overwrite)

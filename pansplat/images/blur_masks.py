@@ -12,7 +12,7 @@ import contextlib
 import os
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -76,18 +76,13 @@ def list_mask_files(folder: Path, kind: str) -> dict[str, list[Path]]:
     return masks
 
 
-def find_masks_beside(pictures: Iterable[Path], kind: str) -> dict[Path, Path]:
-    """The masks of a kind beside pictures, which need not exist, by picture."""
-    pictures, found = list(pictures), {}
-    masks = {folder: list_mask_files(folder, kind) for folder in {picture.parent for picture in pictures}}
-    for picture in pictures:
-        own = masks[picture.parent].get(fold_name(picture.stem), [])
-        if len(own) > 1:
-            names = ", ".join(mask.name for mask in own)
-            raise InputError(f"{picture}: needed one mask {kind}, got {names}; keep the right one.")
-        if own:
-            found[picture] = own[0]
-    return found
+def find_mask_beside(picture: Path, kind: str) -> Path | None:
+    """The mask of a kind beside a picture, which need not exist."""
+    own = list_mask_files(picture.parent, kind).get(fold_name(picture.stem), [])
+    if len(own) > 1:
+        names = ", ".join(mask.name for mask in own)
+        raise InputError(f"{picture}: needed one mask {kind}, got {names}; keep the right one.")
+    return own[0] if own else None
 
 
 def locate_panorama(image: Path) -> Path:
@@ -101,8 +96,7 @@ def locate_panorama(image: Path) -> Path:
 
 def find_blur_mask(image: Path) -> Path | None:
     """The file of the blur mask of a panorama; None if there is none."""
-    place = locate_panorama(image)
-    return find_masks_beside([place], BLUR_SUFFIX).get(place)
+    return find_mask_beside(locate_panorama(image), BLUR_SUFFIX)
 
 
 def resize_hidden(

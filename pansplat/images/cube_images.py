@@ -54,17 +54,15 @@ class CubeLevel:
         size: along a face, pixels.
         tile: along a tile, pixels; tiles of the last row and column may be smaller.
         faces: paths relative to the cube's folder, with `ROW` and `COLUMN` for tiles.
-        rows: of the faces in a picture that holds all of them in a column; empty otherwise.
     """
 
     size: int
     tile: int
     faces: tuple[str, ...]
-    rows: tuple[int, ...] = ()
 
     def list_files(self) -> Iterator[str]:
         """Relative paths of all pictures."""
-        for face in dict.fromkeys(self.faces):
+        for face in self.faces:
             for row, column in self._list_tiles():
                 yield _name_tile(face, row, column)
 
@@ -74,9 +72,6 @@ class CubeLevel:
 
     def read(self, folder: Path, decode: Decode) -> list[UInt8[Array, "size size 3"]]:
         """Read the six faces of the cube."""
-        if self.rows:
-            faces = np.split(decode(folder / self.faces[0]), 6)
-            return [np.ascontiguousarray(faces[row]) for row in self.rows]
         return [self._read_face(face, folder, decode) for face in self.faces]
 
     def _read_face(self, face: str, folder: Path, decode: Decode) -> UInt8[Array, "size size 3"]:
@@ -167,9 +162,8 @@ def read_cube(path: Path) -> CubeImage:
 
 
 def _read_level(content: dict[str, Any]) -> CubeLevel:
-    faces, rows = tuple(map(str, content["faces"])), tuple(map(int, content["rows"]))
-    level = CubeLevel(int(content["size"]), int(content["tile"]), faces, rows)
-    if not (0 < level.size <= MAX_SIZE and level.tile > 0 and len(faces) == 6 and sorted(rows) in ([], [*range(6)])):
+    level = CubeLevel(int(content["size"]), int(content["tile"]), tuple(map(str, content["faces"])))
+    if not (0 < level.size <= MAX_SIZE and level.tile > 0 and len(level.faces) == 6):
         raise ValueError
     return level
 

@@ -31,28 +31,28 @@ from pansplat.images.blur_masks import (
     MASK_SUFFIX,
     blur_hidden,
     find_blur_mask,
-    find_masks_beside,
+    find_mask_beside,
     locate_panorama,
     resize_hidden,
     widen_hidden,
 )
 from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage, read_cube
-from pansplat.images.panorama_metadata import SOFTWARE_XMP, Crop, find_crop, find_xmp, make_gpano_xmp, parse_gpano
+from pansplat.images.panorama_metadata import SOFTWARE_XMP, find_stated_problem, find_xmp, make_gpano_xmp
 from pansplat.images.rig_images import RIG_SUFFIX, RigImage, read_rig
 from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, read_file, require_file
 
 WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
-READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff", ".heic", ".heif")
+READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff")
 
 _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
-_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MAX_BYTES = 1 << 31  # of a file
 _MAX_PIXELS = 178_956_970  # of Pillow: twice Image.MAX_IMAGE_PIXELS
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _JPEG_MAGIC, _JPEG_END, _PNG_MAGIC = b"\xff\xd8", b"\xff\xd9", b"\x89PNG"
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # panoramas of 100 megapixels are normal
+logging.getLogger("PIL").setLevel(logging.CRITICAL)  # a damaged file is an error of one line
 _TAIL = 4096  # bytes at the end of a file that are read to find the end of a JPEG
 _ORIENTATION, _TURNED = 0x0112, (5, 6, 7, 8)  # tag of EXIF, and its values for a quarter turn
 _ORIENT = {
@@ -102,8 +102,8 @@ def read_panorama(
     (`pansplat.images.blur_masks`) is blurred before.
 
     Args:
-        path: JPG, PNG and TIFF (8 or 16 bit), WebP, HEIC or EXR file, 2:1 or a crop with GPano properties; or a file
-            that stands for cube faces or perspective pictures (pansplat.images.cube_images, .rig_images).
+        path: JPG, PNG and TIFF (8 or 16 bit), WebP or EXR file, 2:1; or a file that stands for cube faces or
+            perspective pictures (pansplat.images.cube_images, .rig_images).
         height: pixels.
     """
     decoded = _decode_panorama(path, height)
@@ -125,21 +125,12 @@ def read_height(path: Path | str) -> int:
 
 
 def read_size(path: Path | str) -> tuple[int, int]:
-    """Width and height of an image file, pixels, of a crop those of the full panorama; see `read_height`."""
+    """Width and height of an image file, pixels; see `read_height`."""
     path = Path(path)
     if is_assembled(path):
         height = _read_assembled(path).height
         return 2 * height, height
-    width, height, crop = _read_shape(path)
-    return (width, height) if crop is None else (2 * crop.height, crop.height)
-
-
-def read_crop(path: Path) -> Crop | None:
-    """The place of a picture in its full panorama, by its GPano properties; None if it is one, or cannot be read."""
-    try:
-        return None if is_assembled(path) else _read_shape(path)[2]
-    except InputError:
-        return None
+    return _read_shape(path)[:2]
 
 
 def is_two_to_one(path: Path) -> bool:
@@ -151,41 +142,32 @@ def is_two_to_one(path: Path) -> bool:
     return width == 2 * height
 
 
-def _read_shape(path: Path) -> tuple[int, int, Crop | None]:
-    """Width and height of an image file as it is, and its crop."""
+def _read_shape(path: Path) -> tuple[int, int, str | None]:
+    """Width and height of an image file, and what it is by its metadata instead of a full panorama."""
     require_file(path, "a readable image file")
     try:
         with open(path, "rb") as file:
-            head = file.read(32)
+            head = file.read(len(_EXR_MAGIC))
         if head.startswith(_EXR_MAGIC):
             return (*_exr_size(path), None)
-        with Image.open(path, formats=_list_formats(path, head)) as image:
+        with Image.open(path, formats=_PILLOW_FORMATS) as image:
             size = image.size
             # Pillow would decode the pixels of a PNG to look for EXIF behind them, and turns the size of a TIFF itself.
             is_done = image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info)
             if not is_done and image.getexif().get(_ORIENTATION) in _TURNED:
                 size = size[::-1]
-            return (*size, find_crop(parse_gpano(find_xmp(image)), *size))
+            return (*size, find_stated_problem(find_xmp(image), *size))
     except (*_DAMAGED, Image.DecompressionBombError) as error:
         if isinstance(error, InputError):
             raise
         return (*_open_with_pillow(path, _read_bytes(path), load=False).size, None)  # its error names the reason
 
 
-def _list_formats(path: Path, head: bytes) -> tuple[str, ...]:
-    """Pillow's names of the formats of a file that starts with some bytes."""
-    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # a damaged file is an error of one line
-    if head[4:8] != b"ftyp" or head[8:12] not in _HEIF_BRANDS:
-        return _PILLOW_FORMATS
-    try:
-        import pillow_heif
-    except ImportError as error:
-        raise InputError(
-            f"{path}: needed pillow-heif to read HEIC, got no such package; install it (pip install pillow-heif), or "
-            "convert the picture to JPG."
-        ) from error
-    pillow_heif.register_heif_opener()
-    return ("HEIF",)
+def _require_full(path: Path) -> None:
+    """Check that the metadata of an image file do not state that it is no full panorama."""
+    problem = _read_shape(path)[2]
+    if problem is not None:
+        raise InputError(f"{path}: needed a full equirectangular panorama, got {problem}.")
 
 
 def is_assembled(path: Path) -> bool:
@@ -216,7 +198,10 @@ def require_complete(path: Path | str) -> None:
 
 def require_panorama(path: Path | str) -> None:
     """Check that a file is a 2:1 image that is not damaged (`require_complete`)."""
-    require_two_to_one(Path(path), *read_size(path))
+    path = Path(path)
+    if not is_assembled(path):
+        _require_full(path)
+    require_two_to_one(path, *read_size(path))
     require_complete(path)
 
 
@@ -245,28 +230,15 @@ def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height wid
     return resize_panorama(_decode_panorama(path, height, reduced=find_blur_mask(path) is None).color, height)
 
 
-def find_masks(path: Path, kind: str) -> dict[Path, Path]:
-    """The masks of a panorama, and of the pictures that it is joined from, by the files of these.
-
-    A picture of six faces has the panorama's name: its mask is the panorama's if it is 2:1.
-    """
-    place, pictures = locate_panorama(path), list[Path]()
-    if is_assembled(path):
-        parts = _read_assembled(path)
-        pictures = list(parts.list_files() if isinstance(parts, CubeImage) else (view.file for view in parts.views))
-    found, own = find_masks_beside(pictures, kind), find_masks_beside([place], kind).get(place)
-    if own is None or (own in found.values() and not is_two_to_one(own)):
-        return found
-    return {path: own} | {picture: mask for picture, mask in found.items() if mask != own}
-
-
 def list_masks(path: Path, *, check: bool = False) -> list[Path]:
-    """The files of all masks of a panorama, and of the pictures that it is joined from."""
-    found = [item for kind in (BLUR_SUFFIX, MASK_SUFFIX) for item in find_masks(path, kind).items()]
-    for picture, mask in found if check else ():
-        _require_fit(mask, read_size(mask), read_size(picture))
+    """The files of the blur mask and of the scene mask of a panorama."""
+    place = locate_panorama(path)
+    found = [find_mask_beside(place, kind) for kind in (BLUR_SUFFIX, MASK_SUFFIX)]
+    masks = [mask for mask in found if mask is not None]
+    for mask in masks if check else ():
+        _require_fit(mask, read_size(mask), read_size(path))
         require_complete(mask)
-    return [mask for _, mask in found]
+    return masks
 
 
 def _require_fit(mask: Path, size: tuple[int, int], picture: tuple[int, int]) -> None:
@@ -278,44 +250,16 @@ def _require_fit(mask: Path, size: tuple[int, int], picture: tuple[int, int]) ->
         )
 
 
-def read_hidden(path: Path, height: int, kind: str = BLUR_SUFFIX) -> Bool[Array, "height width"]:
-    """What the blur masks of a panorama and of its pictures hide, at (height, 2 height), without the margin.
-
-    With the kind `MASK_SUFFIX`, what the scene masks of its pictures mask. An InputError if a mask cannot be used.
-    """
-    masks = find_masks(path, kind)
-    own = masks.pop(path, None)
-    hidden = np.zeros((height, 2 * height), bool)
-    if own is not None and kind == BLUR_SUFFIX:
-        hidden = read_blur_mask(own, height)
-        if hidden.all():
-            raise InputError(f"{own}: needed a blur mask with black where the panorama is shown, got white only.")
-    if not masks:
-        return hidden
-
-    def decode(file: Path) -> UInt8[Array, "rows columns 3"]:
-        width, rows = read_size(file)
-        part = read_blur_mask(masks[file], rows, width, kind) if file in masks else np.zeros((rows, width), bool)
-        return np.where(part[..., None], np.uint8(255), np.uint8(0)).repeat(3, axis=2)
-
-    parts = _read_assembled(path)
-    for level in parts.levels if isinstance(parts, CubeImage) else (None,):  # a mask of a tile covers it at all levels
-        one = parts if level is None else dataclasses.replace(parts, levels=(level,))
-        hidden = hidden | (one.read(height, decode)[0].max(axis=2) > 0)
-    return hidden
-
-
-def read_blur_mask(
-    mask: Path, height: int, width: int | None = None, kind: str = BLUR_SUFFIX
-) -> Bool[Array, "height width"]:
-    """A mask at (height, width), 2:1 by default: each pixel that its white touches, or its black if of another kind."""
-    decoded, width = _decode(mask), 2 * height if width is None else width
-    _require_fit(mask, decoded.color.shape[1::-1], (width, height))
-    grey = decoded.color.astype(np.float32).mean(axis=2) / (255 if decoded.color.dtype == np.uint8 else 1)
-    hidden = grey >= 0.5 if kind == BLUR_SUFFIX else grey < 0.5
-    if kind == BLUR_SUFFIX and decoded.alpha is not None:
+def read_blur_mask(mask: Path, height: int) -> Bool[Array, "height width"]:
+    """A blur mask at (height, 2 height), without the margin: each pixel that its white touches."""
+    decoded = _decode(mask)
+    _require_fit(mask, decoded.color.shape[1::-1], (2 * height, height))
+    hidden = decoded.color.astype(np.float32).mean(axis=2) / (255 if decoded.color.dtype == np.uint8 else 1) >= 0.5
+    if decoded.alpha is not None:
         hidden &= decoded.alpha >= 0.5
-    return resize_hidden(hidden, height, width)
+    if hidden.all():
+        raise InputError(f"{mask}: needed a blur mask with black where the panorama is shown, got white only.")
+    return resize_hidden(hidden, height, 2 * height)
 
 
 def read_pixels(path: Path) -> UInt8[Array, "rows columns 3"]:
@@ -506,7 +450,7 @@ def _advise_on_shape(width: int, height: int) -> str:
             "program of its camera; of a stereo panorama give the upper half"
         )
     if width > 2 * height:
-        return "pad a part of a panorama to 2:1, or state its place by GPano properties (exiftool)"
+        return "pad a part of a panorama to 2:1"
     return "crop or resample it first"
 
 
@@ -525,12 +469,11 @@ def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) ->
     path = Path(path)
     _check_height(height)
     decoded = _decode_shown(path, height, reduced=reduced)
-    hidden = read_hidden(path, decoded.color.shape[0])
-    if not hidden.any():
+    mask = find_blur_mask(path)
+    if mask is None:
         return decoded
-    hidden = widen_hidden(hidden)
+    hidden = widen_hidden(read_blur_mask(mask, decoded.color.shape[0]))
     if hidden.mean() > 0.5:
-        mask = next(iter(find_masks(path, BLUR_SUFFIX).values()))
         warnings.warn(
             f"{mask}: {100 * hidden.mean():.0f}% of the photograph is blurred; white is blurred, black is shown.",
             category=InputWarning,
@@ -540,25 +483,12 @@ def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) ->
 
 
 def _decode_shown(path: Path, height: int, *, reduced: bool) -> _DecodedImage:
-    """Pixels of a 2:1 image file as they are; of single pictures without what their blur masks hide."""
+    """Pixels of a panorama as they are."""
     if is_assembled(path):
-        masks = find_masks(path, BLUR_SUFFIX)
-
-        def decode(file: Path) -> UInt8[Array, "rows columns 3"]:
-            pixels = read_pixels(file)
-            if file not in masks:
-                return pixels
-            return np.where(read_blur_mask(masks[file], *pixels.shape[:2])[..., None], np.uint8(0), pixels)
-
-        color, shown = _read_assembled(path).read(height, decode)
-        masked = read_hidden(path, height, MASK_SUFFIX)
-        if masked.any():
-            shown = np.float32(~masked) if shown is None else shown * ~masked
+        color, shown = _read_assembled(path).read(height, read_pixels)
         return _DecodedImage(color, shown, hole="is in no picture; these pixels are masked")
-    crop = read_crop(path)
-    decoded = _decode(path, height if reduced and crop is None else None)
-    if crop is not None:
-        return _pad_crop(decoded, crop)
+    _require_full(path)
+    decoded = _decode(path, height if reduced else None)
     require_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
     if _is_dual_fisheye(decoded.color):
         raise InputError(
@@ -566,18 +496,6 @@ def _decode_shown(path: Path, height: int, *, reduced: bool) -> _DecodedImage:
             "its camera, or by ffmpeg -i IN -vf v360=dfisheye:e:ih_fov=190:iv_fov=190 OUT."
         )
     return decoded
-
-
-def _pad_crop(decoded: _DecodedImage, crop: Crop) -> _DecodedImage:
-    """The full panorama of a crop; what it does not show has no alpha."""
-    rows, columns = decoded.color.shape[:2]
-    place = slice(crop.top, crop.top + rows), slice(crop.left, crop.left + columns)
-    color = np.zeros((crop.height, 2 * crop.height, 3), decoded.color.dtype)
-    alpha = np.zeros(color.shape[:2], np.float32)
-    color[place] = decoded.color
-    alpha[place] = 1 if decoded.alpha is None else decoded.alpha
-    hole = f"is masked: it covers {crop.degrees[0]} x {crop.degrees[1]} degrees (GPano)"
-    return _DecodedImage(color, alpha, hole)
 
 
 def _is_dual_fisheye(color: NDArray[Any]) -> bool:
@@ -621,7 +539,7 @@ def _open_with_pillow(
         orient: whether the orientation of EXIF is applied.
     """
     try:
-        image = Image.open(io.BytesIO(data), formats=_list_formats(path, data[:32]))
+        image = Image.open(io.BytesIO(data), formats=_PILLOW_FORMATS)
         if at_least is not None:
             image.draft("RGB", (2 * at_least, at_least))
         if load:
@@ -633,7 +551,7 @@ def _open_with_pillow(
                 f"{path}: needed a complete image, got damaged or truncated data; copy or export it again."
             ) from error
         raise InputError(
-            f"{path}: needed a JPG, PNG, TIFF, WebP, HEIC or EXR image, got an unknown format "
+            f"{path}: needed a JPG, PNG, TIFF, WebP or EXR image, got an unknown format "
             f"(it starts with {data[:8]!r}); convert it."
         ) from error
     except Image.DecompressionBombError as error:
@@ -641,8 +559,6 @@ def _open_with_pillow(
         raise InputError(
             f"{path}: needed at most {megapixels:.0f} megapixels ({2 * rows}x{rows}), got more ({error}); shrink it."
         ) from error
-    except InputError:
-        raise
     except _DAMAGED as error:
         raise InputError(
             f"{path}: needed a complete image, got damaged or truncated data ({error}); copy or export it again."

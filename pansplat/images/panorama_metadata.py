@@ -11,14 +11,12 @@ ISO/IEC 14496-12, sections 4.2 (boxes) and 8.7.5 (chunk offsets).
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shutil
 import struct
 import uuid
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -72,82 +70,35 @@ def make_gpano_xmp(width: int, height: int, *, is_photograph: bool = False) -> b
     ).encode()
 
 
-def read_xmp(path: Path) -> bytes:
-    """The XMP packet of an image file; empty if there is none, or the file cannot be read."""
-    try:
-        with Image.open(path) as image:
-            return find_xmp(image)
-    except Exception:  # Pillow raises many types for damaged files, which are reported when the pixels are read
-        return b""
-
-
 def find_xmp(image: Image.Image) -> bytes:
     """The XMP packet in the header of an image; empty if there is none."""
     packet = next((image.info[name] for name in _PACKETS if name in image.info), b"")
     return packet if isinstance(packet, bytes) else str(packet).encode()
 
 
-def parse_gpano(xmp: bytes) -> dict[str, str]:
-    """The GPano properties of an XMP packet."""
-    found = _TAG.findall(xmp.decode("utf-8", "replace"))
-    return {name: attribute or element for name, attribute, element in found}
-
-
-def gpano_number(tags: dict[str, str], name: str) -> float | None:
-    """A finite number among GPano properties; None if there is none."""
-    try:
-        value = float(tags[name])
-    except (KeyError, ValueError):
-        return None
-    return value if math.isfinite(value) else None
-
-
-@dataclass(frozen=True)
-class Crop:
-    """The place of a picture in the full panorama, pixels of the picture.
-
-    Attributes:
-        height: of the full panorama, which is twice as wide.
-        left, top: of the picture in it.
-        degrees: width and height that the picture covers.
-    """
-
-    height: int
-    left: int
-    top: int
-    degrees: tuple[int, int]
-
-
-def find_crop(tags: dict[str, str], width: int, height: int) -> Crop | None:
-    """The crop that the GPano properties of a picture state; None if it is a full panorama, or they contradict it.
+def find_stated_problem(xmp: bytes, width: int, height: int) -> str | None:
+    """What a picture is instead of a full equirectangular panorama, by the GPano properties of its XMP packet, and what
+    to do; None if they state nothing else, or contradict the picture.
 
     Args:
-        tags: of `parse_gpano`.
         width, height: of the picture, pixels; it may have been resized.
     """
-    names = (
-        "FullPanoWidthPixels", "FullPanoHeightPixels", "CroppedAreaImageWidthPixels", "CroppedAreaImageHeightPixels",
-        "CroppedAreaLeftPixels", "CroppedAreaTopPixels",
-    )  # fmt: skip
-    numbers = [gpano_number(tags, name) for name in names]
-    if any(number is None for number in numbers):
+    tags = {name: attribute or element for name, attribute, element in _TAG.findall(xmp.decode("utf-8", "replace"))}
+    projection = tags.get("ProjectionType", "equirectangular").strip()
+    if projection.lower() != "equirectangular":
+        return f"the projection {projection!r} (GPano:ProjectionType); convert it"
+    try:
+        full, part = (
+            [float(tags[f"{kind}{side}Pixels"]) for side in ("Width", "Height")]
+            for kind in ("FullPano", "CroppedAreaImage")
+        )
+        degrees = round(360 * part[0] / full[0]), round(180 * part[1] / full[1])
+        is_right = abs(width * part[1] / (height * part[0]) - 1) < _SHAPE_TOLERANCE
+    except (KeyError, ValueError, ArithmeticError):
         return None
-    full_width, full_height, part_width, part_height, left, top = (number or 0.0 for number in numbers)
-    if min(full_width, full_height, part_width, part_height) < 1 or min(left, top) < 0:
+    if degrees == (360, 180) or not is_right:
         return None
-    if (part_width, part_height) == (full_width, full_height):
-        return None
-    scale = width / part_width
-    fits = left + part_width <= full_width + 1 and top + part_height <= full_height + 1
-    is_right = (
-        abs(full_width / (2 * full_height) - 1) < _SHAPE_TOLERANCE
-        and abs(height / (scale * part_height) - 1) < _SHAPE_TOLERANCE
-    )
-    if not (fits and is_right):
-        return None
-    rows = max(round(full_width * scale / 2), math.ceil(width / 2), height)
-    degrees = round(360 * part_width / full_width), round(180 * part_height / full_height)
-    return Crop(rows, min(round(left * scale), 2 * rows - width), min(round(top * scale), rows - height), degrees)
+    return f"{degrees[0]} x {degrees[1]} degrees of 360 x 180 (GPano); pad it to 2:1, and mask the rest"
 
 
 def mark_spherical_video(path: Path, stereo: Stereo = "mono") -> None:

@@ -210,7 +210,7 @@ def write_rig(rig: RigImage, folder: Path, name: str) -> Path:
     """Write the file that stands for a rig; see `pansplat.images.cube_images.write_description`."""
     views = [
         {
-            "file": str(view.file.absolute()),  # its masks are beside a link
+            "file": str(view.file.absolute()),
             "rotation": view.rotation,
             "lens": dataclasses.astuple(view.lens),
             "mask": None if view.mask is None else str(view.mask.resolve()),

@@ -1,9 +1,8 @@
-"""Reading frames of video files by number, and writing MP4 and WebM files."""
+"""Writing MP4 files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,108 +13,9 @@ from numpy.typing import NDArray
 from pansplat.errors import InputError
 from pansplat.images.panorama_metadata import Stereo, mark_spherical_video
 from pansplat.system.atomic import replacing
-from pansplat.system.files import SOFTWARE, require_file
+from pansplat.system.files import SOFTWARE
 
-_MAX_SKIP = 48  # frames between two reads; a larger gap is skipped by seeking
-_ENCODERS = {
-    ".mp4": ("libx264", "libopenh264", "mpeg4"),  # H.264 first: every browser and player supports it
-    ".webm": ("libvpx-vp9", "libsvtav1", "libaom-av1"),  # VP9 first: it is faster to encode
-}
-VIDEO_SUFFIXES = tuple(_ENCODERS)
-
-
-@dataclass(frozen=True, eq=False)
-class VideoFile:
-    """A video file with the times of its frames. `read` decodes frames.
-
-    Attributes:
-        path: the file.
-        stamps: presentation time of each frame in units of the file, ascending.
-        width, height: pixels.
-    """
-
-    path: Path
-    stamps: tuple[int, ...]
-    width: int
-    height: int
-
-    def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
-        """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order."""
-        numbers = sorted(set(frames))
-        if not numbers:
-            return {}
-        if not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
-            raise InputError(
-                f"{self.path}: needed frames 0 to {len(self.stamps) - 1}, got {numbers[0]} to {numbers[-1]}."
-            )
-        found: dict[int, NDArray[np.uint8]] = {}
-        with _open_container(self.path) as container:
-            container.streams.video[0].thread_type = "AUTO"
-            gaps = np.flatnonzero(np.diff(numbers) > _MAX_SKIP)
-            for group in (part.tolist() for part in np.split(numbers, gaps + 1)):
-                found |= self._decode(container, group, self.stamps[group[0]])
-                missing = [frame for frame in group if frame not in found]
-                if missing:  # key frames of some files are wrong: decode from the start
-                    found |= self._decode(container, missing, self.stamps[0])
-        missing = [frame for frame in numbers if frame not in found]
-        if missing:
-            raise InputError(
-                f"{self.path}: needed {len(numbers)} frames, got none for {missing[:5]}: the file is damaged there; "
-                "copy or encode it again."
-            )
-        return found
-
-    def _decode(self, container: Any, frames: Sequence[int], seek_to: int) -> dict[int, NDArray[np.uint8]]:
-        """Pixels of the frames that are found from the key frame at or before the time `seek_to` on."""
-        from av.error import FFmpegError
-
-        numbers = {self.stamps[frame]: frame for frame in frames}
-        last = max(numbers)
-        found = {}
-        stream = container.streams.video[0]
-        try:
-            container.seek(seek_to, stream=stream)
-            for frame in container.decode(stream):
-                if frame.pts in numbers:
-                    found[numbers[frame.pts]] = frame.to_ndarray(format="rgb24")
-                if len(found) == len(numbers) or (frame.pts is not None and frame.pts > last):
-                    break
-        except FFmpegError as error:
-            raise InputError(f"{self.path}: needed readable frames, got '{error}'; copy or encode it again.") from error
-        return found
-
-
-def open_video(path: Path | str) -> VideoFile:
-    """A video file with the times of its frames, which are read from packets without decoding."""
-    path = Path(path)
-    with _open_container(path) as container:
-        from av.error import FFmpegError
-
-        if not container.streams.video:
-            raise InputError(f"{path}: needed a video, got a file without a video stream; give another file.")
-        stream = container.streams.video[0]
-        try:
-            packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
-        except FFmpegError as error:
-            raise InputError(f"{path}: needed a complete video, got '{error}'; copy it again.") from error
-        stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
-        if not stamps or len(stamps) != len(packets):
-            raise InputError(
-                f"{path}: needed a time for each frame, got {len(stamps)} times for {len(packets)} frames; write it "
-                "again as .mp4 (ffmpeg -i FILE -c:v libx264 -crf 12 video.mp4)."
-            )
-        return VideoFile(path, tuple(stamps), stream.width, stream.height)
-
-
-def _open_container(path: Path) -> Any:
-    import av
-    from av.error import FFmpegError
-
-    require_file(path, "a readable video file")
-    try:
-        return av.open(str(path))
-    except (OSError, FFmpegError) as error:
-        raise InputError(f"{path}: needed a readable video file, got '{error}'; check it.") from error
+_ENCODERS = ("libx264", "libopenh264", "mpeg4")  # H.264 first: every browser and player supports it
 
 
 def write_video(
@@ -126,36 +26,32 @@ def write_video(
     panorama: bool = False,
     stereo: Stereo = "mono",
 ) -> int:
-    """Write an MP4 or WebM file atomically and return the number of frames. H.264 or VP9 if PyAV supports it.
+    """Write an MP4 file atomically and return the number of frames; H.264 if PyAV supports it.
 
     The format supports even sizes only: frames of odd width or height lose their last column or row.
 
     Args:
-        path: file to write, ending in .mp4 or .webm.
+        path: file to write, ending in .mp4.
         frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
         fps: frames per second.
-        panorama: whether the frames are equirectangular panoramas; players then show an .mp4 as 360 degrees. A .webm
-            has no such mark.
+        panorama: whether the frames are equirectangular panoramas; players then show the film as 360 degrees.
         stereo: arrangement of the eyes in a panorama's frame.
     """
     path = Path(path)
-    if path.suffix.lower() not in VIDEO_SUFFIXES:
-        allowed = " or ".join(VIDEO_SUFFIXES)
-        raise InputError(f"cannot write {path}: needed a name ending in {allowed}, got '{path.suffix}'; rename it.")
+    if path.suffix.lower() != ".mp4":
+        raise InputError(f"cannot write {path}: needed a name ending in .mp4, got '{path.suffix}'; rename it.")
     if not 0 < fps < float("inf"):
         raise InputError(f"`fps` must be positive, got {fps}; choose one, such as 30.")
     import av
 
     with replacing(path) as temporary:
         count = 0
-        options = {"movflags": "+faststart"} if path.suffix.lower() == ".mp4" else {}
-        with av.open(str(temporary), "w", options=options) as container:
-            container.metadata["comment"] = SOFTWARE  # at the start of a .webm
+        with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
             stream: Any = None
             for count, frame in enumerate(frames, start=1):
                 pixels = _check_frame(path, frame, count, None if stream is None else (stream.height, stream.width))
                 if stream is None:
-                    encoder = video_encoder(path.suffix.lower())
+                    encoder = video_encoder()
                     stream = _add_stream(container, encoder, pixels.shape[1], pixels.shape[0], fps)
                 video_frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 for packet in stream.encode(video_frame.reformat(format="yuv420p", dst_colorspace="ITU709")):
@@ -164,27 +60,26 @@ def write_video(
                 raise InputError(f"cannot write {path}: needed at least one frame, got none; nothing was written.")
             for packet in stream.encode():
                 container.mux(packet)
-        if path.suffix.lower() == ".mp4":
-            if panorama:
-                mark_spherical_video(temporary, stereo)
-            with open(temporary, "ab") as file:  # a box that players skip
-                file.write((8 + len(SOFTWARE)).to_bytes(4, "big") + b"free" + SOFTWARE.encode())
+        if panorama:
+            mark_spherical_video(temporary, stereo)
+        with open(temporary, "ab") as file:  # a box that players skip
+            file.write((8 + len(SOFTWARE)).to_bytes(4, "big") + b"free" + SOFTWARE.encode())
     return count
 
 
-def video_encoder(suffix: str = ".mp4") -> str:
-    """Name of the encoder that `write_video` uses for files of a suffix."""
+def video_encoder() -> str:
+    """Name of the encoder that `write_video` uses."""
     import av
     import av.codec
 
-    for name in _ENCODERS[suffix]:
+    for name in _ENCODERS:
         if name in av.codecs_available:
             try:
                 av.codec.Codec(name, "w")
                 return name
             except ValueError:  # available for decoding only
                 continue
-    raise InputError(f"needed PyAV with one of the encoders {_ENCODERS[suffix]}, got none of them; reinstall `av`.")
+    raise InputError(f"needed PyAV with one of the encoders {_ENCODERS}, got none of them; reinstall `av`.")
 
 
 def _add_stream(container: Any, encoder: str, width: int, height: int, fps: float) -> Any:
@@ -192,10 +87,6 @@ def _add_stream(container: Any, encoder: str, width: int, height: int, fps: floa
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     if encoder == "libx264":
         stream.options = {"crf": "18", "preset": "medium"}
-    elif encoder == "libvpx-vp9":
-        stream.options = {"crf": "24", "b": "0", "row-mt": "1", "cpu-used": "4"}  # crf is 0 to 63
-    elif encoder == "libsvtav1":
-        stream.options = {"crf": "28", "preset": "8"}  # crf is 0 to 63
     else:
         stream.bit_rate = int(width * height * fps * 0.2)
     # BT.709, limited range. Without these tags players guess the colour space from the size, and colours shift.

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from pansplat.errors import InputError, InputWarning, collect_notes
+from pansplat.errors import InputError, InputWarning
 from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
 from pansplat.images.image_files import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
 from pansplat.inputs.folder_formats import PAIRS, POSES
@@ -20,13 +20,13 @@ from pansplat.inputs.pairs import Collection, Pair, Panorama, list_names, list_p
 from pansplat.inputs.photographs import LINKS, add_links, list_unread_panoramas
 from pansplat.inputs.poses import parse_convention
 from pansplat.inputs.web_tours import find_web_tours, is_web_tour_file
-from pansplat.inputs.web_tours.entries import make_panorama
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import expand_home, is_scene_file, is_written, require_text
 from pansplat.system.options import CAMERA_HEIGHT
 
-VIDEO_FILES = (".mp4", ".mov", ".mkv", ".webm")
+_VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
 _RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
+_UNREAD_SUFFIXES = (*_VIDEO_SUFFIXES, *_RAW_SUFFIXES, ".heic", ".heif")
 _TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # that may hold poses
 _PICTURES = (*READABLE_SUFFIXES, ".bmp", ".gif")  # that may be masks
 
@@ -95,27 +95,9 @@ def load_collections(path: Path | str, *, convention: str | None = None, posed: 
     return collections
 
 
-def load_panoramas(path: Path | str) -> list[Panorama]:
-    """All panoramas at a path (see `load_collections`), with titles, links and start views."""
-    return [view for found in load_collections(path) for view in found.views]
-
-
-@list_folders_once()
-def list_unposed(paths: Sequence[Path]) -> list[Panorama]:
-    """The panoramas of folders, files of web tours, and pictures, with links and titles; no poses are read."""
-    panoramas: list[Panorama] = []
-    siblings: dict[Path, dict[Path, Panorama]] = {}
-    for path in paths:
-        if path.exists() and not path.is_dir() and not is_web_tour_file(path):
-            folder = path.parent
-            if folder not in siblings:
-                with collect_notes(), contextlib.suppress(InputError):  # without notes about other files
-                    siblings[folder] = {view.image: view for found in _read_unposed(folder) for view in found.views}
-            panoramas.append(siblings.get(folder, {}).get(path) or make_panorama(path.stem, path, folder))
-            require_known_masks(path)
-        else:
-            panoramas += [view for found in load_collections(path, posed=False) for view in found.views]
-    return panoramas
+def load_panoramas(path: Path | str, *, posed: bool = True) -> list[Panorama]:
+    """All panoramas at a path, with titles, links and start views; see `load_collections`."""
+    return [view for found in load_collections(path, posed=posed) for view in found.views]
 
 
 def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
@@ -131,26 +113,31 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
             raise InputError(f"{image}: needed a panorama, got the mask of another by its name; rename or remove it.")
     folders = dict.fromkeys(_list_folders(root, _MAX_DEPTH) if root.is_dir() else [root.parent])
     read: set[Path] = set()  # pictures
+    parts: set[Path] = set()  # of them, those that panoramas are joined from
     used: set[Path] = set()
     names: dict[str, Path] = {}  # pictures by their names
     for image, view in views.items():
-        places = *list_pictures(image), locate_panorama(image)
+        pictures, place = list_pictures(image), locate_panorama(image)
+        parts |= {picture.resolve() for picture in pictures} - {image.resolve()}
+        places = *pictures, place
         read |= {picture.resolve() for picture in places}
         folders |= dict.fromkeys(folder for file in places for folder in (file.parent, file.resolve().parent))
         used |= {mask.resolve() for mask in (view.mask, *list_masks(image, check=True)) if mask is not None}
-        names[fold_name(view.name)] = places[-1]
+        names[fold_name(view.name)] = place
+    used |= parts  # among them are masks of perspective pictures
     listed = ((folder, name) for folder in folders for name in sorted(next(os.walk(folder), ("", [], []))[2]))
     files = [folder / name for folder, name in listed if not (name.startswith(".") or is_scene_file(name))]
     masks = {file: name for file in files if (name := split_mask_name(file)) and file.resolve() not in used}
     pictures = [file for file in files if file.suffix.lower() in _PICTURES and not split_mask_name(file)]
-    names |= {fold_name(picture.stem): picture for picture in pictures}
+    names |= {fold_name(picture.stem): picture for picture in pictures if picture.resolve() not in parts}
     for mask, (stem, kind) in masks.items():
         own = [
             file for file in pictures if file.parent == mask.parent and fold_name(stem) in ("", fold_name(file.stem))
         ]
         is_named = bool(own) or (mask.parent == root and not stem)
         # Pictures that are not read have masks, too, and poses.json may state another mask of the scene.
-        is_spare = kind == MASK_SUFFIX or (stem and read.isdisjoint(file.resolve() for file in own))
+        shown = parts if kind == MASK_SUFFIX else read
+        is_spare = (stem or kind == MASK_SUFFIX) and shown.isdisjoint(file.resolve() for file in own)
         if (is_named and is_spare and mask.suffix.lower() == ".png") or not (
             is_named or mask.suffix.lower() in _PICTURES
         ):
@@ -174,7 +161,7 @@ def _list_folders(folder: Path, depth: int) -> Iterator[Path]:
 
 def _read_file(file: Path, convention: str | None, posed: bool) -> list[Collection]:
     """The panorama of a picture, those of a triplet or web tour, or those of the folder of another file with poses."""
-    if file.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES):
+    if file.suffix.lower() in _UNREAD_SUFFIXES:
         raise InputError(f"{file}: needed panoramas, got {_advise_on_file(file)}.")
     folder = file.parent
     if file.suffix.lower() in READABLE_SUFFIXES:
@@ -346,7 +333,7 @@ def _is_export(folder: Path) -> bool:
 
 def _nothing_found(root: Path) -> InputError:
     inside = [folder for folder in find_panorama_folders(root) if folder != root]
-    others = [file for file in sorted(root.iterdir()) if file.suffix.lower() in (*VIDEO_FILES, *_RAW_SUFFIXES)]
+    others = [file for file in sorted(root.iterdir()) if file.suffix.lower() in _UNREAD_SUFFIXES]
     tables = [file for file in sorted(root.iterdir()) if file.suffix.lower() in _TABLE_SUFFIXES and file.is_file()]
     if inside:
         got = f"some without poses in {list_first([str(folder.relative_to(root)) for folder in inside])}; "
@@ -358,17 +345,19 @@ def _nothing_found(root: Path) -> InputError:
             "none; " if not tables else f"none, and {list_first([file.name for file in tables])}, of no known format; "
         )
         advice = "give the folder that holds the pictures; docs/input.md lists the formats of poses"
-    return InputError(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP, HEIC or EXR), got {got}{advice}.")
+    return InputError(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP or EXR), got {got}{advice}.")
 
 
 def _advise_on_file(file: Path) -> str:
-    """What a video or a file of a camera is, and what to do with it."""
-    if file.suffix.lower() in VIDEO_FILES:
+    """What a video or a file of a camera or phone is, and what to do with it."""
+    if file.suffix.lower() in _VIDEO_SUFFIXES:
         return (
-            f"the video {file.name}; `pansplat pose {file} -o FOLDER` writes its key frames and their poses, then open "
-            "FOLDER"
+            f"the video {file.name}; write frames of it into a folder (mkdir FOLDER; ffmpeg -i {file} -vf fps=1 "
+            "FOLDER/%03d.png), and open FOLDER"
         )
-    return f"{file.name}, which the program of its camera must stitch; export it as a 2:1 JPG or MP4"
+    if file.suffix.lower() not in _RAW_SUFFIXES:
+        return f"{file.name}; convert it to JPG"
+    return f"{file.name}, which the program of its camera must stitch; export it as a 2:1 JPG"
 
 
 def make_names_unique(pairs: list[Pair]) -> list[Pair]:

@@ -15,10 +15,9 @@ from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import USER_FRAME, WorldFrame, choose_frame, require_depth_range
-from pansplat.images.blur_masks import MASK_SUFFIX, list_mask_files, locate_panorama, split_mask_name
+from pansplat.images.blur_masks import MASK_SUFFIX, find_mask_beside, list_mask_files, locate_panorama, split_mask_name
 from pansplat.images.image_files import (
     READABLE_SUFFIXES,
-    find_masks,
     is_assembled,
     read_depth,
     read_height,
@@ -413,10 +412,10 @@ def list_names(files: Sequence[Path]) -> str:
 
 def find_mask(image: Path, folder: Path) -> Path | None:
     """The mask file of an image: STEM_mask.png or mask.png in the image's folder, or mask.png in `folder`."""
-    own = find_masks(image, MASK_SUFFIX).get(image)
-    places = dict.fromkeys((locate_panorama(image).parent, folder))
+    panorama = locate_panorama(image)
+    places = dict.fromkeys((panorama.parent, folder))
     of_folders = (mask for place in places for mask in list_mask_files(place, MASK_SUFFIX).get("", []))
-    return own or next(of_folders, None)
+    return find_mask_beside(panorama, MASK_SUFFIX) or next(of_folders, None)
 
 
 def list_panorama_files(folder: Path) -> list[Path]:

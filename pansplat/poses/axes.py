@@ -10,7 +10,7 @@ Source: J. Coughlan, A. Yuille, Manhattan World, ICCV 1999; segments: R. Grompon
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,13 +27,11 @@ _FIRST_TOLERANCE = math.radians(3)
 _SEARCH_TOLERANCE = math.radians(1.5)
 _LARGEST_TILT = math.radians(20)  # of the camera
 _MIN_SUPPORT, _MIN_CONTRAST = 12, 2.5  # segments of an axis, also relative to the number by chance
-_LARGEST_COSINE = 0.9  # between two axes that give a third one
 _LONG = math.radians(10)  # segments whose scatter measures the noise of the axes: pixels hardly matter
 _LEAST_NOISE, _LARGEST_NOISE = math.radians(0.03), math.radians(0.26)  # of the normals of long segments
 _TILT_NOISE, _YAW_NOISE = 0.8, 1.35  # of the relative rotation about horizontal axes and gravity, in this noise
 _LARGEST_RESIDUAL = 7.0  # of a rotation that the axes are taken to determine, in the noise's unit
 _LARGEST_DIFFERENCE = math.radians(1.8)  # of axes that count as parallel
-_COMPASS_NOISE, _COMPASS_SHARE = math.radians(20), 0.6  # of headings; their prior probability to be right
 _AGREEMENT = 0.9, 0.06  # prior probability of axes of one building, and of upright cameras in different ones
 
 
@@ -46,14 +44,12 @@ class SceneAxes:
         has_down: whether enough vertical edges determine the first axis.
         has_walls: whether enough horizontal edges determine the other two.
         noise: standard deviation of the normals of long edges, radians: stitching, and edges that are not parallel.
-        heading: compass direction of the picture's centre, radians clockwise from north, if the metadata has it.
     """
 
     axes: Float[Array, "3 3"]
     has_down: bool
     has_walls: bool
     noise: float = _LARGEST_NOISE
-    heading: float | None = None
 
     @property
     def frame(self) -> Float[Array, "3 3"]:
@@ -137,16 +133,6 @@ def _search_axes(normals: Float[Array, "n 3"], lengths: Float[Array, "n"]) -> Fl
     return np.stack((down, wall, np.cross(down, wall)))
 
 
-def with_hints(axes: SceneAxes, down: Float[Array, "3"] | None, heading: float | None) -> SceneAxes:
-    """The axes with gravity and compass by the metadata, where the picture does not determine gravity itself."""
-    if axes.has_down or down is None:
-        return replace(axes, heading=heading)
-    level = axes.axes[2] if abs(down @ axes.axes[2]) < _LARGEST_COSINE else axes.axes[0]
-    wall = np.cross(down, level)
-    wall /= np.linalg.norm(wall)
-    return SceneAxes(np.stack((down, wall, np.cross(down, wall))), True, False, heading=heading)
-
-
 @dataclass(frozen=True, eq=False)
 class RotationPrior:
     """What the axes of two panoramas state about their relative rotation, before any match.
@@ -213,9 +199,8 @@ class RotationPrior:
 
     def score(self, rotation: Float[Array, "3 3"]) -> float:
         """Logarithm of the rotation's probability density under the prior, over that of a random rotation."""
-        heading = self._heading_score(rotation)
         if not self.has_down:
-            return heading
+            return 0.0
         tilt = math.acos(float(np.clip(self.second.axes[0] @ rotation @ self.first.axes[0], -1, 1)))
         sigma = math.sqrt(2) * self.noise[0]
         upright = 2 / sigma**2 * math.exp(-0.5 * (tilt / sigma) ** 2)
@@ -226,16 +211,7 @@ class RotationPrior:
             walls = 2 * math.pi**2 / ((2 * math.pi) ** 1.5 * sigma**3) * math.exp(-0.5 * (nearest / sigma) ** 2)
         else:
             share, others = 0.0, sum(_AGREEMENT)
-        return heading + math.log(share * walls + others * upright + 1 - share - others)
-
-    def _heading_score(self, rotation: Float[Array, "3 3"]) -> float:
-        """The score of a rotation by the compass alone, which metal and careless programs disturb."""
-        if self.first.heading is None or self.second.heading is None:
-            return 0.0
-        north = [np.array((-math.sin(h), 0.0, math.cos(h))) for h in (self.first.heading, self.second.heading)]
-        angle = math.acos(float(np.clip(north[1] @ rotation @ north[0], -1, 1)))
-        density = math.exp(-0.5 * (angle / _COMPASS_NOISE) ** 2) / (math.sqrt(2 * math.pi) * _COMPASS_NOISE)
-        return math.log(_COMPASS_SHARE * density * 2 * math.pi + 1 - _COMPASS_SHARE)
+        return math.log(share * walls + others * upright + 1 - share - others)
 
 
 NO_PRIOR = RotationPrior(*(SceneAxes(np.eye(3), False, False),) * 2)

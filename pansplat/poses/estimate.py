@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import itertools
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
@@ -17,13 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_mask, read_panorama
 from pansplat.images.masks import scene_mask_of_files
 from pansplat.inputs.pairs import FAR, NEAR, find_mask
 from pansplat.inputs.placements import Tie, find_holds
 from pansplat.inputs.views import CAMERA_HEIGHT
-from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes, with_hints
+from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap, estimate_depth
 from pansplat.poses.features import (
@@ -35,11 +33,10 @@ from pansplat.poses.features import (
     drop_repeated,
     match_features,
 )
-from pansplat.poses.hints import Hints, read_hints
 from pansplat.poses.learned import (
+    NO_LEARNED,
     LearnedFeatures,
     Matcher,
-    MatcherMissingError,
     detect_learned,
     load_matcher,
     match_learned,
@@ -203,7 +200,7 @@ class _View:
     Attributes:
         features: by SIFT, of faces along the camera's axes.
         turned: the same, of faces turned against the walls.
-        learned: by the learned matcher, if it is installed.
+        learned: by the learned matcher.
         axes: gravity and walls.
         small: grey, for the search of the floor.
         surroundings: all that it shows, with estimated depth.
@@ -212,7 +209,7 @@ class _View:
 
     features: Features
     turned: Features
-    learned: LearnedFeatures | None
+    learned: LearnedFeatures
     axes: SceneAxes
     small: Float[Array, "height width"]
     surroundings: Surroundings
@@ -222,8 +219,6 @@ class _View:
     @functools.cached_property
     def matched(self) -> Features:
         """The features from which the pose of a pair is estimated."""
-        if self.learned is None:
-            return self.features
         count = len(self.learned)
         return self.features.joined(
             Features(
@@ -242,7 +237,9 @@ class _View:
     @functools.cached_property
     def mirrored(self) -> _View:
         """The view of the panorama that is mirrored left to right; its gravity and walls are not used."""
-        return replace(self, features=self.features.mirrored(), learned=None, surroundings=self.surroundings.mirrored())
+        return replace(
+            self, features=self.features.mirrored(), learned=NO_LEARNED, surroundings=self.surroundings.mirrored()
+        )
 
 
 @with_progress_bar
@@ -254,7 +251,6 @@ def estimate_poses(
     names: Mapping[Path, str] | None = None,
     camera_height: float = CAMERA_HEIGHT,
     baseline: tuple[Path | str, Path | str, float] | None = None,
-    seed: int = 0,
     cache_folder: Path | None = None,
 ) -> PoseEstimate:
     """Camera poses of two or more equirectangular panoramas of one home or site.
@@ -266,7 +262,6 @@ def estimate_poses(
         names: of the images, for messages; by default those of the files.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images of the largest group and their distance in metres, instead of the camera's height.
-        seed: of the random samples.
         cache_folder: folder whose cache keeps features and relative poses, so that a further panorama costs its own
             only; none by default.
 
@@ -292,8 +287,7 @@ def estimate_poses(
                 f"`baseline` must be two different images and a distance above 0 to {_MAX_BASELINE:g} metres, got "
                 f"{' '.join(map(str, baseline))}"
             )
-    hints = [read_hints(path) for path in paths]
-    pixels, unplaced = _read_images(paths, names, hints)
+    pixels, unplaced = _read_images(paths, names)
     kept = [n for n in range(len(paths)) if n not in unplaced]
     if len(kept) < 2:
         raise _no_poses(paths, names, unplaced | {n: "no other panorama is left" for n in kept})
@@ -301,16 +295,17 @@ def estimate_poses(
         files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
         cache = Store(cache_folder, _CACHED)
         count = len(kept)
+        matcher = load_matcher(choose_device("learned matcher", count * _MATCHER_SECONDS))
         split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
         with stage(split):
-            views = _describe_views(paths, files, pixels, hints, kept, cache)
+            views = _describe_views(paths, files, pixels, kept, matcher, cache)
         links = links or {}
         yaws = {
             (i, j): LinkDirections(links.get(paths[a], {}).get(paths[b]), links.get(paths[b], {}).get(paths[a]))
             for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
         }
         with stage(0.9):
-            relations = _relate_views(views, yaws, seed, cache)
+            relations = _relate_views(views, yaws, matcher, cache)
     report_progress("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
@@ -408,17 +403,13 @@ def _no_poses(
 
 
 def _read_images(
-    paths: Sequence[Path], names: Mapping[Path, str], hints: Sequence[Hints]
+    paths: Sequence[Path], names: Mapping[Path, str]
 ) -> tuple[dict[int, UInt8[Array, "height width"]], dict[int, str]]:
     """Grey panoramas by index, and the reasons against those that cannot be used."""
     pixels: dict[int, Array] = {}
     reasons: dict[int, str] = {}
     thumbnails: dict[int, Array] = {}
     for n, path in enumerate(paths):
-        problem = hints[n].problem
-        if problem is not None:
-            reasons[n] = problem
-            continue
         try:
             image = read_panorama(path, _working_height(path))[0].numpy()
         except InputError as error:
@@ -458,15 +449,12 @@ def _describe_views(
     paths: Sequence[Path],
     masks: Mapping[Path, Path | None],
     pixels: dict[int, Array],
-    hints: Sequence[Hints],
     kept: Sequence[int],
+    matcher: Matcher,
     cache: Store,
 ) -> list[_View]:
-    headings = {hints[n].heading for n in kept} - {None}
-    is_compass = len(headings) > 1  # one value for all pictures is a program's default
     hashes = {n: hash_parts(fingerprint_estimates(), pixels[n]) for n in kept}
     static = _find_scene_mask([paths[n] for n in kept], list(hashes.values()), cache)
-    matcher = _load_matcher(len(kept))
 
     def look_up(n: int) -> _View:
         mask = masks.get(paths[n])
@@ -477,18 +465,15 @@ def _describe_views(
         if not opaque.all():
             scene = scene & (cv2.resize(opaque.numpy().astype(np.uint8), scene.shape[::-1]) > 0)
         image = pixels_of_view.permute(1, 2, 0).numpy()
-        heading = hints[n].heading if is_compass else None
-        key = hash_parts(hashes[n], image, np.packbits(scene), f"{hints[n].down} {heading}")
-        return cache.get("view", key, lambda: describe(n, key, scene, image, heading))
+        key = hash_parts(hashes[n], image, np.packbits(scene))
+        return cache.get("view", key, lambda: describe(n, key, scene, image))
 
-    def describe(n: int, key: str, scene: Array, image: Array, heading: float | None) -> _View:
+    def describe(n: int, key: str, scene: Array, image: Array) -> _View:
         grey = pixels[n]
         small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
-        axes = with_hints(find_axes(grey), hints[n].down, heading)
+        axes = find_axes(grey)
         turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
-        learned = None
-        if matcher is not None:
-            learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, frame=axes.frame)
+        learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, axes.frame)
         shown = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
         depth = estimate_depth(shown, axes.axes[0] if axes.has_down else None)
         surroundings = Surroundings(shown, depth)
@@ -536,7 +521,7 @@ def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: Store)
 
 
 def _relate_views(
-    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], seed: int, cache: Store
+    views: Sequence[_View], links: Mapping[IndexPair, LinkDirections], matcher: Matcher, cache: Store
 ) -> dict[IndexPair, RelativePose]:
     """Relative poses of the pairs that have most in common, and of those that links connect.
 
@@ -556,13 +541,11 @@ def _relate_views(
             chosen |= set(own[:_THOROUGH])
         pairs = sorted(chosen, key=lambda pair: (-overlap[pair], pair))
 
-    matcher = None if views[0].learned is None else _load_matcher(len(views))
-
     def relate(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
         matches = _match(first, second, matcher)
         prior = RotationPrior(first.axes, second.axes)
-        relation = _estimate_pair(first, second, matches, prior, links[pair], seed)
+        relation = _estimate_pair(first, second, matches, prior, links[pair])
         if not (relation.is_reliable or relation.is_doubtful):
             return relation
         if relation.is_reliable and _is_mirrored(first, second, overlap.get(pair), relation):
@@ -575,7 +558,7 @@ def _relate_views(
 
     def look_up(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
-        key = hash_parts(first.key, second.key, f"{links[pair]} {seed}")
+        key = hash_parts(first.key, second.key, f"{links[pair]}")
         return cache.get("pair", key, lambda: relate(pair))
 
     groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
@@ -603,30 +586,17 @@ def _relate_views(
 
 def fingerprint_estimates() -> str:
     """A hash of the code and of the weights that poses are estimated by."""
-    files = list_default_weights()
-    with contextlib.suppress(MatcherMissingError):
-        files.append(default_matcher())
-    return hash_parts(hash_sources(__name__), *(hash_file(file) for file in files if file.is_file()))
+    files = *list_default_weights(), default_matcher()
+    return hash_parts(hash_sources(__name__), *map(hash_file, files))
 
 
-def _load_matcher(count: int) -> Matcher | None:
-    """The learned matcher for some panoramas; None, with a warning, if its weights are not installed."""
-    try:
-        return load_matcher(device=choose_device("learned matcher", count * _MATCHER_SECONDS))
-    except MatcherMissingError as error:
-        warnings.warn(f"poses are estimated by SIFT alone: {error}.", InputWarning, stacklevel=2)
-        return None
-
-
-def _match(first: _View, second: _View, matcher: Matcher | None) -> Matches:
+def _match(first: _View, second: _View, matcher: Matcher) -> Matches:
     """Matches of `matched` features: by SIFT, and by the learned matcher where those hardly suffice."""
     matches = match_features(first.features, second.features)
-    if matcher is None or first.learned is None or second.learned is None:
-        return matches
     if matches.prior[matches.prior > _COUNTED_PRIOR].sum() > _ENOUGH_SIFT_MATCHES:
         return matches
     found = match_learned(matcher, first.learned, second.learned)
-    learned = Matches(found.indices, np.minimum(found.probability, _LEARNED_PRIOR))
+    learned = Matches(found.indices, np.minimum(found.prior, _LEARNED_PRIOR))
     every = matches.joined(learned.shifted(len(first.features), len(second.features)))
     return drop_repeated(first.matched, second.matched, every)
 
@@ -637,11 +607,10 @@ def _estimate_pair(
     matches: Matches,
     prior: RotationPrior = NO_PRIOR,
     links: LinkDirections = NO_LINKS,
-    seed: int = 0,
 ) -> RelativePose:
     """The relative pose of two views."""
     surroundings = first.surroundings, second.surroundings
-    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, links, seed=seed)
+    return estimate_relative_pose(first.matched, second.matched, matches, prior, surroundings, links)
 
 
 def _describe_mirrored(view: int, views: Sequence[_View], placed: Sequence[int], names: Sequence[str]) -> str | None:

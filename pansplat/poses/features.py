@@ -26,6 +26,7 @@ from pansplat.geometry.pose import rotations_from_quats
 
 _FIELD_OF_VIEW = 100.0  # degrees of a face; 10 more than a cube's
 _CONTRAST, _EDGE = 0.015, 12.0  # thresholds of SIFT; low, because matching removes weak features
+_FEATURES = 8000  # of a panorama, at most
 _DIM_BRIGHTNESS = 16.0  # mean grey value below which an image is brightened
 _REPEATED_MATCH = 0.008  # distance of matches that count once, radians in both panoramas together
 _NOISE_PIXELS, _MIN_NOISE = 0.45, 8e-4  # of a right match's epipolar angle: pixels at the horizon; radians
@@ -98,10 +99,6 @@ class Matches:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def best(self, count: int) -> Matches:
-        """The first `count` matches."""
-        return Matches(self.indices[:count], self.prior[:count])
-
     def joined(self, other: Matches) -> Matches:
         """These matches and those of `other`, sorted."""
         prior = np.concatenate((self.prior, other.prior))
@@ -122,15 +119,13 @@ def detect_features(
     *,
     rotations: Float[Array, "6 3 3"] = FACE_ROTATIONS,
     faces: int = 6,
-    count: int = 8000,
 ) -> Features:
-    """The `count` strongest features of a grey panorama, outside the masked pixels.
+    """The strongest features of a grey panorama, outside the masked pixels.
 
     Args:
         mask: True where the panorama shows the scene.
         rotations: axes of the faces of a cube in the camera's frame, as columns.
         faces: number of the faces that are used, the first ones.
-        count: largest number of features.
     """
     if image.mean() < _DIM_BRIGHTNESS:
         image = cv2.equalizeHist(image)
@@ -155,7 +150,7 @@ def detect_features(
         descriptors.append(found[own])
         keypoints.append(np.array([(point.response, point.size) for point in points])[own])
     strength, sizes = np.concatenate(keypoints).T
-    order = np.argsort(-strength, kind="stable")[:count]
+    order = np.argsort(-strength, kind="stable")[:_FEATURES]
     descriptor = np.concatenate(descriptors)[order]
     descriptor = np.sqrt(descriptor / np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-9))
     noise = np.full(len(order), max(_NOISE_PIXELS * 2 * math.pi / image.shape[1], _MIN_NOISE))

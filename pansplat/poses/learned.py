@@ -24,13 +24,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray as Array
 from torch import Tensor, nn
 
-from pansplat.errors import InputError
 from pansplat.model.weights import load_weights, require_shapes
 from pansplat.networks.aliked import Aliked
 from pansplat.networks.lightglue import LightGlue
-from pansplat.poses.features import FACE_ROTATIONS, are_distinct, render_face, sample_mask
+from pansplat.poses.features import FACE_ROTATIONS, Matches, are_distinct, render_face, sample_mask
 
-MODEL = "matcher"
 _FACES = 4  # the horizontal ones; floor and ceiling have few keypoints, and no upright direction
 _KEYPOINTS = 640  # of a face
 _STRIDE = 32  # pixels; the sides of an image are multiples of it
@@ -43,10 +41,6 @@ _CONFIDENT = 0.3  # score of matches that count for their pair of faces
 _CALIBRATION = -4.84, 0.264, 1.586
 
 
-class MatcherMissingError(InputError):
-    """The weights of the learned matcher are not installed."""
-
-
 class Matcher(nn.Module):
     """Both networks of the learned matcher."""
 
@@ -57,27 +51,15 @@ class Matcher(nn.Module):
 
 
 def default_weights() -> Path:
-    """The weights of the learned matcher that the package ships; a MatcherMissingError without them."""
-    try:
-        folder = files("pansplat.matcher")
-    except ModuleNotFoundError as error:  # a clone that was set up before it had this folder
-        raise MatcherMissingError("needed the learned matcher's weights, got none; run setup.sh again") from error
-    return Path(str(folder.joinpath("matcher.safetensors")))
+    """The weights of the learned matcher that the package ships."""
+    return Path(str(files("pansplat.matcher").joinpath("matcher.safetensors")))
 
 
 @functools.cache
-def load_matcher(path: Path | None = None, device: torch.device | None = None) -> Matcher:
-    """The learned matcher of a weights file, by default the package's, in eval mode.
-
-    Raises:
-        MatcherMissingError: there is no such file.
-    """
-    path = default_weights() if path is None else path
-    if not path.is_file():
-        raise MatcherMissingError(f"{path}: needed the learned matcher's weights, got no file; install pansplat again")
+def load_matcher(device: torch.device) -> Matcher:
+    """The learned matcher in eval mode."""
+    path = default_weights()
     weights = load_weights(path)
-    if weights.model != MODEL:
-        raise InputError(f"{path}: needed weights of a {MODEL} network, got weights of {weights.model!r}")
     matcher = Matcher().requires_grad_(False)
     require_shapes(weights.tensors, matcher.state_dict(), path)
     matcher.load_state_dict(weights.tensors)
@@ -113,57 +95,36 @@ class LearnedFeatures:
         return self.points[own], self.descriptors[own]
 
 
-@dataclass(frozen=True, eq=False)
-class LearnedMatches:
-    """Pairs of learned features, the most probable first; a place of either panorama is in one of them.
-
-    Attributes:
-        indices: of the features in the first and in the second panorama.
-        score: by LightGlue, in [0, 1].
-        probability: that the match is right, by its score and by the other matches of its faces.
-    """
-
-    indices: Int[Array, "match 2"]
-    score: Float[Array, "match"]
-    probability: Float[Array, "match"]
-
-    def __len__(self) -> int:
-        return len(self.indices)
+NO_LEARNED = LearnedFeatures(np.empty((0, 3)), torch.empty(0, 128), torch.empty(0, 2), (0,) * (_FACES + 1), 0.0)
 
 
 def detect_learned(
     matcher: Matcher,
     image: UInt8[Array, "height width 3"],
-    mask: Bool[Array, "height width"] | None = None,
-    *,
-    frame: Float[Array, "3 3"] | None = None,
-    count: int = _KEYPOINTS,
+    mask: Bool[Array, "height width"],
+    frame: Float[Array, "3 3"],
 ) -> LearnedFeatures:
     """Learned features of an RGB panorama, outside the masked pixels.
 
     Args:
         mask: True where the panorama shows the scene.
-        frame: axes of the walls in the camera's frame, as columns x, y (down), z; by default the camera's own.
-        count: largest number of features of a face.
+        frame: axes of the walls in the camera's frame, as columns x, y (down), z.
     """
     focal, device = image.shape[1] / (2 * math.pi), next(matcher.parameters()).device
-    rotations = FACE_ROTATIONS[:_FACES] if frame is None else frame @ FACE_ROTATIONS[:_FACES]
     bearings, descriptors, places, starts = [], [], [], [0]
-    for rotation in rotations:
+    for rotation in frame @ FACE_ROTATIONS[:_FACES]:
         pixels = render_face(image, rotation, focal)
         margin = len(pixels) % _STRIDE
         side = len(pixels) - margin
         pixels = pixels[margin // 2 :][:side, margin // 2 :][:, :side]
         centre = len(pixels) / 2 + margin / 2 - margin // 2  # of the face, in pixels from the corner
-        allowed = torch.ones(side, side, dtype=torch.bool)
-        if mask is not None:
-            steps = (np.arange(side) + 0.5 - centre) / focal
-            x, y = np.meshgrid(steps, steps)
-            rays = np.stack((x, y, np.ones_like(x)), axis=-1).reshape(-1, 3) @ rotation.T
-            allowed = torch.from_numpy(sample_mask(mask, rays).reshape(side, side))
+        steps = (np.arange(side) + 0.5 - centre) / focal
+        x, y = np.meshgrid(steps, steps)
+        rays = np.stack((x, y, np.ones_like(x)), axis=-1).reshape(-1, 3) @ rotation.T
+        allowed = torch.from_numpy(sample_mask(mask, rays).reshape(side, side))
         with torch.inference_mode():
             rgb = torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
-            found = matcher.aliked(rgb.to(device), allowed.to(device), count)
+            found = matcher.aliked(rgb.to(device), allowed.to(device), _KEYPOINTS)
         points, described = (each.cpu() for each in found)
         xy = (points.double().numpy() + 0.5 - centre) / focal
         rays = np.concatenate((xy, np.ones((len(xy), 1))), axis=1)
@@ -176,8 +137,8 @@ def detect_learned(
     )
 
 
-def match_learned(matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures) -> LearnedMatches:
-    """Matches of two panoramas."""
+def match_learned(matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures) -> Matches:
+    """Matches of two panoramas, whose prior is the probability that each is right."""
     common, device = count_common(first, second), next(matcher.parameters()).device
     order = np.argsort(-common, axis=None, kind="stable")[:_FACE_PAIRS]
     found = []
@@ -191,7 +152,7 @@ def match_learned(matcher: Matcher, first: LearnedFeatures, second: LearnedFeatu
 
 def _join_faces(
     first: LearnedFeatures, second: LearnedFeatures, found: Sequence[tuple[Int[Array, "_ 2"], Float[Array, "_"]]]
-) -> LearnedMatches:
+) -> Matches:
     """The matches of all pairs of faces, without those that contradict or repeat a more probable one."""
     indices = np.concatenate([index for index, _ in found])
     score = np.concatenate([score for _, score in found])
@@ -204,7 +165,7 @@ def _join_faces(
     order = order[score[order] > _MIN_SCORE]
     a, b = first.bearings[indices[order, 0]], second.bearings[indices[order, 1]]
     order = order[are_distinct(a) & are_distinct(b)]
-    return LearnedMatches(indices[order], score[order], probability[order])
+    return Matches(indices[order], probability[order])
 
 
 def count_common(first: LearnedFeatures, second: LearnedFeatures) -> Int[Array, "face face"]:

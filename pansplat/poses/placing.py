@@ -23,10 +23,9 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.path import level_pose, up_direction, wrap_angle
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.pairs import Link, Panorama
-from pansplat.poses.axes import find_axes, with_hints
+from pansplat.poses.axes import find_axes
 from pansplat.poses.dense import Comparison, Surroundings, compare
 from pansplat.poses.depth import estimate_depth
-from pansplat.poses.hints import read_hints
 from pansplat.poses.two_view import RelativePose
 from pansplat.tours.floor import find_ceiling, trace_floor
 
@@ -253,7 +252,7 @@ def read_piece(image: Path) -> Piece:
     """The piece of a panorama file, with its depth by the default model."""
     pixels = read_panorama(image, min(read_height(image), _IMAGE_HEIGHT))[0].permute(1, 2, 0).numpy()
     grey = cv2.cvtColor((pixels * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
-    axes = with_hints(find_axes(grey), read_hints(image).down, None)
+    axes = find_axes(grey)
     pixels = cv2.resize(pixels, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
     depth = estimate_depth(pixels, axes.axes[0] if axes.has_down else None)
     wall = depth.rotation.T @ axes.axes[1]

@@ -108,7 +108,7 @@ REFUSED = {
     "render scene.ply -o x.png --at 0.5 --pose path.txt": "give one of them",
     "render scene.ply -o x.mp4 --pose path.txt --path walk.json": "--pose and --path set the camera",
     "render scene.ply -o x.png --depth --path walk.json": "write the film of --path as .exr",
-    "render scene.ply -o x.jpg --path walk.json": "--out must end in .mp4, .webm, .png, .exr",
+    "render scene.ply -o x.jpg --path walk.json": "--out must end in .mp4, .png, .exr",
     "render scene.ply -o x.png --pose path.txt": "needed 16 numbers, got 24",
     "render scene.ply -o x.mp4 --at 0.5": "--at is one position",
     "render scene.ply -o x.mp4 --pose p.json": "--pose is one position",

@@ -112,11 +112,10 @@ def test_reports_and_pictures_of_all_kinds_are_marked(tmp_path: Path) -> None:
     write_depth(tmp_path / "depth.png", grey[..., 0])
     write_json([{"a": 1}], tmp_path / "list.json")
     write_json({"a": 1}, tmp_path / "object.json")
-    for suffix in (".mp4", ".webm"):
-        noise = np.random.default_rng(0).integers(0, 255, (3, 256, 512, 3), dtype=np.uint8)
-        write_video(tmp_path / f"film{suffix}", noise, 8.0)  # longer than what is searched at each end
+    noise = np.random.default_rng(0).integers(0, 255, (3, 256, 512, 3), dtype=np.uint8)
+    write_video(tmp_path / "film.mp4", noise, 8.0)  # longer than what is searched at each end
     files = list(tmp_path.iterdir())
-    assert len(files) == 13 and all(map(is_written, files))
+    assert len(files) == 12 and all(map(is_written, files))
 
 
 def test_other_files_are_not_taken_for_ours(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`pansplat pose` replaces nothing that it did not write, and key frames without a pose are not lost."""
+"""`pansplat pose` replaces nothing that it did not write, and uses what a folder states."""
 
 import contextlib
 import json
@@ -13,8 +13,6 @@ import pansplat
 from pansplat.cli import run
 from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
-from pansplat.images.video import write_video
-from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import is_progress_shown
@@ -80,62 +78,6 @@ def test_renderings_beside_photographs_are_given_no_poses(folder: Path, estimato
     assert "0_view.png: it was rendered by pansplat" in capsys.readouterr().err
 
 
-@pytest.fixture
-def video(tmp_path: Path) -> Path:
-    """A film of noise, of which each frame differs."""
-    write_video(tmp_path / "film.mp4", [_photograph(number) for number in range(12)], 12)
-    return tmp_path / "film.mp4"
-
-
-def test_key_frames_that_cannot_be_placed_are_scenes_of_their_own(video: Path, tmp_path: Path, estimator) -> None:
-    estimator(_place_two)
-    walk = tmp_path / "walk"
-    assert run(["pose", str(video), "-o", str(walk), "--frames", "3"]) == 0
-    frames = sorted(file.stem for file in walk.glob("*.png"))
-    pairs = load_pairs(walk)
-    assert len(frames) == 3
-    assert [[view.name for view in pair.context] for pair in pairs] == [frames[:2], frames[2:]]
-    assert pairs[1].context[0].placement.reason == "no door"
-
-
-def test_key_frames_without_poses_are_photographs_beside_others(video: Path, tmp_path: Path, estimator) -> None:
-    def fail(images, **options) -> PoseEstimate:
-        raise NoPosesError(dict.fromkeys(images, "no door"))
-
-    estimator(fail)
-    walk = tmp_path / "walk"
-    assert run(["pose", str(video), "-o", str(walk), "--frames", "3"]) == 2
-    assert len(load_panoramas(walk)) == 3
-    Image.fromarray(_photograph(99)).save(walk / "hall.jpg")
-    assert len(load_panoramas(walk)) == 4
-
-
-def test_key_frames_replace_no_picture_of_the_user(video: Path, tmp_path: Path, estimator, capsys) -> None:
-    estimator(_place_two)
-    walk = tmp_path / "walk"
-    arguments = ["pose", str(video), "-o", str(walk), "--frames", "3"]
-    for _ in range(2):  # its own are replaced
-        assert run(arguments) == 0
-    own = sorted(walk.glob("*.png"))
-    Image.fromarray(np.zeros((64, 128, 3), np.uint8)).save(own[-1])
-    states = {file: file.read_bytes() for file in walk.iterdir()}
-    assert run(arguments) == 2
-    error = capsys.readouterr().err
-    assert own[-1].name in error and "--overwrite" in error
-    assert {file: file.read_bytes() for file in walk.iterdir()} == states
-    assert run([*arguments, "--overwrite"]) == 0
-    assert own[-1].read_bytes() != states[own[-1]]
-
-
-def test_key_frames_of_two_films_are_different_files(video: Path, tmp_path: Path, estimator) -> None:
-    estimator(_place_two)
-    (tmp_path / "stairs.mp4").write_bytes(video.read_bytes())
-    for film in (video, tmp_path / "stairs.mp4"):
-        assert run(["pose", str(film), "-o", str(tmp_path / "walk"), "--frames", "3"]) == 0
-    assert len(list((tmp_path / "walk").glob("*.png"))) == 6
-    assert sorted(len(pair.context) for pair in load_pairs(tmp_path / "walk")) == [1, 1, 2, 2]
-
-
 @pytest.fixture(params=["a folder with links", "a web tour of pictures", "a web tour of cube faces"])
 def linked(request: pytest.FixtureRequest, folder: Path, write_tiles) -> Path:
     """Three panoramas, of which the first one links to the second."""
@@ -174,7 +116,6 @@ def _export(folder: Path, out: Path) -> object:
 
 CALLERS = {
     "pose": lambda folder, out: run(["pose", str(folder), "-o", str(folder / "poses.json")]),
-    "pose of files": lambda folder, out: run(["pose", *map(str, sorted(folder.glob("*.png")))]),
     "pose of a tour's file": lambda folder, out: run(["pose", *map(str, folder.glob("*.html"))]),
     "export": _export,
     "predict_tour": lambda folder, out: pansplat.predict_tour(folder),
@@ -191,9 +132,8 @@ def test_all_commands_estimate_poses_from_the_same_arguments(linked: Path, tmp_p
 
     estimator(record)
     callers = dict(CALLERS)
-    callers.pop("pose of a tour's file" if not list(linked.glob("*.html")) else "pose of files")
-    if not list(linked.glob("*.png")):
-        callers.pop("pose of files", None)
+    if not list(linked.glob("*.html")):
+        callers.pop("pose of a tour's file")
     for number, (name, call) in enumerate(callers.items(), start=1):
         for cache in linked.glob(".pansplat/poses-*.entry"):
             cache.unlink()

@@ -121,10 +121,9 @@ def make_film(scene: Scene, *, with_depth: bool = False) -> Film:
     return Film(lambda shot: (scene, 0), draw, "pinhole", (32, 48))
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
-def test_each_frame_of_a_film_shows_the_path_at_its_time(scene: Scene, tmp_path: Path, suffix: str) -> None:
+def test_each_frame_of_a_film_shows_the_path_at_its_time(scene: Scene, tmp_path: Path) -> None:
     shots = follow_path(PATH, 8.0, scene, None)
-    (file,) = write_film(tmp_path / f"film{suffix}", make_film(scene), shots, 8.0)
+    (file,) = write_film(tmp_path / "film.mp4", make_film(scene), shots, 8.0)
     with av.open(str(file)) as video:
         decoded = [(frame.time, frame.to_ndarray(format="rgb24")) for frame in video.decode(video=0)]
     assert [round(8 * time) for time, _ in decoded] == list(range(9))

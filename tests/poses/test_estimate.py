@@ -22,23 +22,20 @@ from pansplat.poses.axes import SceneAxes
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.estimate import (
-    NoPosesError,
     PoseEstimate,
     _find_file,
     _is_mirrored,
-    _load_matcher,
     _match,
     _relate_views,
     _View,
     estimate_poses,
 )
-from pansplat.poses.features import Features, detect_features
+from pansplat.poses.features import Features, Matches, detect_features
 from pansplat.poses.files import write_poses
-from pansplat.poses.learned import LearnedFeatures, LearnedMatches, MatcherMissingError
+from pansplat.poses.learned import NO_LEARNED, LearnedFeatures
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
 from pansplat.poses.solvers import angle_between, rotation_angle
 from pansplat.poses.two_view import RelativePose
-from pansplat.system.devices import use_device
 from pansplat.system.store import Store
 
 SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
@@ -139,36 +136,7 @@ def _relation(log_odds: float, problem: str | None = None) -> RelativePose:
     return RelativePose(np.eye(3), np.eye(3)[0], none, log_odds=log_odds, problem=problem, **figures)
 
 
-def test_without_the_learned_matcher_poses_are_estimated_by_sift_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(**_: object) -> None:
-        raise MatcherMissingError("needed the learned matcher's weights, got none; run setup.sh again")
-
-    monkeypatch.setattr("pansplat.poses.estimate.load_matcher", refuse)
-    for number in range(2):
-        noise = np.tile(np.random.default_rng(number).integers(0, 255, (8, 16, 3), np.uint8), (1, 3, 1))
-        ramp = cv2.resize(noise, (384, 64), interpolation=cv2.INTER_CUBIC)[:, 128:256]
-        cv2.imwrite(str(tmp_path / f"{number}.png"), ramp)
-    with pytest.warns(UserWarning) as caught, pytest.raises(NoPosesError, match=r"too little in common|features match"):
-        estimate_poses(sorted(tmp_path.glob("*.png")))
-    (message,) = {str(warning.message) for warning in caught}
-    assert message.startswith("poses are estimated by SIFT alone: needed the learned matcher's weights, got none")
-    assert len(caught) == 1
-
-
-def test_the_matcher_is_on_the_device_that_is_chosen_for_the_number_of_panoramas(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("pansplat.poses.estimate.load_matcher", lambda device: device.type)
-    monkeypatch.setattr("pansplat.system.devices.find_card", lambda: "Card 9000")
-    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", torch.backends.cudnn.allow_tf32)  # is restored
-    assert (_load_matcher(2), _load_matcher(10)) == ("cpu", "cuda")
-    with use_device("cpu"):
-        assert _load_matcher(10) == "cpu"
-
-
-def _view(features: Features, small: np.ndarray, learned: LearnedFeatures | None = None) -> _View:
+def _view(features: Features, small: np.ndarray, learned: LearnedFeatures = NO_LEARNED) -> _View:
     """A view with unknown walls and depth."""
     depth = DepthMap(np.zeros((48, 96)), np.full((48, 96), 1.0), np.eye(3))
     axes = SceneAxes(np.eye(3), False, False)
@@ -189,7 +157,7 @@ def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: py
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     every = Features(bearings, descriptors, np.ones(400), np.full(400, 1e-3))
     learned = LearnedFeatures(-bearings[:3], torch.zeros(3, 128), torch.zeros(3, 2), (0, 3, 3, 3, 3), 0.01)
-    found = LearnedMatches(np.array(((2, 1), (0, 2))), np.array((0.9, 0.5)), np.array((0.99, 0.4)))
+    found = Matches(np.array(((2, 1), (0, 2))), np.array((0.99, 0.4)))
     monkeypatch.setattr("pansplat.poses.estimate.match_learned", lambda matcher, first, second: found)
     few, many = (_view(every.strongest(count), np.zeros((64, 128), np.float32), learned) for count in (20, 400))
     joined = _match(few, few, object())
@@ -197,7 +165,7 @@ def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: py
     own = joined.indices.min(axis=1) >= 20  # learned features follow those of SIFT
     assert joined.indices[own].tolist() == [[22, 21], [20, 22]] and joined.prior[own].tolist() == [0.7, 0.4]
     assert np.allclose(few.matched.bearings[20:], -bearings[:3]) and len(few.joined) == 43
-    assert len(_match(few, few, None)) == 20 and _match(many, many, object()).indices.max() < 400
+    assert _match(many, many, object()).indices.max() < 400
 
 
 def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,13 +187,13 @@ def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatc
     monkeypatch.setattr("pansplat.poses.estimate.match_features", lambda *_: MagicMock())
     monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_: MagicMock())
     links = {pair: NO_LINKS for pair in itertools.combinations(range(11), 2)}
-    relations = _relate_views(views, links, 0, Store(None))
+    relations = _relate_views(views, links, MagicMock(), Store(None))
     home = {pair for pair in relations if pair[1] < 8}
     assert (0, 7) not in home and 12 <= len(home) < 23, "of 28"
     assert all(sum(n in pair for pair in home) >= 4 for n in range(8))
     assert len([pair for pair in relations if pair[0] > 7]) == 3, "nothing is left out without certain pairs"
     linked = links | {(0, 7): LinkDirections(back=0.5)}
-    assert (0, 7) in _relate_views(views, linked, 0, Store(None))
+    assert (0, 7) in _relate_views(views, linked, MagicMock(), Store(None))
 
 
 def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> None:
@@ -235,7 +203,7 @@ def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> 
         image = cv2.imread(str(SAMPLE / f"{name.replace('mirrored', 'right')}.jpg"), cv2.IMREAD_GRAYSCALE)
         image = cv2.resize(image, (768, 384), interpolation=cv2.INTER_AREA)
         image = image[:, ::-1].copy() if name == "mirrored" else image
-        features = detect_features(image, count=2500)
+        features = detect_features(image).strongest(2500)
         views[name] = _view(features, image.astype(np.float32) / 255)
     assert _is_mirrored(views["left"], views["mirrored"])
     assert not _is_mirrored(views["left"], views["right"])

@@ -11,7 +11,6 @@ import torch
 import pansplat
 from pansplat.errors import InputError
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
-from pansplat.poses.learned import MatcherMissingError
 
 
 def _write(folder: Path, *names: str) -> None:
@@ -94,28 +93,6 @@ def test_links_are_given_to_the_estimate_and_a_changed_one_is_estimated_anew(tmp
             _load(tmp_path)
     assert [own["b.png"] for own in given] == [{}, {}, {}]
     assert [own["a.png"].get("b.png") for own in given] == [1.5, -0.5, None]
-
-
-def test_poses_without_the_learned_matcher_are_estimated_anew_when_it_is_installed(tmp_path: Path, monkeypatch) -> None:
-    _write(tmp_path, "a.png", "b.png")
-    found = []
-
-    def estimate(images, **options) -> PoseEstimate:
-        found.append(images)
-        return _place(("a.png", "b.png"))(images)
-
-    def find_no_matcher() -> Path:
-        raise MatcherMissingError("needed the learned matcher's weights")
-
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", estimate)
-    for _ in range(2):
-        with monkeypatch.context() as patch, pytest.warns(UserWarning, match="2 of 2 panoramas"):
-            patch.setattr("pansplat.poses.estimate.default_matcher", find_no_matcher)
-            _load(tmp_path)
-    assert len(found) == 1
-    with pytest.warns(UserWarning, match="2 of 2 panoramas"):
-        _load(tmp_path)
-    assert len(found) == 2
 
 
 def test_if_none_is_placed_all_are_scenes_of_their_own(tmp_path: Path, monkeypatch) -> None:

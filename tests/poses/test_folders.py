@@ -1,16 +1,12 @@
-"""Folders with pictures that do not belong together, and videos: what can be placed is placed, the rest is named."""
+"""Folders with pictures that do not belong together: what can be placed is placed, the rest is named."""
 
-import json
 import math
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from pansplat.cli import run
-from pansplat.images.video import write_video
 from pansplat.poses.estimate import PoseEstimate, estimate_poses
 from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
 
@@ -56,21 +52,3 @@ def test_the_reason_names_the_picture(estimate: PoseEstimate) -> None:
     assert "too dark" in reasons["dark"] and "2:1" in reasons["narrow"] and "copy of a.png" in reasons["z_copy"]
     assert "mirrored left to right" in reasons["mirrored"]
     assert "too little in common" in reasons["other_room"] and ".png" in reasons["other_room"]
-
-
-@pytest.mark.exhaustive
-def test_key_frames_of_a_video_have_poses(tmp_path: Path, render_room) -> None:
-    centres = [np.array((0.2 * n - 0.6, 0, 0.08 * n)) for n in range(7)]
-    frames = (render_room(2, rotation_exp(np.array((0, 0.08 * n, 0))), c) for n, c in enumerate(centres))
-    write_video(tmp_path / "walk.mp4", frames, 5)
-    assert run(["pose", str(tmp_path / "walk.mp4"), "-o", str(tmp_path / "walk"), "--frames", "3"]) == 0
-    names = sorted(path.name for path in (tmp_path / "walk").glob("*.png"))
-    assert len(names) == 3 and (tmp_path / "walk" / "poses.json").exists()
-    # The key frames lie on a straight line, in the order of the frames.
-    poses = json.loads((tmp_path / "walk" / "poses.json").read_text())["poses"]
-    found = np.stack([np.array(poses[name])[:3, 3] for name in names])
-    truth = np.stack([centres[int(name.removesuffix(".png")[-6:])] for name in names])
-    steps, known = np.diff(found, axis=0), np.diff(truth, axis=0)
-    assert math.degrees(angle_between(steps[0], steps[1])) < 2
-    ratio = np.linalg.norm(steps, axis=1) / np.linalg.norm(known, axis=1)
-    assert ratio[0] == pytest.approx(ratio[1], rel=0.05)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import WorldFrame
-from pansplat.images.blur_masks import fold_name
+from pansplat.images.blur_masks import MASK_SUFFIX, find_mask_beside, fold_name
 from pansplat.images.image_files import READABLE_SUFFIXES
 from pansplat.images.rig_images import Lens, RigImage, RigView, write_rig
 from pansplat.inputs.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
@@ -207,7 +207,7 @@ def _find_range(
 
 
 def _add_masks(found: Reconstruction) -> list[Shot]:
-    """The pictures with the masks of the folder masks/, which have their names with or without the suffix and .png."""
+    """The pictures with their masks: in masks/, of their names with or without the suffix, or beside them."""
     folder = found.folder / "masks"
     files = [file for file in folder.rglob("*") if file.suffix.lower() in READABLE_SUFFIXES and file.is_file()]
     names = {file: file.relative_to(folder).with_suffix("").as_posix() for file in files}
@@ -217,7 +217,9 @@ def _add_masks(found: Reconstruction) -> list[Shot]:
         parts = fold_name(shot.name.replace("\\", "/")).split("/")
         ends = ["/".join(parts[start:]) for start in range(len(parts))]
         keys = (*ends, *(end.rsplit(".", 1)[0] for end in ends))
-        shots.append(replace(shot, mask=shot.mask or next((masks[key] for key in keys if key in masks), None)))
+        found_masks = (masks[key] for key in keys if key in masks)
+        mask = shot.mask or next(found_masks, None) or find_mask_beside(shot.image, MASK_SUFFIX)
+        shots.append(replace(shot, mask=mask))
     used = {shot.mask.resolve() for shot in shots if shot.mask is not None}
     unmasked, folders = {s.image for s in shots if s.mask is None}, {s.image.parent for s in shots}
     for mask in (file for file in files if file.resolve() not in used):

@@ -2,7 +2,7 @@
 
 Angles are radians: yaw to the right of the front face's centre, pitch below the horizon. The reference states the
 opposite sign of pitch; the code and all exports have this one. A level's number is its place in the list. The first,
-smallest level has number 0 and is in preview.jpg, a column of the faces b d f l r u.
+smallest level has number 0; it is in preview.jpg only, and is not read.
 
 Source: https://www.marzipano.net/docs.html; https://www.marzipano.net/reference/CubeGeometry.html;
 https://github.com/google/marzipano: src/geometries/Cube.js (faces), src/sources/ImageUrl.js (tiles),
@@ -20,7 +20,6 @@ from typing import Any
 from pansplat.errors import InputError, InputWarning
 from pansplat.images.cube_faces import find_gap
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
-from pansplat.images.image_files import read_size, require_complete
 from pansplat.inputs.pairs import Link, Note
 from pansplat.inputs.web_tours.entries import (
     Entry,
@@ -42,7 +41,6 @@ from pansplat.system.strict_json import convert
 _DATA = "data.js"
 _FILES = "app-files"  # folder in the archive of the Tool
 _FACES = "frblud"
-_PREVIEW = tuple("bdflru".index(face) for face in _FACES)  # rows of the faces in a preview
 _ASSIGNMENT = re.compile(r"(?<![\w$])[A-Za-z_$][\w$]*\s*=\s*(?=\{)")
 _SHOWN = 30  # characters of a file in a message
 _UNNAMED = "Project Title"  # of a project whose author gave no name
@@ -103,7 +101,7 @@ def _read_note(spot: Mapping[str, Any]) -> Note:
 
 
 def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[CubeLevel, ...]:
-    """The complete levels of a scene; the preview if there is none.
+    """The complete levels of a scene.
 
     The numbers of the folders are those of the list, or one more in exports without a level of preview.
     """
@@ -117,11 +115,6 @@ def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[Cube
         require_tiles(min(pixels, MAX_SIZE), tile)
     attempts = [_find_complete(base, stated, first, folder) for first in (0, 1)]
     best, gap = max(attempts, key=lambda attempt: len(attempt[0]))
-    preview = f"{base}/preview.jpg"
-    if not best and (folder / preview).is_file():
-        width, height = read_size(folder / preview)
-        require_complete(folder / preview)
-        best = [CubeLevel(width, width, 6 * (preview,), _PREVIEW)] if height == 6 * width else []
     gap = gap or f"{base} is missing"
     if not best:
         raise InputError(f"needed all tiles of a level, but {gap}; copy or export the tour again")

@@ -15,7 +15,6 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,11 +51,6 @@ _PICTURES = ("panorama", "cubeMap", "multiRes")
 _FACES = "frblud"
 _MAX_LEVEL = 20  # of tiles
 _CALL = re.compile(r"pannellum\s*\.\s*viewer\s*\(")
-_EMBEDDED = re.compile(r"pannellum\.html?([?#][^\"'\s]*)")
-_STATED = re.compile(r"[?#&]config=([^?#&]+)")
-_SETTING = re.compile(r"(?<![\w$.])([A-Za-z_$][\w$]*)\s*=\s*(?=\{)")
-_MAX_FRAMES = 100  # of a page
-_NAME = re.compile(r"[A-Za-z_$][\w$]*")
 
 
 def find_pannellum(folder: Path) -> Path | None:
@@ -105,48 +99,24 @@ def read_pannellum(source: Path) -> tuple[str, list[Entry]]:
 
 
 def _find_configuration(source: Path) -> dict[str, Any] | None:
-    """The configuration in a file, or in the JSON file that an embedded viewer names; None if there is none."""
+    """The configuration in a file; None if there is none."""
     text = read_text(source)
     if source.suffix.lower() == ".json":
         start = len(text) - len(text.lstrip())
         if not text.startswith("{", start) or not any(key in text for key in ("scenes", *_PICTURES)):
             return None
         return _accept(parse_literal(text, start, source)[0])
-    for literal in _list_arguments(text, source):
-        if _accept(literal) is not None:
-            return literal
-    names = (name for found in _EMBEDDED.finditer(text) for name in _STATED.findall(found[1]))
-    for name in islice(names, _MAX_FRAMES):
-        file = source.parent / locate(source.parent, name)
-        if file.suffix.lower() == ".json" and file.is_file() and file.parent == source.parent:
-            return _find_configuration(file)
-    return None
+    return next((literal for literal in _list_arguments(text, source) if _accept(literal) is not None), None)
 
 
 def _list_arguments(text: str, source: Path) -> Iterator[Any]:
-    """The second arguments of the calls of a page, each a literal or a variable that was set to one.
-
-    The time is proportional to the length of the text: calls in arguments of others are no calls, a variable is read
-    once, and no more once those that were read add up to twice the text.
-    """
-    settings: dict[str, int] = {}  # positions of values, found at the first variable
-    position, left = 0, 2 * len(text)
+    """The second arguments of the calls of a page; calls in arguments of others are no calls."""
+    position = 0
     while (call := _CALL.search(text, position)) is not None:
-        value, position = parse_literal(text, call.end(), source)
-        if not text.startswith(",", position):
-            continue
-        start = skip_space(text, position + 1)
-        value, position = parse_literal(text, start, source)
-        name = _NAME.match(text, start)
-        if value is None and name is not None and left > 0:
-            for found in () if settings else _SETTING.finditer(text):
-                settings.setdefault(found[1], found.end())
-            begin = settings.get(name.group(), len(text))
-            settings[name.group()] = len(text)
-            if begin < len(text):
-                value, end = parse_literal(text, begin, source)
-                left -= end - begin
-        yield value
+        _, position = parse_literal(text, call.end(), source)
+        if text.startswith(",", position):
+            value, position = parse_literal(text, skip_space(text, position + 1), source)
+            yield value
 
 
 def _accept(content: Any) -> dict[str, Any] | None:

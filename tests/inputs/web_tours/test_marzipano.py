@@ -45,11 +45,11 @@ Export = Callable[..., Path]
 def export(tmp_path: Path, write_tiles) -> Export:
     """Write an export with these scenes; returns the folder."""
 
-    def write(*scenes: Any, tiles: bool = True, first: int = 0) -> Path:
+    def write(*scenes: Any, first: int = 0) -> Path:
         data = {"scenes": list(scenes), "name": "Flat", "settings": {"mouseViewMode": "drag"}}
         (tmp_path / "data.js").write_text(f"var APP_DATA = {json.dumps(data, indent=2)};\n")
         (tmp_path / "index.html").write_text("<!DOCTYPE html><script src='data.js'></script>")
-        for scene in scenes if tiles else ():
+        for scene in scenes:
             base = tmp_path / "tiles" / scene["id"]
             for level, content in enumerate(scene["levels"], start=first):
                 if level:
@@ -185,19 +185,6 @@ def test_a_level_with_a_damaged_tile_gives_way_to_the_next_complete_one(export: 
     _check_picture(hall, check_colors, 32)
 
 
-def test_without_tiles_the_preview_is_read(export: Export, color_face, check_colors) -> None:
-    folder = export(_scene("0-hall"), tiles=False)
-    preview = Image.new("RGB", (16, 96))
-    for place, face in enumerate("bdflru"):
-        preview.paste(Image.fromarray(color_face(face, 16)), (0, 16 * place))
-    (folder / "tiles/0-hall").mkdir(parents=True)
-    preview.save(folder / "tiles/0-hall/preview.jpg", quality=97, subsampling=0)
-    with pytest.warns(UserWarning, match="is read at 16 instead of 64 pixels"):
-        (hall,) = load_panoramas(folder / "data.js")
-    assert read_height(hall.image) == 32
-    check_colors(read_panorama(hall.image, 32)[0], tolerance=12)
-
-
 def test_a_broken_start_view_is_dropped(export: Export) -> None:
     views = [{"yaw": {}}, None]
     folder = export(*(_scene(f"{n}-room", initialViewParameters=view) for n, view in enumerate(views)))
@@ -272,9 +259,8 @@ def test_tiles_outside_of_the_folder_are_not_read(export: Export, key: str) -> N
 )
 def test_a_broken_scene_is_named_and_the_others_open(export: Export, content: dict, message: str) -> None:
     broken = _scene("1-attic", **content)
-    folder = export(_scene("0-hall"), broken, tiles=False)
     level = [{"tileSize": 4, "size": 4}]
-    export(_scene("0-hall", levels=level), first=1)
+    folder = export(_scene("0-hall", levels=level), first=1)
     (folder / "data.js").write_text(f"APP_DATA = {json.dumps({'scenes': [_scene('0-hall', levels=level), broken, 7]})}")
     with pytest.warns(UserWarning) as caught:
         panoramas = load_panoramas(folder / "data.js")

@@ -102,20 +102,12 @@ document.getElementById('x').onclick = () => { run(); };
     [
         "pannellum.viewer('panorama', {type: 'equirectangular', /* why */ 'panorama': \"hall.jpg\", autoLoad: true,});",
         "v = pannellum.viewer(document.getElementById('p'), { panorama: b ? 1 : 2, panorama: 'hall.jpg', f() {} })",
-        "const config = { panorama: 'hall.jpg', f: hotspot, g: [run()] };\npannellum.viewer('panorama', config);",
     ],
 )
 def test_a_configuration_in_a_page_is_read_and_not_run(tmp_path: Path, script: str, write_scene) -> None:
     write_scene(tmp_path / "hall.jpg")
     page = _write(tmp_path, HTML % script, "page.html")
     assert find_web_tours(tmp_path) == [page]
-    assert [panorama.image.name for panorama in load_panoramas(page)] == ["hall.jpg"]
-
-
-def test_an_embedded_viewer_names_its_configuration(tmp_path: Path, write_scene) -> None:
-    write_scene(tmp_path / "hall.jpg")
-    _write(tmp_path, {"panorama": "hall.jpg"}, "my.json")
-    page = _write(tmp_path, '<iframe src="pannellum.htm#config=my.json&amp;autoLoad=true"></iframe>', "page.html")
     assert [panorama.image.name for panorama in load_panoramas(page)] == ["hall.jpg"]
 
 
@@ -174,7 +166,7 @@ def test_names_are_file_safe_and_unique(tmp_path: Path, write_scene) -> None:
         ({"panorama": "hall.jpg", "haov": 120}, "needed a picture of 360 x 180 degrees, got 120 x 180"),
         ({"panorama": "hall.jpg", "dynamic": True}, "needed a picture, got a video"),
         ({"panorama": "photo.jpg"}, "photo.jpg: needed a 2:1 equirectangular panorama, got 30x30"),
-        ({"panorama": "text.jpg"}, "text.jpg: needed a JPG, PNG, TIFF, WebP, HEIC or EXR image"),
+        ({"panorama": "text.jpg"}, "text.jpg: needed a JPG, PNG, TIFF, WebP or EXR image"),
         (
             {"type": "fisheye", "panorama": "hall.jpg"},
             "needed the type equirectangular, cubemap, multires, got 'fisheye'",
@@ -219,12 +211,7 @@ def test_json_files_of_other_kinds_are_no_tours(tmp_path: Path) -> None:
 
 HOSTILE_PAGES = {  # file, repetitions, text of n repetitions
     "calls": ("tour.html", 4000, lambda n: "pannellum.viewer(1);" * n),
-    "calls with variables": ("tour.html", 200, lambda n: "".join(f"pannellum.viewer(1, x{i});" for i in range(n))),
     "calls in calls": ("tour.html", 40, lambda n: "pannellum.viewer(" * n + ")" * n),
-    "calls with a long variable": ("tour.html", 40, lambda n: f"x={{{'a: 1,' * n}}};" + "pannellum.viewer(1, x);" * n),
-    "settings of a variable": ("tour.html", 400, lambda n: "x = " * n + "pannellum.viewer(1, x);" * n),
-    "frames": ("tour.html", 1000, lambda n: "pannellum.htm?" * n),
-    "frames of other files": ("tour.html", 200, lambda n: "pannellum.htm?a&config=a.json " * n),
     "digits": ("tour.html", 1000, lambda n: f"pannellum.viewer({'1' * n}a);"),
     "spaces": ("tour.html", 4000, lambda n: f"pannellum.viewer({' ' * n}"),
     "assignments": ("data.js", 40, lambda n: "a={" * n + "}" * n),

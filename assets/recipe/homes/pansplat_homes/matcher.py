@@ -10,7 +10,7 @@ from torch import Tensor
 from tyro.conf import Positional
 
 from pansplat.model.weights import WeightsFile, save_weights
-from pansplat.poses.learned import MODEL, default_weights
+from pansplat.poses.learned import default_weights
 
 
 def convert_aliked(old: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -81,5 +81,5 @@ class ConvertMatcher:
             converted = convert(torch.load(file, "cpu", weights_only=True))
             tensors |= {f"{name}.{key}": tensor for key, tensor in converted.items()}
         half = {name: tensor.half() if tensor.ndim > 1 else tensor for name, tensor in tensors.items()}
-        save_weights(default_weights(), WeightsFile(MODEL, {}, "fixed", half))
+        save_weights(default_weights(), WeightsFile("matcher", {}, "fixed", half))
         return 0
