@@ -75,7 +75,7 @@ class _SceneFile:
 class _FloorPlan:
     """For a floor plan."""
 
-    suffixes: ClassVar = (".svg", ".dxf", ".png")
+    suffixes: ClassVar = (".svg", ".png")
     files: ClassVar = "a floor plan"
 
     def write(self, export: Export) -> None:
@@ -332,13 +332,13 @@ class _Photographs:
 class Export(Computation):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
     web page (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan
-    with straight walls and areas (.svg, .png, .dxf), as textured triangles (.glb with --mesh), or as a folder
+    with straight walls and areas (.svg, .png), as textured triangles (.glb with --mesh), or as a folder
     to train further from (--training-set): cube faces, poses and points for COLMAP, nerfstudio, gsplat and brush."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
     out: Out
-    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg, .dxf or .png
+    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg or .png
     for a floor plan. A folder, without a suffix, for a web page with photographs of their own
     resolution, which are loaded as they are needed; a new one with --training-set for cube faces with poses, and with
     --photos for the photographs of a tour."""

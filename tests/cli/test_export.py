@@ -37,7 +37,7 @@ def test_a_scene_is_written_pruned(
     assert "each surface is kept once" in capsys.readouterr().err
     fused = pipeline.load(out)
     assert fused.joint and 100 < len(fused.gaussians) < 900
-    assert "exported with --layers" in refusal("export", out, "-o", tmp_path / "plan.dxf")
+    assert "exported with --layers" in refusal("export", out, "-o", tmp_path / "plan.svg")
     assert run(["export", str(out), "-o", str(tmp_path / "again.ply")]) == 0
     assert capsys.readouterr().err == "" and (tmp_path / "again.ply").read_bytes() == out.read_bytes()
 
