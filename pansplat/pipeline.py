@@ -642,7 +642,6 @@ def predict_to_file(
     *,
     options: PredictOptions | None = None,
     degree: int | None = None,
-    min_opacity: float = 0.0,
     **keywords: Any,
 ) -> int:
     """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
@@ -654,7 +653,6 @@ def predict_to_file(
         source, model, options, **keywords: see `predict`.
         path: the file.
         degree: highest degree of harmonics in the file; None keeps all.
-        min_opacity: Gaussians of lower opacity are omitted.
         cache: see `predict`; without options by default not, and networks do not cache heights above 512.
 
     Returns:
@@ -671,13 +669,13 @@ def predict_to_file(
         parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
             views.images, views.cam2world, views.near, views.far, masks=views.masks
         )
-        pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
+        pruned = (prune(part, degree=degree) for part in parts)
         if suffix == ".ply":
             return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), task), pruned, path)
         scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), task)
     else:
         scene = predict(task.source, predictor, options=options)
-        scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
+        scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree))
     save(scene, path)
     return len(scene.gaussians)
 

@@ -329,17 +329,10 @@ def test_photographs_for_a_limited_refinement_have_twice_the_rows_if_the_files_d
 
 
 @pytest.mark.slow
-def test_predict_to_file_limits_degree_and_opacity(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
-    predict_to_file(masked_pair, tmp_path / "all.ply", weights, height=TILED_HEIGHT)
-    all_gaussians = load(tmp_path / "all.ply").gaussians
-    min_opacity = float(all_gaussians.opacities.median())
-    count = predict_to_file(
-        masked_pair, tmp_path / "few.ply", weights, height=TILED_HEIGHT, degree=0, min_opacity=min_opacity
-    )
+def test_predict_to_file_limits_the_degree(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
+    count = predict_to_file(masked_pair, tmp_path / "few.ply", weights, height=TILED_HEIGHT, degree=0)
     few = load(tmp_path / "few.ply").gaussians
     assert few.degree == 0 and len(few) == count
-    assert abs(count - int((all_gaussians.opacities >= min_opacity).sum())) <= 2  # logits are rounded
-    assert float(few.opacities.min()) >= min_opacity - 1e-6
 
 
 @pytest.mark.slow

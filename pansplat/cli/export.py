@@ -28,7 +28,7 @@ from pansplat.system.files import (
     require_output_folder,
     require_replaceable,
 )
-from pansplat.system.options import Count, Fraction, Real
+from pansplat.system.options import Count, Real
 from pansplat.system.progress import stage
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ class Page:
             require_output_folder("--out", out)
             require_replaceable("--out", [out / _INDEX], export.overwrite)
             out, split = out / _INDEX, True
-        shows_all = not (export.crop or export.rooms)  # photographs would show what a crop leaves out
+        shows_all = not export.crop  # photographs would show what a crop leaves out
         has_photographs = shows_all and self.photo_height != 0 and not is_scene_file(export.path)
         count = self.gaussians or (PHOTO_GAUSSIANS if has_photographs and not split else DEFAULT_GAUSSIANS)
         with progress_bar():
@@ -267,9 +267,8 @@ class _TrainingSet:
         from pansplat.system.atomic import replacing_folder
 
         require_new_folder("--out", export.out)
-        if export.crop or export.rooms or export.remove_floaters:
-            names = "--crop, --rooms and --remove-floaters"
-            raise InputError(f"{names} are not for {self.files}, got {export.out}; leave them out")
+        if export.crop or export.remove_floaters:
+            raise InputError(f"--crop and --remove-floaters are not for {self.files}, got {export.out}; leave them out")
         if is_scene_file(export.path):
             raise InputError(
                 f"{export.path}: needed the folder of the panoramas to write their cube faces, got a scene file; give "
@@ -277,7 +276,7 @@ class _TrainingSet:
             )
         with stage(0.8):
             scene, source = export.prediction.open_panoramas(export.path, joint=not export.layers)
-        gaussians = prune(scene.gaussians, degree=0, min_opacity=max(export.min_opacity, _MIN_POINT_OPACITY))
+        gaussians = prune(scene.gaussians, degree=0, min_opacity=_MIN_POINT_OPACITY)
         gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
         if len(gaussians) > _MOST_POINTS:
             chosen = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))[:_MOST_POINTS]
@@ -344,13 +343,9 @@ class Export(Computation):
     --photos for the photographs of a tour."""
     degree: Annotated[int, Meta(ge=0, le=4)] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds."""
-    min_opacity: Fraction = 0.0
-    """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
     crop: tuple[Real, Real, Real, Real, Real, Real] | None = None
     """Keep what is in a box: x, y and z of two opposite corners, metres, in the axes of the poses. Cameras outside are
     left out."""
-    rooms: tuple[str, ...] = ()
-    """Keep these rooms of the floor plan, by their names or by those of panoramas in them."""
     remove_floaters: bool = False
     """Leave out isolated Gaussians in free space."""
     up: Literal["y", "z"] | None = None
@@ -402,8 +397,7 @@ class Export(Computation):
         if not is_scene_file(self.path):
             with stage(0.9):
                 scene, source = self.prediction.open_panoramas(self.path, gaussians, joint=joint)
-            layers = self.prediction.predict_layers(source) if self.rooms and scene.joint else None
-            edited, changes = self._edit(scene, layers)
+            edited, changes = self._edit(scene)
             known, views = scene.cam2world.tolist(), range(len(scene.cam2world))
             if len(edited.cam2world) < len(known):  # a crop leaves others out
                 views = [known.index(pose) for pose in edited.cam2world.tolist()]
@@ -416,29 +410,25 @@ class Export(Computation):
             "photographs fits the Gaussians to them, too",
             file=sys.stderr,
         )
-        return (*self._edit(fuse_views(scene), scene), [])
+        return (*self._edit(fuse_views(scene)), [])
 
-    def _edit(self, scene: Scene, layers: Scene | None = None) -> tuple[Scene, list[Change]]:
-        """The scene with its axis up, and the Gaussians and harmonics that are wanted, and what is left out.
-
-        `layers` is the scene with all that each panorama shows, if `scene` is not.
-        """
+    def _edit(self, scene: Scene) -> tuple[Scene, list[Change]]:
+        """The scene with its axis up, and the Gaussians and harmonics that are wanted, and what is left out."""
         import torch
 
-        from pansplat.export.cleanup import Cleaning, clean_up
+        from pansplat.export.cleanup import clean_up
         from pansplat.gaussians.scene import prune
 
         if self.up is not None:
             rows = {"y": ((1.0, 0, 0), (0, -1, 0), (0, 0, -1)), "z": ((1.0, 0, 0), (0, 0, -1), (0, 1, 0))}[self.up]
             turn = torch.tensor(rows, dtype=torch.float64)  # to a world with y down
-            scene, layers = scene.rotated(turn), None if layers is None else layers.rotated(turn)
+            scene = scene.rotated(turn)
         box = self.crop
         if box is not None:
             corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
             box = tuple(scene.frame.localize_places(corners).flatten().tolist())
-        cleaning = Cleaning(self.rooms, box, not self.remove_floaters, self.min_opacity)
         try:
-            scene, changes = clean_up(scene, cleaning, layers)
+            scene, changes = clean_up(scene, box, floaters=not self.remove_floaters)
         except InputError as error:
             raise InputError(f"{self.path}: {error}") from error
         return dataclasses.replace(scene, gaussians=prune(scene.gaussians, degree=self.degree)), changes

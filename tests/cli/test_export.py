@@ -23,13 +23,10 @@ from pansplat.system.progress import show_progress
 from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
 
-def test_a_scene_is_written_pruned(
+def test_a_scene_is_written_with_each_surface_once_or_as_it_is(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], refusal: Callable[..., str]
 ) -> None:
     out = tmp_path / "out.ply"
-    assert run(["export", str(scene), "-o", str(out), "--min-opacity", "0.95"]) == 0
-    assert "0 Gaussians" in capsys.readouterr().out
-    assert len(pipeline.load(out).gaussians) == 0
     assert run(["export", str(scene), "-o", str(out), "--layers"]) == 0
     assert out.read_bytes() == scene.read_bytes()
     capsys.readouterr()
@@ -255,17 +252,6 @@ def test_a_mesh_has_the_photographs_and_that_of_a_crop_the_one_of_the_camera_tha
     assert "a mesh needs a scene with input cameras" in refusal(
         "export", tmp_path / "foreign.splat", "-o", out, "--mesh"
     )
-
-
-def test_rooms_are_kept_by_name_in_layers_and_in_joint_scenes(
-    room: Path, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "part.ply"
-    command = ["export", str(room), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o", str(out)]
-    for source in (["export", str(scene), "-o", str(out)], command):
-        assert run([*source, "--rooms", "B"]) == 0
-        assert "and 1 of 2 cameras" in capsys.readouterr().out
-        assert pipeline.load(out).names == ("b",)
 
 
 def test_floaters_are_left_out_and_counted(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,6 @@ import torch
 from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
-from pansplat.export.cleanup import crop_to_rooms
 from pansplat.export.plan_files import _Drawing, describe_plan, write_plan
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -289,19 +288,3 @@ def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"\.svg, \.png; rename"):
         write_plan(scene, tmp_path / "plan.pdf")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_scene_is_cropped_to_rooms_by_their_names_or_those_of_their_panoramas() -> None:
-    scene = _make_house(WALLS, CAMERAS, names=("Living", "Dining", "Hall"), count=20000)
-    hall = crop_to_rooms(scene, ("HALL",))
-    assert hall.names == ("Hall",) and len(hall.gaussians) == 20000, "its layer, and no other one"
-    rooms = crop_to_rooms(scene, ("Dining",))
-    assert rooms.names == ("Living", "Dining"), "both are in one room"
-    assert rooms.overlaps == ((0, 1, 0.5),)
-    joint = dataclasses.replace(scene, joint=True)
-    cropped = crop_to_rooms(joint, ("Hall",), scene)
-    assert len(cropped.gaussians) > 20000 and set(cropped.gaussians.views.tolist()) == {0}
-    others = scene.gaussians.means[scene.gaussians.views < 2]
-    within = (others[:, 0] > 5.2) & (others[:, 0] < 8.9) & (others[:, 2] > 0.1) & (others[:, 2] < 3.9)
-    assert abs(len(cropped.gaussians) - 20000 - int(within.sum())) < 0.3 * int(within.sum())
-    assert crop_to_rooms(joint, ("Hall",)).names == ("Hall",), "without a plan its layer alone"
