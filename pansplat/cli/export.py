@@ -164,18 +164,14 @@ class Page:
     """Write the data to a folder beside the page, for scenes that are large for one file."""
     serve: bool = False
     """Then show the page to headsets and phones in the local network, by https, until Ctrl+C."""
-    embed: tuple[str, ...] = ()
-    """Origins, such as https://example.com, of pages that may move the camera of this one in a frame; with --serve only
-    they may show it in a frame."""
     title: str | None = None
     """Title of the page; by default the name of the scene."""
 
     def write(self, export: Export) -> None:
         """Write the page, print its size, and serve it."""
-        from pansplat.export.page import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS, parse_origins, write_page
+        from pansplat.export.page import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS, write_page
         from pansplat.export.page_server import serve_page
 
-        parse_origins(self.embed)
         out, split = export.out, self.split
         if not out.suffix:
             require_output_folder("--out", out)
@@ -194,7 +190,6 @@ class Page:
                 gaussians=count,
                 split=split,
                 title=self.title or _name_page(export.path, photographs),
-                embed=self.embed,
                 photographs=photographs if shows_all else (),
                 photo_height=self.photo_height,
             )

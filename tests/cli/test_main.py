@@ -120,8 +120,6 @@ REFUSED = {
     "render room -o x.png --model sphere --precision bfloat16": "`precision` is for networks",
     "export scene.ply -o x.ply --split": "--split is for an .html page, got x.ply",
     "export scene.ply -o x.ply --photo-height 1024": "--photo-height is for an .html page, got x.ply",
-    "export scene.ply -o x.ply --embed https://example.com": "--embed is for an .html page, got x.ply",
-    "export none -o x.html --embed example.com": "got 'example.com'",  # before anything is loaded
     "export scene.ply -o x.stl": ".sog, .glb, .ply",
     "export scene.ply -o x.spz --points": "--points is for a .ply",
     "export scene.ply -o x.png --points": "--points is for a .ply",

@@ -342,25 +342,6 @@ def test_a_title_cannot_leave_its_element(scene: Scene, tmp_path: Path) -> None:
     assert read_header(tmp_path / "tour.html")["spots"][1]["name"] == "<!--"
 
 
-def test_origins_are_stated_as_browsers_write_them(scene: Scene, tmp_path: Path) -> None:
-    assert write_page(scene, tmp_path / "tour.html").embed == ()
-    assert read_header(tmp_path / "tour.html")["embed"] == []
-    given = ["HTTPS://Example.com:443/", "http://localhost:8000", "http://192.168.1.20:080", "https://example.com"]
-    written = write_page(scene, tmp_path / "tour.html", embed=given)
-    assert written.embed == ("https://example.com", "http://localhost:8000", "http://192.168.1.20")
-    assert read_header(tmp_path / "tour.html")["embed"] == list(written.embed)
-
-
-def test_what_is_no_origin_is_refused(scene: Scene, tmp_path: Path) -> None:
-    wrong = ["", "*", "null", "example.com", "https://*.example.com", "file:///home", "https://", "https://a b"]
-    wrong += [f"https://{each}" for each in ("user@example.com", "example.com:99999", "example.com:x", "b\u00fcro.de")]
-    wrong += [f"https://example.com{end}" for end in ("/tour", "?x", "#x", "; script-src *", "\n", "//")]
-    for origin in (*wrong, "http://1.2.3", "http://999.1.1.1"):
-        with pytest.raises(InputError, match=r"`embed` must hold origins such as https://.* got "):
-            write_page(scene, tmp_path / "tour.html", embed=["https://example.com", origin])
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_parts_of_a_split_page_replace_the_old_ones(scene: Scene, tmp_path: Path) -> None:
     other = tmp_path / "tour_files" / "other.js"
     first = write_page(scene, tmp_path / "tour.html", split=True)
