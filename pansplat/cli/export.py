@@ -159,9 +159,7 @@ class Page:
     merged."""
     photo_height: Annotated[int, Meta(ge=0, le=4096)] | None = None
     """Largest height of the photographs that the page shows at panoramas; 0 for none. By default what fits into 15 MB,
-    at least 1024, in a folder and with --split that of the files, at most 4096."""
-    split: bool = False
-    """Write the data to a folder beside the page, for scenes that are large for one file."""
+    at least 1024, in a folder that of the files, at most 4096."""
     serve: bool = False
     """Then show the page to headsets and phones in the local network, by https, until Ctrl+C."""
     title: str | None = None
@@ -172,11 +170,11 @@ class Page:
         from pansplat.export.page import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS, write_page
         from pansplat.export.page_server import serve_page
 
-        out, split = export.out, self.split
-        if not out.suffix:
+        out, split = export.out, not export.out.suffix
+        if split:
             require_output_folder("--out", out)
             require_replaceable("--out", [out / _INDEX], export.overwrite)
-            out, split = out / _INDEX, True
+            out = out / _INDEX
         shows_all = not export.crop  # photographs would show what a crop leaves out
         has_photographs = shows_all and self.photo_height != 0 and not is_scene_file(export.path)
         count = self.gaussians or (PHOTO_GAUSSIANS if has_photographs and not split else DEFAULT_GAUSSIANS)

@@ -103,7 +103,6 @@ class PageFiles:
         files: the page, and its parts if it is split.
         num_bytes: of all files.
         num_gaussians: in the page.
-        degree: of its harmonics.
         photo_height: of its photographs, pixels; 0 without photographs.
         num_flights: number of edges along which it flies.
         fades: labels of the two panoramas of each edge along which it fades.
@@ -113,7 +112,6 @@ class PageFiles:
     files: tuple[Path, ...]
     num_bytes: int
     num_gaussians: int
-    degree: int
     photo_height: int = 0
     num_flights: int = 0
     fades: tuple[tuple[str, str], ...] = ()
@@ -689,7 +687,8 @@ def _write_files(
         fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
         raise InputError(
             f"{path}: needed a page of at most {MAX_FILE_BYTES // 1_000_000} MB in one file, got "
-            f"{len(page) / 1e6:.0f} MB; split it (--split), or keep at most {fitting:,} Gaussians (--gaussians)"
+            f"{len(page) / 1e6:.0f} MB; write a folder (--out without a suffix), or keep at most {fitting:,} "
+            "Gaussians (--gaussians)"
         )
     files = [folder / name for name in parts]
     if split:
@@ -706,7 +705,7 @@ def _write_files(
     names = [spot["name"] for spot in header["spots"]]
     fades = tuple((names[a], names[b]) for a, b in header["poor"])
     num_flights = sum(a != b for a, b, _ in header["edges"]) - len(fades)
-    return PageFiles(tuple(files), total, count, header["degree"], photo_height, num_flights, fades)
+    return PageFiles(tuple(files), total, count, photo_height, num_flights, fades)
 
 
 def _make_folder(folder: Path) -> None:

@@ -118,7 +118,7 @@ REFUSED = {
     "render scene.ply -o x.png --blend view7": "from 0 to 1, got 7",
     "render scene.ply -o x.png --stereo --layout cubemap": "--stereo is for panoramas of --layout equirect",
     "render room -o x.png --model sphere --precision bfloat16": "`precision` is for networks",
-    "export scene.ply -o x.ply --split": "--split is for an .html page, got x.ply",
+    "export scene.ply -o x.ply --serve": "--serve is for an .html page, got x.ply",
     "export scene.ply -o x.ply --photo-height 1024": "--photo-height is for an .html page, got x.ply",
     "export scene.ply -o x.stl": ".sog, .glb, .ply",
     "export scene.ply -o x.spz --points": "--points is for a .ply",

@@ -1161,7 +1161,7 @@ def in_a_host(chromium: Any, origin: str, page: str, **options: Any) -> Iterator
 
 @pytest.mark.slow
 def test_no_other_page_shows_a_served_page_in_a_frame(chromium: Any, sites: Sites, folder: Path) -> None:
-    with PageServer(PageFiles((folder / "house.html",), 0, 0, 0)) as server:
+    with PageServer(PageFiles((folder / "house.html",), 0, 0)) as server:
         Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         page = new_context(chromium, ignore_https_errors=True).new_page()
         with page.expect_event("requestfailed", lambda request: request.url == server.url) as failed:
@@ -1770,7 +1770,7 @@ def test_a_page_from_disk_or_http_says_how_to_enter_vr(chromium: Any, folder: Pa
 
 
 def test_a_served_page_may_use_webxr(chromium: Any, folder: Path) -> None:
-    with PageServer(PageFiles((folder / "tour.html",), 0, 0, 0)) as server:
+    with PageServer(PageFiles((folder / "tour.html",), 0, 0)) as server:
         Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         page = OpenPage(new_context(chromium, ignore_https_errors=True).new_page())  # the user accepts the certificate
         page.page.goto(server.url)

@@ -52,7 +52,7 @@ def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
     header = read_header(tmp_path / "tour.html")
     assert written.files == (tmp_path / "tour.html",)
     assert written.num_bytes == (tmp_path / "tour.html").stat().st_size
-    assert written.num_gaussians == header["count"] == len(scene.gaussians) and written.degree == 1
+    assert written.num_gaussians == header["count"] == len(scene.gaussians) and header["degree"] == 1
     assert [spot["name"] for spot in header["spots"]] == ["room 0", "room 1", "room 2"]
     steps = np.diff([view["position"] for view in header["views"]], axis=0)
     assert np.allclose(steps, np.diff(scene.cam2world[:, :3, 3].numpy(), axis=0), atol=1e-6)
@@ -416,7 +416,7 @@ def test_large_pages_have_a_lower_degree_of_harmonics(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(page_module, "_TARGET_BYTES", 32 * len(scene.gaussians))
-    assert write_page(scene, tmp_path / "tour.html").degree == 0
+    assert read_header(write_page(scene, tmp_path / "tour.html").files[0])["degree"] == 0
 
 
 def test_a_page_of_another_unit_is_that_of_metres_but_for_the_lengths_it_shows(flat: Scene, tmp_path: Path) -> None:
@@ -433,7 +433,7 @@ def test_pages_that_cannot_be_drawn_or_written_are_refused(
     monkeypatch.setattr(page_module, "MAX_FILE_BYTES", 60_000)
     for given, name, options, message in (
         (empty, "tour.html", {}, "no visible Gaussians"),
-        (scene, "tour.html", {}, r"--split.*at most [\d,]+ Gaussians"),
+        (scene, "tour.html", {}, r"write a folder.*at most [\d,]+ Gaussians"),
         (scene, "tour.html", {"gaussians": 0}, "must be 1 to 4,000,000"),
         (scene, "tour.html", {"gaussians": 4_000_001}, "must be 1 to 4,000,000"),
         (scene, "missing/tour.html", {"split": True}, "missing/tour_files: needed a folder"),
