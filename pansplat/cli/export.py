@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from msgspec import Meta
 from tyro.conf import Positional
@@ -34,7 +34,6 @@ from pansplat.system.progress import stage
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from pansplat.export.cleanup import Change
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.pairs import Pair
 
@@ -63,12 +62,11 @@ class _SceneFile:
 
         if self.points and find_scene_suffix(export.out) != ".ply":
             raise InputError(f"--points is for {self.files}, got {export.out}; leave it out")
-        scene, changes, _ = export.open(joint=not export.layers)
+        scene, _ = export.open(joint=not export.layers)
         write, kind = (save_points, "points") if self.points else (save_scene, "Gaussians")
         write(scene, export.out)
         size, count = export.out.stat().st_size, len(scene.gaussians)
         print(f"{export.out}: {count:,} {kind}, {size:,} bytes ({size / max(count, 1):.1f} each)")
-        _print_changes(changes)
 
 
 @dataclass(frozen=True)
@@ -82,9 +80,8 @@ class _FloorPlan:
         """Write the plan and print its rooms."""
         from pansplat.export.plan_files import describe_plan, write_plan
 
-        scene, changes, _ = export.open()
+        scene, _ = export.open()
         print(f"{export.out}: {'; '.join(describe_plan(write_plan(scene, export.out)))}")
-        _print_changes(changes)
 
 
 @dataclass(frozen=True)
@@ -109,7 +106,7 @@ class _Mesh:
         from pansplat.tours.facts import TourFacts
         from pansplat.tours.graph import make_graph, select_views
 
-        scene, changes, photographs = export.open()
+        scene, photographs = export.open()
 
         def load(view: int) -> Tensor:
             pair = photographs[view]
@@ -144,7 +141,6 @@ class _Mesh:
             )
         if not self.whole and len(scene.cam2world):
             print(f"note: {export.out}: without what is outside of the rooms; --whole keeps it", file=sys.stderr)
-        _print_changes(changes)
 
 
 @dataclass(frozen=True)
@@ -180,7 +176,7 @@ class Page:
         count = self.gaussians or (PHOTO_GAUSSIANS if has_photographs and not split else DEFAULT_GAUSSIANS)
         with progress_bar():
             with stage(0.8):
-                scene, changes, photographs = export.open(gaussians=count)
+                scene, photographs = export.open(gaussians=count)
             out.parent.mkdir(parents=True, exist_ok=True)
             page = write_page(
                 scene,
@@ -221,7 +217,6 @@ class Page:
                 f"--gaussians {more} shows more detail in about {size:.0f} MB",
                 file=sys.stderr,
             )
-        _print_changes(changes)
         if self.serve:
             serve_page(page)
 
@@ -341,8 +336,6 @@ class Export(Computation):
     left out."""
     remove_floaters: bool = False
     """Leave out isolated Gaussians in free space."""
-    up: Literal["y", "z"] | None = None
-    """Axis of a given file that points up, if its program did not keep to the axes of the format."""
     layers: bool = False
     """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
     draw all Gaussians together (docs/formats.md)."""
@@ -370,14 +363,12 @@ class Export(Computation):
                 if other is not kind and getattr(other, option.name) != option.default:
                     name = option.name.replace("_", "-")
                     raise InputError(f"--{name} is for {other.files}, got {self.out}; leave it out")
-        if self.up is not None and not is_scene_file(self.path):
-            raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
         kind.write(self)
         return 0
 
     @progress_bar()
-    def open(self, *, joint: bool = False, gaussians: int | None = None) -> tuple[Scene, list[Change], list[Pair]]:
-        """The scene of the file, pair or tour as it is to be written, what is left out, and its photographs.
+    def open(self, *, joint: bool = False, gaussians: int | None = None) -> tuple[Scene, list[Pair]]:
+        """The scene of the file, pair or tour as it is to be written, and its photographs.
 
         Args:
             joint: whether each surface is kept once.
@@ -390,32 +381,28 @@ class Export(Computation):
         if not is_scene_file(self.path):
             with stage(0.9):
                 scene, source = self.prediction.open_panoramas(self.path, gaussians, joint=joint)
-            edited, changes = self._edit(scene)
+            edited = self._edit(scene)
             known, views = scene.cam2world.tolist(), range(len(scene.cam2world))
             if len(edited.cam2world) < len(known):  # a crop leaves others out
                 views = [known.index(pose) for pose in edited.cam2world.tolist()]
-            return edited, changes, list_photographs(source, views)
+            return edited, list_photographs(source, views)
         scene = pipeline.load(self.path)
         if not joint or scene.joint or len(scene.cam2world) < 2:
-            return (*self._edit(scene), [])
+            return self._edit(scene), []
         print(
             f"note: {self.path}: each surface is kept once (--layers keeps all); an export of the folder of the "
             "photographs fits the Gaussians to them, too",
             file=sys.stderr,
         )
-        return (*self._edit(fuse_views(scene)), [])
+        return self._edit(fuse_views(scene)), []
 
-    def _edit(self, scene: Scene) -> tuple[Scene, list[Change]]:
-        """The scene with its axis up, and the Gaussians and harmonics that are wanted, and what is left out."""
+    def _edit(self, scene: Scene) -> Scene:
+        """The scene with the Gaussians and harmonics that are wanted; what is left out is printed."""
         import torch
 
         from pansplat.export.cleanup import clean_up
         from pansplat.gaussians.scene import prune
 
-        if self.up is not None:
-            rows = {"y": ((1.0, 0, 0), (0, -1, 0), (0, 0, -1)), "z": ((1.0, 0, 0), (0, 0, -1), (0, 1, 0))}[self.up]
-            turn = torch.tensor(rows, dtype=torch.float64)  # to a world with y down
-            scene = scene.rotated(turn)
         box = self.crop
         if box is not None:
             corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
@@ -424,10 +411,6 @@ class Export(Computation):
             scene, changes = clean_up(scene, box, floaters=not self.remove_floaters)
         except InputError as error:
             raise InputError(f"{self.path}: {error}") from error
-        return dataclasses.replace(scene, gaussians=prune(scene.gaussians, degree=self.degree)), changes
-
-
-def _print_changes(changes: Sequence[Change]) -> None:
-    """Print what was left out, and what that changes."""
-    for change in changes:
-        print(change)
+        for change in changes:
+            print(change)
+        return dataclasses.replace(scene, gaussians=prune(scene.gaussians, degree=self.degree))

@@ -95,17 +95,6 @@ def test_every_format_is_described_drawn_and_opened(
     assert entry.file == out
 
 
-@pytest.mark.parametrize(("up", "expected"), [("y", (1.0, -2.0, -3.0)), ("z", (1.0, -3.0, 2.0))])
-def test_up_turns_a_file_with_other_axes(
-    scene: Path, tmp_path: Path, up: str, expected: tuple[float, float, float]
-) -> None:
-    foreign = pipeline.load(scene)
-    gaussians = dataclasses.replace(foreign.gaussians, means=torch.tensor([1.0, 2.0, 3.0]).expand(1024, 3))
-    pipeline.save(dataclasses.replace(foreign, gaussians=gaussians), tmp_path / "foreign.ply")
-    assert run(["export", str(tmp_path / "foreign.ply"), "-o", str(tmp_path / "turned.ply"), "--up", up]) == 0
-    assert pipeline.load(tmp_path / "turned.ply").gaussians.means[0].tolist() == list(expected)
-
-
 def test_a_page_of_panoramas_shows_them_and_a_crop_does_not(
     tmp_path: Path,
     write_tour: Callable[..., Path],

@@ -123,7 +123,6 @@ REFUSED = {
     "export scene.ply -o x.spz --points": "--points is for a .ply",
     "export scene.ply -o x.png --points": "--points is for a .ply",
     "export room -o x --training-set --points": "--points is for a .ply",
-    "export room -o x.ply --up z": "--up is for a scene file",
     "export scene.ply -o x.ply --mesh": "--mesh is for a mesh (a .glb with --mesh)",
     "export scene.ply -o x.glb --triangles 9": "--triangles is for a mesh",
     "export scene.ply -o x.glb --mesh --triangles 9": "needs 512 triangles or more",
