@@ -33,7 +33,6 @@ _PUBLIC = {
     "predict_tour": "pansplat.pipeline",
     "rasterize": "pansplat.rendering",
     "refine": "pansplat.pipeline",
-    "refine_to_file": "pansplat.pipeline",
     "render": "pansplat.pipeline",
     "save": "pansplat.pipeline",
     "show": "pansplat.notebook",

@@ -73,7 +73,6 @@ __all__ = [
     "predict_to_file",
     "predict_tour",
     "refine",
-    "refine_to_file",
     "render",
     "save",
 ]
@@ -328,7 +327,7 @@ class _Task:
 @with_device
 @with_progress_bar
 def predict(
-    source: Pair | Views | str | Path | Sequence[str | Path],
+    source: Pair | Views | str | Path,
     model: str | Path | Predictor | None = None,
     *,
     options: PredictOptions | None = None,
@@ -340,8 +339,8 @@ def predict(
     The prediction of a pair and its refinement are cached in its folder (`pansplat.cache`).
 
     Args:
-        source: a pair; the path of a panorama or of a folder that holds exactly one pair; the panoramas of one folder
-            to use, whose poses are estimated if they have none; or loaded panoramas (never cached).
+        source: a pair; the path of a panorama or of a folder that holds exactly one pair; or loaded panoramas (never
+            cached).
         model: the name of a predictor, a file of weights, or a predictor; by default that of the options.
         options: all of the following keywords in one object; a keyword replaces its value.
         on_predicted: called with the prediction before it is refined.
@@ -378,7 +377,7 @@ def _choose_options(
 
 
 def _prepare(
-    source: Pair | Views | str | Path | Sequence[str | Path],
+    source: Pair | Views | str | Path,
     predictor: Predictor,
     options: PredictOptions,
 ) -> _Task:
@@ -475,40 +474,10 @@ def refine(
     Returns:
         The refined scene, or the given one if held-out pixels show that it is better, or if it is of a single view.
     """
-    return _run_refinement(scene, views, config, seed, seconds=seconds, steps=steps)[0]
+    return run_refinement(scene, views, config, seed, seconds=seconds, steps=steps)[0]
 
 
-@with_device
-@with_progress_bar
-def refine_to_file(
-    scene: Scene,
-    views: Views,
-    path: str | Path,
-    *,
-    seconds: float | None = None,
-    steps: int | None = None,
-    config: RefineConfig | None = None,
-    seed: int = 0,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> tuple[Scene, RefineReport]:
-    """Refine a scene and write it in the format of the file's suffix.
-
-    Args:
-        scene, views, seconds, steps, config, seed: see `refine`.
-        path: the file.
-        should_stop: called after each step; True ends the refinement early.
-
-    Returns:
-        The refined scene, and what the refinement did.
-    """
-    find_scene_suffix(path)  # an error before the work
-    limits = {"seconds": seconds, "steps": steps}
-    refined, report = _run_refinement(scene, views, config, seed, **limits, should_stop=should_stop)
-    save(refined, path)
-    return refined, report
-
-
-def _run_refinement(
+def run_refinement(
     scene: Scene, views: Views, config: RefineConfig | None, seed: int, **run: Any
 ) -> tuple[Scene, RefineReport]:
     """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`."""
@@ -524,7 +493,7 @@ def _refine_scene(
     """The refined scene and what the refinement did, which runs on the device of `choose_device`, or a given card's."""
     device = given = scene.gaussians.means.device
 
-    def run_refinement(device: torch.device) -> tuple[Scene, RefineReport]:
+    def run_on(device: torch.device) -> tuple[Scene, RefineReport]:
         moved = replace(scene, gaussians=scene.gaussians.to(device=device))
         refinement = Refinement(moved, views, config, seed=seed)
         report = refinement.run(**run)
@@ -535,12 +504,12 @@ def _refine_scene(
         seconds = run.get("seconds")
         device = choose_device("refinement", math.inf if seconds is None else seconds, kernels=True)
     try:
-        return run_refinement(device)
+        return run_on(device)
     except torch.cuda.OutOfMemoryError:
         if device == given:
             raise
         note_full_card("refinement")  # outside of the block the card's tensors are free
-    return run_refinement(given)
+    return run_on(given)
 
 
 @with_device
@@ -636,13 +605,12 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0) -> 
 @with_device
 @with_progress_bar
 def predict_to_file(
-    source: Pair | Views | str | Path | Sequence[str | Path],
+    source: Pair | Views | str | Path,
     path: str | Path,
     model: str | Path | Predictor | None = None,
     *,
     options: PredictOptions | None = None,
     degree: int | None = None,
-    min_opacity: float = 0.0,
     **keywords: Any,
 ) -> int:
     """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
@@ -654,7 +622,6 @@ def predict_to_file(
         source, model, options, **keywords: see `predict`.
         path: the file.
         degree: highest degree of harmonics in the file; None keeps all.
-        min_opacity: Gaussians of lower opacity are omitted.
         cache: see `predict`; without options by default not, and networks do not cache heights above 512.
 
     Returns:
@@ -671,13 +638,13 @@ def predict_to_file(
         parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
             views.images, views.cam2world, views.near, views.far, masks=views.masks
         )
-        pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
+        pruned = (prune(part, degree=degree) for part in parts)
         if suffix == ".ply":
             return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), task), pruned, path)
         scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), task)
     else:
         scene = predict(task.source, predictor, options=options)
-        scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
+        scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree))
     save(scene, path)
     return len(scene.gaussians)
 
@@ -803,7 +770,7 @@ def _choose_rasterizer(
     return partial(rasterize_official, size=size, near=scene.near, **raster)
 
 
-def _load_source(source: Pair | Views | str | Path | Sequence[str | Path]) -> Pair | Views:
+def _load_source(source: Pair | Views | str | Path) -> Pair | Views:
     """The pair of a path or of listed panoramas; a pair or views as they are, with tensors in place of arrays."""
     if isinstance(source, (str, Path)):
         return _load_only_pair(source)
@@ -811,12 +778,10 @@ def _load_source(source: Pair | Views | str | Path | Sequence[str | Path]) -> Pa
         return source
     if isinstance(source, Views):
         return _as_tensors(source)
-    if not isinstance(source, (list, tuple)) or not all(isinstance(path, (str, Path)) for path in source):
-        raise InputError(
-            f"needed a pair, a path, a list of paths or Views, got {type(source).__name__}; "
-            "give arrays as Views(images, cam2world, masks, near, far, names)"
-        )
-    return _load_only_pair(source[0]) if len(source) == 1 else _load_listed(source)
+    raise InputError(
+        f"needed a pair, a path or Views, got {type(source).__name__}; "
+        "give arrays as Views(images, cam2world, masks, near, far, names)"
+    )
 
 
 def _as_tensors(views: Views) -> Views:
@@ -828,34 +793,6 @@ def _as_tensors(views: Views) -> Views:
         )
     poses = torch.as_tensor(views.cam2world, dtype=torch.float64)
     return replace(views, images=images, masks=masks, cam2world=poses)
-
-
-def _load_listed(paths: Sequence[str | Path]) -> Pair:
-    """The pair of some panoramas of one folder, by the folder's poses, or by poses that are estimated of them alone."""
-    files = [expand_home(path).absolute() for path in paths]
-    others = {file.parent for file in files} - {files[0].parent} if files else {Path()}
-    if others:
-        raise InputError(
-            f"needed panoramas of one folder, got {', '.join(map(str, paths)) or 'none'}; put them into one"
-        )
-    folder = files[0].parent
-    collections = folders.load_collections(folder)
-    if collections[0].needs_poses:
-        listed = [panorama for panorama in collections[0].unposed if panorama.image.absolute() in files]
-        pairs = estimate_pairs(folder, listed) if len(listed) > 1 else []
-    else:
-        pairs = folders.make_pairs(collections)
-    found = {view.image.absolute(): view for pair in pairs for view in (*pair.context, *pair.targets)}
-    missing = [file for file in files if file not in found]
-    if missing:
-        raise InputError(f"{missing[0]}: needed a panorama of the folder, got none of this name; check the list")
-    views = tuple(found[file] for file in dict.fromkeys(files))
-    if len({view.world for view in views}) > 1:
-        names = ", ".join(view.name for view in views)
-        raise InputError(f"{folder}: needed panoramas whose relative poses are known, got {names}; see `pansplat pose`")
-    own = [pair for pair in pairs if {view.image for view in pair.context} & {view.image for view in views}]
-    near, far = min(pair.near for pair in own), max(pair.far for pair in own)
-    return Pair("-".join(view.name for view in views), folder, views, (), near, far, own[0].siblings)
 
 
 def _load_only_pair(path: str | Path) -> Pair:

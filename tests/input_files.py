@@ -7,7 +7,7 @@ import json
 import re
 import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -257,11 +257,6 @@ def _make_depth(folder: Path) -> InputFile:
     return InputFile(folder / "depth.png", _whole(lambda path: read_depth(path, 4)), idle=_CHECKED)
 
 
-def _make_text(path: Path, lines: Sequence[str]) -> InputFile:
-    path.write_text("".join(f"{line}\n" for line in lines))
-    return InputFile(path, _whole(read_pose), has_cuts=True)
-
-
 def _make_cube(folder: Path) -> InputFile:
     """The description of a panorama of cube faces."""
     for face in "frblud":
@@ -289,8 +284,7 @@ FILES: dict[str, Callable[[Path], InputFile]] = {
     "key frames": lambda folder: _make_json(
         folder / "path.json", {"key_frames": [_KEY_FRAME], "software": "x"}, read_path
     ),
-    "pose": lambda folder: _make_json(folder / "pose.json", {"convention": "cam2world opencv", "pose": EYE}, read_pose),
-    "pose of numbers": lambda folder: _make_text(folder / "pose.txt", [" ".join(map(str, row)) for row in EYE]),
+    "pose": lambda folder: _make_json(folder / "pose.json", EYE, read_pose),
     **{f"scene{suffix}": lambda folder, suffix=suffix: _make_scene(folder, suffix) for suffix in SCENE_SUFFIXES},
     "scene comment": _make_comment,
     "network": _make_network,

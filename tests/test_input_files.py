@@ -24,7 +24,7 @@ VALUES: tuple[Any, ...] = (
 )  # fmt: skip
 OF_WHOLE = "no Gaussians|one length|accessor|another file|spherical|another content|its pictures|frame .:|png'"
 OF_WHOLE += "|its . cameras|must be|settings of a|needed the attribute"
-OF_WHOLE += r"|(frame|pose|number) \d|'.*\b[ab]\b"
+OF_WHOLE += r"|(frame|pose|number) \d|pose.json: needed a|'.*\b[ab]\b"
 """Of messages about values that contradict each other or leave nothing, or about a picture, pose or accessor."""
 
 

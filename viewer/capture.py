@@ -68,12 +68,12 @@ def open_film(
     renderers = [create_renderer() for _ in range(1 if scenes is None else 2)]
     uploaded: list[Scene | None] = [None, None]
 
-    def draw(slot: int, scene: Scene, shot: Shot) -> tuple[np.ndarray, np.ndarray | None]:
+    def draw(slot: int, scene: Scene, shot: Shot) -> np.ndarray:
         if uploaded[slot] is not scene:
             renderers[slot].upload(scene)
             uploaded[slot] = scene
         fitted = replace(fit_settings(settings, scene), vertical_fov_degrees=shot.vertical_fov_degrees)
-        return render_image(renderers[slot], shot.pose, size, fitted)
+        return render_image(renderers[slot], shot.pose, size, fitted)[0]
 
     def choose(shot: Shot) -> tuple[Scene, int]:
         assert scenes is not None
@@ -137,8 +137,8 @@ def write_flight(
             show_file(folder / name)
 
     name = "flythrough.mp4" if scenes is None else "tour.mp4"
-    for file in write_film(folder / name, film, shots, fps, show=show):
-        show_file(file)
+    write_film(folder / name, film, shots, fps, show=show)
+    show_file(folder / name)
     if scenes is None:
         file = folder / f"panorama_{round(100 * at):03d}.png"
         write_image(file, pipeline.render(scene, compute_flight_pose(scene, at), blend=settings.mode).color)

@@ -58,8 +58,8 @@ class Batch(Computation):
     """Folder for the results and the report, report.jsonl."""
     do: str = "predict"
     """Steps, separated by commas: predict, refine, export."""
-    format: Literal["html", "svg", "png", "dxf", "ply", "compressed.ply", "spz", "splat", "sog", "glb"] = "html"
-    """Format of the export: a web page, a floor plan (svg, png, dxf), or a scene."""
+    format: Literal["html", "svg", "png", "ply", "compressed.ply", "spz", "splat", "sog", "glb"] = "html"
+    """Format of the export: a web page, a floor plan (svg, png), or a scene."""
     gaussians: Count | None = None
     """For html: largest number of Gaussians, 450,000 by default."""
     workers: Threads | None = None

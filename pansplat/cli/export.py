@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from msgspec import Meta
 from tyro.conf import Positional
@@ -28,13 +28,12 @@ from pansplat.system.files import (
     require_output_folder,
     require_replaceable,
 )
-from pansplat.system.options import Count, Fraction, Real
+from pansplat.system.options import Count, Real
 from pansplat.system.progress import stage
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from pansplat.export.cleanup import Change
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.pairs import Pair
 
@@ -63,28 +62,26 @@ class _SceneFile:
 
         if self.points and find_scene_suffix(export.out) != ".ply":
             raise InputError(f"--points is for {self.files}, got {export.out}; leave it out")
-        scene, changes, _ = export.open(joint=not export.layers)
+        scene, _ = export.open(joint=not export.layers)
         write, kind = (save_points, "points") if self.points else (save_scene, "Gaussians")
         write(scene, export.out)
         size, count = export.out.stat().st_size, len(scene.gaussians)
         print(f"{export.out}: {count:,} {kind}, {size:,} bytes ({size / max(count, 1):.1f} each)")
-        _print_changes(changes)
 
 
 @dataclass(frozen=True)
 class _FloorPlan:
     """For a floor plan."""
 
-    suffixes: ClassVar = (".svg", ".dxf", ".png")
+    suffixes: ClassVar = (".svg", ".png")
     files: ClassVar = "a floor plan"
 
     def write(self, export: Export) -> None:
         """Write the plan and print its rooms."""
         from pansplat.export.plan_files import describe_plan, write_plan
 
-        scene, changes, _ = export.open()
+        scene, _ = export.open()
         print(f"{export.out}: {'; '.join(describe_plan(write_plan(scene, export.out)))}")
-        _print_changes(changes)
 
 
 @dataclass(frozen=True)
@@ -109,7 +106,7 @@ class _Mesh:
         from pansplat.tours.facts import TourFacts
         from pansplat.tours.graph import make_graph, select_views
 
-        scene, changes, photographs = export.open()
+        scene, photographs = export.open()
 
         def load(view: int) -> Tensor:
             pair = photographs[view]
@@ -144,7 +141,6 @@ class _Mesh:
             )
         if not self.whole and len(scene.cam2world):
             print(f"note: {export.out}: without what is outside of the rooms; --whole keeps it", file=sys.stderr)
-        _print_changes(changes)
 
 
 @dataclass(frozen=True)
@@ -159,34 +155,28 @@ class Page:
     merged."""
     photo_height: Annotated[int, Meta(ge=0, le=4096)] | None = None
     """Largest height of the photographs that the page shows at panoramas; 0 for none. By default what fits into 15 MB,
-    at least 1024, in a folder and with --split that of the files, at most 4096."""
-    split: bool = False
-    """Write the data to a folder beside the page, for scenes that are large for one file."""
+    at least 1024, in a folder that of the files, at most 4096."""
     serve: bool = False
     """Then show the page to headsets and phones in the local network, by https, until Ctrl+C."""
-    embed: tuple[str, ...] = ()
-    """Origins, such as https://example.com, of pages that may move the camera of this one in a frame; with --serve only
-    they may show it in a frame."""
     title: str | None = None
     """Title of the page; by default the name of the scene."""
 
     def write(self, export: Export) -> None:
         """Write the page, print its size, and serve it."""
-        from pansplat.export.page import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS, parse_origins, write_page
+        from pansplat.export.page import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS, write_page
         from pansplat.export.page_server import serve_page
 
-        parse_origins(self.embed)
-        out, split = export.out, self.split
-        if not out.suffix:
+        out, split = export.out, not export.out.suffix
+        if split:
             require_output_folder("--out", out)
             require_replaceable("--out", [out / _INDEX], export.overwrite)
-            out, split = out / _INDEX, True
-        shows_all = not (export.crop or export.rooms)  # photographs would show what a crop leaves out
+            out = out / _INDEX
+        shows_all = not export.crop  # photographs would show what a crop leaves out
         has_photographs = shows_all and self.photo_height != 0 and not is_scene_file(export.path)
         count = self.gaussians or (PHOTO_GAUSSIANS if has_photographs and not split else DEFAULT_GAUSSIANS)
         with progress_bar():
             with stage(0.8):
-                scene, changes, photographs = export.open(gaussians=count)
+                scene, photographs = export.open(gaussians=count)
             out.parent.mkdir(parents=True, exist_ok=True)
             page = write_page(
                 scene,
@@ -194,7 +184,6 @@ class Page:
                 gaussians=count,
                 split=split,
                 title=self.title or _name_page(export.path, photographs),
-                embed=self.embed,
                 photographs=photographs if shows_all else (),
                 photo_height=self.photo_height,
             )
@@ -228,7 +217,6 @@ class Page:
                 f"--gaussians {more} shows more detail in about {size:.0f} MB",
                 file=sys.stderr,
             )
-        _print_changes(changes)
         if self.serve:
             serve_page(page)
 
@@ -267,9 +255,8 @@ class _TrainingSet:
         from pansplat.system.atomic import replacing_folder
 
         require_new_folder("--out", export.out)
-        if export.crop or export.rooms or export.remove_floaters:
-            names = "--crop, --rooms and --remove-floaters"
-            raise InputError(f"{names} are not for {self.files}, got {export.out}; leave them out")
+        if export.crop or export.remove_floaters:
+            raise InputError(f"--crop and --remove-floaters are not for {self.files}, got {export.out}; leave them out")
         if is_scene_file(export.path):
             raise InputError(
                 f"{export.path}: needed the folder of the panoramas to write their cube faces, got a scene file; give "
@@ -277,7 +264,7 @@ class _TrainingSet:
             )
         with stage(0.8):
             scene, source = export.prediction.open_panoramas(export.path, joint=not export.layers)
-        gaussians = prune(scene.gaussians, degree=0, min_opacity=max(export.min_opacity, _MIN_POINT_OPACITY))
+        gaussians = prune(scene.gaussians, degree=0, min_opacity=_MIN_POINT_OPACITY)
         gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
         if len(gaussians) > _MOST_POINTS:
             chosen = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))[:_MOST_POINTS]
@@ -332,29 +319,23 @@ class _Photographs:
 class Export(Computation):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
     web page (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan
-    with straight walls and areas (.svg, .png, .dxf), as textured triangles (.glb with --mesh), or as a folder
+    with straight walls and areas (.svg, .png), as textured triangles (.glb with --mesh), or as a folder
     to train further from (--training-set): cube faces, poses and points for COLMAP, nerfstudio, gsplat and brush."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
     out: Out
-    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg, .dxf or .png
+    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg or .png
     for a floor plan. A folder, without a suffix, for a web page with photographs of their own
     resolution, which are loaded as they are needed; a new one with --training-set for cube faces with poses, and with
     --photos for the photographs of a tour."""
     degree: Annotated[int, Meta(ge=0, le=4)] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds."""
-    min_opacity: Fraction = 0.0
-    """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
     crop: tuple[Real, Real, Real, Real, Real, Real] | None = None
     """Keep what is in a box: x, y and z of two opposite corners, metres, in the axes of the poses. Cameras outside are
     left out."""
-    rooms: tuple[str, ...] = ()
-    """Keep these rooms of the floor plan, by their names or by those of panoramas in them."""
     remove_floaters: bool = False
     """Leave out isolated Gaussians in free space."""
-    up: Literal["y", "z"] | None = None
-    """Axis of a given file that points up, if its program did not keep to the axes of the format."""
     layers: bool = False
     """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
     draw all Gaussians together (docs/formats.md)."""
@@ -382,14 +363,12 @@ class Export(Computation):
                 if other is not kind and getattr(other, option.name) != option.default:
                     name = option.name.replace("_", "-")
                     raise InputError(f"--{name} is for {other.files}, got {self.out}; leave it out")
-        if self.up is not None and not is_scene_file(self.path):
-            raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
         kind.write(self)
         return 0
 
     @progress_bar()
-    def open(self, *, joint: bool = False, gaussians: int | None = None) -> tuple[Scene, list[Change], list[Pair]]:
-        """The scene of the file, pair or tour as it is to be written, what is left out, and its photographs.
+    def open(self, *, joint: bool = False, gaussians: int | None = None) -> tuple[Scene, list[Pair]]:
+        """The scene of the file, pair or tour as it is to be written, and its photographs.
 
         Args:
             joint: whether each surface is kept once.
@@ -402,49 +381,36 @@ class Export(Computation):
         if not is_scene_file(self.path):
             with stage(0.9):
                 scene, source = self.prediction.open_panoramas(self.path, gaussians, joint=joint)
-            layers = self.prediction.predict_layers(source) if self.rooms and scene.joint else None
-            edited, changes = self._edit(scene, layers)
+            edited = self._edit(scene)
             known, views = scene.cam2world.tolist(), range(len(scene.cam2world))
             if len(edited.cam2world) < len(known):  # a crop leaves others out
                 views = [known.index(pose) for pose in edited.cam2world.tolist()]
-            return edited, changes, list_photographs(source, views)
+            return edited, list_photographs(source, views)
         scene = pipeline.load(self.path)
         if not joint or scene.joint or len(scene.cam2world) < 2:
-            return (*self._edit(scene), [])
+            return self._edit(scene), []
         print(
             f"note: {self.path}: each surface is kept once (--layers keeps all); an export of the folder of the "
             "photographs fits the Gaussians to them, too",
             file=sys.stderr,
         )
-        return (*self._edit(fuse_views(scene), scene), [])
+        return self._edit(fuse_views(scene)), []
 
-    def _edit(self, scene: Scene, layers: Scene | None = None) -> tuple[Scene, list[Change]]:
-        """The scene with its axis up, and the Gaussians and harmonics that are wanted, and what is left out.
-
-        `layers` is the scene with all that each panorama shows, if `scene` is not.
-        """
+    def _edit(self, scene: Scene) -> Scene:
+        """The scene with the Gaussians and harmonics that are wanted; what is left out is printed."""
         import torch
 
-        from pansplat.export.cleanup import Cleaning, clean_up
+        from pansplat.export.cleanup import clean_up
         from pansplat.gaussians.scene import prune
 
-        if self.up is not None:
-            rows = {"y": ((1.0, 0, 0), (0, -1, 0), (0, 0, -1)), "z": ((1.0, 0, 0), (0, 0, -1), (0, 1, 0))}[self.up]
-            turn = torch.tensor(rows, dtype=torch.float64)  # to a world with y down
-            scene, layers = scene.rotated(turn), None if layers is None else layers.rotated(turn)
         box = self.crop
         if box is not None:
             corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
             box = tuple(scene.frame.localize_places(corners).flatten().tolist())
-        cleaning = Cleaning(self.rooms, box, not self.remove_floaters, self.min_opacity)
         try:
-            scene, changes = clean_up(scene, cleaning, layers)
+            scene, changes = clean_up(scene, box, floaters=not self.remove_floaters)
         except InputError as error:
             raise InputError(f"{self.path}: {error}") from error
-        return dataclasses.replace(scene, gaussians=prune(scene.gaussians, degree=self.degree)), changes
-
-
-def _print_changes(changes: Sequence[Change]) -> None:
-    """Print what was left out, and what that changes."""
-    for change in changes:
-        print(change)
+        for change in changes:
+            print(change)
+        return dataclasses.replace(scene, gaussians=prune(scene.gaussians, degree=self.degree))

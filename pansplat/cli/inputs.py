@@ -111,10 +111,6 @@ class ScenePrediction:
             tour = connect(tours[0])
         return predict_scene(tour, options), tour
 
-    def predict_layers(self, source: Pair | TourGraph) -> Scene:
-        """The unrefined scene of the panoramas of `open_panoramas` with all that each of them shows, from the cache."""
-        return predict_scene(source, replace(self.options, refine_seconds=0.0))
-
 
 def choose_pair(path: Path, choice: PairChoice) -> Pair:
     """The chosen pair of a folder; without a choice the first one, with a note if there are more."""

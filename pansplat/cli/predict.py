@@ -14,7 +14,6 @@ from pansplat.cli.inputs import Computation, Out, PairChoice, choose_pair
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, require_output_file
-from pansplat.system.options import Fraction
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,6 @@ class Predict(Computation):
     degree: Annotated[int, Meta(ge=0, le=4)] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds. The .ply of 4K
     panoramas has 5 GB with degree 4, 1 GB with degree 0."""
-    min_opacity: Fraction = 0.0
-    """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
     prediction: PredictOptions = field(default_factory=PredictOptions)
     choice: PairChoice = field(default_factory=PairChoice)
 
@@ -52,9 +49,7 @@ class Predict(Computation):
         if options.refine_seconds is None and not joint:
             options = replace(options, refine_seconds=0.0)
         began = time.perf_counter()
-        count = pipeline.predict_to_file(
-            pair, self.out, model, options=options, degree=self.degree, min_opacity=self.min_opacity
-        )
+        count = pipeline.predict_to_file(pair, self.out, model, options=options, degree=self.degree)
         seconds = time.perf_counter() - began
         names = ", ".join(panorama.name for panorama in pair.context)
         print(f"{self.out}: {count:,} Gaussians from {names} in {seconds:.1f} s")

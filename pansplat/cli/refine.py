@@ -78,16 +78,16 @@ class Refine(Computation):
         config = RefineConfig(gaussians=self.gaussians, poses=self.poses)
         with stop_at_interrupt() as should_stop:
             report_progress("preparing", 0.0)
-            refined, report = pipeline.refine_to_file(
+            refined, report = pipeline.run_refinement(
                 scene,
                 views,
-                self.out,
+                config,
+                self.seed,
                 seconds=self.seconds,
                 steps=self.steps,
-                config=config,
-                seed=self.seed,
                 should_stop=should_stop,
             )
+            pipeline.save(refined, self.out)
         if self.report is not None:
             write_json(dataclasses.asdict(report), self.report)
         print(_describe(report, "all" if scene.joint else "held-out"))

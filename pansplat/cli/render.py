@@ -14,7 +14,7 @@ from pansplat.cli.inputs import Computation, Out, ScenePrediction, parse_blend
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count
-from pansplat.system.files import expand_home, read_file, require_output_file
+from pansplat.system.files import expand_home, require_output_file
 from pansplat.system.options import EYE_DISTANCE, EyeDistance, ImageHeight
 from pansplat.system.progress import stage
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 _VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # pixels
-_MAX_MATRIX = 4096  # bytes of a file with the 16 numbers of a matrix
 
 
 @dataclass(frozen=True)
@@ -47,9 +46,9 @@ class Render(Computation):
     """Camera position between the first (0) and the last (1) input camera, or on the flight through a tour of several
     parts; 0.5 by default."""
     pose: Path | None = None
-    """File with the camera pose of an image: a JSON matrix (cam2world, OpenCV axes, metres), or 16 numbers."""
+    """File with the camera pose of an image: a JSON matrix (cam2world, OpenCV axes, metres)."""
     path_file: Annotated[Path | None, arg(name="path")] = None
-    """File of a camera path (docs/viewer.md), which the film follows; a .png or .exr becomes a numbered sequence."""
+    """File of a camera path (docs/viewer.md), which the film follows."""
     layout: Literal["equirect", "cubemap", "perspective"] | None = None
     """Panorama with one exact ray per pixel, panorama stitched from six cube faces, or perspective image.
     By default equirect, for a video perspective."""
@@ -97,7 +96,6 @@ class Render(Computation):
             marks = {
                 "panorama": layout != "perspective",
                 "stereo": "top-bottom" if self.stereo else "mono",
-                "unit": scene.frame.unit,
             }
             write_film(self.out, film, shots, self.fps, **marks)
             print(f"{self.out}: {describe_count(len(shots), 'frame')} of {size}, {layout}")
@@ -117,7 +115,7 @@ class Render(Computation):
 
     @property
     def _is_film(self) -> bool:
-        return self.out.suffix.lower() == ".mp4" or self.path_file is not None
+        return self.out.suffix.lower() == ".mp4"
 
     def _choose_height(self, layout: str, scene: Scene) -> int:
         if not self._is_film:
@@ -126,20 +124,14 @@ class Render(Computation):
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        if self.path_file is None:
-            require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, ".mp4"), overwrite=self.overwrite)
-        else:
-            from pansplat.export.film import require_film_file
-
-            require_film_file("--out", self.out, self.overwrite)
+        suffixes = (*(() if self.path_file else _IMAGE_SUFFIXES), ".mp4")
+        require_output_file("--out", self.out, suffixes, overwrite=self.overwrite)
         if self.depth and self.out.suffix.lower() != ".png":
             raise InputError(f"--depth writes a .png, got {self.out}; an .exr holds the depth without it")
         cameras = {"--at": self.at, "--pose": self.pose, "--path": self.path_file}
         given = [name for name, value in cameras.items() if value is not None]
         if len(given) > 1:
             raise InputError(f"{' and '.join(given)} set the camera; give one of them")
-        if self.depth and self.path_file is not None:
-            raise InputError("--depth writes one image; write the film of --path as .exr, which holds depth")
         for name in ("--at", "--pose"):
             if name in given and self._is_film:
                 raise InputError(f"{name} is one position, a video moves; write a .png, or leave out {name}")
@@ -192,7 +184,7 @@ class Render(Computation):
         from pansplat.export.film import Film, FilmPhotographs, choose_scenes
         from pansplat.tours.route import NEAR_OF_FAR
 
-        with_depth, is_perspective = self.out.suffix.lower() == ".exr", options["layout"] == "pinhole"
+        is_perspective = options["layout"] == "pinhole"
         near = NEAR_OF_FAR * scene.far if scene.overlaps else NEAR
 
         @functools.lru_cache(maxsize=2)
@@ -201,12 +193,11 @@ class Render(Computation):
             return pipeline.make_renderer(shown, "film", work, near=near, **options)
 
         @torch.no_grad()
-        def draw(slot: int, shown: Scene, shot: Shot) -> tuple[np.ndarray, np.ndarray | None]:
+        def draw(slot: int, shown: Scene, shot: Shot) -> np.ndarray:
             fov: dict[str, Any] = {"vertical_fov_degrees": shot.vertical_fov_degrees} if is_perspective else {}
-            image = renderer(shown)(shot.pose, **fov)
-            return image.color.permute(1, 2, 0).numpy(), image.depth.numpy() if with_depth else None
+            return renderer(shown)(shot.pose, **fov).color.permute(1, 2, 0).numpy()
 
-        is_plain = self.blend is None and not self.stereo and not with_depth
+        is_plain = self.blend is None and not self.stereo
         photographs = FilmPhotographs.open(source, scene) if source is not None and is_plain else None
         choose = (lambda shot: (scene, 0)) if isinstance(options["blend"], int) else choose_scenes(scene)
         return Film(choose, draw, "pinhole" if is_perspective else "equirect", options["size"], photographs)
@@ -224,16 +215,8 @@ def _plan_flight(scene: Scene) -> Route | None:
 
 
 def read_pose(path: Path) -> Tensor:
-    """The pose of a file (a JSON matrix, or 16 numbers): cam2world, OpenCV axes."""
-    from pansplat.inputs.poses import parse_convention, parse_numbers, rigid_matrix, to_cam2world
+    """The pose of a JSON file: cam2world, OpenCV axes."""
+    from pansplat.inputs.poses import rigid_matrix
     from pansplat.system.strict_json import read_json
 
-    if path.suffix.lower() == ".json":
-        content = read_json(path)
-        convention = "cam2world opencv"
-        if isinstance(content, dict):
-            convention = parse_convention(content.get("convention", convention), path)
-            content = content.get("cam2world", content.get("pose"))
-        return to_cam2world(rigid_matrix(content, str(path)), convention)
-    text = read_file(path, "a readable file of numbers", limit=_MAX_MATRIX).decode("utf-8-sig", errors="replace")
-    return rigid_matrix(parse_numbers(text.replace(",", " "), 16, path).reshape(4, 4).tolist(), str(path))
+    return rigid_matrix(read_json(path), str(path))

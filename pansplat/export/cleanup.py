@@ -1,4 +1,4 @@
-"""Scenes before they are shared: cropped to a box or to rooms, without floaters and without faint Gaussians.
+"""Scenes before they are shared: cropped to a box, and without floaters.
 
 Each step states how many Gaussians it leaves out, and how much the pictures at the cameras change.
 """
@@ -6,15 +6,14 @@ Each step states how many Gaussians it leaves out, and how much the pictures at 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy
 import torch
 from jaxtyping import Bool, Float
-from shapely import contains_xy
-from shapely.geometry import Polygon
 from torch import Tensor
 from torch.nn import functional
 
@@ -26,37 +25,16 @@ from pansplat.pipeline import render
 from pansplat.rendering import rasterize
 from pansplat.system.descriptions import describe_count
 from pansplat.system.progress import report_progress, stage
-from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import assign_storeys
-from pansplat.tours.graph import make_graph
 
 _NEIGHBOURS = 16  # of a Gaussian
 _CHUNK = 1 << 17  # Gaussians whose neighbours are looked for at once
 _ALIKE = 0.15  # largest difference of the logarithms of two distances from a camera that are alike
 _FEW = 2  # neighbours of an isolated Gaussian that are as far are fewer
 _CONFIRMED = 0.03  # distance from a Gaussian of another camera, relative to that from the own camera
-_LONELY = 3.0  # distance of the neighbours, relative to that of their own ones and to the largest standard deviation
 _IN_FRONT = 0.85  # largest distance from a camera, relative to that of the surface behind
 _OPAQUE = 0.5  # least alpha of that surface
 _DEPTH_ROWS, _PICTURE_ROWS = 512, 256  # of the images that are compared
 _MAX_PICTURES = 16  # cameras at which pictures are compared
-
-
-@dataclass(frozen=True)
-class Cleaning:
-    """What is done, in this order.
-
-    Attributes:
-        rooms: names of rooms of the plan, or of panoramas in them, that the scene is cropped to.
-        box: that the scene is cropped to.
-        floaters: whether floaters are kept.
-        min_opacity: of the Gaussians that are kept.
-    """
-
-    rooms: tuple[str, ...] = ()
-    box: Box | None = None
-    floaters: bool = True
-    min_opacity: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -90,31 +68,19 @@ class Change:
 
 
 @stage()
-def clean_up(
-    scene: Scene,
-    cleaning: Cleaning,
-    layers: Scene | None = None,
-) -> tuple[Scene, list[Change]]:
+def clean_up(scene: Scene, box: Box | None = None, *, floaters: bool = True) -> tuple[Scene, list[Change]]:
     """The scene after the steps, and what each of them did.
 
     Args:
         scene: with each surface once, or not.
-        cleaning: the steps.
-        layers: the scene of the same cameras with all that each panorama shows, to find the rooms of a joint one.
+        box: that it is cropped to.
+        floaters: whether they are kept.
     """
     steps: dict[str, Callable[[Scene], Scene]] = {}
-    box, least = cleaning.box, cleaning.min_opacity
-    if cleaning.rooms:
-        names = cleaning.rooms  # first, because the layers are those of all cameras
-        steps["rooms"] = lambda scene: crop_to_rooms(scene, names, layers)
     if box is not None:
-        steps["crop"] = lambda scene: crop(scene, box)
-    if not cleaning.floaters:
+        steps["crop"] = partial(crop, box=box)
+    if not floaters:
         steps["floaters"] = remove_floaters
-    if least > 0:
-        steps["opacity"] = lambda scene: keep_gaussians(
-            scene, scene.gaussians.opacities >= least, range(len(scene.cam2world))
-        )
     changes = []
     for number, (name, step) in enumerate(steps.items()):
         report_progress(name, number / len(steps))
@@ -151,45 +117,6 @@ def compare_pictures(before: Scene, after: Scene) -> float | None:
     return -10 * math.log10(mean) if mean > 0 else math.inf
 
 
-def crop_to_rooms(scene: Scene, names: Sequence[str], layers: Scene | None = None) -> Scene:
-    """The part of a scene that is in some rooms.
-
-    The layers of the rooms' cameras are kept: what these see through doors, too. A joint scene also keeps what other
-    cameras have seen within the rooms' outlines.
-
-    Args:
-        scene: with input cameras.
-        names: of rooms of the floor plan, or of panoramas in them; upper and lower case are equal.
-        layers: see `clean_up`.
-    """
-    if not len(scene.cam2world):
-        raise InputError("rooms need a scene with input cameras, got one without; crop it to a box")
-    tour = make_graph(scene)
-    shown = scene if layers is None else layers
-    rooms = () if shown.joint else TourFacts(shown).plan.rooms
-    labels = [panorama.label.casefold() for panorama in tour.panoramas]
-    views: set[int] = set()
-    for name in names:
-        wanted = name.casefold()
-        found = {view for view, label in enumerate(labels) if label == wanted}
-        found |= {view for room in rooms for view in room.panoramas if room.name.casefold() == wanted}
-        if not found:
-            known = dict.fromkeys([*(room.name for room in rooms), *(panorama.label for panorama in tour.panoramas)])
-            raise InputError(f"needed the name of a room or panorama, got {name!r}; choose from {', '.join(known)}")
-        views |= found
-    inside = [room for room in rooms if views & {*room.panoramas}]
-    views |= {view for room in inside for view in room.panoramas}
-    own = scene.gaussians.views.long().cpu()
-    kept = torch.isin(own, torch.tensor(sorted(views)))
-    if scene.joint and inside:
-        storeys = torch.tensor(assign_storeys(tour))[own]
-        places = scene.gaussians.means.double().cpu().numpy() @ tour.level_axes[:, (0, 2)]
-        for room in inside:
-            is_within = torch.from_numpy(contains_xy(Polygon(room.outline), places[:, 0], places[:, 1]))
-            kept |= is_within & (storeys == room.storey)
-    return keep_gaussians(scene, kept.to(scene.gaussians.means.device), sorted(views))
-
-
 def remove_floaters(scene: Scene) -> Scene:
     """The scene without isolated Gaussians in free space (`find_floaters`); all cameras are kept."""
     return keep_gaussians(scene, ~find_floaters(scene), range(len(scene.cam2world)))
@@ -201,16 +128,17 @@ def find_floaters(scene: Scene) -> Bool[Tensor, "n"]:
 
     A Gaussian is isolated if hardly any of those beside it, in the directions of its camera, is as far, and if no other
     camera has one at its place. A thin thing, such as a wire, has neighbours along itself. What has no surface behind
-    it, such as a distant tree before the sky, is kept. In a scene without input cameras, Gaussians float whose
-    neighbours are far, relative to the neighbours' own ones and to their size.
+    it, such as a distant tree before the sky, is kept.
+
+    Raises:
+        InputError: the scene has no input cameras.
     """
+    if not len(scene.cam2world):
+        raise InputError("floaters are found with input cameras, got a scene without one; crop it to a box")
     gaussians = scene.gaussians
     means = gaussians.means.double().cpu().numpy()
     finite = np.flatnonzero(np.isfinite(means).all(axis=1))
     is_floater = np.zeros(len(means), bool)
-    if not len(scene.cam2world):
-        is_floater[finite] = _are_lonely(means[finite], gaussians.scales.amax(dim=1).double().cpu().numpy()[finite])
-        return torch.from_numpy(is_floater).to(gaussians.means.device)
     views = gaussians.views.long().cpu().numpy()
     for view, center in enumerate(scene.cam2world[:, :3, 3].numpy()):
         own = finite[views[finite] == view]
@@ -259,20 +187,6 @@ def _split(offsets: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], F
     """Lengths and directions."""
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
     return distances, offsets / distances[:, None]
-
-
-def _are_lonely(means: Float[np.ndarray, "n 3"], sizes: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Whether the neighbours of each Gaussian are far."""
-    is_lonely = np.zeros(len(means), bool)
-    if len(means) <= _NEIGHBOURS:
-        return is_lonely
-    tree, workers = scipy.spatial.cKDTree(means), torch.get_num_threads()
-    parts = [slice(start, start + _CHUNK) for start in range(0, len(means), _CHUNK)]
-    reach = np.concatenate([tree.query(means[part], [_NEIGHBOURS + 1], workers=workers)[0][:, 0] for part in parts])
-    suspects = np.flatnonzero(reach > _LONELY * sizes)
-    neighbours = tree.query(means[suspects], _NEIGHBOURS + 1, workers=workers)[1][:, 1:]
-    is_lonely[suspects] = reach[suspects] > _LONELY * np.median(reach[neighbours], axis=1)
-    return is_lonely
 
 
 def _are_in_front(

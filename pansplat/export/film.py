@@ -6,7 +6,6 @@ The photographs replace the image while the camera stands at a panorama.
 from __future__ import annotations
 
 import functools
-import glob
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,19 +13,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from pansplat.export.photographs import list_photographs, load_photograph
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import level_axes
-from pansplat.images.image_files import write_image
 from pansplat.images.panorama_metadata import Stereo
 from pansplat.images.video import write_video
 from pansplat.inputs.pairs import Pair
 from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
-from pansplat.system.files import require_output_file, require_replaceable
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
@@ -37,7 +34,6 @@ FLIGHT_SECONDS = 4.0  # of the film of a pair
 _HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
 
 Image = Float[np.ndarray, "height width 3"]
-Depth = Float[np.ndarray, "height width"]
 DrawnPose = tuple[Float[np.ndarray, "4 4"], float, Callable[[], Image]]  # a pose, its weight, and what draws it
 
 
@@ -204,7 +200,7 @@ class Film:
     def __init__(
         self,
         choose: Callable[[Shot], tuple[Scene, int]],
-        draw: Callable[[int, Scene, Shot], tuple[Image, Depth | None]],
+        draw: Callable[[int, Scene, Shot], Image],
         layout: Layout,
         size: tuple[int, int],
         photographs: FilmPhotographs | None = None,
@@ -213,21 +209,20 @@ class Film:
 
         Args:
             choose: the scene of a frame, and its part of the tour (`choose_scenes`).
-            draw: draws a scene, with depth or without; the number is 0 or 1, and another one for the scene that fades
-                out.
+            draw: draws a scene; the number is 0 or 1, and another one for the scene that fades out.
             layout: of the frames.
             size: (height, width) of the image of one eye, pixels.
-            photographs: that are shown at panoramas; none with depth.
+            photographs: that are shown at panoramas.
         """
         self._choose, self._draw, self._size = choose, draw, size
         self._layout: Layout = layout
         self._photographs = photographs or FilmPhotographs((), torch.zeros(0, 4, 4))
         self._fade = CrossFade()
 
-    def draw(self, shot: Shot) -> tuple[Image, Depth | None]:
-        """Colour of a frame, and the depth that `draw` returns of the scene that is shown or fades in."""
+    def draw(self, shot: Shot) -> Image:
+        """Colour of a frame."""
         scene, part = self._choose(shot)
-        fade, depth = self._fade, None
+        fade = self._fade
         fade.compute_weight(shot.seconds)
         slot = fade.choose_slot(scene)
         if slot is not None:
@@ -235,20 +230,14 @@ class Film:
         fade.move(shot.pose, part)
         weight = fade.compute_weight(shot.seconds)
 
-        def draw(slot: int, scene: Scene, pose: np.ndarray) -> Image:
-            nonlocal depth
-            color, found = self._draw(slot, scene, replace(shot, pose=pose))
-            depth = found if slot == fade.front else depth
-            return color
-
         drawn = [
-            (pose, share, functools.partial(draw, slot, scene, pose))
+            (pose, share, functools.partial(self._draw, slot, scene, replace(shot, pose=pose)))
             for slot, share in ((1 - fade.front, 1 - weight), (fade.front, weight))
             if isinstance(scene := fade.contents[slot], Scene) and (pose := fade.poses[slot]) is not None
             if share > 0 or slot == fade.front
         ]
         (plane,) = image_planes(self._layout, self._size, vertical_fov_degrees=shot.vertical_fov_degrees)
-        return self._photographs.mix(drawn, plane, shot.seconds), depth
+        return self._photographs.mix(drawn, plane, shot.seconds)
 
 
 @stage()
@@ -260,49 +249,25 @@ def write_film(
     *,
     panorama: bool = False,
     stereo: Stereo = "mono",
-    unit: float = 1.0,
     show: Callable[[int, Image], None] = lambda number, color: None,
-) -> list[Path]:
-    """Write a film, or the files of its frames, each completely or not at all; returns the files.
+) -> None:
+    """Write a film (.mp4), completely or not at all.
 
     Args:
-        file: a film (.mp4), or the name of a sequence: `walk.png` and `walk.exr` are written as
-            `walk_0000.png` or `walk_0000.exr`, and so on.
+        file: the film.
         film: draws the frames.
         shots: the frames.
         fps: frames per second.
         panorama: whether the frames are panoramas.
         stereo: arrangement of the eyes.
-        unit: of depth, see `pansplat.geometry.world.WorldFrame`.
         show: called with the number and the colours of each frame.
     """
 
-    def draw() -> Iterator[tuple[Image, Depth | None]]:
+    def draw() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
         for number, shot in enumerate(shots):
             report_progress(f"film: frame {number + 1} of {len(shots)}", number / len(shots))
-            color, depth = film.draw(shot)
+            color = film.draw(shot)
             show(number, color)
-            yield color, depth
+            yield (color.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
-    if file.suffix.lower() == ".mp4":
-        images = ((color.clip(0, 1) * 255 + 0.5).astype(np.uint8) for color, _ in draw())
-        write_video(file, images, fps, panorama=panorama, stereo=stereo)
-        return [file]
-    files = [name_frame(file, number) for number in range(len(shots))]
-    is_marked = panorama and stereo == "mono"  # GPano has no property for stereo
-    for path, (color, depth) in zip(files, draw(), strict=True):
-        write_image(path, color, depth=None if depth is None else depth * unit, panorama=is_marked)
-    return files
-
-
-def name_frame(file: Path, number: int) -> Path:
-    """The file of one frame of a sequence, such as `walk_0012.png` of `walk.png`."""
-    return file.with_name(f"{file.stem}_{number:04d}{file.suffix.lower()}")
-
-
-def require_film_file(option: str, file: Path, overwrite: bool) -> None:
-    """Check that `write_film` can write a film, or the files of its frames; see `require_output_file`."""
-    suffix = file.suffix.lower()
-    require_output_file(option, file, (".mp4", ".png", ".exr"))
-    sequence = file.parent.glob(f"{glob.escape(file.stem)}_[0-9]*{suffix}")
-    require_replaceable(option, [file] if suffix == ".mp4" else sequence, overwrite)
+    write_video(file, draw(), fps, panorama=panorama, stereo=stereo)

@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import html
 import io
-import ipaddress
 import json
 import math
 import os
@@ -90,9 +89,6 @@ _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", 
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
 _SHADERS |= {"photograph": ("screen.vert", "photograph.frag"), "house": ("house.vert", "house.frag")}
 
-_ORIGIN = re.compile(r"(https?)://([a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::([0-9]{1,5}))?/?")
-_DEFAULT_PORTS = {"http": 80, "https": 443}
-
 _WORKER = ("unpack.js", "sorter.js")
 _LIBRARIES = ("graph.js", "renderer.js")  # which know nothing of the page; scripts of their own
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./(\w+\.js)";\n', re.MULTILINE)
@@ -107,8 +103,6 @@ class PageFiles:
         files: the page, and its parts if it is split.
         num_bytes: of all files.
         num_gaussians: in the page.
-        degree: of its harmonics.
-        embed: origins of the pages that may frame it and exchange messages with it.
         photo_height: of its photographs, pixels; 0 without photographs.
         num_flights: number of edges along which it flies.
         fades: labels of the two panoramas of each edge along which it fades.
@@ -118,8 +112,6 @@ class PageFiles:
     files: tuple[Path, ...]
     num_bytes: int
     num_gaussians: int
-    degree: int
-    embed: tuple[str, ...] = ()
     photo_height: int = 0
     num_flights: int = 0
     fades: tuple[tuple[str, str], ...] = ()
@@ -134,7 +126,6 @@ def write_page(
     gaussians: int = DEFAULT_GAUSSIANS,
     split: bool = False,
     title: str | None = None,
-    embed: Sequence[str] = (),
     photographs: Sequence[Pair] = (),
     photo_height: int | None = None,
 ) -> PageFiles:
@@ -148,12 +139,11 @@ def write_page(
         gaussians: largest number of Gaussians; similar neighbours are merged.
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
-        embed: origins of host pages that move the camera by messages (docs/web.md, Embedding).
         photographs: of each view, which the page shows there (`list_photographs`), with the notes of its
             tour; none without them.
         photo_height: their largest height, pixels, 0 for none; by default what fits, if it is split that of the files.
     """
-    path, embed = Path(path), parse_origins(embed)
+    path = Path(path)
     if not 1 <= gaussians <= MAX_GAUSSIANS:
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
     report_progress("checking the scene", 0.0)
@@ -200,7 +190,7 @@ def write_page(
             pictures = pack_photographs(scene, photographs, math.inf if split else left, photo_height)
     report_progress("writing", 0.95)
     header = _describe_scene(scene, packed, origin, flights, tour, facts)
-    header |= {"embed": embed, "doll": [], "photographs": [picture.describe() for picture in pictures]}
+    header |= {"doll": [], "photographs": [picture.describe() for picture in pictures]}
     header["plan"] = _describe_plan(plan, floors, tour, origin, flights.level)
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
         spot["notes"] = [
@@ -697,7 +687,8 @@ def _write_files(
         fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
         raise InputError(
             f"{path}: needed a page of at most {MAX_FILE_BYTES // 1_000_000} MB in one file, got "
-            f"{len(page) / 1e6:.0f} MB; split it (--split), or keep at most {fitting:,} Gaussians (--gaussians)"
+            f"{len(page) / 1e6:.0f} MB; write a folder (--out without a suffix), or keep at most {fitting:,} "
+            "Gaussians (--gaussians)"
         )
     files = [folder / name for name in parts]
     if split:
@@ -714,28 +705,7 @@ def _write_files(
     names = [spot["name"] for spot in header["spots"]]
     fades = tuple((names[a], names[b]) for a, b in header["poor"])
     num_flights = sum(a != b for a, b, _ in header["edges"]) - len(fades)
-    return PageFiles(tuple(files), total, count, header["degree"], header["embed"], photo_height, num_flights, fades)
-
-
-def parse_origins(texts: Sequence[str]) -> tuple[str, ...]:
-    """Origins as browsers write them: in lower case, without the default port."""
-    origins = []
-    for text in texts:
-        found = _ORIGIN.fullmatch(text.lower()) if text.isascii() else None
-        scheme, host, port = found.groups() if found else ("", "", None)
-        number = int(port or _DEFAULT_PORTS.get(scheme, 0))
-        try:
-            if not 0 < number < 1 << 16:
-                raise ValueError("no port")
-            if host.rpartition(".")[2].isdigit():
-                ipaddress.IPv4Address(host)
-        except ValueError:
-            raise InputError(
-                "`embed` must hold origins such as https://example.com or http://localhost:8000, without a path, got "
-                f"{text!r}; give the scheme and the host of the page with the frame"
-            ) from None
-        origins.append(f"{scheme}://{host}" + (f":{number}" if number != _DEFAULT_PORTS[scheme] else ""))
-    return tuple(dict.fromkeys(origins))
+    return PageFiles(tuple(files), total, count, photo_height, num_flights, fades)
 
 
 def _make_folder(folder: Path) -> None:

@@ -180,7 +180,6 @@ class PageHeader(_Record):
     filter_variance: float
     speed: float
     limits: tuple[float, ...]
-    embed: tuple[str, ...]
     doll: tuple[PageHouse, ...]
     photographs: tuple[PagePhotograph, ...]
     plan: PagePlan

@@ -43,7 +43,6 @@ class PageServer(socketserver.ThreadingMixIn, socketserver.TCPServer):
         folder = page.files[0].parent
         self.files = {b"/" + os.fsencode(file.relative_to(folder).as_posix()): file for file in page.files}
         self.files[b"/"] = page.files[0]
-        self.ancestors = " ".join(page.embed) or "'none'"
         address = find_address()
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         with tempfile.TemporaryDirectory() as temporary:
@@ -96,8 +95,8 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET
 
     def end_headers(self) -> None:
-        """Of every answer: only stated origins may frame it, and its type is the stated one."""
-        self.send_header("Content-Security-Policy", f"frame-ancestors {self.server.ancestors}")
+        """Of every answer: no other page may frame it, and its type is the stated one."""
+        self.send_header("Content-Security-Policy", "frame-ancestors 'none'")
         self.send_header("X-Content-Type-Options", "nosniff")
         super().end_headers()
 

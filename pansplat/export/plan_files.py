@@ -1,7 +1,7 @@
-"""Floor plans of straight walls as drawings: SVG and PNG of one figure, and DXF for CAD programs.
+"""Floor plans of straight walls as drawings: SVG and PNG of one figure.
 
 The longest wall is horizontal. Storeys are in rows, the lowest first. Rooms that are not placed are dashed, and beside
-them. All are to scale: figures are 1:50 on paper, a DXF is in metres.
+them. They are 1:50 on paper.
 """
 
 from __future__ import annotations
@@ -13,11 +13,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import ezdxf
 import numpy as np
 import shapely
-from ezdxf import transform, units
-from ezdxf.enums import TextEntityAlignment
 from jaxtyping import Float
 from shapely.geometry import Polygon
 
@@ -31,7 +28,7 @@ from pansplat.tours.floor import assign_storeys
 from pansplat.tours.layout import arrange_in_rows
 from pansplat.tours.plan import Plan, Room
 
-SUFFIXES = (".svg", ".png", ".dxf")
+SUFFIXES = (".svg", ".png")
 
 _PAPER = 0.02  # metres of paper for a metre: 1:50
 _INCH = 0.0254  # metres
@@ -43,7 +40,6 @@ _MEASURED = 0.6  # metres, the shortest wall whose length is written
 _UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below
 _CAP_HEIGHT = 0.73  # of a letter, of the font's size
 _POINT = _INCH / 72
-_LAYERS = {"WALLS": 7, "DOORS": 30, "ROOMS": 5, "LENGTHS": 8, "PANORAMAS": 4, "NOTES": 7}  # names and colours
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,7 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
 
     Args:
         scene: with input cameras, not fused.
-        path: a .svg, .png or .dxf.
+        path: a .svg or .png.
     """
     if scene.joint:
         raise InputError(
@@ -83,7 +79,7 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
         raise InputError(f"cannot write {path}: needed a name ending in {', '.join(SUFFIXES)}; rename it")
     drawing = _Drawing(plan)
     with replacing(path) as partial:
-        partial.write_bytes(_draw_dxf(drawing) if suffix == ".dxf" else _draw_figure(drawing, suffix[1:]))
+        partial.write_bytes(_draw_figure(drawing, suffix[1:]))
     return plan
 
 
@@ -267,30 +263,3 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "pansplat"}):
         figure.savefig(file, format=kind, dpi=_DOTS_PER_INCH, metadata=stated)
     return file.getvalue()
-
-
-def _draw_dxf(drawing: _Drawing) -> bytes:
-    """The plan as a DXF of AutoCAD 2010, in metres, or the unit of the poses."""
-    document = ezdxf.new("R2010", setup=True)
-    document.units = units.M
-    for name, color in _LAYERS.items():
-        document.layers.add(name, color=color)
-    space = document.modelspace()
-    for room in drawing.plan.rooms:
-        style = {"layer": "WALLS", "linetype": "BYLAYER" if room.is_placed else "DASHED"}
-        space.add_lwpolyline(drawing.outline(room).tolist(), close=True, dxfattribs=style)
-    for ends in drawing.doors:
-        space.add_line(*ends.tolist(), dxfattribs={"layer": "DOORS"})
-    for place in drawing.panoramas.tolist():
-        space.add_circle(place, 0.06, dxfattribs={"layer": "PANORAMAS"})
-    for text in [*drawing.list_texts(), *_place_notes(drawing.notes)]:
-        content = text.text.encode(errors="backslashreplace").decode().replace("\n", " ")
-        align = TextEntityAlignment.MIDDLE_CENTER if text.is_centred else TextEntityAlignment.MIDDLE_LEFT
-        entity = space.add_text(content, height=text.size, rotation=text.angle, dxfattribs={"layer": text.layer})
-        entity.set_placement(text.place, align=align)
-    document.header["$LTSCALE"] = drawing.plan.frame.unit  # of dashes
-    transform.scale_uniform(space, drawing.plan.frame.unit)
-    stream = io.StringIO()
-    stream.write(f"999\n{SOFTWARE}\n")
-    document.write(stream)
-    return stream.getvalue().encode()

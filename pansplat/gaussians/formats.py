@@ -137,7 +137,7 @@ def _save_coded(scene: Scene, path: Path, coded: _Coded) -> None:
     if not 0 < len(gaussians) <= coded.max_gaussians:
         raise InputError(
             f"cannot write {path}: the format holds 1 to {coded.max_gaussians:,} Gaussians, got {len(gaussians):,}; "
-            "write a .ply, or change the number with --min-opacity or `pansplat refine --gaussians`"
+            "write a .ply, or change the number with `pansplat refine --gaussians`"
         )
     largest = float(gaussians.means.abs().max())
     if largest >= coded.max_position:

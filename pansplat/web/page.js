@@ -98,7 +98,7 @@ function findNode(panorama) {
   return node;
 }
 
-// For scripts and host pages: docs/web.md, Embedding. An EventTarget.
+// For scripts: docs/web.md, Embedding. An EventTarget.
 window.pansplat = Object.assign(new EventTarget(), {
   camera,
   panoramas: HEADER.spots.map(({ name }) => name),
@@ -130,4 +130,3 @@ window.pansplat = Object.assign(new EventTarget(), {
 });
 window.pansplat.ready = main();
 window.pansplat.ready.catch(fail);
-addEventListener("message", (event) => embed.answer(event));

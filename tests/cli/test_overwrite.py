@@ -61,11 +61,11 @@ def test_a_file_of_the_user_needs_overwrite_and_our_own_does_not(
     assert run([*command, "-o", str(file)]) == 0, "pansplat wrote it"
 
 
-def test_the_folder_of_a_split_page_keeps_files_of_the_user(scene: Path, tmp_path: Path) -> None:
-    out = tmp_path / "page.html"
-    own = write_own(tmp_path / "page_files" / "0123456789abcdef.bin")
+def test_the_folder_of_a_page_keeps_files_of_the_user(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page"
+    own = write_own(out / "index_files" / "0123456789abcdef.bin")
     for count in ("100", "50"):
-        assert run(["export", str(scene), "-o", str(out), "--split", "--gaussians", count]) == 0
+        assert run(["export", str(scene), "-o", str(out), "--gaussians", count]) == 0
     others = [file for file in own.parent.iterdir() if file != own]
     assert own.read_bytes() == OWN and len(others) == 2 and all(map(is_written, others)), (
         "parts of the first page are removed"

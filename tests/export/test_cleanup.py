@@ -1,4 +1,4 @@
-"""Floaters go, and surfaces and thin things stay; rooms are found by their names; changes are stated in dB."""
+"""Floaters go, and surfaces and thin things stay; changes are stated in dB."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,7 @@ import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.errors import InputError
-from pansplat.export.cleanup import Change, Cleaning, clean_up, compare_pictures, find_floaters
+from pansplat.export.cleanup import Change, clean_up, compare_pictures, find_floaters
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.refinement import fuse_views
 
@@ -56,7 +56,7 @@ def test_floaters_go_and_everything_else_stays(joint: bool) -> None:
     found = find_floaters(dirty)
     assert torch.equal(found.nonzero()[:, 0], is_added.nonzero()[:-1, 0]), "the one behind the wall is kept"
     assert joint or not found[: len(is_wire)][is_wire].any()
-    cleaned, (change,) = clean_up(dirty, Cleaning(floaters=False))
+    cleaned, (change,) = clean_up(dirty, floaters=False)
     assert change == Change("floaters", len(dirty.gaussians), len(dirty.gaussians) - 10, (2, 2), change.psnr)
     assert change.psnr is not None and 15 < change.psnr < 55
     assert compare_pictures(scene, cleaned) > 60
@@ -72,29 +72,19 @@ def test_the_unit_of_the_world_and_values_that_are_not_finite_have_no_influence(
     assert torch.equal(find_floaters(broken), expected)
 
 
-def test_without_cameras_isolated_gaussians_float() -> None:
-    dirty, is_added = _add_floaters(_make_room()[0])
-    foreign = replace(dirty, cam2world=dirty.cam2world[:0], names=())
-    assert torch.equal(find_floaters(foreign), is_added)
-    few = replace(foreign, gaussians=foreign.gaussians.select(torch.arange(9)))
-    assert not find_floaters(few).any()
-
-
-def test_an_opacity_cut_states_its_error() -> None:
+def test_without_cameras_floaters_are_refused() -> None:
     scene, _ = _make_room()
-    opacities = torch.where(torch.arange(len(scene.gaussians)) % 4 > 0, 0.9, 0.2)
-    scene = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
-    cleaned, (change,) = clean_up(scene, Cleaning(min_opacity=0.5))
-    assert len(cleaned.gaussians) == change.after == int((opacities > 0.5).sum()) and change.cameras == (2, 2)
+    with pytest.raises(InputError, match="floaters are found with input cameras"):
+        clean_up(replace(scene, cam2world=scene.cam2world[:0], names=()), floaters=False)
+
+
+def test_a_crop_states_its_error() -> None:
+    scene, _ = _make_room()
+    cleaned, (change,) = clean_up(scene, (-3.1, -1.6, -2.1, 3.1, 0.5, 2.1))
+    assert 0 < len(cleaned.gaussians) == change.after < change.before and change.cameras == (2, 2)
     assert change.psnr is not None and 10 < change.psnr < 60
     assert f"{change.before - change.after:,} of {change.before:,} Gaussians left out" in str(change)
     assert f"agree to {change.psnr:.1f} dB" in str(change)
-    _, (none,) = clean_up(scene, Cleaning(min_opacity=0.1))
+    _, (none,) = clean_up(scene, (-9, -9, -9, 9, 9, 9))
     assert none.psnr == math.inf and "did not change" in str(none)
-    assert clean_up(scene, Cleaning()) == (scene, [])
-
-
-def test_rooms_of_scenes_without_cameras_are_refused() -> None:
-    scene, _ = _make_room()
-    with pytest.raises(InputError, match="rooms need a scene with input cameras"):
-        clean_up(replace(scene, cam2world=scene.cam2world[:0], names=()), Cleaning(rooms=("left",)))
+    assert clean_up(scene) == (scene, [])

@@ -111,7 +111,7 @@ SCENES = [
     Fault("vertices: -3e38, as a page", "export scene.ply -o tour.html", vertices(-3e38), "no visible Gaussians"),
     Fault("vertices: 80, as a page", "export scene.ply -o tour.html", vertices(80.0), "no visible Gaussians"),
     Fault("a page in a folder that is missing", "export scene.ply -o missing/tour.html", says="existing folder"),
-    Fault("a page over a file named like its folder", "export scene.ply -o tour.html --split", lambda folder: (folder / "tour_files").write_text(""), "tour_files"),
+    Fault("a page over a file named like its folder", "export scene.ply -o tour", lambda folder: ((folder / "tour").mkdir(), (folder / "tour/index_files").write_text("")), "index_files"),
     Fault("vertices: -3e38, drawn", DRAW, vertices(-3e38), "", 0),
     Fault("vertices: 80, drawn", DRAW, vertices(80.0), "", 0),
 ]  # fmt: skip

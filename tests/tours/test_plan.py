@@ -8,14 +8,12 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import cv2
-import ezdxf
 import numpy as np
 import pytest
 import torch
 from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
-from pansplat.export.cleanup import crop_to_rooms
 from pansplat.export.plan_files import _Drawing, describe_plan, write_plan
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -132,16 +130,12 @@ def test_rooms_have_their_areas_angles_and_corners(noise: float) -> None:
     assert plan.camera_height == pytest.approx(CAMERA_HEIGHT, rel=0.01)
 
 
-@pytest.mark.parametrize("suffix", [".svg", ".dxf"])
-def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Path, suffix: str) -> None:
+def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Path) -> None:
     scene = _make_house(WALLS, CAMERAS, names=("living room", "living room", "hall"), count=20000)
-    file = tmp_path / f"plan{suffix}"
+    file = tmp_path / "plan.svg"
     assert [room.name for room in write_plan(scene, file).rooms] == ["living room", "hall"]
     assert is_written(file)
-    if suffix == ".svg":
-        texts = [element.text for element in ElementTree.parse(file).iter() if element.tag.endswith("}text")]
-    else:
-        texts = [entity.dxf.text for entity in ezdxf.readfile(file).modelspace().query("TEXT[layer=='ROOMS']")]
+    texts = [element.text for element in ElementTree.parse(file).iter() if element.tag.endswith("}text")]
     for name, area in (("living room", 24.0), ("hall", 15.6)):
         label = texts[texts.index(name) + 1]
         assert float(label.split()[0]) == pytest.approx(area, rel=0.05) and "m²" in label
@@ -220,19 +214,10 @@ def _area(corners: np.ndarray | Sequence) -> float:
     return abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1))) / 2
 
 
-@pytest.mark.parametrize("suffix", [".svg", ".dxf"])
-def test_storeys_are_next_to_each_other_in_metres_with_names_and_areas(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"plan{suffix}"
+def test_storeys_are_next_to_each_other_in_metres_with_names_and_areas(tmp_path: Path) -> None:
+    path = tmp_path / "plan.svg"
     plan = write_plan(_two_storeys(), path)
-    if suffix == ".svg":
-        rooms, text = _read_svg(path)
-    else:
-        document = ezdxf.readfile(path)
-        assert not document.audit().has_errors and document.units == ezdxf.units.M
-        space = document.modelspace()
-        rooms = [np.array([point[:2] for point in room]) for room in space.query("LWPOLYLINE[layer=='WALLS']")]
-        text = "\n".join(entity.dxf.text for entity in space.query("TEXT"))
-        assert len(space.query("CIRCLE[layer=='PANORAMAS']")) == 4
+    rooms, text = _read_svg(path)
     assert [_area(room) for room in rooms] == pytest.approx([15.6, 15.6], rel=0.02)
     assert rooms[0][:, 0].max() < rooms[1][:, 0].min(), "the lower storey is on the left"
     for expected in ("Hall", "Attic / x<y", "15.6 m²", "4.00", "3.90", *describe_plan(plan)):
@@ -250,9 +235,8 @@ def test_the_picture_is_the_drawing(tmp_path: Path) -> None:
 def test_lengths_are_in_the_unit_of_the_poses(tmp_path: Path, unit: float, wall: str, area: str) -> None:
     metres = _make_house(_walls_around(HALL), CAMERAS[2:])
     scene = dataclasses.replace(metres, frame=WorldFrame(unit))
-    svg, dxf = tmp_path / "plan.svg", tmp_path / "plan.dxf"
-    plan = write_plan(scene, svg)
-    (room,), text = _read_svg(svg)
+    plan = write_plan(scene, tmp_path / "plan.svg")
+    (room,), text = _read_svg(tmp_path / "plan.svg")
     assert _area(room) == pytest.approx(15.6, rel=0.02), "on paper it has the size of a room in metres"
     lines = text.split("\n")
     assert wall in lines and f"1:{50 * unit:g} on paper; the bar is {unit:g} m" in lines
@@ -260,11 +244,6 @@ def test_lengths_are_in_the_unit_of_the_poses(tmp_path: Path, unit: float, wall:
     height = float(re.search(r"cameras ([\d.]+) m over", text)[1])
     assert height == pytest.approx(CAMERA_HEIGHT * unit, rel=0.01)
     assert describe_plan(plan) != describe_plan(write_plan(metres, tmp_path / "metres.svg"))
-    write_plan(scene, dxf)
-    (outline,) = ezdxf.readfile(dxf).modelspace().query("LWPOLYLINE[layer=='WALLS']")
-    assert _area([point[:2] for point in outline]) == pytest.approx(15.6 * unit**2, rel=0.02)
-    texts = ezdxf.readfile(dxf).modelspace().query("TEXT[layer=='LENGTHS']")
-    assert {entity.dxf.height for entity in texts} == {0.13 * unit} and wall in {entity.dxf.text for entity in texts}
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 200])
@@ -305,23 +284,7 @@ def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="needed a floor, and walls around"):
             write_plan(bad, tmp_path / "plan.svg")
     with pytest.raises(InputError, match="exported with --layers"):
-        write_plan(dataclasses.replace(scene, joint=True), tmp_path / "plan.dxf")
-    with pytest.raises(InputError, match=r"\.svg, \.png, \.dxf"):
+        write_plan(dataclasses.replace(scene, joint=True), tmp_path / "plan.svg")
+    with pytest.raises(InputError, match=r"\.svg, \.png; rename"):
         write_plan(scene, tmp_path / "plan.pdf")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_scene_is_cropped_to_rooms_by_their_names_or_those_of_their_panoramas() -> None:
-    scene = _make_house(WALLS, CAMERAS, names=("Living", "Dining", "Hall"), count=20000)
-    hall = crop_to_rooms(scene, ("HALL",))
-    assert hall.names == ("Hall",) and len(hall.gaussians) == 20000, "its layer, and no other one"
-    rooms = crop_to_rooms(scene, ("Dining",))
-    assert rooms.names == ("Living", "Dining"), "both are in one room"
-    assert rooms.overlaps == ((0, 1, 0.5),)
-    joint = dataclasses.replace(scene, joint=True)
-    cropped = crop_to_rooms(joint, ("Hall",), scene)
-    assert len(cropped.gaussians) > 20000 and set(cropped.gaussians.views.tolist()) == {0}
-    others = scene.gaussians.means[scene.gaussians.views < 2]
-    within = (others[:, 0] > 5.2) & (others[:, 0] < 8.9) & (others[:, 2] > 0.1) & (others[:, 2] < 3.9)
-    assert abs(len(cropped.gaussians) - 20000 - int(within.sum())) < 0.3 * int(within.sum())
-    assert crop_to_rooms(joint, ("Hall",)).names == ("Hall",), "without a plan its layer alone"

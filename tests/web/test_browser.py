@@ -103,18 +103,16 @@ class QuietHandler(SimpleHTTPRequestHandler):
 
 @dataclass(frozen=True)
 class Sites:
-    """A folder that three servers on this machine show, each with an origin of its own.
+    """A folder that two servers on this machine show, each with an origin of its own.
 
     Attributes:
         pages: origin from which pages come that are embedded.
-        host: origin that embedded.html states.
-        stranger: an origin that no page states.
+        host: origin of the page around them.
     """
 
     folder: Path
     pages: str
     host: str
-    stranger: str
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +121,7 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sites]:
     (folder / "host.html").write_text(HOST)
     with ExitStack() as stack:
         origins = []
-        for _ in range(3):
+        for _ in range(2):
             handler = partial(QuietHandler, directory=str(folder))
             server = stack.enter_context(ThreadingHTTPServer(("127.0.0.1", 0), handler))
             Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
@@ -149,7 +147,7 @@ def photographs(scene: Scene, take_photographs: Callable[..., list[Pair]]) -> li
 
 @pytest.fixture(scope="module")
 def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: list[Pair]) -> Path:
-    """tour.html, split.html with files, house.html with a graph, flat.html with parts; embedded.html has a host.
+    """tour.html, split.html with files, house.html with a graph, flat.html with parts.
 
     photos.html and photos/index.html have photographs; poor/index.html has an edge along which the image fades.
     """
@@ -161,7 +159,6 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: l
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
         write_page(house, folder / "house.html")
-        write_page(house, folder / "embedded.html", embed=[sites.host, "https://example.com"])
         write_page(flat, folder / "flat.html")
         write_page(scene, folder / "photos.html", photographs=photographs)
         (folder / "photos").mkdir()
@@ -1147,19 +1144,6 @@ iframe { border: 0; width: 320px; height: 240px }
 <script>
 const frame = document.querySelector("iframe");
 frame.src = location.hash.slice(1);
-told = [];
-addEventListener("message", ({ data }) => told.push(data));
-send = (message) => frame.contentWindow.postMessage(message, new URL(frame.src).origin);
-call = (pansplat, ...values) => new Promise((resolve) => {
-    const id = Math.random();
-    const onAnswer = ({ data }) => {
-        if (data.id !== id) return;
-        removeEventListener("message", onAnswer);
-        resolve(data.error ? "error: " + data.error : data.value);
-    };
-    addEventListener("message", onAnswer);
-    send({ pansplat, values, id });
-});
 </script>"""
 
 
@@ -1176,34 +1160,12 @@ def in_a_host(chromium: Any, origin: str, page: str, **options: Any) -> Iterator
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "is_stated"), [("house.html", True), ("house.html", False), ("embedded.html", False)])
-def test_a_host_that_the_page_does_not_state_is_told_nothing_and_moves_nothing(
-    chromium: Any, sites: Sites, folder: Path, name: str, is_stated: bool
-) -> None:
-    origin = sites.host if is_stated else sites.stranger
-    with in_a_host(chromium, origin, f"{sites.pages}/{name}") as (host, frame):
-        pose = frame.evaluate("pansplat.getPose()")
-        frame.evaluate("heard = 0; addEventListener('message', () => { heard += 1; })")
-        for values in ("['goTo', [3, { jump: true }]]", "['getPose', []]", "['setPose', [{ yaw: 50 }]]"):
-            host.run(f"(([pansplat, values]) => send({{ pansplat, values, id: 1 }}))({values})")
-        host.run("send({ pansplat: 'render', values: [64, 48], id: 2 })")
-        wait_until(frame, "heard === 4")
-        assert frame.evaluate("pansplat.getPose()") == pose
-        assert frame.evaluate("pansplat.goTo(2, { jump: true })") is True, "an arrival of which no host hears"
-        frame.evaluate("parent.postMessage('last', '*')")  # messages arrive in the order in which they are sent
-        host.wait("told.includes('last')")
-        assert host.run("told") == ["last"]
-
-
-@pytest.mark.slow
-def test_a_served_page_is_framed_by_stated_origins_only(chromium: Any, sites: Sites, folder: Path) -> None:
-    with PageServer(PageFiles((folder / "embedded.html",), 0, 0, 0, (sites.host,))) as server:
+def test_no_other_page_shows_a_served_page_in_a_frame(chromium: Any, sites: Sites, folder: Path) -> None:
+    with PageServer(PageFiles((folder / "house.html",), 0, 0)) as server:
         Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-        with in_a_host(chromium, sites.host, server.url, ignore_https_errors=True) as (host, _):
-            assert host.run("call('goTo', 2)") is True
         page = new_context(chromium, ignore_https_errors=True).new_page()
         with page.expect_event("requestfailed", lambda request: request.url == server.url) as failed:
-            page.goto(f"{sites.stranger}/host.html#{server.url}")
+            page.goto(f"{sites.host}/host.html#{server.url}")
         assert failed.value.failure == "net::ERR_BLOCKED_BY_RESPONSE"
         page.context.close()
         server.shutdown()
@@ -1244,37 +1206,24 @@ def test_the_wheel_is_the_host_pages_until_a_click(chromium: Any, sites: Sites, 
 
 
 @pytest.mark.slow
-def test_a_stated_host_moves_the_camera_and_hears_of_arrivals(chromium: Any, sites: Sites, folder: Path) -> None:
-    with in_a_host(chromium, sites.host, f"{sites.pages}/embedded.html") as (host, frame):
-        host.wait("told.length")
-        assert host.run("told[0]") == {"pansplat": "ready", "panoramas": ["room 0", "room 1", "room 2"]}
-        frame.evaluate("HEADER.speed *= 100")
-        assert host.run("call('goTo', 'room 2')") is True
-        position = frame.evaluate("HEADER.spots[2].position")
-        assert host.run("call('getPose')")["position"] == position
-        assert host.run("told.filter(({ pansplat }) => pansplat === 'arrive').at(-1)") == {
-            "pansplat": "arrive",
-            "panorama": 3,
-            "name": "room 2",
-        }
-        assert host.run("Promise.all([call('goTo', 1), call('goTo', 2, { jump: true })])") == [False, True]
+def test_a_script_moves_the_camera_and_hears_of_arrivals(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "house.html") as page:
+        assert page.run("pansplat.panoramas") == ["room 0", "room 1", "room 2"]
+        page.run("HEADER.speed *= 100; pansplat.addEventListener('arrive', ({ detail }) => { heard = detail; })")
+        assert page.run("pansplat.goTo('room 2')") is True
+        assert page.run("heard") == {"panorama": 3, "name": "room 2"}
+        assert page.run("pansplat.getPose()")["position"] == page.run("HEADER.spots[2].position")
+        assert page.run("Promise.all([pansplat.goTo(1), pansplat.goTo(2, { jump: true })])") == [False, True]
         pose = {"position": [0.1, 0.2, 0.3], "yaw": 30, "pitch": -10, "fov": 60}
-        host.run("(pose) => call('setPose', pose)", pose)
-        got = host.run("call('getPose')")
+        page.run("(pose) => pansplat.setPose(pose)", pose)
+        got = page.run("pansplat.getPose()")
         assert got.pop("position") == pytest.approx(pose.pop("position")) and got == pytest.approx(pose)
-        host.run("call('setPose', { pitch: 500, position: [1e6, 0, 0] })")
-        got = host.run("call('getPose')")
+        page.run("pansplat.setPose({ pitch: 500, position: [1e6, 0, 0] })")
+        got = page.run("pansplat.getPose()")
         assert got["pitch"] == pytest.approx(89.9) and abs(got["position"][0]) < 20, "within the limits"
-        assert "panorama 9" in host.run("call('goTo', 9)") and "finite" in host.run("call('setPose', { yaw: 'x' })")
-        assert decode(host.run("call('render', 64, 48)")).shape == (48, 64, 3)
-        # Only the host is answered.
-        told = host.run("told.length")
-        frame.evaluate("postMessage({ pansplat: 'getPose', id: 1 }, '*')")
-        host.run("call('getPose')")
-        assert host.run("told.length") == told + 1
-        hear = "pansplat.addEventListener('arrive', ({ detail }) => { heard = detail; })"
-        assert frame.evaluate(f"{hear}; pansplat.goTo(1)") is True
-        assert frame.evaluate("heard") == {"panorama": 1, "name": "room 0"}
+        assert "panorama 9" in page.run("pansplat.goTo(9).catch(String)")
+        with pytest.raises(Exception, match="finite"):
+            page.run("pansplat.setPose({ yaw: 'x' })")
 
 
 def test_a_link_opens_its_pose(chromium: Any, folder: Path) -> None:
@@ -1821,7 +1770,7 @@ def test_a_page_from_disk_or_http_says_how_to_enter_vr(chromium: Any, folder: Pa
 
 
 def test_a_served_page_may_use_webxr(chromium: Any, folder: Path) -> None:
-    with PageServer(PageFiles((folder / "tour.html",), 0, 0, 0)) as server:
+    with PageServer(PageFiles((folder / "tour.html",), 0, 0)) as server:
         Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         page = OpenPage(new_context(chromium, ignore_https_errors=True).new_page())  # the user accepts the certificate
         page.page.goto(server.url)

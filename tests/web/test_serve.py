@@ -69,19 +69,11 @@ def test_the_page_and_its_parts_are_served_and_nothing_else(server: PageServer, 
     assert get(server, f"/our%20home_files/{part.name}")[0] == 404
 
 
-@pytest.mark.parametrize("origins", [(), ("https://example.com", "http://localhost:8000")])
-def test_every_answer_forbids_frames_of_other_origins_and_guesses_of_types(
-    plain_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, origins: tuple[str, ...]
-) -> None:
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
-    with PageServer(write_page(plain_scene, tmp_path / "home.html", embed=origins)) as server:
-        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-        for path, method, status in (("/", "GET", 200), ("/", "HEAD", 200), ("/none", "GET", 404), ("/", "POST", 501)):
-            answer, _ = ask(server, path, method)
-            assert answer.status == status and answer.getheader("X-Content-Type-Options") == "nosniff"
-            ancestors = " ".join(origins) or "'none'"
-            assert answer.getheader("Content-Security-Policy") == f"frame-ancestors {ancestors}"
-        server.shutdown()
+def test_every_answer_forbids_frames_and_guesses_of_types(server: PageServer) -> None:
+    for path, method, status in (("/", "GET", 200), ("/", "HEAD", 200), ("/none", "GET", 404), ("/", "POST", 501)):
+        answer, _ = ask(server, path, method)
+        assert answer.status == status and answer.getheader("X-Content-Type-Options") == "nosniff"
+        assert answer.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
 
 
 @pytest.mark.parametrize("address", [b"http://[", b"http://[::1"])

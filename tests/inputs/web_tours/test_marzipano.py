@@ -135,8 +135,8 @@ def test_a_tour_comes_out_of_its_tiles_as_photographs(export: Export, check_colo
     assert before[0].links and before[0].notes == (Note(1.0, 0.1, "sofa"),), "links.json adds to what the tour states"
     assert run(["export", str(folder), "-o", str(out), "--photos"]) == 2
     assert "new or empty folder" in capsys.readouterr().err
-    assert run(["export", str(folder), "-o", str(out / "a"), "--photos", "--split"]) == 2
-    assert "--split is for an .html page" in capsys.readouterr().err
+    assert run(["export", str(folder), "-o", str(out / "a"), "--photos", "--serve"]) == 2
+    assert "--serve is for an .html page" in capsys.readouterr().err
 
 
 def test_what_is_hidden_stays_hidden_in_the_photographs_of_a_tour(tmp_path: Path, write_scene) -> None:

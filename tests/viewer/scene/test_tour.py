@@ -260,7 +260,7 @@ def test_the_film_of_a_fade_between_parts_mixes_both_last_views(parted_house, op
 
     def draw(sample: int, seconds: float) -> np.ndarray:
         at = sample / (len(route.legs) - 1)
-        return film.draw(Shot(route.pose(at), 75.0, seconds, route.edge(at)))[0]
+        return film.draw(Shot(route.pose(at), 75.0, seconds, route.edge(at)))
 
     before = draw(jump, 0.0)
     assert np.abs(draw(jump + 1, 1.0) - before).max() < 1e-6, "the fade begins with the last view"
@@ -325,7 +325,7 @@ def test_a_change_of_scenes_changes_the_picture_no_more_than_a_flight_along_an_e
     shown, edges = [], []
     for seconds in times:
         at = seconds / route.seconds
-        shown.append(film.draw(Shot(route.pose(at), 75.0, seconds, route.edge(at)))[0])
+        shown.append(film.draw(Shot(route.pose(at), 75.0, seconds, route.edge(at))))
         edges.append(scenes.edge)
     steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3))
     changes = [k for k, (a, b) in enumerate(itertools.pairwise(edges)) if a != b]
