@@ -55,10 +55,9 @@ from pansplat.tours.floor import assign_storeys, choose_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
-from pansplat.tours.outlook import choose_arrival, find_bin, find_turned, is_hidden
+from pansplat.tours.outlook import choose_arrival, find_bin, find_turned
 from pansplat.tours.plan import Plan, Room
 from pansplat.tours.route import Route, find_angles, plan_route
-from pansplat.tours.surfaces import locate_surfaces
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
 PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
@@ -436,7 +435,7 @@ def _describe_scene(
             "position": _round(position),
             "mark": _round(mark),
             "notes": [],
-            **_describe_outlook(facts, view, (marks - position) @ level, start),
+            **_describe_outlook(facts, view, start),
             "radius": round(0.12 * height, 6),
         }
         for view, (name, position, mark, height, start) in enumerate(
@@ -484,23 +483,18 @@ def _describe_scene(
     }
 
 
-def _describe_outlook(
-    facts: TourFacts, view: int, marks: Float[np.ndarray, "node 3"], start: Float[np.ndarray, "3"] | None
-) -> dict[str, Any]:
+def _describe_outlook(facts: TourFacts, view: int, start: Float[np.ndarray, "3"] | None) -> dict[str, Any]:
     """The rule of `choose_arrival` at a view, as the bits of the directions from which a camera turns, and yaw and
     pitch to which it does; and the panoramas whose marks furniture or walls hide.
 
     Args:
-        marks: of all panoramas on the floor, relative to the camera.
         start: direction of the start view.
     """
     angles = None if start is None else find_angles(facts.level.T @ start)
     is_turned, ahead = find_turned(facts.outlooks[view], angles)
-    places = locate_surfaces(facts.scene, view, facts.level, min_opacity=0.5)
-    hidden = [node for node, mark in enumerate(marks) if node != view and is_hidden(places, mark)]
     turned = sum(1 << number for number in np.flatnonzero(is_turned).tolist())
     clearances = facts.clearances[view].round(2).tolist()
-    return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": hidden, "clearances": clearances}
+    return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": facts.hidden[view], "clearances": clearances}
 
 
 def _outline_floors(facts: TourFacts, rooms: Sequence[Room]) -> list[Room]:

@@ -15,9 +15,9 @@ from pansplat.gaussians.scene import Scene
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 from pansplat.tours.edges import find_poor_edges, find_walls
-from pansplat.tours.floor import FloorOutline, find_camera_height, find_floor_outline
+from pansplat.tours.floor import FloorOutline, choose_camera_height, find_camera_height, find_floor_outline
 from pansplat.tours.graph import Edge, TourGraph, ViewNumbers, make_graph
-from pansplat.tours.outlook import measure_clearance, measure_outlook
+from pansplat.tours.outlook import find_hidden, measure_clearance, measure_outlook
 from pansplat.tours.plan import Door, Plan, Room, make_plan
 
 Value = TypeVar("Value")
@@ -70,7 +70,7 @@ class TourFacts:
 
     def prepare(self) -> TourFacts:
         """Compute what a viewer reads while it draws."""
-        _ = self.outlines, self.outlooks, self.clearances, self.walls, self.poor
+        _ = self.outlines, self.outlooks, self.clearances, self.hidden, self.walls, self.poor
         return self
 
     @property
@@ -117,6 +117,19 @@ class TourFacts:
     def clearances(self) -> Float[np.ndarray, "view row bin"]:
         """Distances of the nearest surfaces around the cameras (`measure_clearance`)."""
         return np.stack([measure_clearance(self.scene, k, self.level) for k in range(len(self.views))])
+
+    @_stored
+    def hidden(self) -> list[list[int]]:
+        """For each view, the panoramas whose places on the floor surfaces hide (`find_hidden`)."""
+        known, usual = (
+            dict(zip(self.views, self.heights, strict=True)),
+            choose_camera_height(self.heights, self.scene.far),
+        )
+        heights = [known.get(node) or usual for node in range(len(self.tour))]
+        marks = self.tour.positions + np.outer(heights, self.level[:, 1])
+        offsets = [(marks - self.tour.positions[node]) @ self.level for node in self.views]
+        found = [find_hidden(self.scene, k, self.level, own) for k, own in enumerate(offsets)]
+        return [[other for other in own if other != node] for node, own in zip(self.views, found, strict=True)]
 
     @_stored
     def walls(self) -> list[Edge]:

@@ -95,6 +95,19 @@ def find_turned(
     return (views < _WALL) & (counts > 0), (((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi, 0.0)
 
 
+def find_hidden(
+    scene: Scene, view: int, level: Float[np.ndarray, "3 3"], marks: Float[np.ndarray, "mark 3"]
+) -> list[int]:
+    """Which marks most surfaces in their directions are in front of.
+
+    Args:
+        scene, view, level: see `measure_outlook`.
+        marks: places relative to the camera, in the axes `level`.
+    """
+    places = locate_surfaces(scene, view, level, min_opacity=_OPAQUE)
+    return [number for number, mark in enumerate(marks) if is_hidden(places, mark)]
+
+
 def is_hidden(places: Float[np.ndarray, "n 3"], mark: Float[np.ndarray, "3"]) -> bool:
     """Whether most surfaces in the direction of a mark are in front of it.
 

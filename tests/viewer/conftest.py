@@ -320,7 +320,12 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     facts = TourFacts(scene, tour, entry.views)
     outlooks = np.zeros((len(entry.views), BINS))
     vars(facts).update(
-        outlines=outlines, outlooks=outlooks, clearances=outlooks[:, None].repeat(12, 1), walls=[], poor=()
+        outlines=outlines,
+        outlooks=outlooks,
+        clearances=outlooks[:, None].repeat(12, 1),
+        hidden=[[] for _ in entry.views],
+        walls=[],
+        poor=(),
     )
     return LoadedScene(entry, scene, facts=facts)
 

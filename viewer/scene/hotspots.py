@@ -40,20 +40,24 @@ class Hotspot:
 
 def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> list[Hotspot]:
     """The panoramas that the nearest one leads to, by its edges and its own links, and that are in the image; the
-    nearest last."""
+    nearest last. Those that surfaces hide are where the links lead; without links, the nearest one stays."""
     tour, position = scenes.tour, np.asarray(camera.position)
     here = scenes.find_nearest(position)
     below = scenes.camera_height * np.asarray(camera.level)[:, 1]
+    links = {node: link for (start, node), link in tour.links.items() if start == here}
+    hidden = scenes.hidden.get(here, [])
+    flown = sorted(tour.neighbours(here), key=lambda node: np.linalg.norm(tour.positions[node] - tour.positions[here]))
+    seen = [node for node in flown if node not in hidden]
     feet = {
         node: (tour.positions[node] + below, tour.panoramas[node].label)
-        for node in (here, *tour.neighbours(here))
+        for node in (here, *(seen if seen or links else flown[:1]))
         if np.linalg.norm(tour.positions[node] - position) >= 3 * _RADIUS
     }
-    for (start, node), link in tour.links.items():
-        if start == here and tour.is_fade(start, node) and node not in feet:
-            ring = find_link_ring(tour, start, node, scenes.camera_height)
+    for node, link in links.items():
+        if (node in hidden or tour.is_fade(here, node)) and node not in feet:
+            ring = find_link_ring(tour, here, node, scenes.camera_height)
             if ring is not None:
-                feet[node] = (tour.positions[start] + ring, link.text or tour.panoramas[node].label)
+                feet[node] = (tour.positions[here] + ring, link.text or tour.panoramas[node].label)
     found = []
     for node, (foot, label) in feet.items():
         hotspot = _make_hotspot(camera, size, node, label, foot, is_fade=tour.is_fade(scenes.edge[0], node))

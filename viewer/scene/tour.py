@@ -39,6 +39,7 @@ class TourScenes:
         tour: the graph.
         edge: the edge that the camera is at.
         outlines: floor outlines of the panoramas whose scenes have been loaded, also after a scene is dropped.
+        hidden: the panoramas whose places on the floor surfaces hide, by those panoramas.
     """
 
     def __init__(self, tour: TourGraph, *, merged: Scene | None = None, max_views: int = MAX_SCENE_VIEWS) -> None:
@@ -55,6 +56,7 @@ class TourScenes:
         self._is_edge_known = False  # whether the camera has been at the edge
         self.outlines: dict[int, FloorOutline] = {}
         self._outlooks: dict[int, np.ndarray] = {}
+        self.hidden: dict[int, list[int]] = {}
         self._views = tour.choose_scene_views()
         everything = tuple(range(len(tour)))
         # The prediction that has the Gaussians of a panorama; none if each scene is a prediction.
@@ -128,6 +130,7 @@ class TourScenes:
         if (facts := loaded.facts) is not None:
             self.outlines |= facts.outlines
             self._outlooks |= zip(facts.views, facts.outlooks, strict=True)
+            self.hidden |= zip(facts.views, facts.hidden, strict=True)
             self._block(facts.walls)
             clearances = dict(zip(facts.views, facts.clearances, strict=True))
             if clearances.keys() - self.tour.clearances.keys():  # a refinement changes them little

@@ -41,3 +41,24 @@ def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(house, lo
     assert find_clicked(hotspots, (x + 5, y)) == 2
     assert find_clicked(hotspots, (x, y - 60)) is None
     assert [spot.node for spot in find_hotspots(scenes, replace(camera, yaw_radians=np.pi), (200, 200))] == [0]
+
+
+def test_a_hidden_panorama_has_its_hotspot_where_a_link_leads_or_none_while_another_one_is_seen(house, load_house):
+    linked = replace(house.panoramas[1], links=(Link("room2", 0.0, 0.6), Link("room0", np.pi, 0.6)))
+    tours = house, replace(house, panoramas=(house.panoramas[0], linked, *house.panoramas[2:]))
+    camera = Camera(position=(0.0, 0.0, 0.0), vertical_fov_degrees=120.0)
+    found = []
+    for tour in tours:
+        scenes = TourScenes(tour)
+        scenes.add(load_house(scenes.make_entry((0, 1))))
+        scenes.move(tour.positions[1])
+        for hidden in ([], [2], [0, 2]):
+            scenes.hidden[1] = hidden
+            places = [replace(camera, position=tuple(tour.positions[1]), yaw_radians=yaw) for yaw in (0.0, np.pi)]
+            found.append([spot for place in places for spot in find_hotspots(scenes, place, (200, 200))])
+    at_foot, at_link = (100 + 100 / np.tan(np.radians(60)) * slope for slope in (1.0 / 0.8, np.tan(0.6)))
+    expected = (
+        *({2: at_foot, 0: at_foot}, {0: at_foot}, {0: at_foot}),  # the nearest one stays
+        *({2: at_foot, 0: at_foot}, {2: at_link, 0: at_foot}, {2: at_link, 0: at_link}),
+    )
+    assert [{spot.node: pytest.approx(spot.center[1]) for spot in spots} for spots in found] == list(expected)
