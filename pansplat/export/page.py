@@ -488,7 +488,7 @@ def _describe_scene(
         "near": constants.NEAR,
         "unit": 1 / scene.frame.unit,
         "tallest": _TALLEST,
-        "filterVariance": constants.FILTER_VARIANCE["angular"],
+        "filterVariance": constants.FILTER_VARIANCE,
         "speed": _SPEED * float(np.median(reaches)),
         "limits": _limit_parts(reaches, positions, flights, len(tour)),
     }

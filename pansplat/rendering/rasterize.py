@@ -17,13 +17,11 @@ from pansplat.constants import FILTER_VARIANCE, NEAR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import orthonormal_error
-from pansplat.rendering.image_planes import ImagePlane, Layout, Stitching, image_planes, stitch_faces
+from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes, stitch_faces
 from pansplat.system.descriptions import describe_count, describe_range
 from pansplat.system.devices import find_triton_problem
 
 Kernel = Literal["ray", "ewa"]
-Order = Literal["radial", "z"]
-Lowpass = Literal["angular", "3dgs"]
 Backend = Literal["auto", "torch", "numba", "triton"]
 
 MAX_EYE_OFFSET = 1e6  # metres
@@ -37,47 +35,23 @@ _R = TypeVar("_R")
 class RasterOptions:
     """Options of an image, apart from scene, camera and layout.
 
-    `pansplat.rendering.official.OFFICIAL` holds the options of the official code.
-
     Attributes:
-        kernel: "ray" is exact; "ewa" is the approximation of 3DGS, for pinhole images and cube faces.
-        order: sort by distance, or by depth along each image plane's optical axis as 3DGS does.
-        lowpass: "angular" conserves energy; "3dgs" adds 0.3 pixel^2.
+        kernel: "ray" is exact; "ewa" is the approximation of 3DGS, for pinhole images and cube faces, with the low-pass
+            filter, the order by depth, and the stitching of cube faces of the official code.
         near: Gaussians whose mean is nearer are not rasterised, metres.
-        stitching: of cube faces, "seamless", or "official" with the borders of the official code.
     """
 
     kernel: Kernel = "ray"
-    order: Order = "radial"
-    lowpass: Lowpass = "angular"
     near: float = NEAR
-    stitching: Stitching = "seamless"
 
     def __post_init__(self) -> None:
         _check_choice("kernel", self.kernel, Kernel)
-        _check_choice("order", self.order, Order)
-        _check_choice("lowpass", self.lowpass, Lowpass)
-        _check_choice("stitching", self.stitching, Stitching)
         if not 0 < self.near < math.inf:
             raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
 
     def filter_variance(self, pixel_angle: float) -> float:
         """e^2 of docs/rendering.md: the variance added across the ray, radians^2."""
-        return FILTER_VARIANCE[self.lowpass] * pixel_angle**2 if self._filters_across_ray else 0.0
-
-    @property
-    def compensate(self) -> bool:
-        """Whether the opacity is lowered by as much as the filter widens a Gaussian."""
-        return self.lowpass == "angular"
-
-    @property
-    def dilation(self) -> float:
-        """Variance added to the projected covariance, pixels^2."""
-        return 0.0 if self._filters_across_ray else FILTER_VARIANCE[self.lowpass]
-
-    @property
-    def _filters_across_ray(self) -> bool:
-        return self.compensate or self.kernel == "ray"
+        return FILTER_VARIANCE * pixel_angle**2 if self.kernel == "ray" else 0.0
 
 
 @dataclass(frozen=True)
@@ -139,7 +113,7 @@ class RasterBackend(Protocol):
             gaussians: float32 or float64.
             pose: cam2world, float64, rigid.
             planes: of one size and focal length; a panorama with an eye offset is the only one.
-            options: `stitching` is not used.
+            options: of the image.
         """
         ...
 
@@ -199,10 +173,7 @@ def rasterize(
     background: Sequence[float] | Float[Tensor, "channel"] = (0.0, 0.0, 0.0),
     backend: Backend = "auto",
     kernel: Kernel = "ray",
-    order: Order = "radial",
-    lowpass: Lowpass = "angular",
     near: float = NEAR,
-    stitching: Stitching = "seamless",
 ) -> Rendering:
     """Rasterise Gaussians as one camera sees them.
 
@@ -220,12 +191,12 @@ def rasterize(
         background: one number for each channel; the default is black for any number of channels.
         backend: "torch" is the reference, "numba" is fast on a CPU (kernel "ray" only), "triton" on CUDA; "auto"
             chooses the fastest available for the kernel and the Gaussians' type and device.
-        kernel, order, lowpass, near, stitching: see `RasterOptions`.
+        kernel, near: see `RasterOptions`.
 
     Returns:
         The image, in the Gaussians' type.
     """
-    options = RasterOptions(kernel, order, lowpass, near, stitching)
+    options = RasterOptions(kernel, near)
     _check_arguments(size, layout, vertical_fov_degrees, face_size, eye_offset, backend, options)
     device = gaussians.means.device
     pose = torch.as_tensor(cam2world, device=device).double()
@@ -249,7 +220,7 @@ def rasterize(
     result = _select_backend(backend, gaussians, options.kernel)(gaussians, pose, planes, options)
     sums = result.sums.squeeze(0)
     if layout == "cubemap":
-        sums = stitch_faces(result.sums, size, stitching=options.stitching)
+        sums = stitch_faces(result.sums, size, official=kernel == "ewa")
     return _normalise_sums(sums, background_color, result.info)
 
 
@@ -302,10 +273,10 @@ def _check_arguments(
             "kernel 'ewa' approximates a pinhole projection and is not defined on layout 'equirect'; "
             "use layout='cubemap', or kernel='ray'"
         )
-    if options.stitching == "official" and (layout != "cubemap" or size[0] % 4 or size[1] != 2 * size[0]):
+    if options.kernel == "ewa" and layout == "cubemap" and (size[0] % 4 or size[1] != 2 * size[0]):
         raise InputError(
-            "stitching 'official' needs layout='cubemap' and a 2:1 panorama with a height that is a multiple of 4, "
-            f"got layout={layout!r} and size {tuple(size)}; use stitching='seamless'"
+            "kernel 'ewa' on layout 'cubemap' needs a 2:1 panorama with a height that is a multiple of 4, got size "
+            f"{tuple(size)}; choose another size, or use kernel='ray'"
         )
 
 

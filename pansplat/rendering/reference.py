@@ -96,7 +96,6 @@ def _select_and_project(
         chosen.gaussians,
         pose,
         filter_variance=options.filter_variance(plane.pixel_angle),
-        compensate=options.compensate,
         exact=options.kernel == "ray",
     )
     return chosen, projected
@@ -144,7 +143,7 @@ def _rasterize_plane(
     if options.kernel == "ewa":
         ahead = z > EWA_NEAR_FACTOR * options.near
         projected, z = ProjectedGaussians(*(field[ahead] for field in projected)), z[ahead]
-    key = projected.radius.detach() if options.order == "radial" or plane.is_panorama else z
+    key = projected.radius.detach() if options.kernel == "ray" else z
     footprints, boxes = compute_footprints(projected, plane, options)
     visible = torch.nonzero(is_in_image(boxes, plane))[:, 0]
     if len(visible) < len(boxes):

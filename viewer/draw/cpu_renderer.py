@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt32
 
+from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.rendering.cpu.display import (
@@ -36,7 +37,6 @@ from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMIT
 from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterOptions
 from pansplat.system.devices import say_place
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.displays import color_by_property
@@ -309,15 +309,14 @@ class CpuRenderer:
         plane = ImagePlane(
             (camera.height, camera.width), torch.from_numpy(np.ascontiguousarray(camera.rotation)), camera.focal
         )
-        options = RasterOptions(near=frame.settings.near)
-        deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
+        deviation = math.sqrt(FILTER_VARIANCE) * plane.pixel_angle
         selection = Selection(camera.compute_side_normals(), deviation)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,
             groups.labels,
             len(groups.weights),
-            options,
+            frame.settings.near,
             selection=selection,
             cache=cache,
             min_transmittance=self._min_transmittance,
@@ -345,7 +344,7 @@ class CpuRenderer:
             plane,
             groups.labels,
             len(groups.weights),
-            RasterOptions(near=settings.near),
+            settings.near,
             min_transmittance=self._min_transmittance,
         )
 

@@ -53,7 +53,8 @@ def rasterize_planes(
 
     The kernels have three channels: other numbers are rasterised in groups of three.
     """
-    require_exact_kernel(options)
+    if options.kernel != "ray":
+        raise InputError(f"backend 'numba' has kernel 'ray' only, got kernel {options.kernel!r}; use backend='torch'")
     if gaussians.means.device.type != "cpu":
         raise InputError(
             f"backend 'numba' needs Gaussians in main memory, got them on {gaussians.means.device}; use "
@@ -68,14 +69,13 @@ def rasterize_planes(
     tensors = tuple(tensor.to(torch.float32).contiguous() for tensor in tensors)
     harmonics = gaussians.harmonics.to(torch.float32)
     has_grad = any(tensor.requires_grad for tensor in (*tensors, harmonics, pose)) and torch.is_grad_enabled()
-    by_depth = options.order == "z" and not planes[0].is_panorama
-    if by_depth or (planes[0].eye_offset and has_grad):  # too rare for kernels of their own
+    if planes[0].eye_offset and has_grad:  # too rare for kernels of its own
         return reference.rasterize_planes(gaussians, pose, planes, options)
     groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
     parts = []
     for group in groups:
         statistics = Statistics()
-        parts.append(_Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors, group))
+        parts.append(_Rasterize.apply(pose, planes, options.near, statistics, torch.is_grad_enabled(), *tensors, group))
     sums = parts[0]
     if harmonics.shape[2] != 3:
         colors = torch.cat([part[:, :3] for part in parts], dim=1)[:, : harmonics.shape[2]]
@@ -92,12 +92,6 @@ def _split_channels(harmonics: Float[Tensor, "n k channel"]) -> list[Float[Tenso
     return [group.contiguous() for group in padded.split(3, dim=2)]
 
 
-def require_exact_kernel(options: RasterOptions) -> None:
-    """Raise an InputError for a kernel other than the exact one."""
-    if options.kernel != "ray":
-        raise InputError(f"backend 'numba' has kernel 'ray' only, got kernel {options.kernel!r}; use backend='torch'")
-
-
 class _Rasterize(torch.autograd.Function):
     """The sums of all image planes, differentiable once in the tensors and the pose."""
 
@@ -106,19 +100,19 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,
         pose: Tensor,
         planes: list[ImagePlane],
-        options: RasterOptions,
+        near: float,
         statistics: Statistics,
         grad_enabled: bool,
         *tensors: Tensor,
     ) -> Tensor:
         """Sums; `tensors` are the fields of GaussianArrays."""
-        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], options)
+        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], near)
         threads, workspace = thread_count(), Workspace()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
         with announce_compilation():
             with statistics.timed("project"):
                 projected = project_gaussians(gaussians, camera, workspace, threads)
-            view = CameraView(gaussians, camera, projected, options, threads)
+            view = CameraView(gaussians, camera, projected, threads)
             sums = pooled_empty((len(planes), VALUE_LANES + 1, *planes[0].size), np.float32)
             states = [
                 rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
@@ -129,7 +123,7 @@ class _Rasterize(torch.autograd.Function):
         result = torch.from_numpy(sums)
         if needs_grad:  # the workspace is kept because it owns the arrays of `projected` and `states`
             ctx.save_for_backward(*tensors, pose, result)
-            ctx.saved = planes, options, projected, states, workspace, threads
+            ctx.saved = planes, near, projected, states, workspace, threads
         return result
 
     @staticmethod
@@ -137,9 +131,9 @@ class _Rasterize(torch.autograd.Function):
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
-        planes, options, projected, states, _workspace, threads = ctx.saved
-        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], options)
-        view = CameraView(gaussians, camera, projected, options, threads)
+        planes, near, projected, states, _workspace, threads = ctx.saved
+        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], near)
+        view = CameraView(gaussians, camera, projected, threads)
         needs_pose, _, _, _, _, *needed = ctx.needs_input_grad
         grads = [
             torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if is_needed else None

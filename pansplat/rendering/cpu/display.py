@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int, UInt32
 
 from pansplat.geometry.cubemap import face_rotations
-from pansplat.rendering.cpu.backend import rasterize_plane, require_exact_kernel
+from pansplat.rendering.cpu.backend import rasterize_plane
 from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.runtime import (
     Workspace,
@@ -33,7 +33,6 @@ from pansplat.rendering.cpu.runtime import (
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterOptions
 
 MIN_TRANSMITTANCE = 2.0**-10
 """A pixel of a display image is finished at this transmittance: a quarter of a step of 8 bits."""
@@ -186,7 +185,7 @@ class DisplayScene:
         plane: ImagePlane,
         labels: Int[np.ndarray, "n"],
         num_layers: int,
-        options: RasterOptions,
+        near: float,
         *,
         selection: Selection | None = None,
         cache: SelectionCache | None = None,
@@ -199,18 +198,17 @@ class DisplayScene:
             plane: its rotation is from its axes to the world's; a direct panorama has its axes in the world's.
             labels: layer of each Gaussian, int16, or `NO_LAYER`.
             num_layers: number of layers.
-            options: of the image; with the exact kernel.
+            near: Gaussians whose mean is nearer are not drawn, metres.
             selection: leaves out Gaussians that are not in view.
             cache: has the Gaussians of earlier views; written if they do not serve this one.
             min_transmittance: a pixel is finished at this transmittance or below.
         """
-        require_exact_kernel(options)
         statistics, threads, workspace = Statistics(), thread_count(), Workspace()
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = torch.from_numpy(np.asarray(position, np.float64))
         if plane.is_panorama:  # its pixels have fixed directions in the records' axes
             pose[:3, :3], plane = plane.rotation, replace(plane, rotation=torch.eye(3, dtype=torch.float64))
-        camera = make_camera(pose, plane, options)
+        camera = make_camera(pose, plane, near)
         sums = pooled_empty((num_layers, 5, *plane.size), np.float32)
         with announce_compilation():
             with statistics.timed("select"):
@@ -229,7 +227,7 @@ class DisplayScene:
                 part = slice(start, end)
                 layer = ProjectedGaussians(*(array[part] for array in projected[:4]), 0, 0)
                 arrays = GaussianArrays(*(array[part] for array in gaussians))
-                view = CameraView(arrays, camera, layer, options, threads, min_transmittance)
+                view = CameraView(arrays, camera, layer, threads, min_transmittance)
                 rasterize_plane(view, plane, layer_sums, statistics)
                 start = end
         return Layers(sums, ends[-1] if ends else 0, statistics)

@@ -95,13 +95,11 @@ class Camera(NamedTuple):
     Attributes:
         pose: cam2world, (4, 4) float64.
         filter_variance: e^2, added across the ray, radians^2; above 0.
-        compensate: whether the filter lowers the opacity by the factor by which it widens the Gaussian.
         near: metres.
     """
 
     pose: np.ndarray
     filter_variance: float
-    compensate: bool
     near: float
 
 
@@ -146,7 +144,7 @@ def project_gaussians(
 @kernel
 def _project_gaussians(
     means, quats, scales, opacities, harmonics, harmonic_bits,
-    pose, filter_variance, compensate, near, view_dependent, records, values, radii, kept, counts, item,
+    pose, filter_variance, near, view_dependent, records, values, radii, kept, counts, item,
 ):  # fmt: skip
     align_stack()
     rows, block_kept = np.ones((NUM_ROWS, GAUSSIAN_BLOCK)), np.empty(GAUSSIAN_BLOCK, np.uint8)
@@ -159,7 +157,7 @@ def _project_gaussians(
         if may_be_invalid:
             _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
         for i in range(0, count, LANES):
-            state, is_kept = _compute_records(camera, filter_variance, compensate, near, rows, i, soa)
+            state, is_kept = _compute_records(camera, filter_variance, near, rows, i, soa)
             lanes_used = min(LANES, count - i)
             used = np.uint64((1 << lanes_used) - 1)
             num_dropped += popcount(mask_bits(state == 0.0) & used)
@@ -176,7 +174,7 @@ def _project_gaussians(
 
 
 @inline_kernel
-def _compute_records(pose, filter_variance, compensate, near, rows, i, soa):
+def _compute_records(pose, filter_variance, near, rows, i, soa):
     """Write the records of eight Gaussians, a row of `soa` per field; return their states and which are kept."""
     unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     n, radius, inverse, state = compute_direction(rows, i, pose, near)
@@ -196,9 +194,7 @@ def _compute_records(pose, filter_variance, compensate, near, rows, i, soa):
     store(soa, layout.L_ALONG_B * LANES, to_f32(inverse_unit * l_along_b))
     store(soa, layout.RADIAL_VARIANCE * LANES, to_f32((1 / layout.HALF_LOG2_E) * radial_variance))
     opacity = load_row(rows, OPACITY_ROW, i)
-    squared_peak = opacity * opacity
-    if compensate:
-        squared_peak = squared_peak * max(cov[6] * inverse_det, MIN_COMPENSATION)
+    squared_peak = opacity * opacity * max(cov[6] * inverse_det, MIN_COMPENSATION)
     kept = (state > 0) & (opacity >= OPACITY_CUT)
     log2_peak = select(kept, 0.5 * _log2(select(kept, squared_peak, broadcast(1.0))), broadcast(CULLED))
     store(soa, layout.LOG2_PEAK * LANES, to_f32(log2_peak))

@@ -53,7 +53,6 @@ def rasterize_planes(
             chosen.gaussians,
             pose,
             filter_variance=options.filter_variance(planes[0].pixel_angle),
-            compensate=options.compensate,
             exact=options.kernel == "ray",
         )
         footprints, instances = _compute_instances(projected, planes, options)
@@ -80,12 +79,11 @@ def project_gaussians(
     cam2world: Float[Tensor, "4 4"],
     *,
     filter_variance: float,
-    compensate: bool,
     exact: bool,
 ) -> ProjectedGaussians:
     """Project Gaussians; see `pansplat.rendering.projection.project_gaussians`."""
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, gaussians.quats, gaussians.scales)
-    return ProjectedGaussians(*_Project.apply(cam2world, filter_variance, compensate, exact, *fields))
+    return ProjectedGaussians(*_Project.apply(cam2world, filter_variance, exact, *fields))
 
 
 class _Project(torch.autograd.Function):
@@ -93,25 +91,25 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, cam2world: Tensor, filter_variance: float, compensate: bool, exact: bool, *fields: Tensor
+        ctx: Any, cam2world: Tensor, filter_variance: float, exact: bool, *fields: Tensor
     ) -> tuple[Tensor, ...]:
         from pansplat.rendering.cuda.projection import project_forward
 
         fields = tuple(field.contiguous() for field in fields)
         ctx.save_for_backward(cam2world, *fields)
-        options: Any = dict(filter_variance=filter_variance, compensate=compensate, exact=exact)
-        ctx.options = options
-        return tuple(project_forward(cam2world, fields, **options))
+        ctx.options = filter_variance, exact
+        return tuple(project_forward(cam2world, fields, filter_variance, exact=exact))
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
         from pansplat.rendering.cuda.projection_backward import backpropagate_projection
 
         cam2world, *fields = ctx.saved_tensors
+        filter_variance, exact = ctx.options
         grad_pose, *grad_fields = backpropagate_projection(
-            cam2world, fields, ProjectedGaussians(*grad_outputs), **ctx.options
+            cam2world, fields, ProjectedGaussians(*grad_outputs), filter_variance, exact=exact
         )
-        return grad_pose, None, None, None, *grad_fields
+        return grad_pose, None, None, *grad_fields
 
 
 def _compute_instances(
@@ -123,12 +121,10 @@ def _compute_instances(
     fixed = ProjectedGaussians(*(field.detach() for field in projected))
     boxes, keys, bases, parts, total = [], [], [], [], 0
     for plane in planes:
-        key, z = fixed.radius, fixed.radius
-        if not plane.is_panorama:
-            z = (fixed.direction * plane.rotation[:, 2]).sum(dim=1) * fixed.radius
-            key = z if options.order == "z" else key
+        key = fixed.radius
         if options.kernel == "ewa":
-            ahead = torch.nonzero(z > EWA_NEAR_FACTOR * options.near)[:, 0]
+            key = (fixed.direction * plane.rotation[:, 2]).sum(dim=1) * fixed.radius
+            ahead = torch.nonzero(key > EWA_NEAR_FACTOR * options.near)[:, 0]
             box = _compute_boxes(ProjectedGaussians(*(field[ahead] for field in fixed)), plane, options)
             visible = is_in_image(box, plane)
             seen, box = ahead[visible], box[visible]

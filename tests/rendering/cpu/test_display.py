@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat.constants import FILTER_VARIANCE, NEAR
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering.blend import blend
 from pansplat.rendering.cpu.display import (
@@ -19,7 +20,7 @@ from pansplat.rendering.cpu.display import (
     enlarge,
 )
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterOptions, rasterize
+from pansplat.rendering.rasterize import rasterize
 
 SIZE, FOV = (48, 70), 70.0
 FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(FOV) / 2)
@@ -63,14 +64,14 @@ def draw(display, pose, labels, layers, selection=None, size=SIZE, focal=FOCAL, 
     labels = labels if labels.dtype == np.int16 else labels.astype(np.int16)
     position = pose[:3, 3].numpy()
     chosen = {"selection": selection, "cache": cache}
-    return display.rasterize(position, plane, labels, layers, RasterOptions(), **chosen, min_transmittance=1e-7)
+    return display.rasterize(position, plane, labels, layers, NEAR, **chosen, min_transmittance=1e-7)
 
 
 def frustum(pose, scale=1.0):
     x, y = scale * 0.5 * SIZE[1] / FOCAL, scale * 0.5 * SIZE[0] / FOCAL
     normals = np.array(((-1, 0, x), (1, 0, x), (0, -1, y), (0, 1, y)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    deviation = math.sqrt(RasterOptions().filter_variance(1 / FOCAL))
+    deviation = math.sqrt(FILTER_VARIANCE) / FOCAL
     return Selection(normals @ pose[:3, :3].numpy().T, deviation)
 
 
@@ -125,7 +126,7 @@ def test_labels_without_a_layer_are_refused(labels, display, pose):
 
 def test_a_direct_panorama_has_the_axes_of_its_plane(scene, display, pose):
     plane = ImagePlane((32, 64), pose[:3, :3], 0.0)
-    layers = display.rasterize(pose[:3, 3].numpy(), plane, np.zeros(600, np.int16), 1, RasterOptions())
+    layers = display.rasterize(pose[:3, 3].numpy(), plane, np.zeros(600, np.int16), 1, NEAR)
     expected = rasterize(scene, pose, size=(32, 64), backend="numba")
     assert np.abs(layers.sums[0, :3] - expected.color.numpy()).max() <= 2e-3
 
