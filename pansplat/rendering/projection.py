@@ -6,7 +6,6 @@ compositing reads have the Gaussians' type.
 
 import functools
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -38,49 +37,21 @@ _UNBOUNDED = 1e9  # pixels, far outside any image
 # --- selection: the Gaussians that are finite, far enough and opaque enough ---
 
 
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """The Gaussians to project, and the number of the others.
-
-    Attributes:
-        total: number of Gaussians before the selection.
-        dropped: number of Gaussians that are not finite.
-        near: number of Gaussians nearer than `near`.
-    """
-
-    gaussians: Gaussians
-    total: int
-    dropped: int
-    near: int
-
-
-def select_drawable(gaussians: Gaussians, pose: Float[Tensor, "4 4"], options: RasterOptions) -> Selection:
+def select_drawable(gaussians: Gaussians, pose: Float[Tensor, "4 4"], near: float) -> Gaussians:
     """Select Gaussians before any arithmetic, so that the gradients of all others are exactly zero."""
-    radius = _compute_radius(gaussians, pose)
-    close = radius < options.near
-    usable = _are_usable(gaussians, radius, close)
-    dropped = len(gaussians) - int(usable.sum())
-    close &= usable
-    keep = usable & ~close & (gaussians.opacities.detach() >= OPACITY_CUT)
-    total, near = len(gaussians), int(close.sum())
-    if not bool(keep.all()):
-        gaussians = gaussians.select(keep)
-    return Selection(gaussians, total, dropped, near)
+    keep = _are_drawable(gaussians, pose, near)
+    return gaussians if bool(keep.all()) else gaussians.select(keep)
 
 
 @torch.no_grad()
-def _compute_radius(gaussians: Gaussians, pose: Tensor) -> Float[Tensor, "n"]:
-    return torch.linalg.vector_norm(gaussians.means.double() - pose[:3, 3], dim=1)
-
-
-@torch.no_grad()
-def _are_usable(gaussians: Gaussians, radius: Tensor, close: Tensor) -> Bool[Tensor, "n"]:
-    """Which Gaussians have finite numbers only, small enough for their products, and are not too large."""
-    keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+def _are_drawable(gaussians: Gaussians, pose: Float[Tensor, "4 4"], near: float) -> Bool[Tensor, "n"]:
+    radius = torch.linalg.vector_norm(gaussians.means.double() - pose[:3, 3], dim=1)
+    keep = (radius >= near) & (gaussians.opacities >= OPACITY_CUT)
+    # Finite numbers only, small enough for their products, and not too large for the distance.
     for name in ("means", "scales", "quats", "opacities", "harmonics"):
         field = getattr(gaussians, name)
-        keep &= (field.detach().abs() < MAX_MAGNITUDE).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
-    return keep & (close | (gaussians.scales.detach().double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius))
+        keep &= (field.abs() < MAX_MAGNITUDE).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
+    return keep & (gaussians.scales.double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius)
 
 
 # --- projection: Gaussians in the axes of one camera ---

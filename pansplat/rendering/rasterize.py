@@ -1,4 +1,4 @@
-"""The function `rasterize`: options, arguments, the protocol of backends, background and normalisation.
+"""The function `rasterize`: options, arguments, the type of backends, background and normalisation.
 
 Source: docs/rendering.md; PanSplat, section 3.4; docs/adr/0005 for why there are several backends.
 """
@@ -6,8 +6,8 @@ Source: docs/rendering.md; PanSplat, section 3.4; docs/adr/0005 for why there ar
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
+from dataclasses import dataclass
+from typing import Literal, ParamSpec, TypeVar, get_args
 
 import torch
 from jaxtyping import Float
@@ -54,68 +54,14 @@ class RasterOptions:
         return FILTER_VARIANCE * pixel_angle**2 if self.kernel == "ray" else 0.0
 
 
-@dataclass(frozen=True)
-class RasterInfo:
-    """Counts and costs of one call.
+RasterBackend = Callable[
+    [Gaussians, Float[Tensor, "4 4"], list[ImagePlane], RasterOptions], Float[Tensor, "plane sums height width"]
+]
+"""A backend's `rasterize_planes`: sums along each pixel's ray of weight x (channels, radial distance, 1).
 
-    Attributes:
-        total: Gaussians given.
-        dropped: Gaussians with a number that is not finite or too large, or a covariance that is not positive.
-        near: Gaussians nearer than `near`; with an eye offset, to the point between the eyes.
-        visible: Gaussians that can reach the alpha cut in the image; summed over the faces of a cubemap, and
-            over the columns of a panorama with an eye offset.
-        intersections: pairs of a Gaussian and a raster tile.
-        backend: its name.
-        bytes: peak working memory, where the backend counts it.
-        seconds: time of each stage, where the backend measures it.
-    """
-
-    total: int
-    dropped: int
-    near: int
-    visible: int
-    intersections: int
-    backend: str = "torch"
-    bytes: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class RasterSums:
-    """Image planes before background and normalisation.
-
-    Attributes:
-        sums: sums along each pixel's ray of weight x (channels, radial distance, 1).
-        info: counts over all the image planes.
-    """
-
-    sums: Float[Tensor, "plane sums height width"]
-    info: RasterInfo
-
-
-@runtime_checkable
-class RasterBackend(Protocol):
-    """Signature of a backend's `rasterize_planes`.
-
-    Differentiable in the pose and in all floating-point fields of the Gaussians.
-    """
-
-    def __call__(
-        self,
-        gaussians: Gaussians,
-        pose: Float[Tensor, "4 4"],
-        planes: list[ImagePlane],
-        options: RasterOptions,
-    ) -> RasterSums:
-        """Rasterise Gaussians on every image plane.
-
-        Args:
-            gaussians: float32 or float64.
-            pose: cam2world, float64, rigid.
-            planes: of one size and focal length; a panorama with an eye offset is the only one.
-            options: of the image.
-        """
-        ...
+It is differentiable in the pose (cam2world, float64, rigid) and in all floating-point fields of the Gaussians (float32
+or float64). The image planes have one size and focal length; a panorama with an eye offset is the only one.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,14 +72,12 @@ class Rendering:
         color: the Gaussians' channels (RGB) over the background; not clamped to 1.
         alpha: opacity in [0, 1].
         depth: mean radial distance, weighted as the colours are, metres; 0 where alpha is 0.
-        info: counts; None for an image that `rasterize` did not return.
         background: behind the Gaussians; None for black.
     """
 
     color: Float[Tensor, "channel height width"]
     alpha: Float[Tensor, "height width"]
     depth: Float[Tensor, "height width"]
-    info: RasterInfo | None = None
     background: Float[Tensor, "channel"] | None = None
 
     def __repr__(self) -> str:
@@ -217,11 +161,9 @@ def rasterize(
         eye_offset=eye_offset,
         device=device,
     )
-    result = _select_backend(backend, gaussians, options.kernel)(gaussians, pose, planes, options)
-    sums = result.sums.squeeze(0)
-    if layout == "cubemap":
-        sums = stitch_faces(result.sums, size, official=kernel == "ewa")
-    return _normalise_sums(sums, background_color, result.info)
+    sums = _select_backend(backend, gaussians, options.kernel)(gaussians, pose, planes, options)
+    sums = stitch_faces(sums, size, official=kernel == "ewa") if layout == "cubemap" else sums.squeeze(0)
+    return _normalise_sums(sums, background_color)
 
 
 def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> RasterBackend:
@@ -296,9 +238,7 @@ def _convert_background(given: Sequence[float] | Tensor, gaussians: Gaussians) -
     return color
 
 
-def _normalise_sums(
-    sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None, info: RasterInfo
-) -> Rendering:
+def _normalise_sums(sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None) -> Rendering:
     """Composite over the background, and divide the sum of distances by the sum of weights."""
     # The backward of `split` concatenates three pieces; that of indexing would add three whole images.
     channels, distance, weight = sums.split((len(sums) - 2, 1, 1))
@@ -307,4 +247,4 @@ def _normalise_sums(
     color = channels.clone() if background is None else channels + (1 - alpha) * background[:, None, None]
     seen = weight > 0
     depth = torch.where(seen, distance / torch.where(seen, weight, torch.ones_like(weight)), 0)
-    return Rendering(color, alpha, depth, info, background)
+    return Rendering(color, alpha, depth, background)

@@ -54,7 +54,6 @@ def test_an_empty_scene_is_background_and_gradients_of_zero(layout: str, render:
         expected = torch.tensor((0.1, 0.25, 0.5), dtype=render.dtype)[:, None, None].expand(3, *render.size)
         assert torch.equal(got.color, expected), name
         assert float(got.alpha.abs().max()) == float(got.depth.abs().max()) == 0
-        assert got.info is not None and got.info.intersections == 0
         for field, gradient in find_gradients(render, scene, layout=layout).items():
             shape = (4, 4) if field == "pose" else getattr(scene, field).shape
             assert gradient.shape == shape and not gradient.any(), (name, field)
@@ -71,7 +70,6 @@ def test_a_number_that_is_not_finite_drops_only_its_gaussian(field: str, render:
         value.reshape(6, -1)[2, -1] = poison
         poisoned = make_leaves(dataclasses.replace(scene, **{field: value}))
         got = render(poisoned, POSE)
-        assert got.info is not None and got.info.dropped == 1
         assert_same_bits(got, expected)
         measure_loss(got).backward()
         for name in FIELDS:
@@ -80,10 +78,9 @@ def test_a_number_that_is_not_finite_drops_only_its_gaussian(field: str, render:
 
 
 def test_scales_far_larger_than_the_distance_are_dropped_and_far_smaller_ones_vanish(render: Renderer) -> None:
-    for sigma, dropped in ((1e15, 1), (1e-25, 0)):
+    for sigma in (1e15, 1e-25):
         scene = make_spheres([(0, 0, 2.0), (0.5, 0.2, 1.0)], [sigma, 0.2])
         got = render(scene)
-        assert got.info is not None and got.info.dropped == dropped
         assert torch.equal(got.color, render(scene.select(torch.tensor([1]))).color)
         for name, gradient in find_gradients(render, scene).items():
             assert torch.isfinite(gradient).all() and (name == "pose" or not gradient[0].any())

@@ -32,7 +32,7 @@ from pansplat.rendering.cpu.tiling import (
 )
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
+from pansplat.rendering.rasterize import RasterOptions
 
 
 class _PlaneState(NamedTuple):
@@ -48,7 +48,7 @@ def rasterize_planes(
     pose: Float[Tensor, "4 4"],
     planes: list[ImagePlane],
     options: RasterOptions,
-) -> RasterSums:
+) -> Float[Tensor, "plane sums height width"]:
     """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
 
     The kernels have three channels: other numbers are rasterised in groups of three.
@@ -72,16 +72,12 @@ def rasterize_planes(
     if planes[0].eye_offset and has_grad:  # too rare for kernels of its own
         return reference.rasterize_planes(gaussians, pose, planes, options)
     groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
-    parts = []
-    for group in groups:
-        statistics = Statistics()
-        parts.append(_Rasterize.apply(pose, planes, options.near, statistics, torch.is_grad_enabled(), *tensors, group))
+    parts = [_Rasterize.apply(pose, planes, options.near, torch.is_grad_enabled(), *tensors, group) for group in groups]
     sums = parts[0]
     if harmonics.shape[2] != 3:
         colors = torch.cat([part[:, :3] for part in parts], dim=1)[:, : harmonics.shape[2]]
         sums = torch.cat((colors, parts[0][:, 3:]), dim=1)
-    info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
-    return RasterSums(sums.to(gaussians.means.dtype), info)
+    return sums.to(gaussians.means.dtype)
 
 
 def _split_channels(harmonics: Float[Tensor, "n k channel"]) -> list[Float[Tensor, "n k 3"]]:
@@ -101,7 +97,6 @@ class _Rasterize(torch.autograd.Function):
         pose: Tensor,
         planes: list[ImagePlane],
         near: float,
-        statistics: Statistics,
         grad_enabled: bool,
         *tensors: Tensor,
     ) -> Tensor:
@@ -110,16 +105,13 @@ class _Rasterize(torch.autograd.Function):
         threads, workspace = thread_count(), Workspace()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
         with announce_compilation():
-            with statistics.timed("project"):
-                projected = project_gaussians(gaussians, camera, workspace, threads)
+            projected = project_gaussians(gaussians, camera, workspace, threads)
             view = CameraView(gaussians, camera, projected, threads)
             sums = pooled_empty((len(planes), VALUE_LANES + 1, *planes[0].size), np.float32)
             states = [
-                rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
+                rasterize_plane(view, plane, plane_sums, Statistics(), workspace if needs_grad else None)
                 for plane, plane_sums in zip(planes, sums, strict=True)
             ]
-        statistics.dropped, statistics.near = projected.dropped, projected.near
-        statistics.bytes += sums.nbytes + sum(array.nbytes for array in projected[:4])
         result = torch.from_numpy(sums)
         if needs_grad:  # the workspace is kept because it owns the arrays of `projected` and `states`
             ctx.save_for_backward(*tensors, pose, result)
@@ -134,7 +126,7 @@ class _Rasterize(torch.autograd.Function):
         planes, near, projected, states, _workspace, threads = ctx.saved
         gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], near)
         view = CameraView(gaussians, camera, projected, threads)
-        needs_pose, _, _, _, _, *needed = ctx.needs_input_grad
+        needs_pose, _, _, _, *needed = ctx.needs_input_grad
         grads = [
             torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if is_needed else None
             for tensor, is_needed in zip(tensors, needed, strict=True)
@@ -153,7 +145,7 @@ class _Rasterize(torch.autograd.Function):
         if needs_pose:
             grad_pose = torch.zeros_like(pose)
             grad_pose[:3] = torch.from_numpy(gradients.pose)
-        return (grad_pose, None, None, None, None, *grads)
+        return (grad_pose, None, None, None, *grads)
 
 
 def rasterize_plane(
@@ -169,7 +161,7 @@ def rasterize_plane(
     """
     projected, threads, needs_grad = view.projected, view.threads, saved_in is not None
     if plane.eye_offset:
-        rasterize_columns(view, plane, sums, statistics)
+        rasterize_columns(view, plane, sums)
         return None
     workspace = saved_in or Workspace()
     with statistics.timed("bound"):
@@ -187,12 +179,9 @@ def rasterize_plane(
         saved = allocate_saved(tiles.starts, tiles.workspace) if needs_grad and is_whole_image else None
         with statistics.timed("rasterize"):
             _rasterize_band(view, tiles, tables, sums, saved)
-        statistics.intersections += len(tiles.intersections)
-        arrays = [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
-        statistics.bytes = max(statistics.bytes, sum(array.nbytes for array in arrays))
         if saved is not None:
             state = state._replace(tiles=tiles, saved=saved)
-        del tiles, arrays  # the next band reuses their memory
+        del tiles  # the next band reuses their memory
     statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
     return state if needs_grad else None
 

@@ -225,7 +225,7 @@ class DisplayScene:
             start = 0
             for end, layer_sums in zip(ends, sums, strict=True):
                 part = slice(start, end)
-                layer = ProjectedGaussians(*(array[part] for array in projected[:4]), 0, 0)
+                layer = ProjectedGaussians(*(array[part] for array in projected))
                 arrays = GaussianArrays(*(array[part] for array in gaussians))
                 view = CameraView(arrays, camera, layer, threads, min_transmittance)
                 rasterize_plane(view, plane, layer_sums, statistics)

@@ -160,7 +160,7 @@ def _backpropagate_projection(
         records_to_soa(record_sums, 0, count, soa.reshape(-1), GAUSSIAN_BLOCK)
         _clear_culled(scene_kept, start, count, pose, rows, soa, kept)
         for i in range(0, GAUSSIAN_BLOCK, LANES):
-            _backpropagate_records(camera, filter_variance, near, rows, soa.reshape(-1), grad_pose, i)
+            _backpropagate_records(camera, filter_variance, rows, soa.reshape(-1), grad_pose, i)
         if view_dependent is None:
             backpropagate_constant_colors(start, count, values, value_sums, grad_harmonics)
         else:
@@ -233,10 +233,10 @@ def _clear_culled(scene_kept, start, count, pose, rows, soa, kept):
 
 
 @inline_kernel
-def _backpropagate_records(pose, filter_variance, near, rows, soa, grad_pose, i):
+def _backpropagate_records(pose, filter_variance, rows, soa, grad_pose, i):
     """Write the gradients of shapes, opacities, directions and distances, given those of records."""
-    n, radius, inverse, state = compute_direction(rows, i, pose, near)
-    u, v, cov, _ = compute_tangent_covariance(rows, i, n, inverse, state)
+    n, radius, inverse = compute_direction(rows, i, pose)
+    u, v, cov, _ = compute_tangent_covariance(rows, i, n, inverse)
     g_n, parts, g_det = _backpropagate_footprint_rows(pose, filter_variance, u, v, n, cov, soa, i, grad_pose)
     g_n, g_radius = _backpropagate_axes(rows, i, u, n, inverse, g_n, parts, g_det)
     store_row(rows, _RADIUS_GRAD_ROW, i, load_row(rows, _RADIUS_GRAD_ROW, i) + g_radius)

@@ -1,4 +1,4 @@
-"""A scene as one camera sees it, and the counts and times of a call."""
+"""A scene as one camera sees it, and the times of a call."""
 
 import time
 from collections.abc import Iterator
@@ -36,13 +36,9 @@ def make_camera(pose: Tensor, plane: ImagePlane, near: float) -> Camera:
 
 @dataclass
 class Statistics:
-    """Counts, peak bytes of arrays and seconds by stage, collected for `RasterInfo`."""
+    """The number of Gaussians that reach an image, and seconds by stage."""
 
-    dropped: int = 0
-    near: int = 0
     visible: int = 0
-    intersections: int = 0
-    bytes: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
