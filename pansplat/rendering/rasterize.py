@@ -133,8 +133,8 @@ def rasterize(
         eye_offset: of layout "equirect": radius of the viewing circle of omni-directional stereo, metres, half the
             distance of the eyes. Positive for the right eye, negative for the left. The gradients are those of "torch".
         background: one number for each channel; the default is black for any number of channels.
-        backend: "torch" is the reference, "numba" is fast on a CPU (kernel "ray" only), "triton" on CUDA; "auto"
-            chooses the fastest available for the kernel and the Gaussians' type and device.
+        backend: "torch" is the reference, "numba" fast on a CPU (kernel "ray", three channels), "triton" on CUDA; "auto"
+            chooses the fastest available for the kernel, and the Gaussians' type, channels and device.
         kernel, near: see `RasterOptions`.
 
     Returns:
@@ -163,14 +163,15 @@ def rasterize(
     )
     sums = _select_backend(backend, gaussians, options.kernel)(gaussians, pose, planes, options)
     sums = stitch_faces(sums, size, official=kernel == "ewa") if layout == "cubemap" else sums.squeeze(0)
-    return _normalise_sums(sums, background_color)
+    return normalise_sums(sums, background_color)
 
 
 def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> RasterBackend:
-    """Select the backend of this name; "auto" chooses by the kernel and the Gaussians' type and device."""
+    """Select the backend of this name; "auto" chooses by the kernel, and the Gaussians' type, channels and device."""
     if name == "auto":
         on_cpu = gaussians.means.device.type == "cpu"
-        available = kernel == "ray" if on_cpu else gaussians.means.is_cuda and find_triton_problem() is None
+        has_numba = on_cpu and kernel == "ray" and gaussians.harmonics.shape[2] == 3
+        available = has_numba if on_cpu else gaussians.means.is_cuda and find_triton_problem() is None
         fast: Backend = "numba" if on_cpu else "triton"
         name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
     if name == "numba":
@@ -238,7 +239,7 @@ def _convert_background(given: Sequence[float] | Tensor, gaussians: Gaussians) -
     return color
 
 
-def _normalise_sums(sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None) -> Rendering:
+def normalise_sums(sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None) -> Rendering:
     """Composite over the background, and divide the sum of distances by the sum of weights."""
     # The backward of `split` concatenates three pieces; that of indexing would add three whole images.
     channels, distance, weight = sums.split((len(sums) - 2, 1, 1))

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.constants import MAX_MAGNITUDE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
@@ -49,12 +48,12 @@ def rasterize_planes(
     planes: list[ImagePlane],
     options: RasterOptions,
 ) -> Float[Tensor, "plane sums height width"]:
-    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
-
-    The kernels have three channels: other numbers are rasterised in groups of three.
-    """
-    if options.kernel != "ray":
-        raise InputError(f"backend 'numba' has kernel 'ray' only, got kernel {options.kernel!r}; use backend='torch'")
+    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`."""
+    if options.kernel != "ray" or gaussians.harmonics.shape[2] != 3:
+        raise InputError(
+            f"backend 'numba' has kernel 'ray' and three channels only, got kernel {options.kernel!r} and "
+            f"{gaussians.harmonics.shape[2]} channels; use backend='torch'"
+        )
     if gaussians.means.device.type != "cpu":
         raise InputError(
             f"backend 'numba' needs Gaussians in main memory, got them on {gaussians.means.device}; use "
@@ -65,27 +64,13 @@ def rasterize_planes(
             f"`size` must be at most {LARGEST_SIDE} pixels a side for backend 'numba', got {planes[0].size}; "
             "choose a smaller size, or use backend='torch'"
         )
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    tensors = tuple(tensor.to(torch.float32).contiguous() for tensor in tensors)
-    harmonics = gaussians.harmonics.to(torch.float32)
-    has_grad = any(tensor.requires_grad for tensor in (*tensors, harmonics, pose)) and torch.is_grad_enabled()
+    fields = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.harmonics
+    tensors = tuple(field.to(torch.float32).contiguous() for field in fields)
+    has_grad = any(tensor.requires_grad for tensor in (*tensors, pose)) and torch.is_grad_enabled()
     if planes[0].eye_offset and has_grad:  # too rare for kernels of its own
         return reference.rasterize_planes(gaussians, pose, planes, options)
-    groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
-    parts = [_Rasterize.apply(pose, planes, options.near, torch.is_grad_enabled(), *tensors, group) for group in groups]
-    sums = parts[0]
-    if harmonics.shape[2] != 3:
-        colors = torch.cat([part[:, :3] for part in parts], dim=1)[:, : harmonics.shape[2]]
-        sums = torch.cat((colors, parts[0][:, 3:]), dim=1)
+    sums = _Rasterize.apply(pose, planes, options.near, torch.is_grad_enabled(), *tensors)
     return sums.to(gaussians.means.dtype)
-
-
-def _split_channels(harmonics: Float[Tensor, "n k channel"]) -> list[Float[Tensor, "n k 3"]]:
-    """The channels in groups of three, the last one with zeros; a Gaussian that is unusable in one is so in all."""
-    usable = (harmonics.abs() <= MAX_MAGNITUDE).all(dim=2).all(dim=1)
-    padded = torch.nn.functional.pad(harmonics, (0, -harmonics.shape[2] % 3 if harmonics.shape[2] else 3))
-    padded = torch.where(usable[:, None, None], padded, torch.nan)
-    return [group.contiguous() for group in padded.split(3, dim=2)]
 
 
 class _Rasterize(torch.autograd.Function):

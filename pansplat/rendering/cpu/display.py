@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, Int, UInt32
 
 from pansplat.geometry.cubemap import face_rotations
+from pansplat.rendering.blend import blend
 from pansplat.rendering.cpu.backend import rasterize_plane
 from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.runtime import (
@@ -33,6 +34,7 @@ from pansplat.rendering.cpu.runtime import (
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.rasterize import normalise_sums
 
 MIN_TRANSMITTANCE = 2.0**-10
 """A pixel of a display image is finished at this transmittance: a quarter of a step of 8 bits."""
@@ -375,19 +377,10 @@ def blend_layers(
 
     Source: docs/rendering.md, section 7, with positive weights.
     """
-    alphas = np.minimum(sums[:, 4], 1)
-    mix = np.asarray(weights, np.float32)[:, None, None] * alphas
-    total = mix.sum(axis=0)
-    scale = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
-    alpha = alphas.max(axis=0)
-    with np.errstate(invalid="ignore"):
-        depths = np.where(sums[:, 4] > 0, sums[:, 3] / np.where(sums[:, 4] > 0, sums[:, 4], 1), 0)
-    color = np.empty((*alpha.shape, 4), np.float32)
-    for channel in range(3):
-        mixed = np.tensordot(np.asarray(weights, np.float32), sums[:, channel], axes=1)
-        color[..., channel] = mixed * scale * alpha + (1 - alpha) * background[channel]
-    color[..., 3] = alpha
-    return color, (mix * depths).sum(axis=0) * scale
+    behind = torch.tensor(background, dtype=torch.float32)
+    layers = [normalise_sums(torch.from_numpy(layer), behind) for layer in sums]
+    image = blend(layers, torch.as_tensor(weights, dtype=torch.float32))
+    return torch.cat((image.color, image.alpha[None])).movedim(0, 2).contiguous().numpy(), image.depth.numpy()
 
 
 def blend_to_pixels(

@@ -112,4 +112,4 @@ def test_auto_selects_triton_only_on_cuda(unchecked, monkeypatch):
 def select_automatically(*, is_cuda: bool) -> object:
     device = torch.device("cuda" if is_cuda else "cpu")
     means = types.SimpleNamespace(is_cuda=is_cuda, device=device, dtype=torch.float32)
-    return _select_backend("auto", types.SimpleNamespace(means=means), "ewa")
+    return _select_backend("auto", types.SimpleNamespace(means=means, harmonics=torch.zeros(1, 1, 3)), "ewa")
