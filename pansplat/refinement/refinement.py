@@ -35,7 +35,7 @@ from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merg
 from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
 from pansplat.rendering import rasterize
-from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.rendering.color_fit import count_steps, fit_colors
 from pansplat.rendering.weights import compute_blending_weights
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
@@ -53,7 +53,6 @@ _BETAS, _POSE_BETAS = (0.5, 0.95), (0.9, 0.99)
 # size; it grows with the number of their pixels. Gaussians of little effect move less.
 _DAMPING = 0.2
 _STEPS_SHARE = 0.65  # of the time, that the steps take; the rest is the fit of colours (the sample on two cores)
-_COLORS = ColorFitConfig()
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
 # Of a timed run: with a limit of Gaussians (merged ones that are not fitted look like dots), and for each photograph in
@@ -420,7 +419,7 @@ class Refinement:
         gradient = 1.7  # of a backward pass
         weights, product = 1.2, 0.5  # of blending weights, and of a product with them
         contributions = (others + views) * (weights + product)
-        steps = _COLORS.steps_at(self._images.shape[-2])
+        steps = count_steps(self._images.shape[-2])
         colors = views * pixels * (weights + product + 2 * steps * product)
         return (contributions + colors) / (layers * (1 + gradient))
 
@@ -429,7 +428,7 @@ class Refinement:
         images = self._images
         if scene.joint and scene.gains:
             images = images / torch.tensor(scene.gains).to(images)[:, :, None, None]
-        colors = fit_colors(scene.gaussians, images, scene.cam2world, self._masks, _COLORS, joint=scene.joint)
+        colors = fit_colors(scene.gaussians, images, scene.cam2world, self._masks, joint=scene.joint)
         return dataclasses.replace(scene, gaussians=colors)
 
 

@@ -133,8 +133,8 @@ def rasterize(
         eye_offset: of layout "equirect": radius of the viewing circle of omni-directional stereo, metres, half the
             distance of the eyes. Positive for the right eye, negative for the left. The gradients are those of "torch".
         background: one number for each channel; the default is black for any number of channels.
-        backend: "torch" is the reference, "numba" fast on a CPU (kernel "ray", three channels), "triton" on CUDA; "auto"
-            chooses the fastest available for the kernel, and the Gaussians' type, channels and device.
+        backend: "torch" is the reference, "numba" fast on a CPU (kernel "ray", three channels), "triton" on CUDA;
+            "auto" chooses the fastest available for the kernel, and the Gaussians' type, channels and device.
         kernel, near: see `RasterOptions`.
 
     Returns:
