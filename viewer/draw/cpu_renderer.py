@@ -14,6 +14,7 @@ from concurrent.futures import Future, TimeoutError
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt32
@@ -31,7 +32,6 @@ from pansplat.rendering.cpu.display import (
     SelectionCache,
     blend_layers,
     blend_to_pixels,
-    enlarge,
 )
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
 from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
@@ -513,7 +513,7 @@ def _enlarge(
     """The pixels at the full size of the frame: OpenGL in software takes ten times as long to enlarge a texture."""
     if frame.size == frame.full_size:
         return pixels
-    start, large = time.perf_counter(), pooled_empty(frame.full_size[::-1], np.uint32)
-    enlarge(pixels, large)
+    start, large = time.perf_counter(), pooled_empty((*frame.full_size[::-1], 4), np.uint8)
+    cv2.resize(pixels.view(np.uint8).reshape(*pixels.shape, 4), frame.full_size, large)
     stages["enlarge"] = 1e3 * (time.perf_counter() - start)
-    return large
+    return large.view(np.uint32)[..., 0]

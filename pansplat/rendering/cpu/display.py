@@ -448,34 +448,6 @@ def _blend_row(sums, weights, background, y, rgb, total, coverage):
         rgb[2, x] = rgb[2, x] * scale + behind * background[2]
 
 
-def enlarge(image: UInt32[np.ndarray, "height width"], pixels: UInt32[np.ndarray, "large_height large_width"]) -> None:
-    """Write an image at a larger size, by bilinear interpolation between the centres of its pixels."""
-    places = []
-    for small, large in zip(image.shape, pixels.shape, strict=True):
-        place = np.clip((np.arange(large) + 0.5) * (small / large) - 0.5, 0, small - 1)
-        places.append((place * (1 << _FRACTION_BITS)).astype(np.int32))
-    work = partial(_enlarge_rows, image, *places, pixels)
-    with announce_compilation():
-        parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
-
-
-@kernel
-def _enlarge_rows(image, rows, columns, pixels, item):
-    height, width = image.shape
-    mixed = np.empty(width + 1, np.uint32)
-    for y in range(item * _ROWS_PER_ITEM, min((item + 1) * _ROWS_PER_ITEM, len(rows))):
-        upper, fraction = rows[y] >> _FRACTION_BITS, np.uint32(rows[y] & 255)
-        lower = min(upper + 1, height - 1)
-        for x in range(width):
-            mixed[x] = _mix(image[upper, x], image[lower, x], fraction)
-        mixed[width] = mixed[width - 1]
-        row = pixels[y]
-        for x in range(len(columns)):
-            place = load_scalar(columns, x)
-            left, right = place >> _FRACTION_BITS, np.uint32(place & 255)
-            store_scalar(row, x, _mix(load_scalar(mixed, left), load_scalar(mixed, left + 1), right))
-
-
 # --- a rotated view from cube faces ---
 
 

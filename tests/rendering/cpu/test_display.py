@@ -17,7 +17,6 @@ from pansplat.rendering.cpu.display import (
     SelectionCache,
     blend_layers,
     blend_to_pixels,
-    enlarge,
 )
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import rasterize
@@ -158,16 +157,6 @@ def test_pixels_are_the_blended_layers_rounded(scene, display, pose, bottom_up):
     bytes_ = pixels.view(np.uint8).reshape(*SIZE, 4)[:: -1 if bottom_up else 1]
     assert np.abs(bytes_[..., :3] - 255 * np.clip(color[..., :3], 0, 1)).max() <= 0.51
     assert (bytes_[..., 3] == 255).all()
-
-
-@pytest.mark.parametrize("size", [(14, 20), (16, 33), (7, 11)])
-def test_enlarged_images_interpolate_between_pixel_centres(size):
-    image = np.random.default_rng(0).integers(0, 2**32, (7, 11), dtype=np.uint32)
-    pixels = np.empty(size, np.uint32)
-    enlarge(image, pixels)
-    channels = torch.from_numpy(image.view(np.uint8).reshape(7, 11, 4)).permute(2, 0, 1).double()
-    expected = torch.nn.functional.interpolate(channels[None], size, mode="bilinear")[0].permute(1, 2, 0).numpy()
-    assert np.abs(pixels.view(np.uint8).reshape(*size, 4) - expected).max() <= 3, "positions are rounded to 1/256"
 
 
 def test_sampled_faces_show_smooth_functions_of_the_direction_without_seams(pose):
