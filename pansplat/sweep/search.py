@@ -27,7 +27,6 @@ from pansplat.sweep.axes import (
 )
 from pansplat.sweep.bend import bend_surfaces
 from pansplat.sweep.matching import (
-    AggregationConfig,
     DepthRange,
     HypothesisSet,
     MatchingConfig,
@@ -298,7 +297,7 @@ class _SearchLevel:
     ) -> Surface:
         """The surface of lowest aggregated cost."""
         count = len(sets[0].penalty)
-        total = aggregate_costs(cost, self.views[view].image, slot_map, slots, AggregationConfig())
+        total = aggregate_costs(cost, self.views[view].image, slot_map, slots)
         label, offset = select_labels(total, count)
         chosen, k = label // count, label % count
         base = np.stack([s.base for s in sets], axis=-1)
