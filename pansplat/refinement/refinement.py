@@ -93,8 +93,6 @@ class RefineReport:
             which is not refined.
         before: mean absolute error of the held-out blocks at the start, of the scene within the limit of Gaussians.
         after: the same before the last part of the run, which fits these blocks, or at the end of a run without it.
-        gains: factors of the photographs' channels relative to their geometric mean.
-        history: (step, seconds, error of the held-out blocks) of each check.
     """
 
     steps: int
@@ -102,8 +100,6 @@ class RefineReport:
     stopped: str
     before: float
     after: float
-    gains: Gains
-    history: tuple[tuple[int, float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -349,17 +345,11 @@ class Refinement:
         if self._start.joint:
             min_steps = _MIN_STEPS * len(self._photographs)
         clock = _Clock(seconds, steps, self._created, min_steps)
-        history: list[tuple[int, float, float]] = []
         if len(self._photographs) == 1:  # one photograph does not show what is wrong seen from elsewhere
             self._result, error = self._start, self.held_out_error()
-            return RefineReport(0, clock.elapsed, "single view", error, error, self._start.gains, ())
+            return RefineReport(0, clock.elapsed, "single view", error, error)
 
-        def measure() -> float:
-            error = self.held_out_error()
-            history.append((clock.steps, clock.elapsed, error))
-            return error
-
-        before = best = measure()
+        before = best = self.held_out_error()
         after: float | None = None  # measured when the release begins, which fits the held-out blocks
         fastest, stale, stopped = math.inf, 0, "done"
         while self._views and (fraction := clock.fraction) < 1:
@@ -368,7 +358,7 @@ class Refinement:
                 break
             report_progress("refining", _STEPS_SHARE * fraction)
             if after is None and fraction >= _RELEASE and not self._start.joint:
-                after = measure()
+                after = self.held_out_error()
             if after is not None and after > before:
                 break
             start = clock.elapsed
@@ -378,13 +368,13 @@ class Refinement:
             clock.reserve(self._end_cost() * fastest)
             if self._start.joint or clock.steps % _CHECK_EVERY or clock.fraction >= _RELEASE:
                 continue
-            error = measure()
+            error = self.held_out_error()
             stale = 0 if error < best * (1 - _MIN_IMPROVEMENT) else stale + 1
             best = min(best, error)
             if stale >= _PATIENCE:
                 stopped, after = "converged", error
                 clock.shorten()
-        after = measure() if after is None else after
+        after = self.held_out_error() if after is None else after
         report_progress("fitting colours", _STEPS_SHARE)
         self._result = self.scene() if after <= before else self._start
         self._free_parameters()
@@ -396,7 +386,7 @@ class Refinement:
         if after <= before or self._start.joint:  # a fused scene has the colours of single photographs
             self._result = self._finish(self._result)
         report_progress("refined", 1.0)
-        return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
+        return RefineReport(clock.steps, clock.elapsed, stopped, before, after)
 
     def _free_parameters(self) -> None:
         """Free the parameters and the optimiser's state, which are gigabytes for millions of Gaussians."""

@@ -48,7 +48,6 @@ def test_refinement_brings_the_image_between_the_cameras_near_the_truth(room) ->
     refined, report = _refine(room, steps=60)
     assert room.error(refined, middle) < 0.5 * room.error(room.predicted, middle)
     assert report.after < 0.5 * report.before and report.steps <= 60
-    assert (report.history[0][0], report.history[0][2]) == (0, report.before)
     assert torch.equal(refined.cam2world, room.predicted.cam2world)
 
 
@@ -66,9 +65,8 @@ def test_the_exposure_of_a_photograph_is_found(room) -> None:
     scene = dataclasses.replace(
         room.predicted, gaussians=dataclasses.replace(room.predicted.gaussians, harmonics=darker)
     )
-    refined, report = _refine(room, views=dataclasses.replace(room.views, images=images), scene=scene, steps=60)
-    assert refined.gains == report.gains
-    ratios = [b / a for a, b in zip(*report.gains, strict=True)]
+    refined, _ = _refine(room, views=dataclasses.replace(room.views, images=images), scene=scene, steps=60)
+    ratios = [b / a for a, b in zip(*refined.gains, strict=True)]
     assert ratios == pytest.approx([0.8] * 3, abs=0.03)
 
 
